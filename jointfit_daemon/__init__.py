@@ -1,0 +1,8 @@
+"""Joint positions and angles from body-worn IMUs, live."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("jointfitd")
+except PackageNotFoundError:  # a checkout that is not installed
+    __version__ = "0+unknown"

@@ -1,0 +1,69 @@
+"""What a calibration is fitted to: recorded tracks on one clock, and what was asked for.
+
+Law: plain data. All instants are host CLOCK_MONOTONIC nanoseconds, already through the clocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+Method = Literal["anchored", "patent12", "patent6", "mean"]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTrack:
+    """Orientations of one sensor over time."""
+
+    t_ns: NDArray[np.int64]
+    """Shape (n,), strictly increasing."""
+    q_world_sensor: NDArray[np.float64]
+    """Shape (n, 4), the sensor's own world."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpticalTrack:
+    """What the optical system saw; NaN where it did not."""
+
+    t_ns: NDArray[np.int64]
+    """Instants of exposure, shape (m,), strictly increasing."""
+    markers: tuple[str, ...]
+    positions: NDArray[np.float64]
+    """Marker positions in the optical world (z up), m, shape (m, len(markers), 3)."""
+    bodies: tuple[str, ...]
+    body_positions: NDArray[np.float64]
+    """m, shape (m, len(bodies), 3)."""
+    body_orientations: NDArray[np.float64]
+    """q_world_body, shape (m, len(bodies), 4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationTrial:
+    """One phase of a calibration as it was recorded."""
+
+    sensors: Mapping[str, SensorTrack]
+    optical: OpticalTrack | None
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationSettings:
+    """What rig.toml says about calibration, in SI."""
+
+    method: Method = "anchored"
+    static_s: float = 5.0
+    align_s: float = 30.0
+    functional_s: float = 30.0
+    markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Markers of each segment or neighbouring body part (pelvis, foot)."""
+    rigid_bodies: Mapping[str, str] = field(default_factory=dict)
+    """Rigid body of each segment, where markers are not given."""
+    plate: str | None = None
+    """Rigid body of the plate that carries the sensors in the align phase."""
+    holdout_share: float = 0.4
+    """Last share of the functional trial, contiguous, that judges the fit."""

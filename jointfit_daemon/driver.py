@@ -1,0 +1,147 @@
+"""What a driver is, what it may raise, and how one is found.
+
+Law: this file names no device. A driver is found by entry point (group ``jointfit.drivers``), one
+at a time and only when asked for, so that a broken plug-in hurts nobody but its users.
+
+A driver has two halves. ``decoder()`` gives the pure half: chunks in, samples in SI out, no clock,
+no port. ``run(emit)`` is the reading half: it opens, configures and reads until cancelled. The
+daemon feeds every emitted chunk to a fresh decoder; a replay does the same with recorded chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, cast
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from jointfit_daemon.model import Chunk
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Decoded, TickClock
+
+ENTRY_POINT_GROUP = "jointfit.drivers"
+
+Emit = Callable[[Chunk], None]
+"""Hands one chunk to the daemon. Synchronous; what it raises is a bug and must reach the caller."""
+
+Wire = Literal["stream", "datagram", "can"]
+"""How chunks are cut: any cut of a byte stream, one datagram each, or runs of CAN records."""
+
+
+class DeviceLost(Exception):  # noqa: N818 - named for what happened, as CONVENTIONS.md asks
+    """The device is absent, taken, unplugged or silent: worth another try."""
+
+
+class DeviceMisconfigured(Exception):  # noqa: N818 - named for what happened
+    """The device can never work with these settings: the message says what to change."""
+
+
+class Settings(BaseModel):
+    """Base of every table a driver reads from rig.toml: frozen, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CanBusSettings(Settings):
+    """One ``[can.NAME]`` table: a bus that several devices may share."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")  # further keys go to python-can as they are
+
+    interface: str = Field("socketcan", description="python-can interface name, or `slcan` (our own codec)")
+    channel: str = Field(description="`can0`, or the serial port of an SLCAN adapter")
+    bitrate: int = Field(1_000_000, gt=0, description="bit/s; ignored where the kernel set it already")
+    baud: int = Field(115_200, gt=0, description="speed of the serial port of an SLCAN adapter, baud")
+
+
+class ImuSettings(Settings):
+    """Keys that every ``[[imu]]`` table has; a driver's ``Settings`` derives from this."""
+
+    id: str = Field(description="name of the sensor; becomes an MQTT topic")
+    segment: str = Field(description="the segment of [chain] it is worn on")
+    driver: str = Field(description="driver name, as `jointfit check` lists them")
+    rate_hz: float = Field(100.0, gt=0, le=2000, description="samples per second asked of the device")
+    silence_s: float = Field(1.0, gt=0, description="no byte for this long is a lost device")
+
+
+class MocapSettings(Settings):
+    """Keys that every ``[mocap]`` table has; a driver's ``Settings`` derives from this."""
+
+    driver: str = Field(description="driver name")
+    up_axis: Literal["x", "y", "z"] = Field("y", description="the stream's up axis")
+    markers: dict[str, tuple[str, ...]] = Field(
+        default_factory=dict, description="markers of each segment, at least three, not on a line"
+    )
+    rigid_body: dict[str, str] = Field(
+        default_factory=dict, description="rigid body of each segment, instead of markers"
+    )
+    plate: str | None = Field(
+        None, description="rigid body of the plate that carries the sensors in the align phase"
+    )
+    silence_s: float = Field(1.0, gt=0, description="no datagram for this long is a lost server")
+
+
+class Decoder(Protocol):
+    """The pure half of a driver. Never raises on input."""
+
+    @property
+    def tick_clock(self) -> TickClock | None:
+        """How the device counts time, as far as known yet."""
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages of any kind so far."""
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes that belong to no message so far."""
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return what `chunk` completed, in wire order."""
+
+    def flush(self) -> list[Decoded]:
+        """Give up waiting for the rest of a pending message: end of input, or silence."""
+
+
+class Driver(Protocol):
+    """A driver class as an entry point names it."""
+
+    Settings: ClassVar[type[Any]]
+    """Pydantic model of its rig.toml table; derives from ImuSettings or MocapSettings."""
+    wire: ClassVar[Wire]
+
+    def __init__(self, settings: Any) -> None: ...
+
+    def decoder(self) -> Decoder:
+        """Return a fresh decoder."""
+
+    async def run(self, emit: Emit) -> None:
+        """Open, configure, read until cancelled; raise DeviceLost or DeviceMisconfigured."""
+
+
+class UnknownDriver(LookupError):  # noqa: N818 - named for what happened
+    """No installed package registers a driver of this name."""
+
+
+def driver_names() -> list[str]:
+    """Return the names of all registered drivers, without importing any."""
+    return sorted({point.name for point in entry_points(group=ENTRY_POINT_GROUP)})
+
+
+def find_driver(name: str) -> type[Driver]:
+    """Return the driver class registered as `name`; only its own module is imported.
+
+    Raises
+    ------
+    UnknownDriver
+        Nothing registers that name; the message gives the nearest spelling and the choices.
+    """
+    found = [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name == name]
+    if not found:
+        known = driver_names()
+        near = get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise UnknownDriver(f"no driver {name!r}; {hint}installed: {', '.join(known) or 'none'}")
+    return cast("type[Driver]", found[0].load())

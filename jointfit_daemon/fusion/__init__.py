@@ -1,0 +1,1 @@
+"""One aligned set of orientations in, one limb state out. Pure."""

@@ -1,0 +1,1 @@
+"""Geometry of limbs: rotations, chains, joint angles. Pure."""

@@ -1,0 +1,1 @@
+"""The pure core, wired: events in, limb states and notices out."""

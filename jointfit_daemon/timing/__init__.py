@@ -1,0 +1,1 @@
+"""When things happened: device clocks to host time, streams to frames, IMU to optical lag."""

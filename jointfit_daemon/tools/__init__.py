@@ -1,0 +1,1 @@
+"""The `jointfit` commands, one module each."""
