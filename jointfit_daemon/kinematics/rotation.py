@@ -1,0 +1,279 @@
+"""Unit quaternions as numpy arrays: products, maps to rotation vectors and matrices, means.
+
+Law: Hamilton quaternions, scalar first, arrays of shape (..., 4) that broadcast against each other;
+vectors have shape (..., 3). ``q_a_b`` takes b-coordinates to a-coordinates and chains as
+``q_a_c = multiply(q_a_b, q_b_c)``. A quaternion and its negative are the same rotation: whatever
+differences, averages or interpolates here is blind to that sign; whoever uses components is not
+and aligns them first. For one sample at a time see ``rotation_scalar``, which is faster there.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Array = NDArray[np.float64]
+
+IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
+IDENTITY.setflags(write=False)
+
+_CONJUGATE: Array = np.array([1.0, -1.0, -1.0, -1.0])
+_SMALL_ANGLE = 1e-6  # rad; below it sin(x/2)/x is its series to rounding
+_SMALL_SINE = 1e-9
+
+
+def _floats(value: ArrayLike) -> Array:
+    return np.asarray(value, dtype=np.float64)
+
+
+def multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    r"""Return the Hamilton product.
+
+    .. math:: p \otimes q = (p_w q_w - p_v \cdot q_v,\; p_w q_v + q_w p_v + p_v \times q_v)
+
+    Parameters
+    ----------
+    p, q : array_like, shape (..., 4)
+        Broadcast against each other.
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+    """
+    pw, px, py, pz = np.moveaxis(_floats(p), -1, 0)
+    qw, qx, qy, qz = np.moveaxis(_floats(q), -1, 0)
+    return np.stack(
+        (
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ),
+        axis=-1,
+    )
+
+
+def conjugate(q: ArrayLike) -> Array:
+    """Return the conjugate, which is the inverse of a unit quaternion; shape (..., 4)."""
+    return np.multiply(_floats(q), _CONJUGATE)
+
+
+def normalize(q: ArrayLike) -> Array:
+    """Return q / |q|, shape (..., 4); NaN where q is zero or not finite."""
+    q = _floats(q)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled: Array = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(np.isfinite(scaled), scaled, np.nan)
+
+
+def rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    r"""Turn vectors: v + w t + q_v x t, with t = 2 q_v x v.
+
+    Parameters
+    ----------
+    q : array_like, shape (..., 4)
+        Unit quaternion ``q_a_b``.
+    v : array_like, shape (..., 3)
+        b-coordinates.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        The same vectors in a-coordinates.
+    """
+    q, v = _floats(q), _floats(v)
+    t = 2.0 * np.cross(q[..., 1:], v)
+    turned: Array = v + q[..., :1] * t + np.cross(q[..., 1:], t)
+    return turned
+
+
+def exp(r: ArrayLike) -> Array:
+    """Return the quaternions, shape (..., 4), of rotation vectors, rad, shape (..., 3)."""
+    r = _floats(r)
+    angle = np.linalg.norm(r, axis=-1, keepdims=True)
+    small = angle < _SMALL_ANGLE
+    safe = np.where(small, 1.0, angle)
+    scale = np.where(small, 0.5 - angle**2 / 48.0, np.sin(0.5 * angle) / safe)
+    return np.concatenate((np.cos(0.5 * angle), scale * r), axis=-1)
+
+
+def log(q: ArrayLike) -> Array:
+    """Return the shortest rotation vector of unit quaternions, rad, shape (..., 4) to (..., 3).
+
+    Its length is at most pi; q and -q give the same. The angle comes from atan2, never from acos,
+    which loses all digits near the identity.
+    """
+    q = _floats(q)
+    q = np.where(q[..., :1] < 0.0, -q, q)
+    w, v = q[..., :1], q[..., 1:]
+    sine = np.linalg.norm(v, axis=-1, keepdims=True)
+    small = sine < _SMALL_SINE
+    scale = np.where(small, 2.0, 2.0 * np.arctan2(sine, w) / np.where(small, 1.0, sine))
+    vector: Array = scale * v
+    return vector
+
+
+def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """Return the angle of the rotation from a to b, rad in [0, pi], shape (...)."""
+    between = multiply(conjugate(a), b)
+    sine = np.linalg.norm(between[..., 1:], axis=-1)
+    angle: Array = 2.0 * np.arctan2(sine, np.abs(between[..., 0]))
+    return angle
+
+
+def to_matrix(q: ArrayLike) -> Array:
+    """Return rotation matrices, shape (..., 3, 3), of unit quaternions, shape (..., 4)."""
+    w, x, y, z = np.moveaxis(_floats(q), -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def from_matrix(R: ArrayLike) -> Array:
+    """Return unit quaternions with w >= 0, shape (..., 4), of rotation matrices, shape (..., 3, 3).
+
+    The largest of the four squared components is taken by square root and the others are divided by
+    it, so no digit is lost at any angle. Source: Shepperd 1978.
+    """
+    R = _floats(R)
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    diagonal = np.stack((R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]), axis=-1)
+    products = np.empty((*R.shape[:-2], 4, 4))  # 4 q_i q_j
+    products[..., 0, 0] = 1.0 + trace
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        products[..., i + 1, i + 1] = 1.0 + 2.0 * diagonal[..., i] - trace
+        products[..., 0, i + 1] = products[..., i + 1, 0] = R[..., k, j] - R[..., j, k]
+        products[..., j + 1, k + 1] = products[..., k + 1, j + 1] = R[..., j, k] + R[..., k, j]
+    squares = np.stack([products[..., i, i] for i in range(4)], axis=-1)
+    best = np.argmax(squares, axis=-1)
+    column = np.take_along_axis(products, best[..., None, None], axis=-1)[..., 0]
+    q = normalize(column)
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def heading(angle: ArrayLike) -> Array:
+    """Return the rotation by `angle` (rad, shape (...)) about the vertical z; shape (..., 4)."""
+    half = 0.5 * _floats(angle)
+    zero = np.zeros_like(half)
+    return np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
+
+
+def heading_of(q: ArrayLike) -> Array:
+    """Return the twist about the vertical, rad in (-pi, pi], shape (...).
+
+    It is the heading that takes q closest to the identity: ``2 atan2(z, w)``, 0 where both vanish.
+    """
+    q = _floats(q)
+    twice = 2.0 * np.arctan2(q[..., 3], q[..., 0])
+    wrapped: Array = np.pi - np.mod(np.pi - twice, 2.0 * np.pi)
+    return wrapped
+
+
+def from_two(a: ArrayLike, b: ArrayLike) -> Array:
+    """Return the shortest rotation that takes direction a to direction b; shape (..., 4).
+
+    Opposite directions have no single shortest rotation: one about some normal of a is returned.
+    """
+    a = _unit(a)
+    b = _unit(b)
+    q = np.concatenate((1.0 + np.sum(a * b, axis=-1, keepdims=True), np.cross(a, b)), axis=-1)
+    opposite = np.linalg.norm(q, axis=-1, keepdims=True) < _SMALL_ANGLE
+    aside = np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    normal = np.cross(a, aside)
+    half_turn = np.concatenate((np.zeros_like(q[..., :1]), normal), axis=-1)
+    return normalize(np.where(opposite, half_turn, q))
+
+
+def _unit(v: ArrayLike) -> Array:
+    v = _floats(v)
+    unit: Array = v / np.linalg.norm(v, axis=-1, keepdims=True)
+    return unit
+
+
+def interpolate(q0: ArrayLike, q1: ArrayLike, a: ArrayLike) -> Array:
+    """Go the share `a` (shape (...)) of the short way from q0 to q1: q0 exp(a log(q0* q1))."""
+    share = _floats(a)[..., None]
+    return multiply(q0, exp(share * log(multiply(conjugate(q0), q1))))
+
+
+def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
+    """Return the mean rotation, the largest eigenvector of the weighted sum of q q^T.
+
+    It minimises the weighted squared chordal distance and does not care about signs.
+    Source: Markley et al. 2007, doi 10.2514/1.28949, eq. 12.
+
+    Parameters
+    ----------
+    q : array_like, shape (..., n, 4)
+        Rotations to average over axis -2, none of them NaN.
+    weights : array_like, shape (..., n), optional
+        Non-negative; equal if None.
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+        Unit, w >= 0.
+
+    Raises
+    ------
+    ValueError
+        There is nothing to average.
+    """
+    q = _floats(q)
+    if q.shape[-2] == 0:
+        raise ValueError("no rotations to average")
+    weighted = q if weights is None else q * _floats(weights)[..., None]
+    M = np.swapaxes(weighted, -1, -2) @ q
+    largest: Array = np.linalg.eigh(M)[1][..., -1]
+    return np.where(largest[..., :1] < 0.0, -largest, largest)
+
+
+def align_hemisphere(q: ArrayLike, ref: ArrayLike) -> Array:
+    """Return q or -q, whichever has a non-negative product with `ref`; shape (..., 4)."""
+    q = _floats(q)
+    product = np.sum(q * _floats(ref), axis=-1, keepdims=True)
+    return np.where(product < 0.0, -q, q)
+
+
+def continuous(q: ArrayLike) -> Array:
+    """Return a series, shape (n, 4), with signs such that successive products are not negative.
+
+    Rows that are NaN stay NaN; continuity is kept across them.
+    """
+    q = _floats(q).copy()
+    seen = np.flatnonzero(np.isfinite(q).all(axis=-1))
+    if seen.size > 1:
+        good = q[seen]
+        flips = np.where(np.sum(good[1:] * good[:-1], axis=-1) < 0.0, -1.0, 1.0)
+        q[seen[1:]] = good[1:] * np.cumprod(flips)[:, None]
+    return q
+
+
+def left_matrix(q: ArrayLike) -> Array:
+    """Return L with ``multiply(q, p) == L @ p``; shape (..., 4, 4)."""
+    w, x, y, z = np.moveaxis(_floats(q), -1, 0)
+    rows = ((w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def right_matrix(q: ArrayLike) -> Array:
+    """Return R with ``multiply(p, q) == R @ p``; shape (..., 4, 4)."""
+    w, x, y, z = np.moveaxis(_floats(q), -1, 0)
+    rows = ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def skew(v: ArrayLike) -> Array:
+    """Return the matrix of the cross product, ``skew(v) @ u == cross(v, u)``; shape (..., 3, 3)."""
+    x, y, z = np.moveaxis(_floats(v), -1, 0)
+    zero = np.zeros_like(x)
+    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

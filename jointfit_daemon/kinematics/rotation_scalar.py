@@ -1,0 +1,112 @@
+"""One unit quaternion at a time, as plain tuples: for the step that runs once per frame.
+
+Law: the same conventions and formulas as ``rotation``, on tuples of floats. A numpy call costs
+about a microsecond before it has done anything, which is more than a whole product costs here.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, sin, sqrt
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.model import Quaternion, Vector
+
+IDENTITY_ONE: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+_SMALL_ANGLE = 1e-6
+_SMALL_SINE = 1e-9
+
+
+def multiply_one(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Return the Hamilton product p q."""
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+def conjugate_one(q: Quaternion) -> Quaternion:
+    """Return the inverse of a unit quaternion."""
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def between_one(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return a* b, the orientation of b seen from a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw + ax * bx + ay * by + az * bz,
+        aw * bx - ax * bw - ay * bz + az * by,
+        aw * by + ax * bz - ay * bw - az * bx,
+        aw * bz - ax * by + ay * bx - az * bw,
+    )
+
+
+def rotate_one(q: Quaternion, v: Vector) -> Vector:
+    """Turn `v` from b- to a-coordinates by ``q_a_b``."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (y * vz - z * vy)
+    ty = 2.0 * (z * vx - x * vz)
+    tz = 2.0 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+def exp_one(r: Vector) -> Quaternion:
+    """Return the quaternion of a rotation vector, rad."""
+    x, y, z = r
+    angle = sqrt(x * x + y * y + z * z)
+    scale = 0.5 - angle * angle / 48.0 if angle < _SMALL_ANGLE else sin(0.5 * angle) / angle
+    return (cos(0.5 * angle), scale * x, scale * y, scale * z)
+
+
+def log_one(q: Quaternion) -> Vector:
+    """Return the shortest rotation vector, rad; its length is at most pi."""
+    w, x, y, z = q
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = sqrt(x * x + y * y + z * z)
+    scale = 2.0 if sine < _SMALL_SINE else 2.0 * atan2(sine, w) / sine
+    return (scale * x, scale * y, scale * z)
+
+
+def angle_between_one(a: Quaternion, b: Quaternion) -> float:
+    """Return the angle of the rotation from a to b, rad in [0, pi]."""
+    w, x, y, z = between_one(a, b)
+    return 2.0 * atan2(sqrt(x * x + y * y + z * z), abs(w))
+
+
+def normalize_one(q: Sequence[float]) -> Quaternion:
+    """Return q / |q|.
+
+    Raises
+    ------
+    ZeroDivisionError
+        `q` is zero.
+    """
+    w, x, y, z = q
+    scale = 1.0 / sqrt(w * w + x * x + y * y + z * z)
+    return (w * scale, x * scale, y * scale, z * scale)
+
+
+def interpolate_one(q0: Quaternion, q1: Quaternion, a: float) -> Quaternion:
+    """Go the share `a` of the short way from q0 to q1."""
+    x, y, z = log_one(between_one(q0, q1))
+    return multiply_one(q0, exp_one((a * x, a * y, a * z)))
+
+
+def as_quaternion(q: Sequence[float]) -> Quaternion:
+    """Return a row of an array, or any four numbers, as a plain tuple of floats."""
+    w, x, y, z = q
+    return (float(w), float(x), float(y), float(z))
