@@ -160,7 +160,7 @@ class XbusDecoder:
                 after = end if after < 0 else after
                 self._skip(after - at, reason, found)
                 at = after
-            else:  # a good message may begin inside a bad one: move on by one byte, not by its length
+            else:  # a good message may begin inside a bad one: move on by one byte only
                 self._skip(1, reason, found)
                 at += 1
         self._pending = buffer[at:]
