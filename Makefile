@@ -1,0 +1,52 @@
+# jointfitd: everything a person types. Needs python3 (3.11 or newer), python3-venv and make.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-vm lint types imports bench docs lock clean
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
+
+$(STAMP): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit("python3 is %d.%d: 3.11 or newer is needed" % sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { echo "python3-venv is missing: sudo apt install python3-venv"; exit 1; }
+	@echo "setting up $(VENV) (once, about a minute) ..."
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable '.[demo]' --group dev
+	@touch $@
+
+demo: $(STAMP)  ## the main job on simulated hardware, with an embedded broker
+	@$(BIN)/jointfit demo $(ARGS)
+
+test: $(STAMP)  ## all tests that this machine can run; what is skipped says why
+	@$(BIN)/python -m pytest $(ARGS)
+
+test-vm: $(STAMP)  ## the SocketCAN tests on a real vcan, in a light virtual machine where the kernel has none
+	@$(BIN)/python .ci/light_vm.py $(ARGS)
+
+lint: $(STAMP)  ## ruff: rules and format
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+types: $(STAMP)  ## mypy, strict
+	@$(BIN)/mypy
+
+imports: $(STAMP)  ## who may import whom
+	@$(BIN)/lint-imports
+
+bench: $(STAMP)  ## measure speed and accuracy; fails where a floor is missed
+	@$(BIN)/python bench/accuracy.py
+	@$(BIN)/python bench/speed.py $(ARGS)
+
+docs: $(STAMP)  ## the documentation as a site, warnings are errors
+	@$(BIN)/mkdocs build --strict --quiet --site-dir build/site
+
+lock: $(STAMP)  ## write requirements.lock anew from what is installed now
+	@$(BIN)/python .ci/lock.py > requirements.lock.new && mv requirements.lock.new requirements.lock
+
+clean:  ## remove what make made
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .benchmarks
