@@ -55,7 +55,7 @@ def native_of(q_world_sensor: Quaternion, world: World = "ENU") -> Quaternion:
     if world == "ENU":
         return (w, x, y, z)
     if world == "NED":
-        return (_S * (x + y), _S * (z - w), _S * (-w - z), _S * (x - y))
+        return (_S * (x + y), _S * (-w - z), _S * (z - w), _S * (x - y))
     return (_S * (w + z), _S * (x + y), _S * (y - x), _S * (z - w))
 
 

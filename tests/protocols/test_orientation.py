@@ -1,0 +1,92 @@
+"""The canonical orientation, against SciPy and the bench test anyone can repeat."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jointfit_protocols.orientation import OrientationGate, canonical, native_of
+
+unit = (
+    st.tuples(*[st.floats(-1, 1)] * 4)
+    .filter(lambda q: math.hypot(*q) > 0.1)
+    .map(lambda q: tuple(part / math.hypot(*q) for part in q))
+)
+worlds: Any = st.sampled_from(["ENU", "NED", "NWU"])
+ENU_FROM = {  # v_enu = matrix @ v_native
+    "ENU": np.eye(3),
+    "NED": np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
+    "NWU": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+}
+
+
+def rotation(q: Any) -> Rotation:
+    w, x, y, z = q
+    return Rotation.from_quat([x, y, z, w])
+
+
+@given(unit, worlds)
+def test_a_vector_lands_where_the_world_table_says(q: Any, world: Any) -> None:
+    vector = np.array([1.0, 2.0, 3.0])
+    expected = ENU_FROM[world] @ rotation(q).apply(vector)
+    assert rotation(canonical(q, world)).apply(vector) == pytest.approx(expected, abs=1e-12)
+
+
+@given(unit, worlds)
+def test_world_to_sensor_is_the_inverse(q: Any, world: Any) -> None:
+    w, x, y, z = q
+    turned = canonical((w, -x, -y, -z), world, world_to_sensor=True)
+    assert turned == pytest.approx(canonical(q, world), abs=0)
+
+
+@given(unit, worlds)
+def test_native_of_undoes_canonical(q: Any, world: Any) -> None:
+    back = canonical(native_of(q, world), world)
+    assert abs(np.dot(back, q)) == pytest.approx(1.0, abs=1e-12)
+
+
+@given(st.lists(unit, min_size=1, max_size=20))
+def test_what_the_gate_lets_through_is_unit_and_never_jumps_sign(path: Any) -> None:
+    gate, last = OrientationGate(), None
+    for q in path:
+        out = gate.admit(tuple(1.005 * part for part in q))
+        assert out is not None
+        assert math.hypot(*out) == pytest.approx(1.0, abs=1e-12)
+        assert abs(np.dot(out, q)) == pytest.approx(1.0, abs=1e-12)
+        if last is not None:
+            assert np.dot(last, out) >= -1e-12
+        last = out
+
+
+@pytest.mark.parametrize(
+    ("norm", "passes"), [(1.0, True), (1.0099, True), (1.011, False), (0.98, False), (0.0, False)]
+)
+def test_the_norm_decides(norm: float, passes: bool) -> None:
+    assert (OrientationGate().admit((norm, 0.0, 0.0, 0.0)) is not None) == passes
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
+def test_what_is_not_finite_is_refused(bad: float) -> None:
+    assert OrientationGate().admit((bad, 0.0, 0.0, 1.0)) is None
+
+
+def test_a_wrong_scale_is_recognised_by_its_median_norm() -> None:
+    gate = OrientationGate()
+    for number in range(99):
+        gate.admit((0.5 + 1e-3 * (number % 3 - 1), 0.0, 0.0, 0.0))
+    assert gate.misconfigured_norm is None
+    gate.admit((0.5, 0.0, 0.0, 0.0))
+    assert gate.misconfigured_norm == pytest.approx(0.5)
+
+
+def test_ten_good_samples_in_a_hundred_are_no_wrong_scale() -> None:
+    gate = OrientationGate()
+    for number in range(200):
+        gate.admit((1.0 if number % 10 == 0 else 0.5, 0.0, 0.0, 0.0))
+    assert gate.misconfigured_norm is None
