@@ -1,0 +1,278 @@
+"""The pure core: events in, limb states and notices out.
+
+Law: synchronous; no clock, no I/O, no logging, no randomness. The same events in the same order
+give the same outputs, byte for byte: that is what makes a recording worth having.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_daemon.pipeline.bulletin import Bulletin
+from jointfit_daemon.pipeline.events import (
+    CalibrationStatus,
+    CalibrationStored,
+    ChunkArrived,
+    Configured,
+    DeviceInfo,
+    DeviceStatus,
+    JobFinished,
+    Notice,
+    Reply,
+    Request,
+    SourceClosed,
+    SourceOpened,
+    Tick,
+)
+from jointfit_daemon.pipeline.health import health_of
+from jointfit_daemon.pipeline.session import CalibrationSession
+from jointfit_daemon.pipeline.source import SourceState, Stamped
+from jointfit_daemon.timing.align import FrameAligner, StreamSpec
+
+if TYPE_CHECKING:
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.model import LimbState
+    from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.timing.align import AlignedFrame
+    from jointfit_daemon.timing.clock import Stamp
+
+_NS = 1_000_000_000
+MOCAP_FRESH_NS = 200_000_000
+"""A rig whose optical system spoke within this time runs in mode ``imu+mocap``."""
+
+
+class Core:
+    """Everything between bytes and limb states.
+
+    The first event must be ``Configured``. ``feed`` is called with every event, in order of
+    arrival; ``next_deadline_ns`` says when a ``Tick`` is due if nothing else arrives before.
+    """
+
+    def __init__(self) -> None:
+        self._rig: Rig | None = None
+        self._sources: dict[str, SourceState] = {}
+        self._now_ns = 0
+        self._seq = 0
+        self._mocap_ns: int | None = None
+        self._mocap_used = self._mocap_idle = 0
+        self._bulletin = Bulletin()
+
+    # --- events ------------------------------------------------------------------------------
+
+    def feed(self, event: Event) -> list[Output]:
+        """Take one event and return everything it brings about, in order."""
+        if isinstance(event, ChunkArrived):  # first: thousands of these to one of the others
+            self._now_ns = max(self._now_ns, event.chunk.t_ns)
+            return self._chunk(event)
+        self._now_ns = max(self._now_ns, event.t_ns)
+        if isinstance(event, Tick):
+            return self._advance()
+        return [*self._state_change(event), *self._advance()]
+
+    def _state_change(self, event: Event) -> list[Output]:
+        if isinstance(event, Configured):
+            return self._configure(event)
+        if isinstance(event, SourceOpened):
+            return self._opened(event)
+        if isinstance(event, SourceClosed):
+            return self._closed(event)
+        if isinstance(event, Request):
+            return self._request(event)
+        if isinstance(event, JobFinished):
+            return self._job_finished(event)
+        if isinstance(event, CalibrationStored):
+            return self._stored(event)
+        return []
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """Return when the core wants a ``Tick`` at the latest; None while nothing is pending."""
+        return None if self._rig is None else self._aligner.next_deadline_ns
+
+    def health(self, now_ns: int) -> dict[str, object]:
+        """Return the counters and clocks of every device: the part of ``bridge/health`` known here."""
+        if self._rig is None:
+            return {"devices": {}, "frames": {}, "calibration": {}}
+        mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
+        return health_of(self._sources, self._aligner, self._session, mocap, now_ns) | {
+            "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames}
+        }
+
+    # --- configuration -----------------------------------------------------------------------
+
+    def _configure(self, event: Configured) -> list[Output]:
+        before, rig = self._rig, event.rig
+        self._rig = rig
+        kept = {
+            source.id: state
+            for source in rig.sources
+            if (state := self._sources.get(source.id)) is not None and state.source == source
+        }
+        self._sources = {s.id: kept.get(s.id) or SourceState.of(s) for s in rig.sources}
+        outputs: list[Output] = []
+        if before is not None:
+            outputs += self._session.abort(event.t_ns, "the rig was reloaded")
+            outputs.append(Notice(event.t_ns, "reload", rig.name, "configuration reloaded"))
+        if before is None or _frame_layout(before) != _frame_layout(rig):
+            self._aligner = _aligner(rig)
+        self._session = CalibrationSession(
+            rig.chain,
+            rig.calibration,
+            mocap=any(source.kind == "mocap" for source in rig.sources),
+            calibration=event.calibration,
+        )
+        self._session.version = event.calibration_version
+        self._use_calibration()
+        text = "stored calibration loaded" if event.calibration else "no calibration stored yet"
+        outputs.append(
+            CalibrationStatus(event.t_ns, self._session.phase, text, event.calibration_version)
+        )
+        return outputs
+
+    def _use_calibration(self) -> None:
+        rig, calibration = self._rig, self._session.calibration
+        if rig is not None:
+            self._fuser = LimbFuser(rig.chain, calibration)
+            self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
+
+    # --- sources -----------------------------------------------------------------------------
+
+    def _opened(self, event: SourceOpened) -> list[Output]:
+        state = self._sources.get(event.source)
+        if state is None:
+            return []
+        if state.counts.opened:  # what the device did while away is unknown: trust nothing old
+            state.clock.feed_restart()
+        state.opened()
+        return []
+
+    def _closed(self, event: SourceClosed) -> list[Output]:
+        state = self._sources.get(event.source)
+        if state is None or not state.open:
+            return [Notice(event.t_ns, "device", event.source, event.text, "warning")]
+        outputs = self._take(event.source, state, state.closed())
+        self._aligner.lose(event.source)
+        level = "info" if event.reason == "removed" else "warning"
+        return [
+            *outputs,
+            DeviceStatus(event.source, online=False),
+            Notice(event.t_ns, "device", event.source, event.text, level),
+        ]
+
+    def _chunk(self, event: ChunkArrived) -> list[Output]:
+        state = self._sources.get(event.source)
+        if state is None:
+            return []
+        outputs = self._take(event.source, state, state.feed(event.chunk))
+        outputs += self._advance()
+        return outputs
+
+    def _take(
+        self, source: str, state: SourceState, items: list[Stamped | Corrupt | DeviceEvent]
+    ) -> list[Output]:
+        outputs: list[Output] = []
+        for item in items:
+            if not isinstance(item, Stamped):
+                outputs += self._told(source, state, item)
+                continue
+            if not state.online:
+                state.online = True
+                outputs.append(DeviceStatus(source, online=True))
+                outputs.append(Notice(self._now_ns, "device", source, "streaming"))
+            if isinstance(item.measurement, ImuSample):
+                outputs += self._imu_sample(source, item.measurement, item.stamp)
+            else:
+                self._mocap_frame(item)
+        return outputs
+
+    def _told(
+        self, source: str, state: SourceState, item: Corrupt | DeviceEvent
+    ) -> list[Output]:
+        if isinstance(item, DeviceEvent) and item.kind == "info":
+            return [DeviceInfo(source, state.info)]
+        if isinstance(item, DeviceEvent) and item.kind == "restart":
+            self._aligner.reset(source)
+        return list(self._bulletin.add(self._now_ns, source, item))
+
+    def _imu_sample(self, source: str, sample: ImuSample, stamp: Stamp) -> list[Output]:
+        t_ns = stamp.t_ns
+        self._aligner.push(
+            source, t_ns - self._lag_ns.get(source, 0), sample.arrival_ns, sample.q_world_sensor,
+            synced=stamp.synced, epoch=stamp.epoch,
+        )
+        if self._session.collecting:
+            return self._session.add_sample(source, t_ns, sample.q_world_sensor)
+        return []
+
+    def _mocap_frame(self, item: Stamped) -> None:
+        frame = item.measurement
+        if isinstance(frame, ImuSample):
+            return
+        self._mocap_ns = self._now_ns
+        if self._session.collecting and frame.live:
+            self._mocap_used += 1
+            self._session.add_mocap(item.stamp.t_ns, frame)
+        else:
+            self._mocap_idle += 1
+
+    # --- time --------------------------------------------------------------------------------
+
+    def _advance(self) -> list[Output]:
+        if self._rig is None:
+            return []
+        now_ns = self._now_ns
+        outputs: list[Output] = [self._fuse(frame) for frame in self._aligner.advance(now_ns)]
+        if self._session.collecting:
+            outputs += self._session.advance(now_ns)
+        outputs += self._bulletin.due(now_ns)
+        return outputs
+
+    def _fuse(self, frame: AlignedFrame) -> LimbState:
+        self._seq += 1
+        fresh = self._mocap_ns is not None and self._now_ns - self._mocap_ns < MOCAP_FRESH_NS
+        return self._fuser.fuse(
+            frame.t_ns,
+            frame.completed_ns,
+            self._seq,
+            frame.orientations,
+            extrapolated=frame.extrapolated,
+            sync="locked" if frame.synced else "settling",
+            mode="imu+mocap" if fresh else "imu",
+        )
+
+    # --- calibration -------------------------------------------------------------------------
+
+    def _request(self, event: Request) -> list[Output]:
+        if event.command == "calibrate":
+            return self._session.request(event)
+        message = f"unknown request {event.command!r}; known: calibrate"
+        error = {"key": "command", "message": message}
+        return [Reply(event.command, event.transaction, "error", {}, error)]
+
+    def _job_finished(self, event: JobFinished) -> list[Output]:
+        before = self._session.calibration
+        outputs = self._session.job_finished(event)
+        if self._session.calibration is not before:
+            self._use_calibration()
+        return outputs
+
+    def _stored(self, event: CalibrationStored) -> list[Output]:
+        self._session.version = event.version
+        text = f"stored as version {event.version}"
+        return [CalibrationStatus(event.t_ns, self._session.phase, text, event.version)]
+
+
+def _frame_layout(rig: Rig) -> tuple[object, ...]:
+    imus = tuple((s.id, s.rate_hz) for s in rig.sources if s.kind == "imu")
+    return rig.output_rate_hz, rig.align_mode, imus
+
+
+def _aligner(rig: Rig) -> FrameAligner:
+    streams = {
+        source.id: StreamSpec(round(_NS / source.rate_hz))
+        for source in rig.sources
+        if source.kind == "imu"
+    }
+    return FrameAligner(streams, round(_NS / rig.output_rate_hz), mode=rig.align_mode)

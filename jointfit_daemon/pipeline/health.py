@@ -1,0 +1,69 @@
+"""The part of ``bridge/health`` that the core knows: counters and clocks of every device.
+
+Law: a snapshot, computed when asked for; nothing here changes anything.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.pipeline.session import CalibrationSession
+    from jointfit_daemon.pipeline.source import SourceState
+    from jointfit_daemon.timing.align import FrameAligner
+
+_NS_PER_MS = 1e6
+_NS_PER_US = 1e3
+
+
+def health_of(
+    sources: Mapping[str, SourceState],
+    aligner: FrameAligner,
+    session: CalibrationSession,
+    mocap: Mapping[str, int],
+    now_ns: int,
+) -> dict[str, object]:
+    """Return the health of every device and of the calibration, as JSON-able values.
+
+    For every device ``received = used + decimated + idle + late + duplicate + dropped + pending``;
+    what is pending gets its verdict within a few sample periods.
+    """
+    devices = {}
+    for name, state in sources.items():
+        verdicts = dict(mocap) if state.source.kind == "mocap" else aligner.counts(name)
+        devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state)}
+    return {
+        "devices": devices,
+        "calibration": {"phase": session.phase, "version": session.version},
+    }
+
+
+def _wire(state: SourceState, now_ns: int) -> dict[str, object]:
+    counts, last = state.counts, state.last_arrival_ns
+    return {
+        "online": state.online,
+        "received": counts.received,
+        "corrupt": counts.corrupt,
+        "discarded_bytes": counts.discarded_bytes,
+        "lost": counts.lost,
+        "restarts": counts.restarts,
+        "reconnects": max(0, counts.opened - 1),
+        "last_age_ms": None if last is None else round((now_ns - last) / _NS_PER_MS, 1),
+    }
+
+
+def _clock(state: SourceState) -> dict[str, object]:
+    clock = state.clock
+    return {
+        "clock": clock.state,
+        "epoch": clock.epoch,
+        "skew_ppm": clock.skew_ppm,
+        "sigma_us": _us(clock.sigma_ns),
+        "jitter_us": _us(clock.jitter_ns),
+    }
+
+
+def _us(value_ns: float | None) -> float | None:
+    return None if value_ns is None else round(value_ns / _NS_PER_US, 1)

@@ -1,0 +1,106 @@
+"""Keeps one calibration phase: samples and camera frames on the host clock, bounded.
+
+Law: appends while recording, hands out arrays once; decides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import MocapFrame, Quaternion
+
+LONGEST_S = 600
+"""No phase is longer; at 400 Hz a sensor then holds 240 000 samples, about 40 MB."""
+
+_NS = 1_000_000_000
+_MAX_SAMPLES = LONGEST_S * 400
+
+
+@dataclass(slots=True)
+class TrialRecorder:
+    """Records from construction on."""
+
+    _samples: dict[str, list[tuple[int, Quaternion]]] = field(default_factory=dict)
+    _frames: list[tuple[int, MocapFrame]] = field(default_factory=list)
+    overflowed: int = 0
+    """Measurements refused because the phase lasted longer than the bound."""
+
+    def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> None:
+        """Keep one orientation."""
+        track = self._samples.setdefault(sensor, [])
+        if len(track) < _MAX_SAMPLES:
+            track.append((t_ns, q_world_sensor))
+        else:
+            self.overflowed += 1
+
+    def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
+        """Keep one camera frame."""
+        if len(self._frames) < _MAX_SAMPLES:
+            self._frames.append((t_ns, frame))
+        else:
+            self.overflowed += 1
+
+    def trial(self, start_ns: int | None = None, end_ns: int | None = None) -> CalibrationTrial:
+        """Return what was kept between two instants, each track strictly increasing in time."""
+        low = -(2**62) if start_ns is None else start_ns
+        high = 2**62 if end_ns is None else end_ns
+        sensors = {
+            sensor: _sensor_track([row for row in track if low <= row[0] <= high])
+            for sensor, track in self._samples.items()
+        }
+        frames = [row for row in self._frames if low <= row[0] <= high]
+        return CalibrationTrial(sensors, _optical_track(frames) if frames else None)
+
+
+def _increasing(t_ns: np.ndarray) -> np.ndarray:
+    """Return the indices that keep time strictly increasing: a restarted clock may step back."""
+    if t_ns.size == 0:
+        return np.zeros(0, dtype=np.int64)
+    before = np.concatenate(([np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)[:-1]))
+    return np.flatnonzero(t_ns > before)
+
+
+def _sensor_track(rows: list[tuple[int, Quaternion]]) -> SensorTrack:
+    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+    q = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 4)
+    keep = _increasing(t_ns)
+    return SensorTrack(t_ns[keep], q[keep])
+
+
+def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
+    """Merge frames of one or more layouts by name; what a layout lacks is NaN."""
+    layouts = dict.fromkeys(frame.layout for _, frame in frames)
+    markers = tuple(dict.fromkeys(name for layout in layouts for name in layout.markers))
+    bodies = tuple(dict.fromkeys(name for layout in layouts for name in layout.bodies))
+    n = len(frames)
+    positions = np.full((n, len(markers), 3), np.nan)
+    body_positions = np.full((n, len(bodies), 3), np.nan)
+    body_orientations = np.full((n, len(bodies), 4), np.nan)
+    columns = {
+        layout: (
+            [markers.index(name) for name in layout.markers],
+            [bodies.index(name) for name in layout.bodies],
+        )
+        for layout in layouts
+    }
+    for row, (_, frame) in enumerate(frames):
+        marker_columns, body_columns = columns[frame.layout]
+        positions[row, marker_columns] = frame.markers
+        body_positions[row, body_columns] = frame.body_positions
+        body_orientations[row, body_columns] = frame.body_orientations
+    t_ns = np.array([t for t, _ in frames], dtype=np.int64)
+    keep = _increasing(t_ns)
+    return OpticalTrack(
+        t_ns[keep],
+        markers,
+        positions[keep],
+        bodies,
+        body_positions[keep],
+        body_orientations[keep],
+    )

@@ -1,0 +1,46 @@
+"""The `jointfit` commands. Law: one module a command; heavy imports wait for the command."""
+
+from __future__ import annotations
+
+import typer
+
+from jointfit_daemon import __version__
+from jointfit_daemon.tools import calibrate, check, decode, demo, schema
+
+app = typer.Typer(
+    name="jointfit",
+    help="Tools around jointfitd: check a rig, calibrate it, decode captures, see it all in a demo.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command(name="check")(check.check)
+app.command(name="demo")(demo.demo)
+app.command(name="calibrate")(calibrate.calibrate)
+app.command(name="decode")(decode.decode)
+app.command(name="schema")(schema.schema)
+
+
+def _version(wanted: bool) -> None:  # noqa: FBT001 - typer calls it so
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    *,
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
+    ),
+) -> None:
+    """Take the options that every command shares."""
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

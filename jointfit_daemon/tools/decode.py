@@ -1,0 +1,171 @@
+"""`jointfit decode`: what is in a capture, through the same decoder that the daemon uses."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+
+from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jointfit_daemon.driver import Decoder, Driver
+    from jointfit_daemon.model import Decoded
+
+MISUSE = 2
+
+
+@dataclass(slots=True)
+class Summary:
+    """Counts over one capture."""
+
+    corrupt: int = 0
+    quaternions: int = 0
+    first_quaternion: tuple[float, ...] | None = None
+    last_quaternion: tuple[float, ...] | None = None
+    time_resets: int = 0
+    counter_gaps: int = 0
+    frames: int = 0
+    warnings: list[str] = field(default_factory=list)
+
+    def add(self, item: Decoded) -> None:
+        """Count one decoded item."""
+        if isinstance(item, ImuSample):
+            self._quaternion(item.q_native)
+        elif isinstance(item, MocapFrame):
+            self.frames += 1
+            for row in item.body_orientations:
+                if row[0] == row[0]:  # noqa: PLR0124 - NaN is "not tracked"
+                    self._quaternion(tuple(row.tolist()))
+        elif isinstance(item, Corrupt):
+            self.corrupt += 1
+        elif isinstance(item, DeviceEvent):
+            self.time_resets += item.kind == "restart"
+            self.counter_gaps += item.kind == "gap"
+            if item.kind in ("warning", "error"):
+                self.warnings.append(item.text)
+
+    def _quaternion(self, q: tuple[float, ...]) -> None:
+        self.quaternions += 1
+        self.first_quaternion = self.first_quaternion or q
+        self.last_quaternion = q
+
+
+def decode(
+    protocol: Annotated[str, typer.Argument(help="Driver name, as `jointfit check` lists them.")],
+    file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or a `candump -L` log.")],
+    *,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object a decoded item.")] = False,
+    summary: Annotated[bool, typer.Option("--summary", help="One JSON object of counts.")] = False,
+    setting: Annotated[
+        list[str] | None, typer.Option("--set", help="A driver setting, KEY=VALUE (TOML value).")
+    ] = None,
+) -> None:
+    """Decode a capture of any registered protocol: as a table of counts, JSON lines, or a summary."""
+    import orjson
+
+    from jointfit_daemon.driver import UnknownDriver, find_driver
+    from jointfit_daemon.files.capture import read_capture
+
+    try:
+        driver = find_driver(protocol)
+        decoder = driver(_settings(driver, protocol, setting or [])).decoder()
+        chunks = read_capture(file, driver.wire)
+    except (UnknownDriver, OSError, ValueError) as fault:
+        typer.echo(f"jointfit decode: {fault}", err=True)
+        raise typer.Exit(MISUSE) from None
+    counts = Summary()
+    for item in _items(decoder, chunks):
+        counts.add(item)
+        if jsonl:
+            row = orjson.dumps(_row(item), default=str, option=orjson.OPT_SERIALIZE_NUMPY)
+            sys.stdout.buffer.write(row + b"\n")
+    if jsonl and not summary:
+        return
+    found = _found(decoder, counts)
+    if summary:
+        typer.echo(orjson.dumps(found))
+    else:
+        for key, value in found.items():
+            typer.echo(f"{key:18} {value}")
+        for text in dict.fromkeys(counts.warnings):
+            typer.echo(f"warning: {text}", err=True)
+
+
+def _items(decoder: Decoder, chunks: Any) -> Iterator[Decoded]:
+    for chunk in chunks:
+        yield from decoder.feed(chunk)
+    yield from decoder.flush()
+
+
+def _found(decoder: Decoder, counts: Summary) -> dict[str, object]:
+    found: dict[str, object] = {
+        "messages": decoder.messages,
+        "corrupt": counts.corrupt,
+        "discarded_bytes": decoder.discarded_bytes,
+        "quaternions": counts.quaternions,
+        "first_quaternion": counts.first_quaternion,
+        "last_quaternion": counts.last_quaternion,
+        "time_resets": counts.time_resets,
+        "counter_gaps": counts.counter_gaps,
+    }
+    return found | ({"mocap_frames": counts.frames} if counts.frames else {})
+
+
+def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
+    """Return settings for a decoder alone: what only opening needs gets a placeholder."""
+    import tomllib
+
+    given: dict[str, Any] = {"driver": name}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            message = f"--set {pair}: expected KEY=VALUE"
+            raise ValueError(message)
+        try:
+            given |= tomllib.loads(f"{key} = {value}")
+        except tomllib.TOMLDecodeError:  # a bare word is meant as text
+            given[key] = value
+    for key, info in driver.Settings.model_fields.items():
+        if info.is_required() and key not in given:
+            given[key] = _placeholder(info.annotation)
+    return driver.Settings.model_validate(given)
+
+
+def _placeholder(annotation: Any) -> Any:
+    from pydantic import BaseModel
+
+    kinds = [annotation, *get_args(annotation)]
+    if any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds):
+        return {"interface": "virtual", "channel": "file"}
+    return "file" if str in kinds else 1
+
+
+def _row(item: Decoded) -> dict[str, object]:
+    if isinstance(item, ImuSample):
+        return {"type": "imu", **item._asdict()}
+    if isinstance(item, MocapFrame):
+        return {
+            "type": "mocap",
+            "number": item.number,
+            "ticks": item.ticks,
+            "arrival_ns": item.arrival_ns,
+            "live": item.live,
+            "markers_m": dict(zip(item.layout.markers, item.markers, strict=True)),
+            "bodies": {
+                name: {"p_m": p, "q": q}
+                for name, p, q in zip(
+                    item.layout.bodies, item.body_positions, item.body_orientations, strict=True
+                )
+            },
+        }
+    if isinstance(item, Corrupt):
+        return {"type": "corrupt", "discarded": item.discarded, "reason": item.reason}
+    if isinstance(item, ClockEcho):
+        return {"type": "echo", "sent_ns": item.sent_ns, "ticks": item.ticks}
+    return {"type": item.kind, "text": item.text, "data": dict(item.data)}
