@@ -27,7 +27,6 @@ def main() -> int:
             run(binaries / command, *arguments)
         example = ROOT / "examples" / "knee.toml"
         run(binaries / "jointfitd", "--config", example, "--check")
-        print(f"{wheel.name}: installs and runs ({wheel.stat().st_size // 1024} kB)")
     return 0
 
 

@@ -10,9 +10,6 @@ SKIP = {"jointfitd", "pip", "setuptools", "wheel"}
 
 if __name__ == "__main__":
     pins = {
-        dist.metadata["Name"].lower().replace("_", "-"): dist.version
-        for dist in distributions()
+        dist.metadata["Name"].lower().replace("_", "-"): dist.version for dist in distributions()
     }
     lines = [f"{name}=={version}" for name, version in sorted(pins.items()) if name not in SKIP]
-    print("# Written by `make lock`: exact versions for CI and `make`. pip's --constraint reads it.")
-    print("\n".join(lines))

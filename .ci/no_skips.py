@@ -19,9 +19,8 @@ def main(report: Path) -> int:
         if (found := case.find("skipped")) is not None and found.get("type") != "pytest.xfail"
     ]
     wrong = [(name, why) for name, why in skipped if not name.startswith(MAY_SKIP)]
-    for name, why in wrong:
-        print(f"skipped, but CI must run it: {name}: {why}")
-    print(f"{len(cases)} tests, {len(skipped)} left to the virtual machine, {len(wrong)} wrongly skipped")
+    for _name, _why in wrong:
+        pass
     return 1 if wrong or not cases else 0
 
 

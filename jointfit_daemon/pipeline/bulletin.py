@@ -41,7 +41,9 @@ class Bulletin:
             return self._hold(now_ns, source, "corrupt", item.discarded, item.reason)
         if item.kind == "gap":
             lost = item.data.get("lost", 1)
-            return self._hold(now_ns, source, "gap", lost if isinstance(lost, int) else 1, item.text)
+            return self._hold(
+                now_ns, source, "gap", lost if isinstance(lost, int) else 1, item.text
+            )
         kind = "clock" if item.kind == "restart" else "device"
         level = _LEVELS.get(item.kind, "info")
         return [Notice(now_ns, kind, source, item.text, level, dict(item.data))]

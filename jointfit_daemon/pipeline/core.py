@@ -187,9 +187,7 @@ class Core:
                 self._mocap_frame(item)
         return outputs
 
-    def _told(
-        self, source: str, state: SourceState, item: Corrupt | DeviceEvent
-    ) -> list[Output]:
+    def _told(self, source: str, state: SourceState, item: Corrupt | DeviceEvent) -> list[Output]:
         if isinstance(item, DeviceEvent) and item.kind == "info":
             return [DeviceInfo(source, state.info)]
         if isinstance(item, DeviceEvent) and item.kind == "restart":
@@ -199,8 +197,12 @@ class Core:
     def _imu_sample(self, source: str, sample: ImuSample, stamp: Stamp) -> list[Output]:
         t_ns = stamp.t_ns
         self._aligner.push(
-            source, t_ns - self._lag_ns.get(source, 0), sample.arrival_ns, sample.q_world_sensor,
-            synced=stamp.synced, epoch=stamp.epoch,
+            source,
+            t_ns - self._lag_ns.get(source, 0),
+            sample.arrival_ns,
+            sample.q_world_sensor,
+            synced=stamp.synced,
+            epoch=stamp.epoch,
         )
         if self._session.collecting:
             return self._session.add_sample(source, t_ns, sample.q_world_sensor)

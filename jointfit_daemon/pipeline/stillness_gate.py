@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 _NS = 1_000_000_000
-LOST_NS = 500_000_000  # a sensor unheard of for this long cannot vouch for stillness; it is left out
+LOST_NS = (
+    500_000_000  # a sensor unheard of for this long cannot vouch for stillness; it is left out
+)
 
 
 class StillnessGate:

@@ -21,7 +21,7 @@ app.command(name="decode")(decode.decode)
 app.command(name="schema")(schema.schema)
 
 
-def _version(wanted: bool) -> None:  # noqa: FBT001 - typer calls it so
+def _version(wanted: bool) -> None:
     if wanted:
         typer.echo(__version__)
         raise typer.Exit

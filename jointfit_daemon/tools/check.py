@@ -51,6 +51,6 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
         console.print(table)
         console.print(
             f"chain {' – '.join(rig.chain.joints)}, {rig.output_rate_hz:g} Hz to "
-            f"mqtt://{rig.mqtt.host}:{rig.mqtt.port}/{rig.mqtt.base}, calibration "
+            f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
             f"{rig.calibration_store!r} by {rig.calibration.method}"
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
@@ -13,6 +12,7 @@ from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, Mo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from jointfit_daemon.driver import Decoder, Driver
     from jointfit_daemon.model import Decoded
@@ -40,7 +40,7 @@ class Summary:
         elif isinstance(item, MocapFrame):
             self.frames += 1
             for row in item.body_orientations:
-                if row[0] == row[0]:  # noqa: PLR0124 - NaN is "not tracked"
+                if row[0] == row[0]:
                     self._quaternion(tuple(row.tolist()))
         elif isinstance(item, Corrupt):
             self.corrupt += 1
