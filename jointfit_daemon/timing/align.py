@@ -1,0 +1,242 @@
+"""Streams of samples to frames at a fixed rate: every stream interpolated to the same instant.
+
+Law: pure; time comes in with samples and with ``advance``. Bounded memory. Frames come out in
+order, each once, whatever comes in. Every pushed sample gets exactly one verdict.
+
+Frame k is true for ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on when
+anything started. It goes out as soon as every living stream has a sample at or after t_k, or at
+its deadline: each stream's next sample is expected at its usual delay, and is waited for 1.5 of
+its periods at most. What is lacking then is continued at constant angular rate for up to 2.5
+periods after the last sample, and is missing after that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from jointfit_daemon.timing.stream import Stream, StreamSpec, Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.model import Quaternion
+
+__all__ = ["AlignedFrame", "FrameAligner", "Mode", "StreamSpec", "Verdict"]
+
+Mode = Literal["smooth", "fast"]
+"""``smooth`` waits for samples and interpolates; ``fast`` does not wait and extrapolates."""
+
+FAST_WAIT_NS = 1_000_000
+"""What ``fast`` grants the streams after t_k."""
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedFrame:
+    """All streams at one instant."""
+
+    t_ns: int
+    completed_ns: int
+    """Arrival of the sample that completed the frame, or the deadline that ended the waiting."""
+    orientations: Mapping[str, Quaternion]
+    """Of every stream that is not missing, in the order of the streams."""
+    extrapolated: frozenset[str]
+    missing: frozenset[str]
+    synced: bool
+    """Whether the clocks behind all of `orientations` had settled."""
+
+
+_NONE: frozenset[str] = frozenset()
+
+
+class FrameAligner:
+    """Aligns streams of orientations to frames.
+
+    Parameters
+    ----------
+    streams : mapping of str to StreamSpec
+        The streams, by id; the order is the order of what comes out.
+    period_ns : int
+        Time from frame to frame, ns.
+    mode : {"smooth", "fast"}
+        Whether to wait for samples.
+    active : bool
+        While False samples are counted as idle and no frames come out.
+
+    Raises
+    ------
+    ValueError
+        A period is not positive.
+    """
+
+    def __init__(
+        self,
+        streams: Mapping[str, StreamSpec],
+        period_ns: int,
+        *,
+        mode: Mode = "smooth",
+        active: bool = True,
+    ) -> None:
+        if period_ns <= 0 or any(spec.period_ns <= 0 for spec in streams.values()):
+            raise ValueError("periods must be positive")
+        self._streams = {name: Stream(spec) for name, spec in streams.items()}
+        self._items = tuple(self._streams.items())
+        self._period_ns = period_ns
+        self._fast = mode == "fast"
+        self._active = active
+        self._next: int | None = None  # number of the next frame; None until a stream begins
+        self._completed_ns = 0
+        self.emitted_frames = 0
+        self.skipped_frames = 0
+        """Frames never emitted because no stream had anything near them."""
+        self.forced_frames = 0
+        """Frames that went out at their deadline."""
+
+    # --- samples -----------------------------------------------------------------------------
+
+    def push(
+        self,
+        name: str,
+        t_ns: int,
+        arrival_ns: int,
+        q: Quaternion,
+        *,
+        synced: bool = True,
+        epoch: int = 0,
+    ) -> Verdict | None:
+        """Take one sample; return its verdict if that is certain already.
+
+        Parameters
+        ----------
+        name : str
+            A stream of this aligner; another is a KeyError.
+        t_ns, arrival_ns : int
+            Host instant it is true for, and of its arrival, ns.
+        q : Quaternion
+            Unit quaternion; its sign does not matter.
+        synced : bool
+            Whether its clock has settled.
+        epoch : int
+            Epoch of its clock: samples of different epochs are never joined.
+        """
+        stream = self._streams[name]
+        if not self._active:
+            return stream.idle()
+        passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
+        return stream.push(t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns)
+
+    def counts(self, name: str) -> dict[str, int]:
+        """Return ``received`` and what became of it: the verdicts and ``pending`` add up to it."""
+        return self._streams[name].counts()
+
+    # --- frames ------------------------------------------------------------------------------
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """Return when ``advance`` will emit a frame if no sample comes; None: only samples can."""
+        if not self._active or not self._begin():
+            return None
+        return self._due()
+
+    def advance(self, now_ns: int) -> list[AlignedFrame]:
+        """Return the frames due at `now_ns`, in order."""
+        frames: list[AlignedFrame] = []
+        if not self._active:
+            return frames
+        while self._begin():
+            due_ns = self._due()
+            if due_ns > now_ns:
+                break
+            frame = self._emit(due_ns)
+            if frame is not None:
+                frames.append(frame)
+        return frames
+
+    def _begin(self) -> bool:
+        """Choose the next frame; skip those no stream can serve. False if there is none yet."""
+        starts = [
+            start for _, s in self._items if (start := s.serves_from(self._t_next)) is not None
+        ]
+        if not starts:
+            return False
+        first = -(-min(starts) // self._period_ns)
+        if self._next is None:
+            self._next = first
+        elif first > self._next:
+            self.skipped_frames += first - self._next
+            self._next = first
+        return True
+
+    @property
+    def _t_next(self) -> int | None:
+        return None if self._next is None else self._next * self._period_ns
+
+    def _due(self) -> int:
+        """Return when the next frame is or was complete, or its deadline if it is not, ns."""
+        t_k = (self._next or 0) * self._period_ns
+        due = 0
+        for _, stream in self._items:
+            at = stream.due(t_k)
+            if self._fast and stream.newest_ns < t_k:
+                at = min(at, t_k + FAST_WAIT_NS)
+            due = max(due, at)
+        return due
+
+    def _emit(self, due_ns: int) -> AlignedFrame | None:
+        number = self._next or 0
+        t_k = number * self._period_ns
+        self._next = number + 1
+        self._completed_ns = completed_ns = max(self._completed_ns, due_ns)
+        orientations: dict[str, Quaternion] = {}
+        extrapolated: list[str] = []
+        missing: list[str] = []
+        synced, forced = True, False
+        for name, stream in self._items:
+            q = stream.at(t_k)
+            if q is None:
+                missing.append(name)
+                continue
+            orientations[name] = q
+            synced = synced and stream.synced
+            if stream.extrapolated:
+                extrapolated.append(name)
+                forced = True
+        if not orientations:
+            self.skipped_frames += 1
+            return None
+        self.emitted_frames += 1
+        self.forced_frames += forced
+        return AlignedFrame(
+            t_k,
+            completed_ns,
+            orientations,
+            frozenset(extrapolated) if extrapolated else _NONE,
+            frozenset(missing) if missing else _NONE,
+            synced,
+        )
+
+    # --- changes of state --------------------------------------------------------------------
+
+    @property
+    def active(self) -> bool:
+        """Whether frames are wanted."""
+        return self._active
+
+    @active.setter
+    def active(self, wanted: bool) -> None:
+        if self._active and not wanted:
+            self.close()
+        self._active = wanted
+
+    def lose(self, name: str) -> None:
+        """Take it that the stream has ended: do not wait for it until it returns."""
+        self._streams[name].lose()
+
+    def reset(self, name: str) -> None:
+        """Forget the samples of a stream whose clock began anew."""
+        self._streams[name].reset()
+
+    def close(self) -> None:
+        """Give every pending sample its verdict; the next sample begins anew."""
+        for _, stream in self._items:
+            stream.reset()

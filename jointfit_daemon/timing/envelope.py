@@ -1,0 +1,168 @@
+"""The line under the fastest samples: device clock to host clock without asking the device.
+
+Law: pure, integers in, constant memory, constant time a sample (a refit a second).
+
+With device time u and arrival A the difference ``y = A - u = c + s u + D`` has a delay
+``D >= D_min`` of unknown shape. The line that minimises ``sum(y - c - s u)`` without passing above
+any point is the edge of the lower convex hull that straddles the mean of u (Moon, Skelly, Towsley,
+INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002). It rests on the fastest samples, so jitter of any
+shape leaves it unbiased but for D_min, which nobody can see from one side.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from heapq import nsmallest
+from itertools import pairwise
+from math import hypot, inf
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+Point = tuple[int, int]
+"""Device time and difference, ns."""
+
+BUCKET_NS = 250_000_000
+"""Of each bucket only the fastest sample is kept."""
+BUCKETS = 240
+"""One minute: long against jitter, short against the temperature of a crystal."""
+YOUNG_NS = 5_000_000_000
+"""Until this span every bucket is worth a refit; later one a second is."""
+SETTLED_NS = 2_000_000_000
+SETTLED_POINTS = 10
+FLOOR_NS = 10_000.0
+"""No envelope is believed better than this."""
+CRYSTAL = 50e-6
+"""Prior standard deviation of the skew of a clock."""
+NOMINAL_RATE = 5000e-6
+"""Prior standard deviation of a sample rate against its nominal value."""
+
+_OLD_REFIT_BUCKETS = 4
+_LINE_POINTS = 3
+
+
+def lower_hull(points: Iterable[Point]) -> list[Point]:
+    """Return the lower convex hull from left to right (Andrew's monotone chain, exact)."""
+    hull: list[Point] = []
+    for u, y in sorted(points):
+        while len(hull) > 1:
+            (u0, y0), (u1, y1) = hull[-2], hull[-1]
+            if (u1 - u0) * (y - y0) > (y1 - y0) * (u - u0):
+                break
+            hull.pop()
+        if hull and hull[-1][0] == u:  # same instant, and not lower: sorted() put the lower first
+            continue
+        hull.append((u, y))
+    return hull
+
+
+def straddling_edge(hull: Sequence[Point], mean_u: float) -> tuple[Point, Point]:
+    """Return the edge of `hull` (two points or more) that spans `mean_u`."""
+    for left, right in pairwise(hull):
+        if mean_u <= right[0]:
+            return left, right
+    return hull[-2], hull[-1]
+
+
+class Envelope:
+    """Streaming lower envelope of (u, y).
+
+    The slope is the hull's, drawn towards its prior as far as the hull cannot tell: with a short
+    span or a few scattered points it stays near 0, later the prior no longer matters.
+
+    Parameters
+    ----------
+    skew_sd : float
+        Prior standard deviation of the slope, dimensionless; its mean is 0.
+    """
+
+    __slots__ = (
+        "_best", "_best_key", "_bucket_end", "_c", "_points", "_prior", "_prior_sd", "_ref",
+        "_sealed", "_sigma_c", "_sigma_s", "_span", "_y0", "skew",
+    )  # fmt: skip
+
+    def __init__(self, skew_sd: float = CRYSTAL) -> None:
+        self.skew = 0.0
+        """Slope s, dimensionless: positive when the device clock runs slow."""
+        self._prior, self._prior_sd = 0.0, skew_sd
+        self._points: deque[Point] = deque(maxlen=BUCKETS)
+        self._best: Point | None = None
+        self._best_key = inf
+        self._bucket_end = self._ref = self._y0 = self._sealed = self._span = 0
+        self._c = 0.0
+        self._sigma_c, self._sigma_s = inf, skew_sd
+
+    @property
+    def settled(self) -> bool:
+        """Whether the line rests on enough."""
+        return len(self._points) >= SETTLED_POINTS and self._span >= SETTLED_NS
+
+    def residual(self, u: int, y: int) -> float:
+        """Return how far (u, y) lies above the line, ns; 0 before the first point."""
+        if self._best is None:
+            return 0.0
+        return y - self._y0 - self._c - self.skew * (u - self._ref)
+
+    def offset_ns(self, u: int) -> int:
+        """Return the height of the line at `u`, ns: host time minus device time, plus D_min."""
+        return self._y0 + round(self._c + self.skew * (u - self._ref))
+
+    def sigma_ns(self, u: int) -> float:
+        """Return the standard deviation of the line at `u`, ns; inf before the third bucket."""
+        return self._sigma_c + self._sigma_s * abs(u - self._ref + self._span // 2)
+
+    def feed(self, u: int, y: int) -> float:
+        """Take a point with increasing `u`; return how far above the line it was, ns.
+
+        A point below the line pulls it down at once: nothing arrives before it was sent.
+        """
+        if self._best is None:
+            self._y0, self._ref, self._bucket_end = y, u, u + BUCKET_NS
+            self._best, self._best_key = (u, 0), 0.0
+            return 0.0
+        y -= self._y0
+        key = y - self.skew * (u - self._ref)
+        residual = key - self._c
+        if u >= self._bucket_end:
+            self._seal(u, y)
+        elif key < self._best_key:
+            self._best, self._best_key = (u, y), key
+        if residual < 0.0:
+            self._c = min(self._c, y - self.skew * (u - self._ref))
+        return residual
+
+    def _seal(self, u: int, y: int) -> None:
+        points = self._points
+        if self._best is not None:
+            points.append(self._best)
+        oldest = u - BUCKETS * BUCKET_NS
+        while points and points[0][0] < oldest:
+            points.popleft()
+        self._span = u - points[0][0] if points else 0
+        self._sealed += 1
+        if not points:  # a silence of a whole window: the slope is still a good guess
+            self._prior, self._prior_sd = self.skew, CRYSTAL / 10
+            self._c, self._ref, self._sigma_c = y - 0.0, u, inf
+        elif self._span < YOUNG_NS or self._sealed % _OLD_REFIT_BUCKETS == 0:
+            self._refit(u)
+        self._best, self._best_key = (u, y), y - self.skew * (u - self._ref)
+        self._bucket_end = u + BUCKET_NS
+
+    def _refit(self, u: int) -> None:
+        points = self._points
+        if len(points) < _LINE_POINTS:
+            self._c, self._ref = self._c + self.skew * (u - self._ref), u
+            return
+        hull = lower_hull(points)
+        (ua, ya), (ub, yb) = straddling_edge(hull, sum(p[0] for p in points) / len(points))
+        slope = (yb - ya) / (ub - ua)
+        rests = nsmallest(_LINE_POINTS, (y - ya - slope * (at - ua) for at, y in points))
+        self._sigma_c = max(FLOOR_NS, rests[-1] - rests[0])
+        reach = max(ub - ua, self._span / 2)
+        hull_var, prior_var = 2.0 * (self._sigma_c / reach) ** 2, self._prior_sd**2
+        trust = prior_var / (prior_var + hull_var)
+        self.skew = self._prior + trust * (slope - self._prior)
+        self._sigma_s = hypot(self._prior_sd * (1.0 - trust), trust * hull_var**0.5)
+        self._ref = u
+        self._c = min(y - self.skew * (at - u) for at, y in hull)

@@ -1,0 +1,245 @@
+"""One stream on its way into frames: its waiting samples, its habits, its verdicts.
+
+Law: pure, bounded; knows nothing of the other streams. A sample stays while a frame may still need
+it, at most two at or before the last frame (the rate of an extrapolation needs both), and gets its
+verdict when it leaves.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import StrEnum
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.kinematics.rotation_scalar import interpolate_one
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Quaternion
+
+CAPACITY = 512
+"""Samples that may wait in one stream."""
+PATIENCE = 1.45
+"""Periods a sample is waited for beyond its usual delay: under 1.5 with the delay's own ripple."""
+REACH = 2.5
+"""Periods after the last sample that may be extrapolated over."""
+GAP = 4.0
+"""Periods between two samples that may be interpolated over."""
+LOST_PERIODS = 3
+LOST_LEAST_NS = 50_000_000
+FUTURE_NS = 100_000_000
+"""A stamp this far after its own arrival is no stamp."""
+DELAY_MOST_NS = 250_000_000
+"""A stream that is always later than this does not hold up the others."""
+
+_EARLY = 20  # a twentieth of a period: a sample due just before t_k may as well come just after
+_DELAY_STEP = 128
+_DELAY_UP = 3  # three steps up for one down: settles where a quarter of the samples is later
+
+
+class StreamSpec(NamedTuple):
+    """What is known of a stream beforehand."""
+
+    period_ns: int
+    """Nominal time from sample to sample, ns."""
+
+
+class Verdict(StrEnum):
+    """What became of a sample."""
+
+    USED = "used"
+    """Took part in at least one emitted frame."""
+    DECIMATED = "decimated"
+    """Passed over: the stream is faster than the frames."""
+    LATE = "late"
+    """Came when the frames that needed it were out, and no later frame needed it."""
+    DUPLICATE = "duplicate"
+    """Has the time of a sample that is there already."""
+    DROPPED = "dropped"
+    """Given up: overflow, reset, close, or a stamp from the future."""
+    IDLE = "idle"
+    """Came while nobody wanted frames."""
+
+
+class _Sample:
+    __slots__ = ("arrival_ns", "late", "q", "synced", "t_ns", "used")
+
+    def __init__(self, t_ns: int, arrival_ns: int, q: Quaternion, synced: bool, late: bool) -> None:
+        self.t_ns, self.arrival_ns, self.q, self.synced = t_ns, arrival_ns, q, synced
+        self.late, self.used = late, False
+
+
+class Stream:
+    """Samples of one stream between their arrival and their verdict."""
+
+    __slots__ = (
+        "_counts", "_delay_ns", "_delay_step", "_epoch", "_gap_ns", "_lost_after_ns",
+        "_patience_ns", "_period_ns", "_reach_ns", "_received", "_samples", "_waited_for",
+        "extrapolated", "newest_arrival_ns", "newest_ns", "synced",
+    )  # fmt: skip
+
+    def __init__(self, spec: StreamSpec) -> None:
+        period = self._period_ns = spec.period_ns
+        self._patience_ns = round(PATIENCE * period)
+        self._reach_ns = round(REACH * period)
+        self._gap_ns = round(GAP * period)
+        self._lost_after_ns = max(LOST_PERIODS * period, LOST_LEAST_NS)
+        self._delay_step = max(1, period // _DELAY_STEP)
+        self._delay_ns: int | None = None  # usual arrival minus stamp
+        self._samples: deque[_Sample] = deque()
+        self._epoch: int | None = None
+        self._waited_for = False
+        self._received = 0
+        self._counts = dict.fromkeys(Verdict, 0)
+        self.newest_ns = self.newest_arrival_ns = 0
+        self.extrapolated = self.synced = False
+        """What the last ``at`` did, and whether the clock behind it had settled."""
+
+    # --- in ----------------------------------------------------------------------------------
+
+    def idle(self) -> Verdict:
+        """Count a sample nobody wants."""
+        self._received += 1
+        return self._count(Verdict.IDLE)
+
+    def push(
+        self,
+        t_ns: int,
+        arrival_ns: int,
+        q: Quaternion,
+        *,
+        synced: bool,
+        epoch: int,
+        passed_ns: int | None,
+    ) -> Verdict | None:
+        """Take a sample; `passed_ns` is the last frame that is out. Return an early verdict."""
+        self._received += 1
+        if t_ns > arrival_ns + FUTURE_NS:
+            return self._count(Verdict.DROPPED)
+        if epoch != self._epoch:
+            self.reset()
+            self._epoch = epoch
+        samples = self._samples
+        sample = _Sample(t_ns, arrival_ns, q, synced, passed_ns is not None and t_ns <= passed_ns)
+        if samples and t_ns <= samples[-1].t_ns:
+            return self._insert(sample)
+        self._learn_delay(arrival_ns - t_ns)
+        samples.append(sample)
+        self.newest_ns, self._waited_for = t_ns, True
+        self.newest_arrival_ns = max(self.newest_arrival_ns, arrival_ns)
+        if len(samples) > CAPACITY:
+            self._leave(samples.popleft(), Verdict.DROPPED)
+        return None
+
+    def _insert(self, sample: _Sample) -> Verdict | None:
+        """Put a reordered sample where it belongs, if it is still worth anything there."""
+        samples = self._samples
+        at = len(samples)
+        while at and samples[at - 1].t_ns > sample.t_ns:
+            at -= 1
+        if at and samples[at - 1].t_ns == sample.t_ns:
+            return self._count(Verdict.DUPLICATE)
+        if sample.late or at == 0 or len(samples) >= CAPACITY:
+            return self._count(Verdict.LATE)
+        samples.insert(at, sample)
+        return None
+
+    def _learn_delay(self, delay_ns: int) -> None:
+        usual, step = self._delay_ns, self._delay_step
+        if usual is None:
+            self._delay_ns = delay_ns
+        elif delay_ns > usual:
+            self._delay_ns = min(delay_ns, usual + _DELAY_UP * step)
+        else:
+            self._delay_ns = max(delay_ns, usual - step)
+
+    # --- out ---------------------------------------------------------------------------------
+
+    def serves_from(self, t_ns: int | None) -> int | None:
+        """Return the first instant at or after `t_ns` that this stream can serve; None if none."""
+        samples = self._samples
+        if not samples:
+            return None
+        if t_ns is None:
+            return samples[0].t_ns
+        before = None
+        for sample in samples:
+            if sample.t_ns >= t_ns:
+                close = before is not None and sample.t_ns - before.t_ns <= self._gap_ns
+                return t_ns if close else self._reached(before, t_ns) or sample.t_ns
+            before = sample
+        return self._reached(before, t_ns)
+
+    def _reached(self, before: _Sample | None, t_ns: int) -> int | None:
+        return t_ns if before is not None and t_ns - before.t_ns <= self._reach_ns else None
+
+    def due(self, t_ns: int) -> int:
+        """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
+        if not self._waited_for:
+            return 0
+        newest = self.newest_ns
+        if newest < t_ns:
+            period = self._period_ns
+            expected = newest - (newest + period // _EARLY - t_ns) // period * period
+            deadline = expected + min(self._delay_ns or 0, DELAY_MOST_NS) + self._patience_ns
+            return min(deadline, self.newest_arrival_ns + self._lost_after_ns)
+        for sample in self._samples:
+            if sample.t_ns >= t_ns:
+                return sample.arrival_ns
+        return 0
+
+    def at(self, t_ns: int) -> Quaternion | None:
+        """Return the orientation at `t_ns`, which grows from call to call; None: missing."""
+        self.extrapolated = False
+        samples = self._samples
+        while len(samples) > 2 and samples[2].t_ns <= t_ns:  # noqa: PLR2004 - two may lie before
+            self._leave(samples.popleft(), Verdict.DECIMATED)
+        if not samples or samples[0].t_ns > t_ns:
+            return None
+        left = 1 if len(samples) > 1 and samples[1].t_ns <= t_ns else 0
+        a = samples[left]
+        if a.t_ns == t_ns:
+            a.used, self.synced = True, a.synced
+            return a.q
+        if len(samples) > left + 1:
+            b = samples[left + 1]
+            if b.t_ns - a.t_ns <= self._gap_ns:
+                return self._between(a, b, t_ns)
+        if left and t_ns - a.t_ns <= self._reach_ns and a.t_ns - samples[0].t_ns <= self._gap_ns:
+            self.extrapolated = True
+            return self._between(samples[0], a, t_ns)
+        return None
+
+    def _between(self, a: _Sample, b: _Sample, t_ns: int) -> Quaternion:
+        a.used = b.used = True
+        self.synced = a.synced and b.synced
+        return interpolate_one(a.q, b.q, (t_ns - a.t_ns) / (b.t_ns - a.t_ns))
+
+    # --- end ---------------------------------------------------------------------------------
+
+    def lose(self) -> None:
+        """Stop waiting for this stream until a sample comes."""
+        self._waited_for = False
+
+    def reset(self) -> None:
+        """Forget all samples; what no frame used is dropped."""
+        samples = self._samples
+        while samples:
+            self._leave(samples.popleft(), Verdict.DROPPED)
+        self._waited_for, self._epoch = False, None
+
+    def counts(self) -> dict[str, int]:
+        """Return samples received, by verdict, and still pending."""
+        verdicts = {verdict.value: count for verdict, count in self._counts.items()}
+        return {"received": self._received, **verdicts, "pending": len(self._samples)}
+
+    def _leave(self, sample: _Sample, otherwise: Verdict) -> None:
+        if sample.used:
+            self._count(Verdict.USED)
+        elif sample.late and otherwise is Verdict.DECIMATED:
+            self._count(Verdict.LATE)
+        else:
+            self._count(otherwise)
+
+    def _count(self, verdict: Verdict) -> Verdict:
+        self._counts[verdict] += 1
+        return verdict
