@@ -1,0 +1,51 @@
+"""Scale and Huber weights from residual magnitudes. Law: no estimator here, only what all share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+HUBER_K = 1.5
+"""Residuals beyond this many robust scales count less than fully."""
+
+MAX_PASSES = 30
+SETTLED = 1e-7
+"""Iterated weights that change by less than this have settled."""
+
+_MEDIAN_TO_SD = 1.4826
+
+
+def robust_scale(magnitudes: NDArray[np.float64], floor: float = 1e-6) -> float:
+    """Return 1.4826 times the median magnitude, at least `floor`, in the unit of the residuals."""
+    return max(_MEDIAN_TO_SD * float(np.median(magnitudes)), floor)
+
+
+def huber_weights(magnitudes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    r"""Return min(1, 1.5 s / r), shape as `magnitudes`. Source: Huber 1964."""
+    return np.minimum(1.0, HUBER_K * scale / np.maximum(magnitudes, 1e-300))
+
+
+def effective_count(residuals: NDArray[np.float64]) -> float:
+    r"""Return how many independent looks a series of residuals is worth.
+
+    .. math:: n_{eff} = n \frac{1 - \rho_1}{1 + \rho_1}
+
+    with the lag-one autocorrelation of the series about its mean, taken over all columns; never
+    more than n.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (n, k)
+    """
+    n = len(residuals)
+    centered = residuals - residuals.mean(axis=0)
+    total = float(np.sum(centered**2))
+    if n < 3 or total == 0.0:
+        return float(n)
+    rho = float(np.sum(centered[1:] * centered[:-1])) / total
+    rho = min(max(rho, 0.0), 1.0 - 1.0 / n)
+    return max(1.0, n * (1.0 - rho) / (1.0 + rho))
