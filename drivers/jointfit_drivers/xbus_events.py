@@ -1,0 +1,214 @@
+"""The pure half of the Xbus driver: chunks in, samples in SI and canonical orientation out.
+
+Law: a function of the chunks fed; no clock, no port. A sample is stamped with the arrival of its
+first byte: that of the chunk, less the bytes that followed and its own, at ten bits each.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
+from jointfit_drivers.xbus_continuity import Continuity
+from jointfit_protocols import xbus_messages as setup
+from jointfit_protocols.mtdata2 import Item, decode_item, split, world_of
+from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
+from jointfit_protocols.xbus import MAX_MESSAGE, MessageId, XbusDecoder, XbusMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_protocols.corrupt import Corrupt as WireCorrupt
+
+_BITS = 10  # of one byte on the line, 8N1
+_SILENCE_FLOOR_NS = 250_000_000
+"""At high speed 1.5 messages take so little that a stalled host would look like a silent line."""
+_COUNTER, _TIME = int(Item.PACKET_COUNTER), int(Item.SAMPLE_TIME_FINE)
+_QUATERNION = int(Item.QUATERNION)
+_STATUS_BYTE, _STATUS_WORD = int(Item.STATUS_BYTE), int(Item.STATUS_WORD)
+_WANTED = {_COUNTER, _TIME, _QUATERNION, _STATUS_BYTE, _STATUS_WORD}
+_ALIGNED = ("sensor", "local")
+
+
+class XbusEvents:
+    """Decoder of one Xbus device.
+
+    Parameters
+    ----------
+    baud
+        Speed of the line, for back-dating.
+    rate_hz
+        Nominal rate, used until the stream has shown its own.
+    """
+
+    def __init__(self, baud: int, rate_hz: float) -> None:
+        self._xbus = XbusDecoder()
+        self._byte_ns = _BITS * 1e9 / baud
+        self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
+        self._continuity = Continuity(rate_hz)
+        self._gate = OrientationGate()
+        self._last_ns = self._arrival_ns = 0
+        self._refused = self._refused_bytes = 0
+        self._measuring = self._warned = False
+
+    @property
+    def tick_clock(self) -> TickClock:
+        """100 us ticks; the modulus follows the model, or the first wrap seen."""
+        return TickClock(setup.TICK_NS, self._continuity.modulus or setup.WRAP_32_BIT)
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages so far."""
+        return self._xbus.messages - self._refused
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes that belong to no message so far, or to one that made no sense."""
+        return self._xbus.discarded + self._refused_bytes
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return what `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._xbus.pending:
+            quiet_ns = chunk.t_ns - self._last_ns - len(chunk.data) * self._byte_ns
+            if quiet_ns > self._silence_ns:  # the rest of what waits will never come
+                out = self.flush()
+        self._last_ns = chunk.t_ns
+        found = self._xbus.feed(chunk.data)
+        return out + self._take(found) if found else out
+
+    def flush(self) -> list[Decoded]:
+        """Give up waiting for the rest of a pending message."""
+        return self._take(self._xbus.flush())
+
+    def _take(self, found: list[XbusMessage | WireCorrupt]) -> list[Decoded]:
+        out: list[Decoded] = []
+        for event in found:
+            if isinstance(event, XbusMessage):
+                if event.mid == MessageId.MT_DATA2:
+                    out += self._measurement(event)
+                else:
+                    out += self._told(event)
+            else:
+                out.append(Corrupt(event.discarded, event.reason))
+        return out
+
+    def _arrived(self, message: XbusMessage) -> int:
+        """Return when the first byte of `message` came, monotonic ns."""
+        since = self._xbus.fed - message.end + message.size
+        at_ns = self._last_ns - round(since * self._byte_ns)
+        # a line cannot be faster than its speed, but USB devices and ptys are: never backwards
+        self._arrival_ns = max(self._arrival_ns, at_ns)
+        return self._arrival_ns
+
+    def _measurement(self, message: XbusMessage) -> list[Decoded]:
+        """Return the sample of an MTData2, after what its counter and time say."""
+        items = split(message.data)
+        if items is None:
+            return [self._refuse(message, "MTData2 items do not fill the message")]
+        values, world_id = {}, 0
+        for data_id, raw in items:
+            kind = data_id & 0xFFF0
+            if kind in _WANTED:
+                values[kind] = decode_item(data_id, raw)
+                if values[kind] is None:
+                    return [self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
+                world_id = data_id if kind == _QUATERNION else world_id
+        counter = cast("int | None", values.get(_COUNTER))
+        if counter is not None:
+            self._continuity.message(counter)
+        native = cast("Quaternion | None", values.get(_QUATERNION))
+        if native is None:
+            return []
+        self._measuring = True
+        ticks = cast("int | None", values.get(_TIME))
+        status = cast("int | None", values.get(_STATUS_WORD, values.get(_STATUS_BYTE)))
+        out = self._continued(ticks)
+        q = self._gate.admit(canonical(native, world_of(world_id) or "ENU"))
+        if q is None:
+            out.append(self._refuse(message, "quaternion norm is not 1"))
+        else:
+            out.append(ImuSample(self._arrived(message), q, native, ticks, counter, status))
+        return out if self._warned else out + self._judged()
+
+    def _continued(self, ticks: int | None) -> list[Decoded]:
+        """Return a gap or a restart, if there was one."""
+        step = self._continuity.orientation(ticks)
+        if step.restarted:
+            self._gate.forget()
+            return [DeviceEvent("restart", f"its clock began anew at {ticks} ticks")]
+        if step.lost:
+            return [DeviceEvent("gap", f"{step.lost} messages lost", {"lost": step.lost})]
+        return []
+
+    def _judged(self) -> list[Decoded]:
+        """Return one warning where hardly any quaternion has norm 1."""
+        norm = self._gate.misconfigured_norm
+        if norm is None:
+            return []
+        self._warned = True
+        text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
+        return [DeviceEvent("warning", text, {"median_norm": norm})]
+
+    def _refuse(self, message: XbusMessage, reason: str) -> Corrupt:
+        self._refused += 1
+        self._refused_bytes += message.size
+        return Corrupt(message.size, reason)
+
+    def _told(self, message: XbusMessage) -> list[Decoded]:
+        """Return what a message other than a measurement says."""
+        mid, data = message.mid, message.data
+        if mid == MessageId.WAKE_UP:
+            return self._woke()
+        if mid in {MessageId.ERROR, MessageId.WARNING}:
+            code = data[0] if data else 0
+            kind = "error" if mid == MessageId.ERROR else "warning"
+            return [DeviceEvent(kind, setup.error_text(code), {"code": code})]
+        if mid == MessageId.PRODUCT_CODE:
+            self._continuity.modulus = setup.fine_time_modulus(setup.decode_text(data))
+        known = _info(mid, data)
+        text = ", ".join(f"{key} {value}" for key, value in known.items())
+        return [DeviceEvent("info", text, known)] if known else []
+
+    def _woke(self) -> list[Decoded]:
+        """Return a restart if the device had been measuring: it lost power, or was reset."""
+        self._continuity.forget()
+        self._gate.forget()
+        if not self._measuring:
+            return []
+        self._measuring = False
+        return [DeviceEvent("restart", "it woke up anew")]
+
+
+def _info(mid: int, data: bytes) -> dict[str, object]:
+    """Return what a reply says of the device; empty for other messages and malformed ones."""
+    if mid == MessageId.ALIGNMENT_ROTATION_ACK:
+        rotation = setup.decode_alignment(data)
+        if rotation is None or rotation.frame >= len(_ALIGNED):
+            return {}
+        return {f"alignment_{_ALIGNED[rotation.frame]}": list(rotation.q)}
+    if mid not in _TOLD or not data:
+        return {}
+    key, read = _TOLD[mid]
+    value = read(data)
+    return {} if value is None else {key: value}
+
+
+def _firmware(data: bytes) -> str | None:
+    firmware = setup.decode_firmware(data)
+    return None if firmware is None else ".".join(map(str, firmware[:3]))
+
+
+def _outputs(data: bytes) -> dict[str, int] | None:
+    outputs = setup.decode_outputs(data)
+    return None if outputs is None else {f"0x{data_id:04X}": rate for data_id, rate in outputs}
+
+
+_TOLD: dict[int, tuple[str, Callable[[bytes], object]]] = {
+    MessageId.DEVICE_ID: ("serial", setup.decode_device_id),
+    MessageId.PRODUCT_CODE: ("model", setup.decode_text),
+    MessageId.FIRMWARE: ("firmware", _firmware),
+    MessageId.FILTER_PROFILE_ACK: ("filter_profile", setup.decode_filter_profile),
+    MessageId.OUTPUT_CONFIGURATION_ACK: ("outputs", _outputs),
+}

@@ -1,0 +1,229 @@
+"""From an open port to a measuring Xbus device, or to words that say why not.
+
+Law: what the device has stored is read and compared, and changed only where it differs in a way
+that matters and ``persist`` allows it, for every set of an Xbus device is stored in flash at once.
+What can heal is DeviceLost, what cannot is DeviceMisconfigured.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NoReturn
+
+from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_drivers.xbus_conversation import Conversation
+from jointfit_protocols import xbus_messages as setup
+from jointfit_protocols.mtdata2 import Item, real_id
+from jointfit_protocols.xbus import MessageId, XbusMessage
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.byte_stream import SerialPort
+    from jointfit_drivers.xbus_settings import XbusSettings
+
+log = logging.getLogger(__name__)
+
+_OTHER_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19_200, 9_600)
+"""Factory settings and common choices first."""
+_LISTEN_S = 0.15  # an acknowledgement takes 10 ms at 9600 baud, a sample at 10 Hz 100 ms
+_RESETS, _RESET_WAIT_S = 50, 0.1  # 5 s: a stuck MTi-G-700 answered 1.8 s after its reset
+_SMALLEST_BYTES = 36  # counter, time and quaternion in one message
+_BITS = 10  # of one byte on the line, 8N1
+_FRAMES = (0, 1)  # of the alignment rotations: sensor, local
+
+
+class Handshake:
+    """Brings one device to measure.
+
+    Parameters
+    ----------
+    port, emit
+        Open port; where what the device says goes.
+    settings
+        Its table of rig.toml.
+    hunt
+        Whether to look for the device at other speeds where it is silent at its own. Where bytes
+        come but mean nothing it is looked for anyway.
+    """
+
+    def __init__(
+        self, port: SerialPort, emit: Emit, settings: XbusSettings, *, hunt: bool = True
+    ) -> None:
+        self._port = port
+        self._settings = settings
+        self._hunt = hunt
+        self._talk = Conversation(port, emit)
+        self._who = f"{settings.id} ({settings.port})"
+
+    async def ensure_measuring(self) -> None:
+        """Return when the device measures as the settings ask.
+
+        Raises
+        ------
+        DeviceLost
+            Silent, unplugged, or it stopped answering.
+        DeviceMisconfigured
+            Another speed, another kind of device, or an output configuration that differs and may
+            not be written.
+        """
+        self._refuse_too_much_for_the_line()
+        self._talk.begin_anew()
+        if not await self._ensure_config():
+            await self._explain_silence()
+        await self._read_identity()
+        await self._ensure_outputs()
+        await self._start()
+
+    def _refuse_too_much_for_the_line(self) -> None:
+        settings = self._settings
+        needs = settings.rate_hz * _SMALLEST_BYTES * _BITS
+        if needs > settings.baud:
+            raise DeviceMisconfigured(
+                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
+                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
+            )
+
+    async def _ensure_config(self) -> bool:
+        """Return whether the device is in configuration mode."""
+        if await self._talk.enter_config():
+            return True
+        if not self._settings.reset_if_stuck or not self._talk.understood:
+            return False
+        log.warning("%s: streams but does not answer; resetting it", self._who)
+        await self._talk.send(MessageId.RESET)
+        return await self._talk.enter_config(tries=_RESETS, wait_s=_RESET_WAIT_S)
+
+    async def _read_identity(self) -> None:
+        """Ask for what the decoder hands on as information; only the id is owed."""
+        await self._answer(MessageId.REQ_DEVICE_ID)
+        for mid in (MessageId.REQ_PRODUCT_CODE, MessageId.REQ_FIRMWARE, MessageId.FILTER_PROFILE):
+            await self._talk.ask(mid)  # its reply is emitted; older devices refuse some
+        for frame in _FRAMES:
+            await self._talk.ask(MessageId.ALIGNMENT_ROTATION, bytes((frame,)))
+
+    async def _answer(self, mid: int, data: bytes = b"") -> XbusMessage:
+        """Return the reply to a request the device owes an answer, which may be an error."""
+        reply = await self._talk.ask(mid, data, tries=3)
+        if reply is None:
+            raise DeviceLost(f"{self._who}: stopped answering during configuration")
+        return reply
+
+    async def _ensure_outputs(self) -> None:
+        """Have the device send what is needed, at the rate asked for."""
+        rate = int(self._settings.rate_hz)
+        reply = await self._answer(MessageId.OUTPUT_CONFIGURATION)
+        found = _outputs_of(reply)
+        faults = differences(found, rate)
+        if not faults:
+            return
+        listed = "; ".join(faults)
+        if not self._settings.persist:
+            raise DeviceMisconfigured(
+                f"{self._who}: {listed}{_rate_hint(found)}: set persist = true once to write it "
+                "into the device's flash, or configure the device with the vendor's tool"
+            )
+        log.warning("%s: writing its output configuration: %s", self._who, listed)
+        wanted = (
+            (Item.PACKET_COUNTER, setup.MAX_RATE),
+            (Item.SAMPLE_TIME_FINE, setup.MAX_RATE),
+            (Item.STATUS_WORD, setup.MAX_RATE),
+            (real_id(Item.QUATERNION, world=self._settings.world), rate),
+        )
+        reply = await self._answer(MessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(wanted))
+        self._refuse_error(reply, f"refuses quaternions at {rate} Hz")
+        left = differences(_outputs_of(reply), rate)
+        if left:
+            hint = _rate_hint(_outputs_of(reply))
+            raise DeviceMisconfigured(f"{self._who}: cannot do as asked: {'; '.join(left)}{hint}")
+
+    async def _start(self) -> None:
+        reply = await self._answer(MessageId.GOTO_MEASUREMENT)
+        self._refuse_error(reply, "does not start to measure")
+
+    def _refuse_error(self, reply: XbusMessage, what: str) -> None:
+        if reply.mid == MessageId.ERROR:
+            code = reply.data[0] if reply.data else 0
+            raise DeviceMisconfigured(
+                f"{self._who}: {what} ({setup.error_text(code)}): change `rate_hz` or `baud`"
+            )
+
+    async def _explain_silence(self) -> NoReturn:
+        """Raise what fits a device that does not answer GoToConfig."""
+        heard, talk = self._talk.heard, self._talk
+        if talk.understood:
+            raise DeviceLost(
+                f"{self._who}: streams but does not answer GoToConfig: check the wire from host "
+                "to device, or set reset_if_stuck = true"
+            )
+        speed = await self._other_speed() if self._hunt or heard else None
+        if speed is not None:
+            raise DeviceMisconfigured(
+                f"{self._who}: {self._settings.baud} baud but nothing decodes; "
+                f"the device answers at {speed}: set baud = {speed}"
+            )
+        if not heard:
+            raise DeviceLost(
+                f"{self._who}: silent: check its power, and that TX and RX are not swapped"
+            )
+        await self._listen_at(self._settings.baud)
+        if not talk.heard:
+            raise DeviceLost(f"{self._who}: {heard} bytes of noise, then silence")
+        raise DeviceMisconfigured(
+            f"{self._who}: what answers on this port is not an Xbus device: {heard} bytes, none "
+            "of them Xbus at any usual speed: set `port` to the right one, or `driver`"
+        )
+
+    async def _other_speed(self) -> int | None:
+        """Return the speed at which the device talks; it is left measuring as it was."""
+        for baud in _OTHER_SPEEDS:
+            if baud == self._settings.baud:
+                continue
+            try:
+                answered = await self._listen_at(baud)
+            except DeviceMisconfigured:  # the port cannot run at it
+                continue
+            if answered:
+                await self._talk.send(MessageId.GOTO_MEASUREMENT)
+            if answered or self._talk.understood:
+                return baud
+        return None
+
+    async def _listen_at(self, baud: int) -> bool:
+        self._port.set_baud(baud)
+        self._talk.begin_anew()
+        return await self._talk.enter_config(tries=1, wait_s=_LISTEN_S)
+
+
+def differences(found: tuple[setup.Output, ...], rate: int) -> list[str]:
+    """Return in words what an output configuration lacks; empty if it will do.
+
+    It will do with a counter, a fine time and a quaternion at `rate` Hz; precision, world and
+    further items do not matter, for the decoder understands them all.
+    """
+    faults = []
+    kinds = {output.data_id & 0xFFF0: output.rate for output in found}
+    for item, name in ((Item.PACKET_COUNTER, "packet counter"), (Item.SAMPLE_TIME_FINE, "time")):
+        if item not in kinds:
+            faults.append(f"it sends no {name} (0x{item:04X})")
+    if Item.QUATERNION not in kinds:
+        faults.append("it sends no quaternion (0x2010)")
+    elif kinds[Item.QUATERNION] != rate:
+        faults.append(f"it sends quaternions at {_hz(kinds[Item.QUATERNION])}, not {rate} Hz")
+    return faults
+
+
+def _outputs_of(reply: XbusMessage) -> tuple[setup.Output, ...]:
+    return (setup.decode_outputs(reply.data) or ()) if reply.mid != MessageId.ERROR else ()
+
+
+def _hz(rate: int) -> str:
+    return "its maximum rate" if rate in {0, setup.MAX_RATE} else f"{rate} Hz"
+
+
+def _rate_hint(found: tuple[setup.Output, ...]) -> str:
+    """Offer the rate the device has, where that alone would do."""
+    rates = {output.rate for output in found if output.data_id & 0xFFF0 == Item.QUATERNION}
+    rate = next(iter(rates), 0)
+    if rate in {0, setup.MAX_RATE} or differences(found, rate):
+        return ""
+    return f" (or set rate_hz = {rate})"
