@@ -1,0 +1,39 @@
+"""Rotations of the simulator's own, over SciPy: whole arrays, scalar first.
+
+Law: nothing of the estimator's kinematics is used here, so that a slip there cannot hide behind
+the same slip in the truth it is judged by. The only module of this package that names SciPy's
+rotations.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import (
+    Rotation,  # noqa: TID251 - independent of the estimator's own rotations
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["Rotation", "from_wxyz", "heading", "to_wxyz"]
+
+_SCALAR_LAST = [1, 2, 3, 0]
+_SCALAR_FIRST = [3, 0, 1, 2]
+
+
+def from_wxyz(quaternions: NDArray[np.float64]) -> Rotation:
+    """Return rotations of Hamilton quaternions (w, x, y, z), shape (..., 4)."""
+    return Rotation.from_quat(quaternions[..., _SCALAR_LAST])
+
+
+def to_wxyz(rotations: Rotation) -> NDArray[np.float64]:
+    """Return Hamilton quaternions (w, x, y, z), shape (4,) or (n, 4)."""
+    found: NDArray[np.float64] = np.asarray(rotations.as_quat())[..., _SCALAR_FIRST]
+    return found
+
+
+def heading(angle: float) -> Rotation:
+    """Return the rotation by `angle` rad about the vertical."""
+    return Rotation.from_rotvec([0.0, 0.0, angle])

@@ -1,0 +1,68 @@
+"""Band-limited random signals that can be read at any instant, in any order.
+
+Law: a wander is a function of time and of its seed, nothing else: no state, so two readers at
+different rates see the same movement, and a run repeats exactly.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LINES = 48
+"""Sinusoids in one signal; with fewer it would visibly repeat and its RMS would swing."""
+
+
+class Wander:
+    r"""A stationary, nearly Gaussian signal of several channels within a frequency band.
+
+    .. math:: x_c(t) = \sum_k a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t
+
+    (Rice's sum of sinusoids, Bell Syst. Tech. J. 23, 1944), with the :math:`f_k` stratified over
+    the band and the amplitudes scaled so that every channel has its RMS exactly, over a time
+    that is long against ``1/low_hz``.
+
+    Parameters
+    ----------
+    random
+        Source of frequencies and amplitudes; used here and never again.
+    channels
+        Number of signals.
+    low_hz, high_hz
+        The band.
+    rms
+        RMS of each channel, any unit.
+    """
+
+    def __init__(
+        self,
+        random: np.random.Generator,
+        channels: int,
+        *,
+        low_hz: float,
+        high_hz: float,
+        rms: float,
+    ) -> None:
+        edges = np.linspace(low_hz, high_hz, LINES + 1)
+        self._omega = 2 * np.pi * random.uniform(edges[:-1], edges[1:])
+        amplitudes = random.standard_normal((2 * LINES, channels))
+        power = np.sum(amplitudes**2, axis=0) / 2
+        self._amplitudes = amplitudes * (rms / np.sqrt(power))
+
+    def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signals at instants `t_s` of shape (n,), shape (n, channels)."""
+        phase = t_s[:, None] * self._omega
+        waves = np.concatenate((np.cos(phase), np.sin(phase)), axis=1)
+        found: NDArray[np.float64] = waves @ self._amplitudes
+        return found
+
+
+def vector_wander(
+    random: np.random.Generator, vectors: int, *, low_hz: float, high_hz: float, rms: float
+) -> Wander:
+    """Return a wander of 3-vectors whose *length* has the given RMS (isotropic)."""
+    return Wander(random, 3 * vectors, low_hz=low_hz, high_hz=high_hz, rms=rms / np.sqrt(3))
