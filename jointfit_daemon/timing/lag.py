@@ -1,0 +1,245 @@
+r"""Lag of an IMU behind motion capture, found from the motion itself.
+
+Law: pure, whole windows, numpy. No world frames, no heading, no gravity, no mount: this comes
+before all other fits. It says how sure it is, and refuses rather than guesses.
+
+Two bodies rigidly connected turn at the same rate up to a constant rotation and a gyro bias,
+
+.. math:: g(t + \tau) = R\,\omega(t) + b + n ,
+
+g and omega each in its own body frame. The lag tau is **IMU stamp minus mocap stamp of the same
+event**: positive when the IMU is later; subtract it from IMU stamps. It is what the clocks cannot
+see: unseen transport delay, filters inside both systems, exposure conventions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf, nan, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
+from jointfit_daemon.timing.lag_fit import fit_lag
+from jointfit_daemon.timing.rates import (
+    BRIDGE_S,
+    KERNEL_HALF_S,
+    Interpolant,
+    low_pass,
+    rates_from_orientations,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.model import Quaternion, Vector
+    from jointfit_daemon.timing.lag_fit import LagFit
+    from jointfit_daemon.timing.rates import Floats, Rates
+
+_NYQUIST_SHARE = 0.4
+_FAR_S = 0.1
+_RIVAL = 0.95
+_LEAST_OVERLAP = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LagSettings:
+    """How to search, and the gates an estimate must pass."""
+
+    span_s: float = 0.15
+    """Largest lag searched for, s. 3 s at first contact if a clock is not mapped."""
+    step_s: float = 0.004
+    cutoff_hz: float = 12.0
+    """Low-pass on both rates; at most 0.4 of the lower sample rate."""
+    bridge_s: float = BRIDGE_S
+    min_rate: float = radians(30.0)
+    """RMS angular rate of the reference, rad/s."""
+    min_acceleration: float = radians(300.0)
+    """RMS angular acceleration of the reference, rad/s²."""
+    max_sigma_ns: float = 300_000.0
+    min_r2: float = 0.98
+    """Right data on one rigid body reach 0.998; skin-mounted sensors deserve less."""
+    min_weight: float = 0.7
+    """Mean Huber weight: else the fit rests on a minority of the data."""
+    min_valid: float = 0.8
+    """Share of the window without gaps."""
+    max_bias: float = radians(10.0)
+    """Larger means wrong units or a wrong stream, rad/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagEstimate:
+    """A lag, how sure it is, and what else the fit found."""
+
+    lag_ns: float
+    """IMU stamp minus reference stamp of the same event, ns; NaN if there was nothing to fit."""
+    sigma_ns: float
+    """Standard deviation, honest for correlated residuals, ns."""
+    r2: float
+    """1 - sum |residual|² / sum |omega|²."""
+    refused: str | None
+    """Why not to use it; None if it may be used."""
+    q_imu_ref: Quaternion = IDENTITY_ONE
+    """Takes reference-body coordinates to IMU coordinates. About a single axis it is a guess."""
+    bias: Vector = (0.0, 0.0, 0.0)
+    """Of the IMU's rate, rad/s."""
+    residual_rms: float = nan
+    """Per axis, rad/s."""
+    rate_rms: float = nan
+    """Of the reference, rad/s."""
+    acceleration_rms: float = nan
+    """Of the reference, rad/s²."""
+    mean_weight: float = nan
+    valid_share: float = nan
+    pairs: int = 0
+    """Rates compared."""
+
+
+def estimate_lag(
+    imu_t_ns: NDArray[np.int64],
+    imu_q: Floats,
+    ref_t_ns: NDArray[np.int64],
+    ref_q: Floats,
+    settings: LagSettings | None = None,
+) -> LagEstimate:
+    """Estimate the lag between two tracks of orientations.
+
+    The lag of orientations is not the lag of the gyro behind them (an orientation filter leads its
+    gyro by half its internal period): it belongs to the quantity it was estimated from.
+
+    Parameters
+    ----------
+    imu_t_ns, ref_t_ns : ndarray, shape (n,), (m,)
+        Host instants, strictly increasing, ns.
+    imu_q, ref_q : ndarray, shape (n, 4), (m, 4)
+        q_world_body of either, each in its own world; rows with NaN are poses not seen.
+    settings : LagSettings, optional
+        Search and gates.
+
+    Returns
+    -------
+    LagEstimate
+        Refused, saying why, where the data cannot tell.
+    """
+    settings = settings or LagSettings()
+    if min(np.size(imu_t_ns), np.size(ref_t_ns)) == 0:
+        return LagEstimate(nan, inf, nan, "no data")
+    origin = int(ref_t_ns[0])
+
+    def rates(t_ns: NDArray[np.int64], q: Floats) -> Rates:
+        return rates_from_orientations(t_ns, q, origin, bridge_s=settings.bridge_s)
+
+    imu, ref = rates(imu_t_ns, imu_q), rates(ref_t_ns, ref_q)
+    estimate = estimate_lag_of_rates(imu, ref, settings)
+    if not estimate.r2 < settings.min_r2:
+        return estimate
+    turned = rates(ref_t_ns, rotation.conjugate(ref_q))
+    if estimate_lag_of_rates(imu, turned, settings).refused is not None:
+        return estimate
+    hint = f"{estimate.refused}; it fits with one side's quaternions conjugated"
+    return replace(estimate, refused=hint)
+
+
+def estimate_lag_of_rates(
+    imu: Rates, ref: Rates, settings: LagSettings | None = None
+) -> LagEstimate:
+    """Estimate the lag between two tracks of angular rates with a common origin.
+
+    See ``estimate_lag``.
+    """
+    settings = settings or LagSettings()
+    lower_hz = 1.0 / max(imu.period_s, ref.period_s)
+    cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE * lower_hz)
+    valid = min(imu.valid_share, ref.valid_share)
+    imu, ref = low_pass(imu, cutoff), low_pass(ref, cutoff)
+    if min(imu.t_s.size, ref.t_s.size) < 4 / (cutoff * KERNEL_HALF_S):
+        return LagEstimate(nan, inf, nan, "no gapless stretch of data", valid_share=valid)
+    coarse, refused = coarse_lag(imu, ref, settings)
+    rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)
+    seen = LagEstimate(
+        nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
+    )
+    if rate < settings.min_rate or acceleration < settings.min_acceleration:
+        return replace(seen, refused=f"too little motion: {np.degrees(rate):.1f} deg/s rms")
+    if refused is not None:
+        return replace(seen, refused=refused)
+    fit = fit_lag(imu, ref, coarse, cutoff)
+    if fit is None:
+        return replace(seen, refused="the tracks do not overlap")
+    estimate = replace(
+        seen,
+        lag_ns=1e9 * fit.tau_s,
+        sigma_ns=1e9 * fit.sigma_s,
+        r2=fit.r2,
+        q_imu_ref=as_quaternion(rotation.from_matrix(fit.rotation).tolist()),
+        bias=(float(fit.bias[0]), float(fit.bias[1]), float(fit.bias[2])),
+        residual_rms=fit.residual_rms,
+        mean_weight=fit.mean_weight,
+        pairs=fit.pairs,
+    )
+    return replace(estimate, refused=_gate(estimate, fit, settings))
+
+
+def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | None:
+    """Return the first gate the estimate fails, in words."""
+    gates = (
+        (estimate.valid_share >= settings.min_valid, "too many gaps"),
+        (fit.converged, "the fit did not converge"),
+        (
+            estimate.r2 >= settings.min_r2,
+            f"R² {estimate.r2:.3f} < {settings.min_r2}: not the same motion, or a wrong convention",
+        ),
+        (estimate.mean_weight >= settings.min_weight, "too many outliers"),
+        (float(np.linalg.norm(fit.bias)) <= settings.max_bias, "rate bias too large: wrong units?"),
+        (
+            estimate.sigma_ns <= settings.max_sigma_ns,
+            f"too uncertain: {estimate.sigma_ns * 1e-6:.2f} ms",
+        ),
+        (abs(fit.tau_s) <= settings.span_s, "the lag is outside the searched span"),
+    )
+    return next((reason for passed, reason in gates if not passed), None)
+
+
+def coarse_lag(imu: Rates, ref: Rates, settings: LagSettings) -> tuple[float, str | None]:
+    """Return the lag, s, that best correlates the magnitudes of both rates, and why not to use it.
+
+    The magnitude needs no rotation. A maximum at the border, or a far rival nearly as high
+    (periodic motion), is refused.
+    """
+    step, reach = settings.step_s, round(settings.span_s / settings.step_s)
+    grid = np.arange(ref.t_s[0], ref.t_s[-1], step)
+    wide = grid[0] + step * np.arange(-reach, grid.size + reach)
+    a, a_ok = _magnitude(ref, grid)
+    b, b_ok = _magnitude(imu, wide)
+    least = _LEAST_OVERLAP * a_ok.sum()
+    scores = np.full(2 * reach + 1, -inf)
+    for shift in range(scores.size):
+        both = a_ok & b_ok[shift : shift + grid.size]
+        if both.sum() > max(2.0, least):
+            x = a[both] - a[both].mean()
+            y = b[shift : shift + grid.size][both]
+            y = y - y.mean()
+            scores[shift] = (x @ y) / np.sqrt(max((x @ x) * (y @ y), 1e-300))
+    best = int(np.argmax(scores))
+    lag = (best - reach) * step
+    if not np.isfinite(scores[best]):
+        return nan, "the tracks do not overlap"
+    if best in {0, scores.size - 1}:
+        return nan, f"no common motion within {settings.span_s:g} s"
+    peaks = np.flatnonzero((scores[1:-1] > scores[:-2]) & (scores[1:-1] >= scores[2:])) + 1
+    far = peaks[np.abs(peaks - best) * step > _FAR_S]
+    if far.size and scores[far].max() >= _RIVAL * scores[best]:
+        return nan, "the motion is periodic and the lag ambiguous: move irregularly"
+    return lag, None
+
+
+def _magnitude(rates: Rates, t: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return |rate| at instants `t`, linear between samples, and where it is known."""
+    _, inside = Interpolant(rates).locate(t)
+    return np.interp(t, rates.t_s, np.linalg.norm(rates.w, axis=1)), inside
+
+
+def _rms(vectors: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

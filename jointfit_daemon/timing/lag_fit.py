@@ -1,0 +1,179 @@
+"""The fine fit of the lag: rotation, bias and lag at once, on three axes.
+
+Law: pure; starts from a coarse lag; returns numbers, judges nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.timing.rates import Interpolant
+
+if TYPE_CHECKING:
+    from jointfit_daemon.timing.rates import Floats, Rates
+
+HUBER = 2.4
+"""Times sigma: 1.345 per axis, on the norm of three."""
+MEDIAN_NORM = 1.538
+"""Median norm of a standard normal vector of three."""
+STEP_S = 0.020
+ITERATIONS = 30
+DONE_S = 1e-9
+LEAST_PAIRS = 16
+
+_RIDGE = 1e-9
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class LagFit:
+    """What the fit found, in the convention of ``lag``."""
+
+    tau_s: float
+    sigma_s: float
+    rotation: Floats
+    """R, reference-body to IMU coordinates, shape (3, 3)."""
+    bias: Floats
+    """rad/s, shape (3,)."""
+    r2: float
+    residual_rms: float
+    mean_weight: float
+    pairs: int
+    converged: bool
+
+
+class _State(NamedTuple):
+    tau: float
+    rot: Floats
+    bias: Floats
+
+
+class _Linear(NamedTuple):
+    """Residuals r (n, 3), weights w (n,), and the Jacobian's columns."""
+
+    r: Floats
+    w: Floats
+    jac: Floats
+    """Of phi and b, shape (n, 3, 6)."""
+    jtau: Floats
+    """Of tau, shape (n, 3)."""
+    omega: Floats
+
+
+def fit_lag(imu: Rates, ref: Rates, start_s: float, cutoff_hz: float) -> LagFit | None:
+    r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
+
+    Gauss-Newton on all seven unknowns with Huber weights on |r|. The faster track is interpolated
+    at the instants of the slower one. The standard deviation is Newey-West's, for low-passed
+    residuals are correlated over the filter's memory.
+
+    Parameters
+    ----------
+    imu, ref : Rates
+        Filtered alike.
+    start_s : float
+        Coarse lag, s.
+    cutoff_hz : float
+        Of the filter: it sets how far residuals are correlated.
+
+    Returns
+    -------
+    LagFit or None
+        None if too little overlaps.
+    """
+    swapped = imu.period_s > ref.period_s  # then omega is interpolated at the instants of g
+    fast, slow = (ref, imu) if swapped else (imu, ref)
+    cubic = Interpolant(fast)
+    state = _start(cubic, slow, -start_s if swapped else start_s)
+    if state is None:
+        return None
+    converged = False
+    for _ in range(ITERATIONS):
+        linear = _linearize(cubic, slow, state)
+        if linear is None:
+            return None
+        state, moved = _step(linear, state)
+        if moved < DONE_S:
+            converged = True
+            break
+    linear = _linearize(cubic, slow, state)
+    if linear is None:
+        return None
+    rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
+    lags = max(1, round(2.0 / (cutoff_hz * slow.period_s)))
+    square = float(np.sum(linear.r**2))
+    return LagFit(
+        tau_s=-state.tau if swapped else state.tau,
+        sigma_s=_newey_west(linear, lags),
+        rotation=rot,
+        bias=bias,
+        r2=1.0 - square / max(float(np.sum(linear.omega**2)), _TINY),
+        residual_rms=float(np.sqrt(square / linear.r.size)),
+        mean_weight=float(linear.w.mean()),
+        pairs=len(linear.r),
+        converged=converged,
+    )
+
+
+def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
+    """Return R by SVD of the covariance, means removed, and b = 0."""
+    g, _, ok = cubic(slow.t_s + tau)
+    if ok.sum() < LEAST_PAIRS:
+        return None
+    g, omega = g[ok] - g[ok].mean(axis=0), slow.w[ok] - slow.w[ok].mean(axis=0)
+    u, _, vt = np.linalg.svd(g.T @ omega)
+    u[:, 2] *= np.sign(np.linalg.det(u @ vt))
+    return _State(tau, u @ vt, np.zeros(3))
+
+
+def _linearize(cubic: Interpolant, slow: Rates, state: _State) -> _Linear | None:
+    g, slope, ok = cubic(slow.t_s + state.tau)
+    if ok.sum() < LEAST_PAIRS:
+        return None
+    omega = slow.w[ok]
+    turned = omega @ state.rot.T
+    r = g[ok] - state.bias - turned
+    norm = np.linalg.norm(r, axis=1)
+    limit = HUBER * np.median(norm) / MEDIAN_NORM
+    weight = np.where(norm <= limit, 1.0, limit / np.maximum(norm, _TINY))
+    jac = np.concatenate(
+        (rotation.skew(turned), np.broadcast_to(-np.eye(3), (*norm.shape, 3, 3))), axis=2
+    )
+    return _Linear(r, weight, jac, slope[ok], omega)
+
+
+def _step(linear: _Linear, state: _State) -> tuple[_State, float]:
+    """Return the next state and how far it moved (s; a radian counts as a millisecond)."""
+    jac = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
+    weighted = jac * linear.w[:, None, None]
+    normal = np.einsum("nij,nik->jk", weighted, jac)
+    gradient = np.einsum("nij,ni->j", weighted, linear.r)
+    normal[np.arange(3), np.arange(3)] += _RIDGE * max(np.trace(normal[:3, :3]), _TINY)
+    normal[6, 6] += _TINY
+    move = -np.linalg.solve(normal, gradient)
+    tau = float(np.clip(move[6], -STEP_S, STEP_S))
+    rot = rotation.to_matrix(rotation.exp(move[:3])) @ state.rot
+    moved = max(abs(tau), 1e-3 * float(np.abs(move[:6]).max()))
+    return _State(state.tau + tau, rot, state.bias + move[3:6]), moved
+
+
+def _newey_west(linear: _Linear, lags: int) -> float:
+    """Return the standard deviation of tau, s, for residuals correlated over `lags` samples."""
+    w, jac = linear.w, linear.jac
+    weighted = jac * w[:, None, None]
+    normal = np.einsum("nij,nik->jk", weighted, jac)
+    normal[np.arange(3), np.arange(3)] += _RIDGE * max(np.trace(normal[:3, :3]), _TINY)
+    cross = np.einsum("nij,ni->j", weighted, linear.jtau)
+    jtau = linear.jtau - np.einsum("nij,j->ni", jac, np.linalg.solve(normal, cross))
+    information = float(w @ np.sum(jtau**2, axis=1))
+    score = w * np.sum(jtau * linear.r, axis=1)
+    variance = float(score @ score)
+    for lag in range(1, min(lags, len(score) - 1) + 1):
+        variance += 2.0 * (1.0 - lag / (lags + 1)) * float(score[lag:] @ score[:-lag])
+    if information <= _TINY:
+        return float("inf")
+    return float(np.sqrt(max(variance, 0.0))) / information

@@ -1,0 +1,194 @@
+"""Angular rates for the lag: derived from orientations, centred, filtered without phase.
+
+Law: whole tracks, numpy. Nothing here may shift a signal in time: a rate is stamped in the middle
+of the interval it was measured over, and every filter is symmetric. A rate stamped at the left end
+instead would shift the lag by half a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+KERNEL_HALF_S = 0.125
+"""Half the length of the low-pass; what a run of rates loses at either end."""
+GAP = 1.5
+"""Nominal periods between two poses from which on something is missing."""
+BRIDGE_S = 0.035
+"""Gaps up to this are bridged by the mean rate over them: exact in integral, symmetric, and
+harmless below the cut-off. Longer ones split the track."""
+
+_KAISER = 5.0
+_MOST_ANGLE = np.pi / 2
+_STENCIL = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Angular rate of a body in its own frame."""
+
+    t_s: Floats
+    """Instants, s after the origin, shape (n,)."""
+    w: Floats
+    """rad/s, shape (n, 3)."""
+    run: NDArray[np.intp]
+    """Number of the gapless stretch each belongs to, never falling, shape (n,)."""
+    period_s: float
+    """Median sample period, s."""
+    valid_share: float
+    """Share of the track's duration that is covered."""
+
+    def runs(self) -> list[slice]:
+        """Return the gapless stretches."""
+        edges = np.flatnonzero(np.diff(self.run)) + 1
+        bounds = [0, *edges.tolist(), self.run.size]
+        return [slice(a, b) for a, b in pairwise(bounds) if b > a]
+
+
+def rates_from_orientations(
+    t_ns: NDArray[np.int64], q: Floats, origin_ns: int, *, bridge_s: float = BRIDGE_S
+) -> Rates:
+    r"""Return the body rate between neighbouring poses.
+
+    .. math:: \omega_{k+1/2} = \frac{\log(q_k^* q_{k+1})}{t_{k+1} - t_k},
+              \quad t_{k+1/2} = \frac{t_k + t_{k+1}}{2}
+
+    Parameters
+    ----------
+    t_ns : ndarray, shape (n,)
+        Strictly increasing.
+    q : ndarray, shape (n, 4)
+        q_world_body; rows with NaN are poses not seen.
+    origin_ns : int
+        Instant that becomes 0 s.
+    bridge_s : float
+        Longest gap that is bridged, s.
+
+    Returns
+    -------
+    Rates
+        Empty if fewer than three poses were seen.
+    """
+    seen = np.isfinite(q).all(axis=1)
+    t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
+    if t.size < 3:  # noqa: PLR2004 - one rate is no track
+        return _empty()
+    q = q[seen]
+    step = np.diff(t)
+    period = float(np.median(step))
+    turn = rotation.log(rotation.multiply(rotation.conjugate(q[:-1]), q[1:]))
+    usable = (step > 0) & (step < max(GAP * period, bridge_s))
+    usable &= np.linalg.norm(turn, axis=1) < _MOST_ANGLE
+    pieces = np.where(usable, np.maximum(1, np.rint(step / period)), 0).astype(np.intp)
+    first = np.repeat(np.cumsum(pieces) - pieces, pieces)
+    share = (np.arange(first.size) - first + 0.5) / np.repeat(pieces, pieces)
+    long_step = np.repeat(step, pieces)
+    middle: Floats = np.repeat(t[:-1], pieces) + share * long_step
+    return Rates(
+        t_s=middle,
+        w=np.repeat(turn, pieces, axis=0) / long_step[:, None],
+        run=np.repeat(np.cumsum(~usable), pieces),
+        period_s=period,
+        valid_share=float(step[usable].sum() / (t[-1] - t[0])),
+    )
+
+
+def rates_from_gyro(t_ns: NDArray[np.int64], w: Floats, origin_ns: int) -> Rates:
+    """Return measured rates, rad/s, shape (n, 3), as a track; NaN rows are samples not seen."""
+    seen = np.isfinite(w).all(axis=1)
+    t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
+    if t.size < 3:  # noqa: PLR2004 - one rate is no track
+        return _empty()
+    step = np.diff(t)
+    period = float(np.median(step))
+    whole = (step > 0) & (step < GAP * period)
+    run = np.concatenate(([0], np.cumsum(~whole)))
+    share = float(step[whole].sum() / (t[-1] - t[0]))
+    return Rates(t, w[seen], run, period, share)
+
+
+def _empty() -> Rates:
+    return Rates(np.empty(0), np.empty((0, 3)), np.empty(0, dtype=np.intp), np.inf, 0.0)
+
+
+def low_pass(rates: Rates, cutoff_hz: float) -> Rates:
+    """Return the rates through a symmetric FIR (sinc times Kaiser, a quarter of a second).
+
+    The kernel is one function of time for all sample rates, so two tracks are filtered alike.
+    Only places with a whole kernel of data remain: no start-up transients.
+    """
+    half = int(KERNEL_HALF_S / rates.period_s) if np.isfinite(rates.period_s) else 0
+    at = np.arange(-half, half + 1) * rates.period_s if half else np.zeros(1)
+    window = np.i0(_KAISER * np.sqrt(np.clip(1.0 - (at / KERNEL_HALF_S) ** 2, 0.0, 1.0)))
+    kernel = np.sinc(2.0 * cutoff_hz * at) * window
+    kernel /= kernel.sum()
+    runs = [run for run in rates.runs() if run.stop - run.start >= kernel.size]
+    if not runs:
+        return _empty()
+    inner = [slice(run.start + half, run.stop - half) for run in runs]
+    smooth = [
+        np.stack([np.convolve(rates.w[run, axis], kernel, "valid") for axis in range(3)], axis=1)
+        for run in runs
+    ]
+    return Rates(
+        np.concatenate([rates.t_s[part] for part in inner]),
+        np.concatenate(smooth),
+        np.concatenate([rates.run[part] for part in inner]),
+        rates.period_s,
+        rates.valid_share,
+    )
+
+
+class Interpolant:
+    """Cubic Hermite interpolant of a track, run by run, with slopes of fourth order."""
+
+    def __init__(self, rates: Rates) -> None:
+        self._t, self._w, self._run = rates.t_s, rates.w, rates.run
+        self.slopes = np.zeros_like(rates.w)
+        """Time derivative at the samples, rad/s², shape (n, 3)."""
+        for run in rates.runs():
+            if run.stop - run.start > 1:
+                self.slopes[run] = _slopes(rates.t_s[run], rates.w[run])
+
+    def locate(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Return the interval each instant lies in, and whether it lies inside a run."""
+        if self._t.size < 2:  # noqa: PLR2004 - an interval has two ends
+            return np.zeros(t.size, dtype=np.intp), np.zeros(t.size, dtype=np.bool_)
+        at = np.clip(np.searchsorted(self._t, t, side="right") - 1, 0, self._t.size - 2)
+        inside = (t >= self._t[at]) & (t <= self._t[at + 1]) & (self._run[at] == self._run[at + 1])
+        return at, inside
+
+    def __call__(self, t: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Return value, time derivative (both shape (n, 3)) and validity at instants `t`, s."""
+        at, inside = self.locate(t)
+        if not inside.any():
+            return np.zeros((t.size, 3)), np.zeros((t.size, 3)), inside
+        h = (self._t[at + 1] - self._t[at])[:, None]
+        x = (t - self._t[at])[:, None] / h
+        f0, f1 = self._w[at], self._w[at + 1]
+        d0, d1 = self.slopes[at] * h, self.slopes[at + 1] * h
+        rise = f1 - f0
+        c2, c3 = 3.0 * rise - 2.0 * d0 - d1, d0 + d1 - 2.0 * rise
+        value = f0 + x * (d0 + x * (c2 + x * c3))
+        slope = (d0 + x * (2.0 * c2 + 3.0 * x * c3)) / h
+        return value, slope, inside
+
+
+def _slopes(t: Floats, w: Floats) -> Floats:
+    """Return dw/dt: central differences of fourth order, of second near the ends."""
+    slopes = np.empty_like(w)
+    slopes[:] = np.gradient(w, t, axis=0)
+    if t.size >= _STENCIL:
+        h = (t[4:] - t[:-4])[:, None] / 4.0
+        slopes[2:-2] = (w[:-4] - w[4:] + 8.0 * (w[3:-1] - w[1:-3])) / (12.0 * h)
+    return slopes

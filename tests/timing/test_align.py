@@ -1,0 +1,316 @@
+"""Frames on a fixed grid from streams that are late, lossy, fast, slow, restarting or dead."""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.timing.align import AlignedFrame, FrameAligner, StreamSpec, Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+MS = 1_000_000
+T0 = 5_000 * MS
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+VERDICTS = [verdict.value for verdict in Verdict]
+
+Push = tuple[int, str, int]
+"""Arrival, stream, stamp."""
+
+
+def turned(t_ns: int, rate: float = 2.0) -> tuple[float, float, float, float]:
+    """Orientation of a body that turns about x at a constant rate, rad/s."""
+    half = rate * (t_ns - T0) * 1e-9 / 2
+    return (cos(half), sin(half), 0.0, 0.0)
+
+
+def stream(
+    name: str, period: int, count: int, *, phase: int = 0, delay: int = 0, lost: Iterable[int] = ()
+) -> list[Push]:
+    gone = set(lost)
+    stamps = (T0 + phase + k * period for k in range(count) if k not in gone)
+    return [(t + delay, name, t) for t in stamps]
+
+
+def play(aligner: FrameAligner, pushes: list[Push]) -> list[AlignedFrame]:
+    """Push in order of arrival and wake at every deadline, as the daemon does."""
+    frames: list[AlignedFrame] = []
+    for arrival, name, t in sorted(pushes):
+        while (deadline := aligner.next_deadline_ns) is not None and deadline < arrival:
+            frames += aligner.advance(deadline)
+        aligner.push(name, t, arrival, turned(t))
+        frames += aligner.advance(arrival)
+    return frames
+
+
+def aligner(period: int = 10 * MS, mode: str = "smooth", **periods: int) -> FrameAligner:
+    specs = {name: StreamSpec(p) for name, p in periods.items()}
+    return FrameAligner(specs, period, mode="fast" if mode == "fast" else "smooth")
+
+
+def assert_accounted(of: FrameAligner, name: str) -> dict[str, int]:
+    counts = of.counts(name)
+    assert counts["received"] == counts["pending"] + sum(counts[v] for v in VERDICTS)
+    return counts
+
+
+def test_frames_are_interpolated_to_multiples_of_the_period() -> None:
+    a = aligner(A=10 * MS, B=7 * MS)
+    frames = play(a, stream("A", 10 * MS, 50, phase=3 * MS) + stream("B", 7 * MS, 70, phase=MS))
+    assert [f.t_ns for f in frames] == list(range(T0 + 10 * MS, frames[-1].t_ns + 1, 10 * MS))
+    assert len(frames) > 45
+    for frame in frames:
+        assert not frame.extrapolated
+        assert not frame.missing
+        for q in frame.orientations.values():
+            assert q == pytest.approx(turned(frame.t_ns), abs=1e-12)
+
+
+def test_a_frame_leaves_with_the_sample_that_completes_it() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    pushes = stream("A", 10 * MS, 50, phase=3 * MS) + stream(
+        "B", 10 * MS, 50, phase=6 * MS, delay=MS
+    )
+    for frame in play(a, pushes):
+        assert frame.completed_ns == frame.t_ns + 7 * MS  # B's sample 6 ms later, 1 ms on its way
+
+
+@pytest.mark.parametrize("lost", [[40], [40, 41], [40, 41, 42, 43]])
+@pytest.mark.parametrize("phase", [0, 1, 5 * MS, 9 * MS])
+def test_missing_samples_delay_a_frame_by_one_and_a_half_periods_at_most(
+    lost: list[int], phase: int
+) -> None:
+    whole = stream("A", 10 * MS, 90) + stream("B", 10 * MS, 90, phase=phase, delay=2 * MS)
+    holes = stream("A", 10 * MS, 90) + stream(
+        "B", 10 * MS, 90, phase=phase, delay=2 * MS, lost=lost
+    )
+    usual = {f.t_ns: f.completed_ns for f in play(aligner(A=10 * MS, B=10 * MS), whole)}
+    frames = play(aligner(A=10 * MS, B=10 * MS), holes)
+    delays = [f.completed_ns - usual[f.t_ns] for f in frames if f.t_ns in usual]
+    assert len(frames) >= len(usual)
+    assert min(delays) >= 0
+    assert 5 * MS < max(delays) <= 15 * MS
+
+
+def test_a_sample_period_that_is_not_quite_nominal_keeps_that_bound() -> None:
+    period = 10_003_000
+    lost = range(20, 400, 20)
+    for phase in range(0, 10 * MS, 900_000):
+        usual = play(aligner(B=10 * MS), stream("B", period, 400, phase=phase))
+        frames = play(aligner(B=10 * MS), stream("B", period, 400, phase=phase, lost=lost))
+        went = {f.t_ns: f.completed_ns for f in usual}
+        assert max(f.completed_ns - went[f.t_ns] for f in frames if f.t_ns in went) <= 15 * MS
+
+
+def test_a_constantly_late_stream_does_not_force_frames() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    frames = play(a, stream("A", 10 * MS, 200) + stream("B", 10 * MS, 200, phase=MS, delay=48 * MS))
+    assert a.forced_frames == 0
+    assert len(frames) > 190
+    assert not any(f.missing for f in frames[10:])
+
+
+def test_a_stream_that_becomes_late_is_waited_for_after_a_while() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    early = stream("B", 10 * MS, 100, delay=MS)
+    late = stream("B", 10 * MS, 300, phase=1000 * MS, delay=31 * MS)
+    frames = play(a, stream("A", 10 * MS, 400) + early + late)
+    assert any(f.extrapolated or f.missing for f in frames[100:150])
+    assert not any(f.extrapolated or f.missing for f in frames[200:390])
+
+
+def test_what_is_lacking_is_extrapolated_then_missing_then_not_waited_for() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    frames = play(a, stream("A", 10 * MS, 100) + stream("B", 10 * MS, 51, phase=0))
+    of = {(f.t_ns - T0) // MS: f for f in frames}
+    for late in (510, 520):
+        assert of[late].extrapolated == {"B"}
+        assert of[late].orientations["B"] == pytest.approx(turned(of[late].t_ns), abs=1e-12)
+    assert of[530].missing == {"B"}
+    assert "B" not in of[530].orientations
+    assert of[600].completed_ns == of[600].t_ns  # lost: nobody waits
+    assert a.next_deadline_ns is not None
+
+
+def test_a_lost_stream_is_back_with_its_second_sample() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    pushes = stream("A", 10 * MS, 100) + stream("B", 10 * MS, 100, phase=2 * MS, lost=range(30, 60))
+    of = {(f.t_ns - T0) // MS: f for f in play(a, pushes)}
+    assert of[600].missing == {"B"}
+    assert not of[610].missing
+    assert not of[610].extrapolated
+
+
+def test_a_source_that_ends_is_not_waited_for() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    play(a, stream("A", 10 * MS, 20) + stream("B", 10 * MS, 20))
+    a.lose("B")
+    t = T0 + 200 * MS
+    a.push("A", t, t, turned(t))
+    assert [f.t_ns for f in a.advance(t)] == [t]
+
+
+def test_fast_mode_waits_for_nobody() -> None:
+    a = aligner(mode="fast", A=10 * MS, B=10 * MS)
+    pushes = stream("A", 10 * MS, 100, delay=4 * MS) + stream(
+        "B", 10 * MS, 100, phase=5 * MS, delay=MS
+    )
+    frames = play(a, pushes)[5:]
+    assert max(f.completed_ns - f.t_ns for f in frames) <= MS
+    for f in frames:
+        assert f.orientations["A"] == pytest.approx(turned(f.t_ns), abs=1e-12)
+    assert assert_accounted(a, "A")["late"] == 0
+
+
+def test_a_stream_faster_than_the_frames_is_decimated() -> None:
+    a = aligner(A=2_500_000)
+    play(a, stream("A", 2_500_000, 400, phase=MS))
+    counts = assert_accounted(a, "A")
+    assert counts["decimated"] == pytest.approx(200, abs=4)
+    assert counts["used"] == pytest.approx(198, abs=4)
+
+
+def test_a_slow_stream_is_interpolated_between_its_samples() -> None:
+    a = aligner(A=10 * MS, B=40 * MS)
+    frames = play(a, stream("A", 10 * MS, 100) + stream("B", 40 * MS, 25, phase=MS))
+    assert a.forced_frames == 0
+    for f in frames[10:90]:
+        assert f.orientations["B"] == pytest.approx(turned(f.t_ns), abs=1e-12)
+
+
+def test_the_same_stamp_twice_is_a_duplicate() -> None:
+    a = aligner(A=10 * MS)
+    a.push("A", T0, T0, IDENTITY)
+    assert a.push("A", T0, T0 + MS, IDENTITY) is Verdict.DUPLICATE
+
+
+def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
+    a = aligner(A=10 * MS)
+    for t in (0, 10, 30):
+        a.push("A", T0 + t * MS, T0 + t * MS, turned(T0 + t * MS))
+    assert a.push("A", T0 + 20 * MS, T0 + 31 * MS, turned(T0 + 20 * MS)) is None
+    a.advance(T0 + 40 * MS)
+    assert a.push("A", T0 + 15 * MS, T0 + 41 * MS, IDENTITY) is Verdict.LATE
+
+
+def test_a_long_silence_of_all_skips_frames() -> None:
+    a = aligner(A=10 * MS)
+    hour = 3_600_000 * MS
+    frames = play(a, stream("A", 10 * MS, 50) + stream("A", 10 * MS, 50, phase=hour))
+    assert len(frames) < 110
+    assert a.skipped_frames == pytest.approx(hour / (10 * MS) - 50, abs=5)
+
+
+def test_nothing_is_interpolated_across_an_epoch() -> None:
+    a = aligner(A=10 * MS)
+    for k in range(10):
+        a.push("A", T0 + k * 10 * MS, T0 + k * 10 * MS, turned(T0))
+    a.advance(T0 + 90 * MS)
+    other = (0.0, 1.0, 0.0, 0.0)
+    for k in range(2):
+        t = T0 + 95 * MS + k * 10 * MS
+        a.push("A", t, t, other, epoch=1)
+        for frame in a.advance(t):
+            assert frame.orientations["A"] in {turned(T0), other}
+    assert_accounted(a, "A")
+
+
+def test_a_stamp_from_the_future_is_dropped() -> None:
+    a = aligner(A=10 * MS)
+    assert a.push("A", T0 + 3_600_000 * MS, T0, IDENTITY) is Verdict.DROPPED
+
+
+def test_a_stream_stamped_seconds_late_does_not_hold_up_the_others() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    frames = play(a, stream("A", 10 * MS, 300) + stream("B", 10 * MS, 300, delay=2_000 * MS))
+    lively = [f for f in frames if "A" in f.orientations and f.t_ns < T0 + 2_900 * MS]
+    assert max(f.completed_ns - f.t_ns for f in lively[60:]) < 300 * MS
+
+
+def test_an_inactive_aligner_counts_what_comes_as_idle() -> None:
+    a = aligner(A=10 * MS)
+    play(a, stream("A", 10 * MS, 10))
+    a.active = False
+    assert assert_accounted(a, "A")["pending"] == 0
+    assert a.push("A", T0 + 100 * MS, T0 + 100 * MS, IDENTITY) is Verdict.IDLE
+    assert a.advance(T0 + 200 * MS) == []
+    assert a.next_deadline_ns is None
+
+
+def test_what_nobody_fetches_is_dropped_in_the_end() -> None:
+    a = aligner(A=10 * MS)
+    for k in range(5_000):
+        a.push("A", T0 + k * 10 * MS, T0 + k * 10 * MS, IDENTITY)
+    counts = assert_accounted(a, "A")
+    assert counts["pending"] <= 512
+    assert counts["dropped"] >= 4_400
+
+
+def test_unsettled_clocks_mark_the_frame() -> None:
+    a = aligner(A=10 * MS)
+    for k in range(6):
+        t = T0 + k * 10 * MS + MS
+        a.push("A", t, t, IDENTITY, synced=k > 2)
+    assert [f.synced for f in a.advance(T0 + 60 * MS)] == [False, False, False, True, True]
+
+
+samples = st.tuples(
+    st.sampled_from(["A", "B", "C"]),
+    st.integers(-30 * MS, 60 * MS)
+    | st.integers(-(10**13), 10**13)
+    | st.sampled_from([0, 10 * MS]),  # stamp against the one before
+    st.integers(0, 40 * MS) | st.integers(0, 10**11),  # arrival after the one before
+    st.integers(0, 2) | st.just(0),  # epoch
+)
+actions = st.one_of(
+    samples,
+    samples,
+    samples,
+    st.sampled_from(["on", "off", "lose", "reset", "close"]),
+)
+
+
+@given(st.lists(actions, max_size=80), st.sampled_from(["smooth", "fast"]))
+def test_whatever_comes_in_frames_are_in_order_and_samples_accounted(
+    script: list[tuple[str, int, int, int] | str], mode: str
+) -> None:
+    a = aligner(mode=mode, A=10 * MS, B=2_500_000, C=33 * MS)
+    now, stamp, last = T0, dict.fromkeys("ABC", T0), 0
+    counted = dict.fromkeys("ABC", 0)
+    frames: list[AlignedFrame] = []
+    for action in script:
+        if isinstance(action, str):
+            change = {"lose": a.lose, "reset": a.reset}.get(action)
+            if change is not None:
+                change("A")
+            elif action == "close":
+                a.close()
+            else:
+                a.active = action == "on"
+        else:
+            name, step, wait, epoch = action
+            now += wait
+            stamp[name] += step
+            counted[name] += 1
+            a.push(name, stamp[name], now, IDENTITY, epoch=epoch)
+        new = a.advance(now)
+        assert len(new) <= 3_000
+        frames += new
+        deadline = a.next_deadline_ns
+        assert deadline is None or deadline > now
+        for name in "ABC":
+            assert assert_accounted(a, name)["received"] == counted[name]
+    for frame in frames:
+        assert frame.t_ns > last
+        assert frame.t_ns % (10 * MS) == 0
+        assert frame.orientations
+        assert frame.completed_ns <= now
+        assert not frame.missing & frame.orientations.keys()
+        last = frame.t_ns
+    a.close()
+    assert all(assert_accounted(a, name)["pending"] == 0 for name in "ABC")
