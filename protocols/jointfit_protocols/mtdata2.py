@@ -219,3 +219,8 @@ def encode_item(data_id: int, value: Value) -> bytes:
 def encode_items(items: Iterable[tuple[int, Value]]) -> bytes:
     """Write the data of one MTData2 message."""
     return b"".join(encode_item(data_id, value) for data_id, value in items)
+
+
+def reals_in(data_id: int) -> int | None:
+    """Return how many reals an item holds; None if it holds none."""
+    return _REALS.get(data_id & 0xFFF0) if world_of(data_id) else None
