@@ -182,8 +182,8 @@ class Handshake:
                 answered = await self._listen_at(baud)
             except DeviceMisconfigured:  # the port cannot run at it
                 continue
-            if answered:
-                await self._talk.send(MessageId.GOTO_MEASUREMENT)
+            if answered:  # and wait: closing the port throws away what was not sent yet
+                await self._talk.ask(MessageId.GOTO_MEASUREMENT)
             if answered or self._talk.understood:
                 return baud
         return None
