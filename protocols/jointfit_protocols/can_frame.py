@@ -1,0 +1,129 @@
+"""CAN frames as fixed-size records: what ``Chunk.data`` of a driver with ``wire = "can"`` holds.
+
+Law: one record is 24 bytes, whatever the frame; unpacking never raises, a record that is no CAN
+frame becomes ``Corrupt``. Records carry the stamp of every frame, so a chunk of many frames loses
+no time, and a recording of chunks replays exactly.
+
+ 0        8          12      13     14    16         24
+| t_ns i64 | id u32   | flags | size | zero | data[8] |   little-endian
+flags: 1 extended (29-bit), 2 remote request, 4 error frame
+
+Error frames keep Linux's layout (linux/can/error.h): the identifier is a set of error classes.
+Two classes that Linux leaves free carry what only the host knows, see ``host_dropped`` and
+``host_corrupt``.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_protocols.corrupt import Corrupt
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+RECORD_BYTES = 24
+STANDARD_MAX = 0x7FF
+EXTENDED_MAX = 0x1FFF_FFFF
+HOST_DROPPED = 1 << 28
+"""Error class of ours: the host lost frames; data is their number, u64 little-endian."""
+HOST_CORRUPT = 1 << 27
+"""Error class of ours: an adapter's line held bytes that are no frame; data is their number."""
+
+_RECORD = struct.Struct("<qIBBxx8s")
+_COUNT = struct.Struct("<Q")
+_EXTENDED, _REMOTE, _ERROR = 1, 2, 4
+_FLAGS = _EXTENDED | _REMOTE | _ERROR
+
+
+class CanFrame(NamedTuple):
+    """One classic CAN frame."""
+
+    t_ns: int
+    """Host CLOCK_MONOTONIC at the start of the frame, as well as it is known."""
+    can_id: int
+    """Identifier; for an error frame its classes."""
+    data: bytes
+    """At most 8 bytes."""
+    extended: bool = False
+    """29-bit identifier."""
+    error: bool = False
+    """An error frame of the controller or a note of the host, not a frame from the wire."""
+    remote: bool = False
+    """A remote request: it asks for data and carries none."""
+
+
+def pack_frames(frames: Iterable[CanFrame]) -> bytes:
+    """Return the records of `frames`, 24 bytes each.
+
+    Raises
+    ------
+    ValueError
+        A frame with more than 8 bytes of data.
+    """
+    pack = _RECORD.pack
+    records = []
+    for t_ns, can_id, data, extended, error, remote in frames:
+        size = len(data)
+        if size > 8:  # noqa: PLR2004 - classic CAN
+            raise ValueError(f"a classic CAN frame holds at most 8 bytes, not {size}")
+        flags = extended | remote << 1 | error << 2
+        records.append(pack(t_ns, can_id, flags, size, data))  # struct pads data with zeros
+    return b"".join(records)
+
+
+def unpack_frames(data: bytes) -> list[CanFrame | Corrupt]:
+    """Return the frames of the records in `data`; any bytes are accepted.
+
+    A record that `pack_frames` cannot have made costs 24 bytes and the search goes on with the
+    next one; an incomplete last record is corrupt too, for records are never split over chunks.
+    """
+    found: list[CanFrame | Corrupt] = []
+    whole = len(data) - len(data) % RECORD_BYTES
+    for t_ns, can_id, flags, size, body in _RECORD.iter_unpack(
+        data if whole == len(data) else data[:whole]
+    ):
+        if size > 8 or flags > _FLAGS:  # noqa: PLR2004 - classic CAN
+            found.append(Corrupt(RECORD_BYTES, "no CAN record"))
+        elif not flags and can_id <= STANDARD_MAX:  # by far the most
+            found.append(CanFrame(t_ns, can_id, body[:size]))
+        elif can_id > (EXTENDED_MAX if flags & (_EXTENDED | _ERROR) else STANDARD_MAX):
+            found.append(Corrupt(RECORD_BYTES, "CAN identifier out of range"))
+        else:
+            found.append(
+                CanFrame(
+                    t_ns,
+                    can_id,
+                    body[:size],
+                    bool(flags & _EXTENDED),
+                    bool(flags & _ERROR),
+                    bool(flags & _REMOTE),
+                )
+            )
+    if whole != len(data):
+        found.append(Corrupt(len(data) - whole, "incomplete CAN record"))
+    return found
+
+
+def host_dropped(t_ns: int, count: int) -> CanFrame:
+    """Return the note that the host lost `count` frames (a full receive queue) before `t_ns`."""
+    return CanFrame(t_ns, HOST_DROPPED, _COUNT.pack(count), error=True)
+
+
+def host_corrupt(t_ns: int, count: int) -> CanFrame:
+    """Return the note that `count` bytes on an adapter's line were no frame."""
+    return CanFrame(t_ns, HOST_CORRUPT, _COUNT.pack(count), error=True)
+
+
+def host_count(frame: CanFrame) -> int:
+    """Return the number in a note of `host_dropped` or `host_corrupt`; 0 where there is none."""
+    return int(_COUNT.unpack(frame.data)[0]) if len(frame.data) == _COUNT.size else 0
+
+
+def frame_bits(size: int, extended: bool) -> int:
+    """Return the length of a frame on the wire, bits, stuff bits left out (they depend on content).
+
+    47 + 8 n with an 11-bit identifier, 67 + 8 n with a 29-bit one, interframe space included.
+    """
+    return (67 if extended else 47) + 8 * size
