@@ -1,0 +1,154 @@
+"""A bounded reading position in one NatNet payload.
+
+Law: nothing is read past the end, and no count is believed before the bytes left could hold it.
+What does not fit raises `Malformed` (or `struct.error`, which means the same); the codec's outer
+functions turn both into `Corrupt`, so neither leaves the package.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MAX_NAME = 255
+"""Longest name believed, bytes; real ones are below 64."""
+
+I32 = struct.Struct("<i")
+XYZ = struct.Struct("<3f")
+
+BREAKS = (ValueError, struct.error)
+"""What reading a hostile payload may raise inside the codec (`Malformed` is a ValueError)."""
+
+
+class Malformed(ValueError):  # noqa: N818 - named for what the payload is
+    """The payload contradicts the layout of its version."""
+
+
+class Cursor:
+    """A reading position that moves from ``at`` to ``end`` of ``data``.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole datagram.
+    at : int
+        Offset of the first payload byte.
+    """
+
+    __slots__ = ("at", "data", "end")
+
+    def __init__(self, data: bytes, at: int = 0) -> None:
+        self.data = data
+        self.at = at
+        self.end = len(data)
+
+    @property
+    def left(self) -> int:
+        """Bytes not read yet."""
+        return self.end - self.at
+
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Read one record of `layout`."""
+        at = self.at
+        after = at + layout.size
+        if after > self.end:
+            raise Malformed("ends inside a record")
+        self.at = after
+        return layout.unpack_from(self.data, at)
+
+    def integer(self) -> int:
+        """Read one little-endian int32."""
+        value: int = self.unpack(I32)[0]
+        return value
+
+    def count(self, smallest: int) -> int:
+        """Read a count of items of at least `smallest` bytes; the bytes left must hold them."""
+        n = self.integer()
+        self.check(n, smallest)
+        return n
+
+    def check(self, n: int, smallest: int) -> None:
+        """Refuse a count that is negative or that the bytes left cannot hold."""
+        if n < 0 or n * smallest > self.end - self.at:
+            raise Malformed("a count exceeds the datagram")
+
+    def records(self, layout: struct.Struct, n: int) -> list[tuple[Any, ...]]:
+        """Read `n` records of `layout`; the caller has not checked `n`."""
+        if not n:
+            return []
+        self.check(n, layout.size)
+        at = self.at
+        self.at = at + n * layout.size
+        return list(layout.iter_unpack(self.data[at : self.at]))
+
+    def text(self) -> str:
+        """Read a NUL-terminated name: at most 255 bytes, UTF-8 with replacement."""
+        stop = self.data.find(0, self.at, min(self.end, self.at + MAX_NAME + 1))
+        if stop < 0:
+            raise Malformed("a name without an end")
+        found = self.data[self.at : stop]
+        self.at = stop + 1
+        return found.decode("utf-8", "replace")
+
+    def texts(self) -> tuple[str, ...]:
+        """Read a count and that many names."""
+        return tuple(self.text() for _ in range(self.count(1)))
+
+    def window(self, size: int, read: Callable[[], Any]) -> Any:
+        """Call `read` with the end moved to `size` bytes from here, and go there whatever it does.
+
+        Returns None where `read` broke off or left bytes over: a section that is unknown or
+        malformed is skipped by its size. A size that the payload cannot hold is `Malformed`.
+        """
+        if size < 0 or size > self.left:
+            raise Malformed("a section exceeds the datagram")
+        outer, self.end = self.end, self.at + size
+        try:
+            found = read()
+        except BREAKS:
+            return None
+        else:
+            return found if self.at == self.end else None
+        finally:
+            self.at, self.end = self.end, outer
+
+
+def put_text(name: str) -> bytes:
+    """Return `name` as NUL-terminated UTF-8.
+
+    Raises
+    ------
+    ValueError
+        The name holds a NUL or exceeds 255 bytes: our own caller's fault.
+    """
+    data = name.encode("utf-8")
+    if 0 in data or len(data) > MAX_NAME:
+        raise ValueError(f"a NatNet name is at most {MAX_NAME} bytes without NUL, not {name!r}")
+    return data + b"\0"
+
+
+def put_texts(names: tuple[str, ...]) -> bytes:
+    """Return a count and that many NUL-terminated names."""
+    return I32.pack(len(names)) + b"".join(map(put_text, names))
+
+
+def put_fixed_text(name: str, size: int) -> bytes:
+    """Return `name` in a field of `size` bytes, padded with NUL, at least one of them.
+
+    Raises
+    ------
+    ValueError
+        The name does not fit.
+    """
+    data = put_text(name)
+    if len(data) > size:
+        raise ValueError(f"{name!r} does not fit into {size} bytes")
+    return data.ljust(size, b"\0")
+
+
+def fixed_text(field: bytes) -> str:
+    """Return the name in a fixed field: cut at the first NUL; stale memory may follow it."""
+    return field.partition(b"\0")[0].decode("utf-8", "replace")
