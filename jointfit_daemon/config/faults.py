@@ -1,0 +1,128 @@
+"""What can be wrong in a rig.toml and how it is told: key, value, expectation, nearest spelling.
+
+Law: faults are collected, never raised one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ValidationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from pydantic_core import ErrorDetails
+
+_SHOWN = 60  # characters of a value worth repeating
+_NO_VALUE = object()
+
+
+def nearest(word: object, known: Iterable[str]) -> str | None:
+    """Return the spelling in `known` closest to `word`, or None if none is close."""
+    found = get_close_matches(str(word), list(known), n=1, cutoff=0.5)
+    return found[0] if found and found[0] != word else None
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing wrong in a rig.toml."""
+
+    key: str
+    """Path of the key, as ``imu[S1].rate_hz``."""
+    expected: str
+    value: Any = _NO_VALUE
+    near: str | None = None
+    """Nearest valid spelling."""
+
+    def text(self) -> str:
+        """Return one line for people."""
+        shown = "" if self.value is _NO_VALUE else f" = {_brief(self.value)}"
+        hint = f"; did you mean {self.near!r}?" if self.near else ""
+        return f"{self.key}{shown}: {self.expected}{hint}"
+
+
+class ConfigError(Exception):
+    """A rig.toml that cannot be used; lists every fault found.
+
+    Parameters
+    ----------
+    source
+        Name of the file.
+    faults
+        At least one.
+    """
+
+    def __init__(self, source: str, faults: Sequence[Fault]) -> None:
+        count = f"{len(faults)} fault{'s' if len(faults) > 1 else ''}"
+        super().__init__("\n  ".join([f"{source}: {count}", *[fault.text() for fault in faults]]))
+        self.source = source
+        self.faults = tuple(faults)
+
+
+def _brief(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def faults_of(error: ValidationError, model: type[BaseModel], key: str) -> list[Fault]:
+    """Return what pydantic found in the table at `key`, each in our words."""
+    return [_fault(detail, model, key) for detail in error.errors(include_url=False)]
+
+
+def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
+    loc = detail["loc"]
+    path = join(key, loc)
+    owner = _model_at(model, loc[:-1])
+    fields = owner.model_fields if owner is not None else {}
+    match detail["type"]:
+        case "extra_forbidden":
+            known = f"no such key; known here: {', '.join(fields)}"
+            return Fault(path, known, detail["input"], nearest(loc[-1], fields))
+        case "missing":
+            return Fault(path, f"missing; {_described(fields, loc[-1])}")
+        case "literal_error":
+            choices = str(detail["ctx"]["expected"])
+            words = choices.replace("'", "").replace(" or ", ", ").split(", ")
+            return Fault(
+                path, f"expected {choices}", detail["input"], nearest(detail["input"], words)
+            )
+        case _:
+            name = next((part for part in reversed(loc) if part in fields), loc[-1] if loc else "")
+            why = f" ({about})" if (about := _described(fields, name)) else ""
+            return Fault(path, f"{_lowered(detail['msg'])}{why}", detail["input"])
+
+
+def join(key: str, loc: Sequence[int | str]) -> str:
+    """Return the path of `loc` below `key`: names after dots, positions in brackets."""
+    return key + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
+
+
+def _lowered(text: str) -> str:
+    text = text.removeprefix("Value error, ").removeprefix("Input ")
+    return text[:1].lower() + text[1:]
+
+
+def _described(fields: Mapping[str, Any], name: object) -> str:
+    field = fields.get(str(name))
+    return str(field.description or "") if field is not None else ""
+
+
+def _model_at(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseModel] | None:
+    """Return the model that holds the keys at `loc`, where that is a model."""
+    here: type[BaseModel] | None = model
+    for part in loc:
+        field = here.model_fields.get(str(part)) if here is not None else None
+        here = _model_in(field.annotation) if field is not None else None
+    return here
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        if (found := _model_in(inner)) is not None:
+            return found
+    return None

@@ -1,0 +1,107 @@
+"""The tables of rig.toml that belong to the daemon itself, one model each.
+
+Law: unknown keys are refused, every field says what it is and in which unit; this text is what
+``jointfit schema`` prints. The tables of devices belong to their drivers.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from jointfit_daemon.calibration.trial import Method  # noqa: TC001 - pydantic reads it at run time
+from jointfit_daemon.driver import Settings
+
+_PLAIN, _TLS = 1883, 8883  # IANA: mqtt, secure-mqtt
+
+
+class RigTable(Settings):
+    """``[rig]``."""
+
+    name: str = Field(description="name of the rig; becomes an MQTT topic")
+    output_rate_hz: float = Field(100.0, gt=0, le=1000, description="limb states per second, Hz")
+    align_mode: Literal["smooth", "fast"] = Field(
+        "smooth",
+        description="`smooth` interpolates every sensor to the instant of the frame; "
+        "`fast` takes the newest samples, a sample period earlier",
+    )
+
+
+class ChainTable(Settings):
+    """``[chain]``: the limb, from proximal to distal."""
+
+    joints: tuple[str, ...] = Field(
+        min_length=2, description="joints from proximal to distal, one more than segments"
+    )
+    segments: tuple[str, ...] = Field(min_length=1, description="segments between the joints")
+    side: Literal["right", "left"] = Field("right", description="side of the body: sign of angles")
+    proximal: str | None = Field(
+        None, description="body part before the first joint, seen by markers only (pelvis)"
+    )
+    distal: str | None = Field(
+        None, description="body part after the last joint, seen by markers only (foot)"
+    )
+    origin_m: tuple[float, float, float] | None = Field(
+        None, description="fixed position of the first joint in the world, m"
+    )
+    lengths_m: dict[str, float] = Field(
+        default_factory=dict, description="known segment lengths, m; calibration finds the others"
+    )
+
+
+class CalibrationTable(Settings):
+    """``[calibration]``."""
+
+    store: str = Field(
+        "default", description="name of the calibration's folder under $STATE_DIRECTORY"
+    )
+    method: Method = Field("anchored", description="how redundant sensors are combined")
+    static_s: float = Field(5.0, gt=0, le=120, description="length of the static pose, s")
+    align_s: float = Field(30.0, gt=0, le=600, description="length of the align phase, s")
+    functional_s: float = Field(30.0, gt=0, le=600, description="length of the movement phase, s")
+    holdout_share: float = Field(
+        0.4, gt=0, lt=1, description="last share of the movement, which judges the fit"
+    )
+
+
+class TlsSettings(Settings):
+    """``[mqtt.tls]``: files in PEM; relative names start at the folder of rig.toml."""
+
+    ca: str | None = Field(None, description="certificates to trust; default: the system's")
+    cert: str | None = Field(None, description="own certificate, for brokers that ask for one")
+    key: str | None = Field(None, description="private key of `cert`")
+
+
+class MqttSettings(Settings):
+    """``[mqtt]``."""
+
+    host: str = Field("localhost", min_length=1, description="name or address of the broker")
+    port: int = Field(0, ge=0, le=65535, description="TCP port; 0: 1883, or 8883 with tls")
+    base: str = Field("", description="first levels of every topic; default jointfit/<rig name>")
+    username: str | None = Field(None, description="user name for the broker")
+    password_file: str | None = Field(
+        None,
+        description="file that holds the password; default: the systemd credential "
+        "jointfitd.mqtt-password",
+    )
+    tls: TlsSettings | None = Field(None, description="talk TLS to the broker")
+    version: Literal["5", "3.1.1"] = Field(
+        "5", description="MQTT version; never changed silently: an old broker needs `3.1.1`"
+    )
+    pose_ui_hz: float = Field(10.0, gt=0, le=30, description="rate of the topic pose/ui, Hz")
+    joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
+    health_s: float = Field(10.0, gt=0, le=60, description="time between two bridge/health, s")
+
+    @property
+    def tcp_port(self) -> int:
+        """The port to connect to."""
+        return self.port or (_TLS if self.tls else _PLAIN)
+
+
+class RecordingSettings(Settings):
+    """``[recording]``: its presence makes the daemon keep a log of all its input events."""
+
+    directory: str = Field(
+        "recordings", description="folder; a relative name starts at $STATE_DIRECTORY"
+    )

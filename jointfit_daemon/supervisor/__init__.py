@@ -1,0 +1,5 @@
+"""The async shell: start, retry, stop, reload, tell systemd. Moves events and time, decides nothing."""
+
+from jointfit_daemon.supervisor.daemon import run_daemon
+
+__all__ = ["run_daemon"]

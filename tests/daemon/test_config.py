@@ -1,0 +1,261 @@
+"""rig.toml: what is accepted, and that all that is wrong is told at once."""
+
+from __future__ import annotations
+
+import contextlib
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jointfit_daemon.config import ConfigError, load_rig, parse_rig, rig_schema
+from jointfit_daemon.driver import CanBusSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Table = dict[str, Any]
+
+
+def complaints(table: Table) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse_rig(table)
+    return [fault.text() for fault in caught.value.faults]
+
+
+def test_a_sound_rig_becomes_si_and_plain_data(table: Table) -> None:
+    table["chain"] |= {"side": "left", "lengths_m": {"shank": 0.4}, "distal": "foot"}
+    rig = parse_rig(table)
+    assert rig.chain.sensors == (("S1", "S2"), ("S3", "S4"))
+    assert rig.chain.left_side
+    assert rig.chain.lengths == (None, 0.4)
+    assert [source.id for source in rig.sources] == ["S1", "S2", "S3", "S4", "mocap"]
+    assert rig.mqtt.base == "jointfit/bench-1"
+    assert rig.mqtt.tcp_port == 1883
+    assert rig.calibration.markers == {"thigh": ("T1", "T2", "T3")}
+    assert rig.recording is None
+    assert rig.table == table
+
+
+def test_the_name_of_a_bus_becomes_its_table(table: Table) -> None:
+    assert parse_rig(table).sources[2].settings.can == CanBusSettings(channel="can0")
+
+
+def test_the_same_table_gives_equal_sources(table: Table) -> None:
+    assert parse_rig(table).sources == parse_rig(deepcopy(table)).sources
+
+
+def test_a_changed_bus_changes_the_sources_on_it_alone(table: Table) -> None:
+    before = parse_rig(table).sources
+    table["can"]["can0"]["bitrate"] = 500_000
+    after = parse_rig(table).sources
+    assert [old == new for old, new in zip(before, after, strict=True)] == [
+        True, True, False, False, True,
+    ]  # fmt: skip
+
+
+def test_the_table_given_is_neither_kept_nor_changed(table: Table) -> None:
+    given_table = deepcopy(table)
+    rig = parse_rig(table)
+    table["rig"]["name"] = "another"
+    assert rig.table == given_table
+
+
+TEN_MISTAKES = """
+[rig]
+name = "bench/1"
+output_rate_hz = "fast"
+aling_mode = "smooth"
+[chain]
+joints = ["hip", "knee"]
+segments = ["thigh", "shank"]
+[[imu]]
+id = "S1"
+segment = "tigh"
+driver = "fkae"
+port = "/dev/ttyUSB0"
+[[imu]]
+id = "S1"
+segment = "shank"
+driver = "fakecan"
+can = "can1"
+[can.can0]
+channel = "can0"
+[calibration]
+method = "patent21"
+[mqtt]
+hots = "broker"
+[mocap]
+driver = "fakemocap"
+markers.thigh = ["T1", "T1"]
+"""
+
+
+def test_ten_mistakes_are_told_at_once(
+    fakes: object, tmp_path: Path, subtests: pytest.Subtests
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(TEN_MISTAKES, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+    text = str(caught.value)
+    for line in (
+        "rig.name = 'bench/1': must not hold /",
+        "rig.output_rate_hz = 'fast': should be a valid number (limb states per second, Hz)",
+        "rig.aling_mode = 'smooth': no such key; known here: name, output_rate_hz, align_mode; "
+        "did you mean 'align_mode'?",
+        "chain.joints = ['hip', 'knee']: expected 3 joints, one more than segments",
+        "imu.id = 'S1': named 2 times, expected once",
+        "imu[S1].segment = 'tigh': no such segment; known: thigh, shank; did you mean 'thigh'?",
+        "imu[S1].driver = 'fkae': no such driver; known: fake, fakecan, fakemocap; "
+        "did you mean 'fake'?",
+        "imu[S1].can = 'can1': no table [can.can1]; known: can0; did you mean 'can0'?",
+        "imu: no sensor is on segment 'thigh'",
+        "calibration.method = 'patent21': expected 'anchored', 'patent12', 'patent6' or 'mean'; "
+        "did you mean 'patent12'?",
+        "mqtt.hots = 'broker': no such key",
+        "did you mean 'host'?",
+        "mocap.markers.thigh = ['T1', 'T1']: expected at least three different markers",
+    ):
+        with subtests.test(line):
+            assert line in text
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "said"),
+    [
+        (("rig",), None, "[rig]: this table is missing"),
+        (("rigg",), {}, "rigg: no such table"),
+        (("imu",), {}, "imu = {}: expected [[imu]] tables"),
+        (("can",), 3, "can = 3: expected tables [can.NAME]"),
+        (("mocap",), [], "mocap = []: expected a table"),
+        (("imu", 0, "port"), None, "imu[S1].port: missing; name of the port"),
+        (("imu", 0, "rate_hz"), "100", "imu[S1].rate_hz = '100': should be a valid number"),
+        (("imu", 0, "id"), "mocap", "is the name of the optical source"),
+        (("imu", 0, "id"), "", "must not be empty"),
+        (("imu", 0, "id"), "$S", "must not begin with $"),
+        (("imu", 0, "driver"), "fakemocap", "is a driver of motion capture"),
+        (("imu", 1, "port"), "/dev/nowhere-S1", "imu[S2].port = '/dev/nowhere-S1': is the port of"),
+        (("imu", 3, "ids", "counter"), 0x21, "id 0x21 on this bus is taken by S3 (quaternion)"),
+        (("imu", 2, "can"), None, "imu[S3].can: missing"),
+        (("imu", 3, "ids", "quaternoin"), 5, "did you mean 'quaternion'?"),
+        (("chain", "segments"), ["thigh", "thigh"], "named 2 times"),
+        (("chain", "lengths_m"), {"shank": 420}, "expected a length in metres"),
+        (("chain", "proximal"), "shank", "is already a segment"),
+        (("mocap", "markers", "shak"), ["A", "B", "C"], "did you mean 'shank'?"),
+        (("mocap", "markers", "shank"), ["T1", "B", "C"], "is a marker of 'thigh' already"),
+        (("mocap", "rigid_body"), {"thigh": "Thigh"}, "has markers already"),
+        (("mqtt",), {"base": "a//b"}, "mqtt.base = 'a//b': must not be empty"),
+        (("mqtt",), {"base": "a/#"}, "must not hold #"),
+        (("mqtt",), {"version": "3"}, "expected '5' or '3.1.1'"),
+        (("calibration",), {"store": "../elsewhere"}, "plain name of one folder"),
+    ],
+)
+def test_each_fault_names_key_value_and_expectation(
+    table: Table, where: tuple[Any, ...], value: object, said: str
+) -> None:
+    part: Any = table
+    for step in where[:-1]:
+        part = part[step]
+    if value is None:
+        del part[where[-1]]
+    else:
+        part[where[-1]] = value
+    assert any(said in line for line in complaints(table)), complaints(table)
+
+
+def test_two_spellings_of_one_port_are_one_port(table: Table, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("/dev/nowhere-S1")
+    table["imu"][1]["port"] = str(tmp_path / "link")
+    assert any("is the port of imu[S1] already" in line for line in complaints(table))
+
+
+def test_an_unknown_driver_brings_no_second_complaint(table: Table) -> None:
+    table["imu"][0]["driver"] = "fkae"
+    assert len(complaints(table)) == 1
+
+
+def test_a_driver_that_cannot_be_loaded_is_a_fault_of_its_users_alone(
+    table: Table, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(
+        __import__("tests.daemon.fake_drivers").daemon.fake_drivers.NAMES, "bad", "No"
+    )
+    parse_rig(table)
+    table["imu"][0]["driver"] = "bad"
+    (said,) = complaints(table)
+    assert "imu[S1].driver = 'bad': cannot be loaded: AttributeError" in said
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[rig\nname = 1", "line 1"),
+        (b"\xff\xfe", "is not UTF-8"),
+        (None, "cannot be read: No such file or directory"),
+    ],
+)
+def test_a_file_that_is_no_toml_says_where(
+    tmp_path: Path, content: bytes | None, said: str
+) -> None:
+    path = tmp_path / "rig.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=said):
+        load_rig(path)
+
+
+def test_names_of_files_start_at_the_folder_of_the_rig(
+    table: Table, tmp_path: Path, fakes: object
+) -> None:
+    text = TEN_MISTAKES.partition("[mqtt]")[0].replace("fkae", "fake").replace("tigh", "thigh")
+    text = text.replace("bench/1", "b").replace('"fast"', "50").replace("aling", "align")
+    text = text.replace('"hip", ', '"hip", "ankle", ').replace('= "S1"', '= "S2"', 1)
+    text = text.replace("can.can0", "can.can1").replace("patent21", "patent12")
+    path = tmp_path / "rig.toml"
+    path.write_text(text + '[mqtt]\npassword_file = "secret"\ntls.ca = "/etc/ca.pem"\n')
+    mqtt = load_rig(path).mqtt
+    assert mqtt.password_file == str(tmp_path / "secret")
+    assert mqtt.tls is not None
+    assert mqtt.tls.ca == "/etc/ca.pem"
+    assert mqtt.tcp_port == 8883
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.dates(),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@given(data=st.data())
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_table_does_worse_than_config_error(table: Table, data: st.DataObject) -> None:
+    broken = deepcopy(table)
+    section = data.draw(st.sampled_from(sorted(broken)))
+    part = broken[section]
+    if isinstance(part, list):
+        part = data.draw(st.sampled_from(part))
+    if data.draw(st.booleans()):
+        broken[section] = data.draw(anything)
+    else:
+        part[data.draw(st.sampled_from(sorted(part)) | st.text(max_size=5))] = data.draw(anything)
+    with contextlib.suppress(ConfigError):
+        parse_rig(broken)
+
+
+def test_the_schema_describes_every_key() -> None:
+    schema = rig_schema()
+    for name, model in schema["$defs"].items():
+        for key, field in model.get("properties", {}).items():
+            assert field.get("description") or "$ref" in field, f"{name}.{key}"
+    assert set(schema["properties"]) >= {"rig", "chain", "imu", "mocap", "mqtt"}
+
+
+def test_in_the_schema_a_bus_is_a_name(fakes: object) -> None:
+    can = rig_schema()["$defs"]["FakeCanSettings"]["properties"]["can"]
+    assert can["type"] == "string"
