@@ -1,0 +1,1 @@
+"""WitMotion IMUs for jointfitd: a driver that lives outside of it."""
