@@ -1,0 +1,186 @@
+"""Xsens MTi-600, Sirius and Avior on CAN ("XCDI").
+
+Law: this driver only listens. The device is configured over its UART, once (CAN is off by factory
+default); over CAN nothing can be asked or set, so what is wrong is reported with what to change.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
+from jointfit_daemon.model import Chunk
+from jointfit_drivers.can_bus import shared_bus
+from jointfit_drivers.xcdi_events import XcdiEvents
+from jointfit_protocols.can_frame import (
+    EXTENDED_MAX,
+    RECORD_BYTES,
+    CanFrame,
+    pack_frames,
+    unpack_frames,
+)
+from jointfit_protocols.candump import parse_candump
+from jointfit_protocols.xcdi import DataId, XcdiIds
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+
+log = logging.getLogger(__name__)
+
+_RAW_FRAMES = 20  # logged at debug level, so that a first real device can be judged from its log
+_CAPTURE_FRAMES = 64  # a chunk, as live
+
+
+class XcdiIdSettings(Settings):
+    """CAN identifiers of one sensor; give each sensor on a bus a block of its own."""
+
+    sample_time: int = Field(DataId.SAMPLE_TIME, ge=0, le=EXTENDED_MAX, description="SampleTime")
+    group_counter: int = Field(
+        DataId.GROUP_COUNTER, ge=0, le=EXTENDED_MAX, description="GroupCounter"
+    )
+    quaternion: int = Field(DataId.QUATERNION, ge=0, le=EXTENDED_MAX, description="Quaternion")
+    status_word: int | None = Field(
+        None,
+        ge=0,
+        le=EXTENDED_MAX,
+        description="StatusWord; default: 0x11, moved like the three above if they move together",
+    )
+    error: int | None = Field(
+        None,
+        ge=0,
+        le=EXTENDED_MAX,
+        description="Error; default: 0x01, moved like the three above if they move together",
+    )
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        """Refuse identifiers that cannot be told apart or would tear groups apart."""
+        ids = self.resolved()
+        given = [number for number in ids[:5] if number is not None]
+        if len(set(given)) < len(given):
+            raise ValueError("each identifier once: found one twice")
+        if not self.sample_time < self.group_counter < self.quaternion:
+            raise ValueError(
+                "sample_time < group_counter < quaternion: the lowest identifier leaves first, and "
+                "the quaternion must complete its group"
+            )
+        return self
+
+    def resolved(self, *, extended: bool = False) -> XcdiIds:
+        """Return all identifiers, those left out derived from a block if there is one."""
+        base = self.quaternion - DataId.QUATERNION
+        block = base >= 0 and (
+            self.sample_time - DataId.SAMPLE_TIME
+            == self.group_counter - DataId.GROUP_COUNTER
+            == base
+        )
+
+        def default(data_id: DataId) -> int | None:
+            return base + data_id if block else None
+
+        return XcdiIds(
+            sample_time=self.sample_time,
+            group_counter=self.group_counter,
+            quaternion=self.quaternion,
+            status_word=default(DataId.STATUS_WORD)
+            if self.status_word is None
+            else self.status_word,
+            error=default(DataId.ERROR) if self.error is None else self.error,
+            extended=extended,
+        )
+
+
+class XcdiSettings(ImuSettings):
+    """One Xsens / Movella IMU on a CAN bus."""
+
+    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
+    ids: XcdiIdSettings = Field(
+        default_factory=XcdiIdSettings,
+        description="its identifiers; required in effect when two sensors share a bus",
+    )
+    extended_ids: bool = Field(
+        False, description="29-bit identifiers even where the numbers would fit 11 bits"
+    )
+    sample_time_unit: Literal["auto", "100us", "1us"] = Field(
+        "auto", description="unit of SampleTime; auto decides from ten groups or more"
+    )
+    byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
+
+
+class XcdiImu:
+    """Xsens IMU on a CAN bus: orientation, device time and counter, as three frames a sample."""
+
+    Settings: ClassVar[type[XcdiSettings]] = XcdiSettings
+    wire: ClassVar[Wire] = "can"
+
+    def __init__(self, settings: XcdiSettings) -> None:
+        self._settings = settings
+        self._ids = settings.ids.resolved(extended=settings.extended_ids)
+
+    def decoder(self) -> XcdiEvents:
+        """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
+        settings = self._settings
+        return XcdiEvents(
+            self._ids, settings.rate_hz, settings.sample_time_unit, settings.byte_order
+        )
+
+    async def run(self, emit: Emit) -> None:
+        """Read the bus until cancelled.
+
+        Raises
+        ------
+        DeviceLost
+            Bus absent or down, adapter unplugged, or this sensor silent for `silence_s`.
+        DeviceMisconfigured
+            No such bus here, or another sensor of the rig claims the same identifiers.
+        """
+        settings = self._settings
+        ids = {key: data_id.name.lower() for key, data_id in self._ids.by_id().items()}
+        async with shared_bus(settings.can) as bus:
+            await bus.pump(settings.id, ids, self._logged(emit), settings.silence_s)
+
+    def _logged(self, emit: Emit) -> Emit:
+        """Return `emit`, with the first frames written to the log at debug level."""
+        if not log.isEnabledFor(logging.DEBUG):
+            return emit
+        left = _RAW_FRAMES
+
+        def emit_and_log(chunk: Chunk) -> None:
+            nonlocal left
+            for frame in unpack_frames(chunk.data)[:left]:
+                left -= 1
+                log.debug("%s: %s", self._settings.id, frame)
+            emit(chunk)
+
+        return emit_and_log
+
+    @staticmethod
+    def read_capture(capture: bytes) -> list[Chunk]:
+        """Return the chunks of a capture file: a ``candump -L`` log, or bare records.
+
+        For `jointfit decode`. Lines of the log that are no frames become records that the decoder
+        counts as discarded.
+        """
+        if capture.lstrip()[:1] not in {b"(", b"#"}:
+            return [Chunk(0, capture)]
+        chunks: list[Chunk] = []
+        frames: list[CanFrame] = []
+        for item in parse_candump(capture):
+            if isinstance(item, CanFrame):
+                frames.append(item)
+                if len(frames) == _CAPTURE_FRAMES:
+                    chunks.append(Chunk(item.t_ns, pack_frames(frames)))
+                    frames = []
+            else:
+                chunks.append(Chunk(frames[-1].t_ns if frames else 0, pack_frames(frames)))
+                frames = []
+                chunks.append(Chunk(chunks[-1].t_ns, _NO_RECORD))
+        if frames:
+            chunks.append(Chunk(frames[-1].t_ns, pack_frames(frames)))
+        return [chunk for chunk in chunks if chunk.data]
+
+
+_NO_RECORD = b"\xff" * RECORD_BYTES
