@@ -1,4 +1,4 @@
-"""The example driver works as a stranger's would: installed, found by name, it keeps the contract."""
+"""The example driver as a stranger's: installed, found by name, true to the contract."""
 
 from __future__ import annotations
 
