@@ -1,0 +1,76 @@
+"""``candump -L`` text as CAN chunks. Law: text in, records out, and every line is accounted for.
+
+    (1436509052.249713) can0 105#2A366C2B       eight digits of identifier: a 29-bit one; #R: remote
+
+A record is what `jointfit_protocols.can_frame` defines (24 bytes: i64 time in ns, u32 identifier,
+u8 flags, u8 size, two zeros, eight data bytes). It is packed here once more because the daemon
+knows no wire format; a test holds the two together. A line that is no classic CAN frame becomes
+that format's note of bytes lost, so that whoever decodes the chunks counts it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Chunk
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+RECORD_BYTES = 24
+
+_RECORD = struct.Struct("<qIBBxx8s")
+_EXTENDED, _REMOTE, _ERROR = 1, 2, 4
+_LOST_BYTES = 1 << 27
+_ERROR_BIT = 1 << 29
+_STANDARD_DIGITS = 3
+_STANDARD_MAX, _EXTENDED_MAX = 0x7FF, 0x1FFF_FFFF
+_LINE = re.compile(
+    rb"\((\d{1,10})(?:\.(\d{1,9}))?\)\s+\S+\s+"
+    rb"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(?:([Rr])\d?|((?:[0-9A-Fa-f]{2}){0,8}))(?:\s+[RT])?"
+)
+
+
+def is_candump(data: bytes) -> bool:
+    """Tell whether the first line that is neither empty nor a comment is one of ``candump -L``."""
+    for line in data[:4096].splitlines():
+        text = line.strip()
+        if text and not text.startswith(b"#"):
+            return re.match(rb"\(\d+\.?\d*\)\s+\S+\s+[0-9A-Fa-f]+#", text) is not None
+    return False
+
+
+def read_candump(data: bytes) -> Iterator[Chunk]:
+    """Yield one chunk of one record for each line; empty lines and comments yield none."""
+    t_ns = 0
+    for line in data.splitlines(keepends=True):
+        text = line.strip()
+        if not text or text.startswith(b"#"):
+            continue
+        found = _record(text)
+        if found is None:
+            lost = len(line).to_bytes(8, "little")
+            yield Chunk(t_ns, _RECORD.pack(t_ns, _LOST_BYTES, _ERROR, 8, lost))
+        else:
+            t_ns, record = found
+            yield Chunk(t_ns, record)
+
+
+def _record(line: bytes) -> tuple[int, bytes] | None:
+    """Return time and record of one line; None if it is no classic CAN frame."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return None
+    seconds, fraction, digits, remote, body = match.groups()
+    t_ns = int(seconds) * 10**9 + int((fraction or b"0").ljust(9, b"0"))
+    number, extended = int(digits, 16), len(digits) > _STANDARD_DIGITS
+    error = bool(extended and number & _ERROR_BIT)
+    number &= ~_ERROR_BIT
+    if number > (_EXTENDED_MAX if extended else _STANDARD_MAX):
+        return None
+    payload = bytes.fromhex((body or b"").decode())
+    kind = _ERROR if error else _EXTENDED * extended
+    flags = kind | _REMOTE * (remote is not None)
+    return t_ns, _RECORD.pack(t_ns, number, flags, len(payload), payload)

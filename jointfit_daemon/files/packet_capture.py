@@ -1,0 +1,184 @@
+"""UDP payloads out of pcapng and pcap files. Law: bytes in, datagrams out; a cut file ends early.
+
+Read: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
+stamps, Ethernet (with VLAN tags), Linux cooked and raw IP links, IPv4, fragments put together.
+Everything else in the file is passed over. Time is the packet's own, ns since 1970.
+
+Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PCAPNG_MAGIC = b"\x0a\x0d\x0d\x0a"
+PCAP_MAGICS = {
+    b"\xd4\xc3\xb2\xa1": ("<", 1000),
+    b"\xa1\xb2\xc3\xd4": (">", 1000),
+    b"\x4d\x3c\xb2\xa1": ("<", 1),
+    b"\xa1\xb2\x3c\x4d": (">", 1),
+}
+"""First bytes of a pcap file: byte order, and nanoseconds a unit of its fraction."""
+
+_SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
+_LITTLE_MAGIC = b"\x4d\x3c\x2b\x1a"
+_RESOLUTION, _OFFSET = 9, 14  # options if_tsresol, if_tsoffset
+_LINK_HEADS = {101: (0, None), 228: (0, None), 113: (16, 14), 276: (20, 0)}
+"""Link types: bytes before the IP header, and where their EtherType stands."""
+_ETHERNET = 1
+_IPV4, _VLAN = 0x0800, (0x8100, 0x88A8)
+_UDP = 17
+_IP_VERSION, _IP_HEAD = 4, 20
+_UDP_HEAD = struct.Struct(">HHHH")
+_BLOCK_EDGES, _INTERFACE_HEAD, _PACKET_HEAD, _OFFSET_BYTES = 12, 8, 20, 8
+_PCAP_HEAD = 24
+_MAX_PENDING = 64
+"""Datagrams in fragments that may wait at once."""
+
+
+class UdpPacket(NamedTuple):
+    """One UDP datagram of a capture."""
+
+    t_ns: int
+    source_port: int
+    target_port: int
+    payload: bytes
+
+
+def read_udp(data: bytes) -> Iterator[UdpPacket]:
+    """Yield the UDP datagrams of a pcapng or pcap file in file order."""
+    packets = _read_pcapng(data) if data.startswith(PCAPNG_MAGIC) else _read_pcap(data)
+    fragments = _Fragments()
+    for t_ns, link, frame in packets:
+        at = _ip_offset(frame, link)
+        segment = None if at is None else fragments.segment(frame[at:])
+        if segment is not None and len(segment) >= _UDP_HEAD.size:
+            source, target, size, _ = _UDP_HEAD.unpack_from(segment)
+            if _UDP_HEAD.size <= size <= len(segment):
+                yield UdpPacket(t_ns, source, target, segment[_UDP_HEAD.size : size])
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+class _Interface(NamedTuple):
+    link: int
+    ticks_per_s: int
+    offset_s: int
+
+
+def _read_pcapng(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    order = "<"
+    interfaces: list[_Interface] = []
+    at = 0
+    while at + _BLOCK_EDGES <= len(data):
+        if data[at : at + 4] == PCAPNG_MAGIC:
+            order = "<" if data[at + 8 : at + 12] == _LITTLE_MAGIC else ">"
+        kind, size = struct.unpack_from(order + "II", data, at)
+        if size < _BLOCK_EDGES or size % 4 or at + size > len(data):
+            return
+        body = data[at + 8 : at + size - 4]
+        at += size
+        if kind == _SECTION:
+            interfaces = []
+        elif kind == _INTERFACE and len(body) >= _INTERFACE_HEAD:
+            interfaces.append(_interface(body, order))
+        elif kind == _PACKET and len(body) >= _PACKET_HEAD:
+            number, high, low, captured = struct.unpack_from(order + "4I", body)
+            if number < len(interfaces):
+                link, ticks_per_s, offset_s = interfaces[number]
+                t_ns = (high << 32 | low) * 10**9 // ticks_per_s + offset_s * 10**9
+                yield t_ns, link, body[_PACKET_HEAD : _PACKET_HEAD + captured]
+
+
+def _interface(body: bytes, order: str) -> _Interface:
+    ticks_per_s, offset_s = 10**6, 0
+    at = _INTERFACE_HEAD
+    while at + 4 <= len(body):
+        code, size = struct.unpack_from(order + "HH", body, at)
+        value = body[at + 4 : at + 4 + size]
+        at += 4 + (size + 3) // 4 * 4
+        if code == _RESOLUTION and size == 1:
+            power = value[0] & 0x7F
+            ticks_per_s = 2**power if value[0] & 0x80 else 10**power
+        elif code == _OFFSET and size == len(value) == _OFFSET_BYTES:
+            (offset_s,) = struct.unpack(order + "q", value)
+    return _Interface(struct.unpack_from(order + "H", body)[0], ticks_per_s, offset_s)
+
+
+def _read_pcap(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    order, ns = PCAP_MAGICS[data[:4]]
+    if len(data) < _PCAP_HEAD:
+        return
+    link = struct.unpack_from(order + "I", data, 20)[0] & 0xFFFF
+    at = _PCAP_HEAD
+    while at + 16 <= len(data):
+        seconds, fraction, captured = struct.unpack_from(order + "III", data, at)
+        at += 16
+        if at + captured > len(data):
+            return
+        yield seconds * 10**9 + fraction * ns, link, data[at : at + captured]
+        at += captured
+
+
+# --- links and IP -----------------------------------------------------------------------------
+
+
+def _ip_offset(frame: bytes, link: int) -> int | None:
+    """Return where the IPv4 header begins; None where there is none."""
+    if link == _ETHERNET:
+        at = 12
+        while frame[at : at + 2] in {kind.to_bytes(2, "big") for kind in _VLAN}:
+            at += 4
+        head, kind_at = at + 2, at
+    else:
+        head, place = _LINK_HEADS.get(link, (0, -1))
+        if place is None:
+            return head
+        kind_at = place
+    if kind_at < 0 or frame[kind_at : kind_at + 2] != _IPV4.to_bytes(2, "big"):
+        return None
+    return head
+
+
+class _Fragments:
+    """Puts the fragments of IPv4 datagrams together; what never completes is forgotten."""
+
+    def __init__(self) -> None:
+        self._pending: dict[tuple[bytes, int], dict[int, tuple[bytes, bool]]] = {}
+
+    def segment(self, packet: bytes) -> bytes | None:
+        """Return the UDP segment that `packet` holds or completes, if any."""
+        if len(packet) < _IP_HEAD or packet[0] >> 4 != _IP_VERSION or packet[9] != _UDP:
+            return None
+        total, number, flags = struct.unpack_from(">HHH", packet, 2)
+        body = packet[(packet[0] & 15) * 4 : total or len(packet)]
+        more, offset = bool(flags & 0x2000), (flags & 0x1FFF) * 8
+        if not more and not offset:
+            return body
+        key = (packet[12:20], number)
+        parts = self._pending.setdefault(key, {})
+        parts[offset] = (body, more)
+        if len(self._pending) > _MAX_PENDING:
+            del self._pending[next(iter(self._pending))]
+        whole = _join(parts)
+        if whole is not None:
+            self._pending.pop(key, None)
+        return whole
+
+
+def _join(parts: dict[int, tuple[bytes, bool]]) -> bytes | None:
+    """Return the bytes of all fragments if there is no gap and the last one is there."""
+    whole = b""
+    for offset in sorted(parts):
+        body, more = parts[offset]
+        if offset != len(whole):
+            return None
+        whole += body
+        if not more:
+            return whole
+    return None
