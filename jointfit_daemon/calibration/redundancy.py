@@ -1,0 +1,74 @@
+"""Several sensors on one segment, some of them dead or alive: which model, and how it is fitted.
+
+Law: the one door to the segment models. A fit is given bone-aligned sensors in the world of the
+reference; what is trained for one set of sensors is used for exactly that set.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.calibration.anchored import AnchoredModel, fit_anchored
+from jointfit_daemon.calibration.mean_model import MeanModel, fit_mean
+from jointfit_daemon.calibration.patent import PatentModel, fit_patent
+from jointfit_daemon.calibration.segment_model import (
+    Prediction,
+    SegmentModel,
+    SegmentTraining,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.calibration.trial import Method
+
+__all__ = [
+    "AnchoredModel",
+    "MeanModel",
+    "PatentModel",
+    "Prediction",
+    "SegmentModel",
+    "SegmentTraining",
+    "fit_segment",
+]
+
+
+def fit_segment(
+    method: Method,
+    sensors: Sequence[ArrayLike],
+    q_other: ArrayLike | None,
+    q_reference: ArrayLike,
+    trials: ArrayLike | None = None,
+) -> SegmentModel:
+    """Fit a model of one segment for one set of sensors.
+
+    Parameters
+    ----------
+    method : {"anchored", "patent12", "patent6", "mean"}
+        ``anchored`` without a neighbour gives the weighted mean: it has nothing else to look at.
+    sensors : sequence of array_like, shape (n, 4)
+        q_world_segment as each sensor says it through its static mount. Any number: the mean
+        weighs each, the regressions have a column for each, ``anchored`` a difference for each.
+    q_other : array_like, shape (n, 4), or None
+        The same of one sensor of the neighbouring segment.
+    q_reference : array_like, shape (n, 4)
+        q_world_segment by optics, same world. Frames with NaN anywhere are left out.
+    trials : array_like of int, shape (n,), optional
+        Which trial, that is kind of movement, each frame belongs to; one if None. Fewer than
+        three widen the claimed standard deviation 2.5-fold.
+
+    Raises
+    ------
+    ValueError
+        No sensor, fewer than 30 complete frames, or an unknown method.
+    """
+    training = SegmentTraining.of(sensors, q_other, q_reference, trials)
+    if method == "patent12" or method == "patent6":  # noqa: PLR1714 - narrows the literal
+        return fit_patent(method, training)
+    if method == "anchored" and training.q_other is not None:
+        return fit_anchored(training)
+    if method in {"mean", "anchored"}:
+        return fit_mean(training)
+    raise ValueError(f"method {method!r}; known: anchored, patent12, patent6, mean")
