@@ -1,0 +1,116 @@
+"""The fits that run in the worker process: recorded trials in, JSON-able results out.
+
+Law: pure and picklable; a refusal is a result (`refused`), anything raised is a bug.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
+    """Run one fit.
+
+    Parameters
+    ----------
+    kind : str
+        ``align``, ``static`` or ``functional``.
+    payload : mapping
+        ``chain`` and ``settings``; the trials ``trial`` (align), ``static``, ``functional``;
+        ``alignment`` and ``previous`` as dicts or None.
+
+    Returns
+    -------
+    dict
+        ``quality`` and what the kind gives: ``alignment``, ``calibration`` (dicts), ``worse`` (why
+        the stored calibration is better); or ``refused`` with the reason alone.
+    """
+    from jointfit_daemon.calibration.refused import CalibrationRefused
+
+    try:
+        return _JOBS[kind](payload)
+    except CalibrationRefused as refusal:
+        return {"refused": str(refusal)}
+
+
+def _alignment(payload: Mapping[str, Any]) -> Any:
+    """Return the alignment of this session, else the one of the calibration in force, else None."""
+    from jointfit_daemon.calibration.alignment_phase import AlignedSensor, Alignment
+
+    if payload.get("alignment") is not None:
+        return Alignment.from_dict(payload["alignment"])
+    previous = _previous(payload)
+    if previous is None or "headings_from_static" in previous.flags:
+        return None
+    # Worlds are a matter of the room, not of the wearer: they outlive a calibration.
+    return Alignment(
+        {
+            name: AlignedSensor(item.q_optical_world, "stored", 0.0, 0.0, 0.0, item.lag_ns)
+            for name, item in previous.sensor.items()
+        }
+    )
+
+
+def _previous(payload: Mapping[str, Any]) -> Any:
+    from jointfit_daemon.calibration.result import Calibration
+
+    stored = payload.get("previous")
+    if stored is None:
+        return None
+    calibration = Calibration.from_dict(stored)
+    return calibration if calibration.fits(payload["chain"]) else None
+
+
+def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
+    from jointfit_daemon.calibration.alignment_phase import fit_alignment
+
+    found = fit_alignment(payload["trial"], payload["settings"])
+    return {"alignment": found.to_dict(), "quality": found.quality}
+
+
+def _static(payload: Mapping[str, Any]) -> dict[str, Any]:
+    from jointfit_daemon.calibration.static_pose import (
+        fit_static,
+        fit_static_only,
+        with_new_static,
+    )
+
+    chain, settings = payload["chain"], payload["settings"]
+    pose = fit_static(payload["static"], settings, chain)
+    result: dict[str, Any] = {"quality": pose.quality}
+    previous, markers = _previous(payload), bool(settings.markers or settings.rigid_bodies)
+    if previous is not None:
+        calibration = with_new_static(previous, pose)
+    elif not markers:  # no cameras: a static pose is all there will ever be
+        calibration = fit_static_only(pose, _alignment(payload), chain, software=__version__)
+    else:
+        return result
+    return result | {"calibration": calibration.to_dict()}
+
+
+def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
+    from jointfit_daemon.calibration.fit import better, fit_calibration
+
+    found = fit_calibration(
+        payload["static"],
+        payload["functional"],
+        _alignment(payload),
+        payload["settings"],
+        payload["chain"],
+        software=__version__,
+    )
+    result: dict[str, Any] = {"quality": dict(found.quality), "calibration": found.to_dict()}
+    previous = _previous(payload)
+    if previous is not None:
+        wins, why = better(found, previous)
+        if not wins:
+            result["worse"] = why
+    return result
+
+
+_JOBS = {"align": _align, "static": _static, "functional": _functional}
