@@ -67,8 +67,8 @@ class DeviceClock:
     """
 
     __slots__ = (
-        "_absent", "_arrival_ns", "_echo", "_envelope", "_kind", "_last_t",
-        "_last_u", "_late_since", "_latency_ns", "_period_ns", "_reader", "_synced",
+        "_absent", "_arrival_ns", "_echo", "_envelope", "_kind", "_last_t", "_last_u",
+        "_late_since", "_latency_ns", "_newest_t", "_period_ns", "_reader", "_synced",
         "_tick_clock", "epoch", "jitter_ns", "sigma_ns",
     )  # fmt: skip
 
@@ -80,6 +80,7 @@ class DeviceClock:
         """Mean delay beyond the fastest sample (with echoes: beyond the sampled instant), ns."""
         self._period_ns, self._latency_ns = period_ns, latency_ns
         self._last_t: int | None = None
+        self._newest_t: int | None = None  # of all stamps, also those without device time
         self._arrival_ns = 0
         self._tick_clock: TickClock | None = None
         self._kind, self._absent = _ARRIVAL, 0
@@ -262,7 +263,7 @@ class DeviceClock:
                 sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
         jitter = self.jitter_ns
         self.jitter_ns = delay if jitter is None else jitter + _JITTER_GAIN * (delay - jitter)
-        t = self._slewed(u, target, skew)
+        t = self._forward(self._slewed(u, target, skew))
         self._last_u, self._last_t = u, t
         self._synced = settled
         self.sigma_ns = sigma = sigma + abs(t - target)
@@ -271,21 +272,24 @@ class DeviceClock:
     def _slewed(self, u: int, target: int, skew: float) -> int:
         """Return the stamp nearest to `target` that neither runs backwards nor jumps."""
         last_t, last_u = self._last_t, self._last_u
-        if last_t is None:
+        if last_t is None or last_u is None:
             return target
-        if last_u is None:
-            return max(target, last_t + 1)
         step = u - last_u
         if not self._synced:
-            return max(target, last_t + max(1, min(step, self._period_ns) // 2))
+            return max(target, last_t + min(step, self._period_ns) // 2)
         expected = last_t + step + round(skew * step)
-        error, limit = target - expected, SLEW * step
-        if -limit <= error <= limit:
-            return max(target, last_t + 1)
-        if abs(error) > STEP_NS:
+        error, limit = target - expected, round(SLEW * step)
+        if abs(error) > max(STEP_NS, limit):
             self.epoch += 1
-            return max(target, last_t + 1)
-        return max(expected + round(limit if error > 0 else -limit), last_t + 1)
+            return target
+        return expected + max(-limit, min(error, limit))
+
+    def _forward(self, t: int) -> int:
+        """Return `t`, or the first instant after every stamp given so far."""
+        if self._newest_t is not None and t <= self._newest_t:
+            t = self._newest_t + 1
+        self._newest_t = t
+        return t
 
     def _past(self, u: int, last_u: int) -> Stamp:
         """Stamp a duplicate (u = last) or reordered sample; it teaches nothing."""
@@ -296,6 +300,4 @@ class DeviceClock:
     def _by_arrival(self, arrival_ns: int) -> Stamp:
         """Stamp a sample that lacks the time its neighbours have."""
         t = arrival_ns - self._latency_ns - round(self.jitter_ns or 0.0)
-        if self._last_t is not None:
-            t = max(t, self._last_t + 1)
-        return Stamp(t, float(self._period_ns), synced=False, epoch=self.epoch)
+        return Stamp(self._forward(t), float(self._period_ns), synced=False, epoch=self.epoch)

@@ -103,17 +103,19 @@ class TickTime:
         if counter is None or before is None or step == 0:
             return False
         counts, usual = counter - before, self._step
-        if usual is None or step <= _GAP * usual:
-            if 0 < counts <= _SLACK:
-                self._step = step / counts
-            return False
-        expected = round(step / usual)
-        slack = _SLACK + expected // 100
-        return not any(
-            min((counts - expected) % width, (expected - counts) % width) <= slack
-            for width in COUNTER_WIDTHS
-            if width > counter and width > before
-        )
+        if usual is not None and step > _GAP * usual:
+            expected = round(step / usual)
+            slack = _SLACK + expected // 100
+            shared = any(
+                min((counts - expected) % width, (expected - counts) % width) <= slack
+                for width in COUNTER_WIDTHS
+                if width > counter and width > before
+            )
+            if not shared:
+                return True
+        if 0 < counts <= _SLACK:
+            self._step = step / counts
+        return False
 
 
 class CounterTime:

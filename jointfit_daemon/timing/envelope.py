@@ -12,7 +12,6 @@ shape leaves it unbiased but for D_min, which nobody can see from one side.
 from __future__ import annotations
 
 from collections import deque
-from heapq import nsmallest
 from itertools import pairwise
 from math import hypot, inf
 from typing import TYPE_CHECKING
@@ -39,7 +38,7 @@ NOMINAL_RATE = 5000e-6
 """Prior standard deviation of a sample rate against its nominal value."""
 
 _OLD_REFIT_BUCKETS = 4
-_LINE_POINTS = 3
+_LINE_POINTS = 3  # two make a line, the third a doubt
 
 
 def lower_hull(points: Iterable[Point]) -> list[Point]:
@@ -157,8 +156,11 @@ class Envelope:
         hull = lower_hull(points)
         (ua, ya), (ub, yb) = straddling_edge(hull, sum(p[0] for p in points) / len(points))
         slope = (yb - ya) / (ub - ua)
-        rests = nsmallest(_LINE_POINTS, (y - ya - slope * (at - ua) for at, y in points))
-        self._sigma_c = max(FLOOR_NS, rests[-1] - rests[0])
+        rests = sorted(y - ya - slope * (at - ua) for at, y in points)
+        # Two rest on the line and the third may be near it by luck; the median never is, and the
+        # line is the better the more points there are (1/n, as for any minimum).
+        typical = rests[len(rests) // 2] * min(1.0, SETTLED_POINTS / len(rests))
+        self._sigma_c = max(FLOOR_NS, rests[2], typical)
         reach = max(ub - ua, self._span / 2)
         hull_var, prior_var = 2.0 * (self._sigma_c / reach) ** 2, self._prior_sd**2
         trust = prior_var / (prior_var + hull_var)

@@ -22,10 +22,9 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
-from jointfit_daemon.timing.lag_fit import fit_lag
+from jointfit_daemon.timing.lag_fit import LEAST_PAIRS, fit_lag
 from jointfit_daemon.timing.rates import (
     BRIDGE_S,
-    KERNEL_HALF_S,
     Interpolant,
     low_pass,
     rates_from_orientations,
@@ -150,11 +149,10 @@ def estimate_lag_of_rates(
     See ``estimate_lag``.
     """
     settings = settings or LagSettings()
-    lower_hz = 1.0 / max(imu.period_s, ref.period_s)
-    cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE * lower_hz)
+    cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE / max(imu.period_s, ref.period_s))
     valid = min(imu.valid_share, ref.valid_share)
     imu, ref = low_pass(imu, cutoff), low_pass(ref, cutoff)
-    if min(imu.t_s.size, ref.t_s.size) < 4 / (cutoff * KERNEL_HALF_S):
+    if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
         return LagEstimate(nan, inf, nan, "no gapless stretch of data", valid_share=valid)
     coarse, refused = coarse_lag(imu, ref, settings)
     rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)

@@ -28,6 +28,8 @@ LOST_PERIODS = 3
 LOST_LEAST_NS = 50_000_000
 FUTURE_NS = 100_000_000
 """A stamp this far after its own arrival is no stamp."""
+PAST_NS = 10_000_000_000
+"""A stamp this far before its arrival is of no use to anyone live."""
 DELAY_MOST_NS = 250_000_000
 """A stream that is always later than this does not hold up the others."""
 
@@ -115,6 +117,8 @@ class Stream:
         self._received += 1
         if t_ns > arrival_ns + FUTURE_NS:
             return self._count(Verdict.DROPPED)
+        if t_ns < arrival_ns - PAST_NS:
+            return self._count(Verdict.LATE)
         if epoch != self._epoch:
             self.reset()
             self._epoch = epoch

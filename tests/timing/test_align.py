@@ -225,6 +225,12 @@ def test_a_stamp_from_the_future_is_dropped() -> None:
     assert a.push("A", T0 + 3_600_000 * MS, T0, IDENTITY) is Verdict.DROPPED
 
 
+def test_a_stamp_long_before_its_arrival_makes_no_frame() -> None:
+    a = aligner(A=10 * MS)
+    assert a.push("A", T0 - 60_000 * MS, T0, IDENTITY) is Verdict.LATE
+    assert a.advance(T0 + 1000 * MS) == []
+
+
 def test_a_stream_stamped_seconds_late_does_not_hold_up_the_others() -> None:
     a = aligner(A=10 * MS, B=10 * MS)
     frames = play(a, stream("A", 10 * MS, 300) + stream("B", 10 * MS, 300, delay=2_000 * MS))
@@ -280,7 +286,7 @@ def test_whatever_comes_in_frames_are_in_order_and_samples_accounted(
     script: list[tuple[str, int, int, int] | str], mode: str
 ) -> None:
     a = aligner(mode=mode, A=10 * MS, B=2_500_000, C=33 * MS)
-    now, stamp, last = T0, dict.fromkeys("ABC", T0), 0
+    now, stamp, last = T0, dict.fromkeys("ABC", T0), -(10**15)
     counted = dict.fromkeys("ABC", 0)
     frames: list[AlignedFrame] = []
     for action in script:

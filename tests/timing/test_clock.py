@@ -1,0 +1,492 @@
+"""Device time to host time: accuracy, settling, wraps, restarts; and what it costs."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.model import ClockEcho, TickClock
+from jointfit_daemon.timing.clock import DeviceClock, Stamp
+from jointfit_daemon.timing.envelope import Envelope, lower_hull, straddling_edge
+from jointfit_daemon.timing.wrap import unwrap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+MS = 1_000_000
+S = 1_000_000_000
+PERIOD = 10 * MS
+START = 7_000 * S
+MICROSECONDS = TickClock(1000, 1 << 32)
+NO_STAMP = Stamp(0, 0.0, synced=False, epoch=-1)
+
+Delay: TypeAlias = Callable[[np.random.Generator, int], "NDArray[np.float64]"]
+
+
+def exponential(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """0.3 ms of jitter, 2 % spikes."""
+    spikes = (rng.random(n) < 0.02) * rng.uniform(5e6, 20e6, n)
+    return rng.exponential(3e5, n) + spikes
+
+
+def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """USB bridge with its timer at 16 ms."""
+    return rng.uniform(0, 16e6, n)
+
+
+def punctual(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    return rng.exponential(2e4, n)
+
+
+class Device:
+    """A device with a skewed clock, sampled at true host instants."""
+
+    def __init__(self, seed: int = 0, *, skew: float | None = None, first: int = 1000) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.skew = float(self.rng.uniform(-50e-6, 50e-6)) if skew is None else skew
+        self.first = first
+
+    def samples(
+        self, seconds: float, delay: Delay, start: int = START
+    ) -> Iterable[tuple[int, int, int, int]]:
+        """Yield true host instant, device microseconds, counter, arrival."""
+        true = start + PERIOD * np.arange(int(seconds * S / PERIOD))
+        arrivals = np.maximum.accumulate(true + delay(self.rng, len(true)).astype(np.int64))
+        ticks = self.first + ((true - start) / (1 + self.skew) / 1000).astype(np.int64)
+        yield from zip(
+            true.tolist(), ticks.tolist(), range(len(true)), arrivals.tolist(), strict=True
+        )
+
+
+def errors_of(
+    clock: DeviceClock, samples: Iterable[tuple[int, int, int, int]], use: str = "ticks"
+) -> tuple[NDArray[np.float64], list[Stamp]]:
+    errors, stamps = [], []
+    for true, ticks, counter, arrival in samples:
+        stamp = clock.feed_sample(
+            ticks % (1 << 32) if use == "ticks" else None,
+            counter % (1 << 16) if use == "counter" else None,
+            arrival,
+            MICROSECONDS,
+        )
+        errors.append(stamp.t_ns - true)
+        stamps.append(stamp)
+    return np.abs(errors), stamps
+
+
+def after(errors: NDArray[np.float64], seconds: float) -> float:
+    """Worst error in the second that follows, ms."""
+    at = int(seconds * S / PERIOD)
+    return float(errors[at : at + S // PERIOD].max()) / MS
+
+
+# --- accuracy ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("delay", "ten", "sixty"), [(exponential, 0.05, 0.02), (latency_timer, 0.25, 0.05)]
+)
+def test_passive_clocks_reach_their_accuracy(
+    seed: int, delay: Delay, ten: float, sixty: float
+) -> None:
+    device, clock = Device(seed), DeviceClock(PERIOD)
+    errors, stamps = errors_of(clock, device.samples(62, delay))
+    assert after(errors, 10) <= ten
+    assert after(errors, 60) <= sixty
+    assert clock.skew_ppm == pytest.approx(1e6 * device.skew, abs=2)
+    assert clock.state == "passive"
+    assert {stamp.epoch for stamp in stamps} == {0}
+    assert stamps[-1].sigma_ns < 0.2 * MS
+
+
+@pytest.mark.parametrize("delay", [exponential, latency_timer])
+@pytest.mark.parametrize(("use", "state"), [("counter", "passive"), ("nothing", "arrival")])
+def test_devices_without_time_are_stamped_evenly(delay: Delay, use: str, state: str) -> None:
+    clock = DeviceClock(10_020_000)  # its nominal period is off by 2000 ppm
+    errors, stamps = errors_of(clock, Device(1).samples(40, delay), use)
+    assert errors[1500:].max() <= 0.2 * MS
+    assert clock.state == state
+    assert stamps[-1].epoch == 0
+    assert clock.skew_ppm == pytest.approx(-1996, abs=10)
+
+
+def test_sigma_is_honest() -> None:
+    for seed in range(6):
+        errors, stamps = errors_of(DeviceClock(PERIOD), Device(seed).samples(12, latency_timer))
+        assert all(
+            error < 6 * stamp.sigma_ns
+            for error, stamp in zip(errors, stamps, strict=True)
+            if stamp.synced
+        )
+
+
+def test_a_configured_latency_is_subtracted() -> None:
+    late, known = DeviceClock(PERIOD), DeviceClock(PERIOD, latency_ns=MS)
+    samples = list(Device(2).samples(3, punctual))
+    assert errors_of(late, samples)[1][-1].t_ns - errors_of(known, samples)[1][-1].t_ns == MS
+
+
+def test_first_stamps_are_usable_and_settling_is_short() -> None:
+    errors, stamps = errors_of(DeviceClock(PERIOD), Device(3).samples(6, exponential))
+    assert not stamps[0].synced
+    assert errors[20:].max() < MS
+    assert min(k for k, stamp in enumerate(stamps) if stamp.synced) <= 300
+    assert all(stamp.synced for stamp in stamps[300:])
+
+
+def test_losses_of_a_device_without_time_are_found() -> None:
+    samples = [s for s in Device(4).samples(30, exponential) if s[2] not in {1000, 1500, 1501}]
+    errors, stamps = errors_of(DeviceClock(PERIOD), samples, "nothing")
+    assert errors[1040:1480].max() < MS
+    assert errors[1540:].max() < MS
+    assert stamps[-1].epoch == 0
+
+
+# --- wraps ------------------------------------------------------------------------------------
+
+
+@given(
+    st.sampled_from([256, 1 << 16, 86_400_00]),
+    st.lists(st.floats(0, 90), min_size=1, max_size=20),
+    st.floats(-0.2, 0.2),
+)
+def test_unwrapping_undoes_wrapping(modulus: int, gaps: list[float], jitter: float) -> None:
+    turn_ns = modulus * MS
+    true = last = 5
+    for gap in gaps:
+        step = int(gap * modulus)
+        true += step
+        elapsed = max(0, step * MS + (int(jitter * turn_ns) if 4 * step > 2 * modulus else 0))
+        if modulus / 2 <= step and 4 * elapsed <= turn_ns:
+            continue
+        last = unwrap(true % modulus, last, modulus, elapsed, turn_ns)
+        assert last == true
+
+
+def test_no_stamp_is_off_across_a_wrap_of_ticks() -> None:
+    device = Device(5, first=(1 << 32) - 20_000_000)
+    errors, stamps = errors_of(DeviceClock(PERIOD), device.samples(30, exponential))
+    assert errors[1000:].max() < MS
+    assert {stamp.epoch for stamp in stamps} == {0}
+
+
+@pytest.mark.parametrize("width", [256, 1 << 16])
+def test_no_stamp_is_off_across_wraps_of_a_counter(width: int) -> None:
+    clock = DeviceClock(PERIOD)
+    worst = 0
+    for true, _, counter, arrival in Device(6).samples(20, exponential):
+        stamp = clock.feed_sample(None, (counter + width - 700) % width, arrival)
+        worst = max(worst, abs(stamp.t_ns - true)) if stamp.synced else worst
+    assert 0 < worst < MS
+    assert clock.epoch == 0
+
+
+def test_a_clock_that_wraps_at_midnight_is_followed() -> None:
+    midnight = TickClock(100_000, 864_000_000)
+    clock = DeviceClock(PERIOD)
+    for k in range(2000):
+        t = START + k * PERIOD
+        stamp = clock.feed_sample((864_000_000 - 50_000 + k * 100) % 864_000_000, None, t, midnight)
+        assert abs(stamp.t_ns - t) < MS
+    assert clock.epoch == 0
+
+
+def test_a_silence_of_many_wraps_keeps_the_clock() -> None:
+    clock = DeviceClock(PERIOD)
+    ticks = TickClock(100_000, 1 << 16)  # wraps after 6.55 s
+    samples = [s for s in Device(7, skew=0.0).samples(90, punctual) if not 30 < s[2] / 100 < 75]
+    for true, us, _, arrival in samples:
+        stamp = clock.feed_sample(us // 100 % (1 << 16), None, arrival, ticks)
+        assert abs(stamp.t_ns - true) < MS or not stamp.synced
+    assert clock.epoch == 0
+
+
+# --- restarts ---------------------------------------------------------------------------------
+
+
+def restarted(first: int, use: str = "ticks", gap: float = 0.4) -> tuple[DeviceClock, list[Stamp]]:
+    clock = DeviceClock(PERIOD)
+    errors_of(clock, Device(8, first=60_000_000).samples(20, exponential), use)
+    again = Device(9, first=first).samples(10, exponential, START + int((20 + gap) * S))
+    errors, stamps = errors_of(clock, again, use)
+    assert errors[50:].max() < 2 * MS
+    return clock, stamps
+
+
+@pytest.mark.parametrize("first", [0, 10_000, 79_000_000, 1 << 30, 3 << 30])
+def test_after_a_restart_nothing_is_synced_before_it_has_settled(first: int) -> None:
+    clock, stamps = restarted(first)
+    assert clock.epoch == 1
+    assert not any(stamp.synced for stamp in stamps[:150])
+    assert all(stamp.synced for stamp in stamps[400:])  # settled within 5 s
+
+
+def test_a_counter_that_begins_anew_is_a_restart() -> None:
+    clock, _ = restarted(0, "counter")
+    assert clock.epoch == 1
+
+
+def test_a_clock_that_jumps_while_its_counter_does_not_is_a_restart() -> None:
+    clock = DeviceClock(PERIOD)
+    for k in range(3000):
+        jumped = 300_000 if k >= 2000 else 0  # late by 0.3 s: no arrival contradicts it for 2 s
+        clock.feed_sample(
+            1000 + k * 10_000 + jumped, k, START + k * PERIOD + jumped * 1000, MICROSECONDS
+        )
+        if k == 2000:
+            assert clock.epoch == 1
+
+
+def test_a_gap_that_the_counter_shares_is_no_restart() -> None:
+    clock = DeviceClock(PERIOD)
+    samples = [s for s in Device(8).samples(30, punctual) if not 900 < s[2] < 1400]
+    for true, ticks, counter, arrival in samples:
+        stamp = clock.feed_sample(ticks, counter % 256, arrival, MICROSECONDS)
+        assert not stamp.synced or abs(stamp.t_ns - true) < MS
+    assert clock.epoch == 0
+
+
+def test_stale_bytes_before_fresh_ones_do_not_spoil_the_clock() -> None:
+    """Minutes-old samples from a full buffer come first, all at once."""
+    device = Device(10)
+    samples = list(device.samples(200, punctual))
+    stale = [(t, u, c, START + 195 * S + c * 1000) for t, u, c, _ in samples[:40]]
+    clock, stamp = DeviceClock(PERIOD), NO_STAMP
+    for true, ticks, counter, arrival in stale + samples[-500:]:
+        stamp = clock.feed_sample(ticks, counter, arrival, MICROSECONDS)
+        assert not stamp.synced or abs(stamp.t_ns - true) < MS
+    assert stamp.synced
+    assert clock.epoch == 0
+
+
+def test_what_the_decoder_calls_a_restart_is_one() -> None:
+    clock = DeviceClock(PERIOD)
+    errors_of(clock, Device(11).samples(5, punctual))
+    clock.feed_restart()
+    clock.feed_restart()  # nothing has been since: not another
+    assert clock.epoch == 1
+    assert clock.state == "settling"
+    assert clock.skew_ppm is None
+
+
+def test_the_same_ticks_twice_are_a_duplicate_and_old_ones_are_in_the_past() -> None:
+    clock = DeviceClock(PERIOD)
+    first, second = (
+        clock.feed_sample(t, None, START + t * 1000, MICROSECONDS) for t in (0, 10_000)
+    )
+    again = clock.feed_sample(10_000, None, START + 11 * MS, MICROSECONDS)
+    assert (again.t_ns, again.duplicate) == (second.t_ns, True)
+    between = clock.feed_sample(5_000, None, START + 12 * MS, MICROSECONDS)
+    assert first.t_ns < between.t_ns < second.t_ns
+
+
+def test_samples_that_lack_their_time_now_and_then_are_not_synced() -> None:
+    clock = DeviceClock(PERIOD)
+    for true, ticks, counter, arrival in Device(12).samples(10, punctual):
+        absent = counter % 50 == 49
+        stamp = clock.feed_sample(None if absent else ticks, None, arrival, MICROSECONDS)
+        assert abs(stamp.t_ns - true) < MS
+        assert not (absent and stamp.synced)
+    assert clock.epoch == 0
+
+
+# --- whatever comes ---------------------------------------------------------------------------
+
+inputs = st.tuples(
+    st.none() | st.integers(0, (1 << 32) - 1) | st.integers(0, 100_000),
+    st.none() | st.integers(0, 300),
+    st.integers(0, 20 * MS) | st.integers(0, 10**12),
+)
+
+
+@given(st.lists(inputs, max_size=60))
+def test_time_never_runs_backwards(
+    samples: list[tuple[int | None, int | None, int]],
+) -> None:
+    clock, arrival, newest = DeviceClock(PERIOD), START, 0
+    for ticks, counter, wait in samples:
+        arrival += wait
+        stamp = clock.feed_sample(ticks, counter, arrival, MICROSECONDS)
+        assert stamp.sigma_ns >= 0
+        if stamp.t_ns > newest:
+            newest = stamp.t_ns
+        elif not stamp.duplicate:  # only a sample the device itself calls older may be older
+            assert ticks is not None or counter is not None
+
+
+@given(st.integers(0, 2**31), st.floats(-400e-6, 400e-6))
+def test_stamps_grow_with_device_time(seed: int, skew: float) -> None:
+    _, stamps = errors_of(DeviceClock(PERIOD), Device(seed, skew=skew).samples(4, latency_timer))
+    assert all(a.t_ns < b.t_ns for a, b in pairwise(stamps))
+
+
+# --- the envelope -----------------------------------------------------------------------------
+
+points = st.lists(
+    st.tuples(st.integers(0, 10**6), st.integers(-1000, 1000)), min_size=2, max_size=30
+)
+
+
+def supports(a: tuple[int, int], b: tuple[int, int], cloud: list[tuple[int, int]]) -> bool:
+    return all((b[0] - a[0]) * (y - a[1]) >= (b[1] - a[1]) * (u - a[0]) for u, y in cloud)
+
+
+@given(points, st.randoms())
+def test_the_edge_is_the_best_line_under_all_points(
+    cloud: list[tuple[int, int]], shuffle: np.random.Generator
+) -> None:
+    if len({u for u, _ in cloud}) < 2:
+        return
+    mean = sum(u for u, _ in cloud) / len(cloud)
+    a, b = straddling_edge(lower_hull(cloud), mean)
+    shuffled = list(cloud)
+    shuffle.shuffle(shuffled)
+    assert lower_hull(shuffled) == lower_hull(cloud)
+
+    def height(a: tuple[int, int], b: tuple[int, int]) -> float:
+        return a[1] + (b[1] - a[1]) * (mean - a[0]) / (b[0] - a[0])
+
+    assert supports(a, b, cloud)
+    candidates = [
+        height(p, q) for p in cloud for q in cloud if p[0] < q[0] and supports(p, q, cloud)
+    ]
+    assert height(a, b) == pytest.approx(max(candidates))
+
+
+@given(points, st.data())
+def test_delaying_a_point_off_the_hull_changes_nothing(
+    cloud: list[tuple[int, int]], data: st.DataObject
+) -> None:
+    hull = lower_hull(cloud)
+    off = [point for point in cloud if point not in hull]
+    if off:
+        u, y = data.draw(st.sampled_from(off))
+        later = [(u, y + data.draw(st.integers(1, 1000))) if p == (u, y) else p for p in cloud]
+        assert lower_hull(later) == hull
+
+
+def test_the_envelope_never_lies_above_a_point_of_its_window() -> None:
+    rng, envelope = np.random.default_rng(0), Envelope()
+    for k in range(2000):
+        y = int(rng.exponential(MS))
+        envelope.feed(k * PERIOD, y)
+        assert envelope.residual(k * PERIOD, y) >= -1e-3
+
+
+# --- echoes -----------------------------------------------------------------------------------
+
+SERVER_HZ = 3_312_787
+SERVER = TickClock(1, None, SERVER_HZ)
+
+
+class Lan:
+    """Round trips of 0.86 ms and exponential 0.1 ms each way, 1 % spikes of 20 ms; skew 42 ppm."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+
+    def ticks(self, t: float) -> int:
+        return int((t - START + 400 * S) * (1 + 42e-6) * SERVER_HZ / S)
+
+    def echo(self, t: int) -> ClockEcho:
+        there, back = 430_000 + self.rng.exponential(1e5, 2) + (self.rng.random(2) < 0.01) * 20e6
+        return ClockEcho(t, int(t + there + back), self.ticks(t + there))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_echoes_map_the_server_at_once_and_better_later(seed: int) -> None:
+    lan, clock = Lan(seed), DeviceClock(PERIOD)
+    now, stamp = START, NO_STAMP
+    for number in range(70):
+        clock.feed_echo(lan.echo(now), SERVER)
+        now += 50 * MS if number < 10 else S + int(lan.rng.uniform(-0.2, 0.2) * S)
+        stamp = clock.feed_sample(lan.ticks(now), None, now + 6 * MS, SERVER)
+        if number >= 9:
+            assert stamp.synced
+            assert abs(stamp.t_ns - now) < 4 * stamp.sigma_ns
+        if number == 9:
+            assert abs(stamp.t_ns - now) < 0.1 * MS
+            assert stamp.sigma_ns < 50_000
+    assert abs(stamp.t_ns - now) < 60_000
+    assert stamp.sigma_ns < 20_000
+    assert clock.skew_ppm == pytest.approx(-42, abs=1)
+    assert clock.bound_ns == pytest.approx(440_000, abs=40_000)
+    assert clock.state == "echo"
+
+
+def test_a_server_that_restarts_is_noticed_by_its_echo() -> None:
+    lan, clock = Lan(0), DeviceClock(PERIOD)
+    for k in range(20):
+        clock.feed_echo(lan.echo(START + k * 50 * MS), SERVER)
+    clock.feed_echo(ClockEcho(START + S, START + S + MS, 5), SERVER)
+    assert clock.epoch == 1
+    assert clock.state == "settling"
+
+
+def test_echoes_before_anyone_knows_the_tick_rate_are_ignored() -> None:
+    clock = DeviceClock(PERIOD)
+    clock.feed_echo(ClockEcho(START, START + MS, 5))
+    assert clock.bound_ns is None
+
+
+def test_a_clock_without_fresh_echoes_is_stale() -> None:
+    lan, clock = Lan(0), DeviceClock(PERIOD)
+    for k in range(20):
+        clock.feed_echo(lan.echo(START + k * 50 * MS), SERVER)
+    for second in (1, 60):
+        clock.feed_sample(lan.ticks(START + second * S), 0, START + second * S + 6 * MS, SERVER)
+    assert clock.state == "stale"
+
+
+@pytest.fixture
+def capture(shared_data: Path) -> list[tuple[int, bytes]]:
+    """UDP payloads to or from the NatNet server with their packet times, ns."""
+    file = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data" / "raw" / "traffic.pcapng"
+    data, at, packets = file.read_bytes(), 0, []
+    while at < len(data):
+        kind, size = struct.unpack_from("<II", data, at)
+        if kind == 6:
+            high, low, length = struct.unpack_from("<III", data, at + 12)
+            packets.append((((high << 32) | low) * 1000, data[at + 28 : at + 28 + length][42:]))
+        at += size
+    return packets
+
+
+def test_the_real_capture_gives_its_known_timing(capture: list[tuple[int, bytes]]) -> None:
+    clock, passive = DeviceClock(S // 120), DeviceClock(S // 120)
+    sent: dict[bytes, int] = {}
+    echoes, transits = [], []
+    for t, payload in capture:
+        (kind,) = struct.unpack_from("<H", payload)
+        if kind == 12:
+            sent[payload[4:12]] = t
+        elif kind == 13:
+            (ticks,) = struct.unpack_from("<Q", payload, 12)
+            echoes.append(ClockEcho(sent[payload[4:12]], t, ticks))
+    for echo in echoes:
+        clock.feed_echo(echo, SERVER)
+    assert len(echoes) == 9
+    clock.feed_echo(echoes[-1], SERVER)  # the tenth completes the burst
+    for t, payload in capture:
+        if struct.unpack_from("<H", payload)[0] == 7:
+            (number,) = struct.unpack_from("<i", payload, 4)
+            (transmit,) = struct.unpack_from("<Q", payload, len(payload) - 14)
+            stamp = clock.feed_sample(transmit, number, t, SERVER)
+            transits.append((t - stamp.t_ns) / MS)
+            passive.feed_sample(transmit, None, t, SERVER)
+    assert len(transits) == 518
+    assert clock.skew_ppm == pytest.approx(42, abs=24)
+    assert np.median(transits) == pytest.approx(0.693, abs=0.06)
+    assert min(transits) == pytest.approx(0.416, abs=0.08)
+    assert passive.skew_ppm == pytest.approx(34, abs=25)
