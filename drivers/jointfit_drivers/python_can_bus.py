@@ -125,8 +125,7 @@ class PythonCanBus:
         """Open the bus, off the loop where that may take long; errors as the house names them."""
         try:
             if self._kernel:
-                socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-                socket.if_nametoindex(self._settings.channel)  # else python-can leaks a socket
+                _require_interface(self._settings.channel)  # else python-can leaks a socket
                 return self._make()
             if self._settings.interface == "virtual":
                 return self._make()
@@ -235,6 +234,13 @@ class PythonCanBus:
                 f"{self._settings.bitrate}`"
             )
         return DeviceLost(f"{channel} ({self._settings.interface}): {error}")
+
+
+def _require_interface(name: str) -> None:
+    """Raise the OSError that binding a socket to `name` would."""
+    socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    if name not in {known for _, known in socket.if_nameindex()}:
+        raise OSError(errno.ENODEV, "no such interface")
 
 
 def _unknown(kind: str, error: Exception) -> str:

@@ -1,0 +1,344 @@
+"""The XCDI driver on real SocketCAN: filters, stamps, overflow, links that go and come.
+
+Runs where the kernel has an interface vcan0 that may be changed: in the light virtual machine
+(``.ci/light_vm.py``), or as root on any Linux with vcan.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import socket
+import subprocess
+import time
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
+from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
+from jointfit_drivers.can_bus import shared_bus
+from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
+from jointfit_protocols.can_frame import HOST_DROPPED, CanFrame, host_count, unpack_frames
+from jointfit_protocols.xcdi import XcdiIds, id_block
+from jointfit_simulators.can_wire import PythonCanWire
+from jointfit_simulators.driver_contract import DriverContract
+from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Driver
+    from jointfit_simulators.imu_device import WireNoise
+
+LINK = "vcan0"
+
+
+def has_vcan() -> bool:
+    try:
+        socket.if_nametoindex(LINK)
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True
+
+
+pytestmark = [
+    pytest.mark.vm,
+    pytest.mark.skipif(
+        not has_vcan(), reason=f"no interface {LINK}: run .ci/light_vm.py, or `ip link add {LINK}`"
+    ),
+]
+
+
+def ip(*words: str) -> None:
+    tool = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
+    assert tool is not None
+    subprocess.run([tool, "link", *words], check=True)
+
+
+@pytest.fixture(autouse=True)
+def vcan_is_up_before_and_after(request: pytest.FixtureRequest) -> Any:
+    yield
+    if LINK not in {name for _, name in socket.if_nameindex()}:
+        ip("add", "dev", LINK, "type", "vcan")
+    ip("set", LINK, "up")
+
+
+BUS = CanBusSettings(interface="socketcan", channel=LINK, bitrate=1_000_000)
+
+
+def settings(name: str = "S3", **more: Any) -> XcdiSettings:
+    return XcdiSettings(
+        id=name, segment="shank", driver="xcdi", can=BUS, **({"silence_s": 0.5} | more)
+    )
+
+
+class LinkWire(PythonCanWire):
+    """A wire whose plug is the interface itself."""
+
+    def __init__(self) -> None:
+        ip("set", LINK, "up")
+        super().__init__("socketcan", LINK)
+
+    @override
+    def unplug(self) -> None:
+        super().unplug()
+        ip("set", LINK, "down")
+
+    @override
+    def plug(self) -> None:
+        ip("set", LINK, "up")
+        super().plug()
+
+
+class RemovableWire(PythonCanWire):
+    """A wire whose plug is the adapter: the interface vanishes and comes back."""
+
+    def __init__(self) -> None:
+        super().__init__("socketcan", LINK)
+
+    @override
+    def unplug(self) -> None:
+        super().unplug()
+        if LINK in {name for _, name in socket.if_nameindex()}:
+            ip("delete", LINK)
+
+    @override
+    def plug(self) -> None:
+        if LINK not in {name for _, name in socket.if_nameindex()}:
+            ip("add", "dev", LINK, "type", "vcan")
+            ip("set", LINK, "up")
+        super().plug()
+
+
+class TestXcdiOnVcanThatGoesDown(DriverContract):
+    registered_as = "xcdi"
+    has_noise = False  # CAN has its own error detection
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
+        return XcdiDevice(LinkWire())
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        return XcdiImu(settings())
+
+    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
+    test_a_wrong_device_is_named_not_retried = None  # type: ignore[assignment]
+
+
+class TestXcdiOnVcanThatIsRemoved(TestXcdiOnVcanThatGoesDown):
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
+        return XcdiDevice(RemovableWire())
+
+
+class Heard:
+    """Everything a driver emitted, decoded."""
+
+    def __init__(self, driver: XcdiImu) -> None:
+        self.decoder = driver.decoder()
+        self.events: list[Any] = []
+        self.frames: list[CanFrame] = []
+
+    def emit(self, chunk: Chunk) -> None:
+        self.frames += [f for f in unpack_frames(chunk.data) if isinstance(f, CanFrame)]
+        self.events += self.decoder.feed(chunk)
+
+    @property
+    def samples(self) -> list[ImuSample]:
+        return [event for event in self.events if isinstance(event, ImuSample)]
+
+    async def wait_for(self, count: int) -> None:
+        async with asyncio.timeout(5):
+            while len(self.samples) < count:
+                await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def running(driver: XcdiImu) -> AsyncIterator[Heard]:
+    heard = Heard(driver)
+    task = asyncio.create_task(driver.run(heard.emit))
+    await asyncio.sleep(0.05)
+    try:
+        yield heard
+    finally:
+        task.cancel()
+        await asyncio.wait({task})
+        if not task.cancelled():
+            task.result()
+
+
+@pytest.fixture
+def wire() -> Any:
+    made = PythonCanWire("socketcan", LINK)
+    yield made
+    made.unplug()
+
+
+def identity(device: XcdiDevice, count: int, first: int = 0) -> None:
+    for number in range(first, first + count):
+        device.push(number * 10_000_000, (1.0, 0.0, 0.0, 0.0))
+
+
+async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanWire) -> None:
+    bases = {f"S{n}": 0x100 * n for n in range(1, 5)}
+    devices = [
+        XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(base), first_counter=base))
+        for base in bases.values()
+    ]
+    drivers = [
+        XcdiImu(
+            settings(
+                name,
+                ids=XcdiIdSettings(
+                    sample_time=base + 5, group_counter=base + 6, quaternion=base + 0x21
+                ),
+            )
+        )
+        for name, base in bases.items()
+    ]
+    async with asyncio.TaskGroup() as group:
+        heard = [Heard(driver) for driver in drivers]
+        tasks = [
+            group.create_task(driver.run(each.emit))
+            for driver, each in zip(drivers, heard, strict=True)
+        ]
+        await asyncio.sleep(0.1)
+        for number in range(50):
+            for device in devices:
+                device.push(number * 10_000_000, (1.0, 0.0, 0.0, 0.0))
+            await asyncio.sleep(0.002)
+        for each in heard:
+            await each.wait_for(50)
+        for task in tasks:
+            task.cancel()
+    for each, base in zip(heard, bases.values(), strict=True):
+        assert [sample.counter for sample in each.samples] == list(range(base, base + 50))
+        assert each.decoder.foreign == each.decoder.incomplete == each.decoder.discarded_bytes == 0
+        assert not [
+            event for event in each.events if isinstance(event, DeviceEvent) and event.kind == "gap"
+        ]
+
+
+async def test_the_kernel_passes_only_what_the_devices_want(wire: PythonCanWire) -> None:
+    driver = XcdiImu(settings())
+    other = XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(0x300)))
+    async with shared_bus(BUS) as bus, running(driver) as heard:
+        identity(other, 20)
+        identity(XcdiDevice(wire), 20)
+        await heard.wait_for(20)
+        assert bus.foreign == 0
+        assert heard.decoder.foreign == 0
+
+
+async def test_29_bit_identifiers_are_not_taken_for_11_bit_ones(wire: PythonCanWire) -> None:
+    driver = XcdiImu(settings(extended_ids=True))
+    async with running(driver) as heard:
+        identity(XcdiDevice(wire), 5)
+        identity(XcdiDevice(wire, XcdiDeviceOptions(ids=XcdiIds(extended=True))), 20)
+        await heard.wait_for(20)
+        assert len(heard.samples) == 20
+        assert all(frame.extended for frame in heard.frames)
+
+
+async def test_stamps_are_the_kernels_not_those_of_the_read(wire: PythonCanWire) -> None:
+    async with running(XcdiImu(settings())) as heard:
+        device = XcdiDevice(wire)
+        identity(device, 1)
+        await heard.wait_for(1)
+        before = time.monotonic_ns()
+        identity(device, 10, first=1)
+        after = time.monotonic_ns()
+        time.sleep(0.2)  # noqa: ASYNC251 - the loop is to stall
+        await heard.wait_for(11)
+        slack = 1_000_000  # back-dating by a frame, two clocks
+        stamps = [sample.arrival_ns for sample in heard.samples[1:]]
+        assert all(before - slack <= stamp <= after + slack for stamp in stamps)
+        assert stamps == sorted(stamps)
+
+
+async def test_frames_that_the_kernel_dropped_are_counted_exactly(wire: PythonCanWire) -> None:
+    async with running(XcdiImu(settings(silence_s=10))) as heard:
+        device, burst = XcdiDevice(wire), 3000
+        identity(device, burst)  # the loop does not run meanwhile: 12 000 frames into one queue
+        await asyncio.sleep(0.5)
+        identity(device, 1, first=burst)
+        await asyncio.sleep(0.5)
+        dropped = sum(host_count(f) for f in heard.frames if f.can_id == HOST_DROPPED)
+        arrived = sum(not frame.error for frame in heard.frames)
+        assert dropped > 0
+        assert arrived + dropped == 4 * (burst + 1)
+        told = [
+            e.data["dropped_frames"]
+            for e in heard.events
+            if "kernel dropped" in getattr(e, "text", "")
+        ]
+        assert sum(told) == dropped
+
+
+async def test_a_link_that_is_down_is_lost_and_says_how_to_bring_it_up() -> None:
+    ip("set", LINK, "down")
+    with pytest.raises(DeviceLost, match=f"ip link set {LINK} up"):
+        async with asyncio.timeout(2):
+            await XcdiImu(settings(silence_s=1.5)).run(lambda _: None)
+
+
+async def test_every_device_is_lost_when_the_link_goes_down_and_all_come_back() -> None:
+    names = ["S3", "S4"]
+    drivers = [
+        XcdiImu(settings("S3", silence_s=5)),
+        XcdiImu(
+            settings(
+                "S4",
+                silence_s=5,
+                ids=XcdiIdSettings(sample_time=0x205, group_counter=0x206, quaternion=0x221),
+            )
+        ),
+    ]
+    tasks = [asyncio.create_task(driver.run(lambda _: None)) for driver in drivers]
+    await asyncio.sleep(0.1)
+    ip("set", LINK, "down")
+    began = time.monotonic()
+    await asyncio.wait(tasks, timeout=2)
+    assert time.monotonic() - began < 1
+    assert [type(task.exception()) for task in tasks] == [DeviceLost] * len(names)
+    ip("set", LINK, "up")
+    wire = PythonCanWire("socketcan", LINK)
+    try:
+        async with running(drivers[0]) as heard:
+            identity(XcdiDevice(wire), 10)
+            await heard.wait_for(10)
+    finally:
+        wire.unplug()
+
+
+async def test_an_interface_that_is_not_there_is_lost_not_fatal() -> None:
+    bus = CanBusSettings(interface="socketcan", channel="can9")
+    with pytest.raises(DeviceLost, match="can9: no such CAN interface"):
+        await XcdiImu(settings().model_copy(update={"can": bus})).run(lambda _: None)
+
+
+async def test_a_silent_sensor_is_lost_alone_on_a_live_bus(wire: PythonCanWire) -> None:
+    silent = XcdiImu(
+        settings("S4", ids=XcdiIdSettings(sample_time=0x205, group_counter=0x206, quaternion=0x221))
+    )
+    async with running(XcdiImu(settings())) as heard:
+        device = XcdiDevice(wire)
+        task = asyncio.create_task(silent.run(lambda _: None))
+        for number in range(80):
+            identity(device, 1, first=number)
+            await asyncio.sleep(0.01)
+        with pytest.raises(DeviceLost, match=r"S4.*silent for 0.5 s"):
+            await task
+        assert len(heard.samples) == 80
+
+
+async def test_two_sensors_with_one_identifier_are_refused_by_name(wire: PythonCanWire) -> None:
+    async with running(XcdiImu(settings("S3"))):
+        with pytest.raises(DeviceMisconfigured, match=r"S4.*0x.*S3"):
+            await XcdiImu(settings("S4")).run(lambda _: None)
