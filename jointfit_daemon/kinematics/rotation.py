@@ -231,8 +231,12 @@ def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
     if q.shape[-2] == 0:
         raise ValueError("no rotations to average")
     weighted = q if weights is None else q * _floats(weights)[..., None]
-    M = np.swapaxes(weighted, -1, -2) @ q
-    largest: Array = np.linalg.eigh(M)[1][..., -1]
+    return first_eigenvector(np.swapaxes(weighted, -1, -2) @ q)
+
+
+def first_eigenvector(M: ArrayLike) -> Array:
+    """Return the unit eigenvector, w >= 0, of the largest eigenvalue; (..., 4, 4) to (..., 4)."""
+    largest: Array = np.linalg.eigh(_floats(M))[1][..., -1]
     return np.where(largest[..., :1] < 0.0, -largest, largest)
 
 

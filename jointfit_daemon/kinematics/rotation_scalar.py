@@ -10,7 +10,7 @@ from math import atan2, cos, sin, sqrt
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from jointfit_daemon.model import Quaternion, Vector
 
@@ -106,7 +106,7 @@ def interpolate_one(q0: Quaternion, q1: Quaternion, a: float) -> Quaternion:
     return multiply_one(q0, exp_one((a * x, a * y, a * z)))
 
 
-def as_quaternion(q: Sequence[float]) -> Quaternion:
+def as_quaternion(q: Iterable[float]) -> Quaternion:
     """Return a row of an array, or any four numbers, as a plain tuple of floats."""
     w, x, y, z = q
     return (float(w), float(x), float(y), float(z))

@@ -1,0 +1,124 @@
+r"""The fits of this room sample by sample, with forgetting: for tracking drift while optics run.
+
+Law: O(1) per sample, no history. With forgetting 1 each gives what its batch form gives.
+A forgetting factor of :math:`\mu = e^{-\Delta t/\tau}` remembers for about tau seconds.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics.rotation import first_eigenvector
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.float64]
+
+EXCITATION = 1e-3
+"""Below this g^T P g a sample teaches nothing; with forgetting it would only wind P up."""
+IDLE_SAMPLES = 100
+"""Even then one sample in so many is taken: about one a second at 100 Hz."""
+SYMMETRIZE_EVERY = 1000
+
+
+class RecursiveLeastSquares:
+    r"""Least squares by the matrix-inversion lemma.
+
+    .. math:: K = \frac{P g}{\mu / w + g^T P g},\quad
+              \Theta \leftarrow \Theta + K (y^T - g^T \Theta),\quad
+              P \leftarrow (P - K g^T P) / \mu, \qquad P_0 = I / \lambda_0
+
+    Guarded against wind-up: samples that excite nothing are mostly passed over, and tr P never
+    exceeds what it began with.
+
+    Parameters
+    ----------
+    regressors, targets : int
+        p and m: Theta has shape (p, m).
+    ridge : float
+        lambda_0, the weight of the prior Theta = 0.
+    forgetting : float
+        mu in (0, 1]; 1 forgets nothing, and then no sample is passed over.
+    """
+
+    def __init__(
+        self, regressors: int, targets: int, ridge: float, forgetting: float = 1.0
+    ) -> None:
+        if not 0.0 < forgetting <= 1.0:
+            raise ValueError(f"forgetting {forgetting} is not in (0, 1]")
+        self.coefficients: Array = np.zeros((regressors, targets))
+        self._P: Array = np.eye(regressors) / ridge
+        self._largest_trace = regressors / ridge
+        self._forgetting = forgetting
+        self._samples = self._passed_over = 0
+
+    def feed(self, g: ArrayLike, y: ArrayLike, weight: float = 1.0) -> bool:
+        """Take regressors g (p,) and target y (m,); return False if the sample was passed over."""
+        g = np.asarray(g, dtype=np.float64)
+        Pg = self._P @ g
+        excitation = float(g @ Pg)
+        if self._forgetting < 1.0 and excitation <= EXCITATION:
+            self._passed_over += 1
+            if self._passed_over < IDLE_SAMPLES:
+                return False
+        self._passed_over = 0
+        K = Pg / (self._forgetting / weight + excitation)
+        self.coefficients = self.coefficients + np.outer(K, np.asarray(y) - g @ self.coefficients)
+        self._P = (self._P - np.outer(K, Pg)) / self._forgetting
+        self._keep_sound()
+        return True
+
+    def _keep_sound(self) -> None:
+        self._samples += 1
+        trace = float(np.trace(self._P))
+        if trace > self._largest_trace:
+            self._P *= self._largest_trace / trace
+        if self._samples % SYMMETRIZE_EVERY == 0:
+            self._P = 0.5 * (self._P + self._P.T)
+
+
+class InformationForm:
+    r"""The same least squares from its sums; the coefficients are solved for on demand.
+
+    .. math:: A \leftarrow \mu A + w g g^T,\quad B \leftarrow \mu B + w g y^T,\quad
+              \Theta = A^{-1} B
+    """
+
+    def __init__(
+        self, regressors: int, targets: int, ridge: float, forgetting: float = 1.0
+    ) -> None:
+        self._A: Array = ridge * np.eye(regressors)
+        self._B: Array = np.zeros((regressors, targets))
+        self._forgetting = forgetting
+
+    def feed(self, g: ArrayLike, y: ArrayLike, weight: float = 1.0) -> None:
+        """Take regressors g (p,) and target y (m,)."""
+        g = np.asarray(g, dtype=np.float64)
+        self._A = self._forgetting * self._A + weight * np.outer(g, g)
+        self._B = self._forgetting * self._B + weight * np.outer(g, np.asarray(y))
+
+    @property
+    def coefficients(self) -> Array:
+        """Theta, shape (p, m)."""
+        return np.asarray(np.linalg.solve(self._A, self._B), dtype=np.float64)
+
+
+class RecursiveMean:
+    r"""The mean rotation, :math:`M \leftarrow \mu M + w b b^T`; its first eigenvector on demand."""
+
+    def __init__(self, forgetting: float = 1.0) -> None:
+        self._M: Array = np.zeros((4, 4))
+        self._forgetting = forgetting
+
+    def feed(self, q: ArrayLike, weight: float = 1.0) -> None:
+        """Take one unit quaternion; its sign does not matter."""
+        q = np.asarray(q, dtype=np.float64)
+        self._M = self._forgetting * self._M + weight * np.outer(q, q)
+
+    @property
+    def q(self) -> Array:
+        """The mean so far, shape (4,), w >= 0."""
+        return first_eigenvector(self._M)

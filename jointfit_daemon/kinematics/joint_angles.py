@@ -1,0 +1,243 @@
+r"""Angles of a joint from the rotation between its two segments.
+
+.. math:: q_j = q_{proximal}^* \otimes q_{distal}
+
+with matrix R, entries counted from 0. Law: segment axes and signs are those of CONVENTIONS.md (x to
+the right, y anterior, z proximal); rad; q and -q give the same. Where the middle angle of a
+sequence reaches 90 degrees the outer two turn about one line: the last is then called 0, the first
+takes all, and the frame is flagged as gimbal-locked.
+"""
+
+from __future__ import annotations
+
+from math import asin, atan2, hypot, pi
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import between_one
+from jointfit_daemon.model import JointAngles
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.model import Quaternion
+
+    Array = NDArray[np.float64]
+
+GIMBAL_SINE = 0.9999
+"""Sine of the middle angle beyond which the outer two are not told apart."""
+
+_DOWN = np.array([0.0, 0.0, -1.0])
+
+
+class AngleSequence(NamedTuple):
+    """Three angles of a rotation sequence."""
+
+    angles: Array
+    """rad, shape (..., 3)."""
+    gimbal: NDArray[np.bool_]
+    """Where the first and last angle cannot be told apart, shape (...)."""
+
+
+def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
+    """Return q_proximal_distal, shape (..., 4), from two segments in one world."""
+    return rotation.multiply(rotation.conjugate(q_proximal), q_distal)
+
+
+def patent_angles(q_joint: ArrayLike) -> AngleSequence:
+    r"""Return the patent's angles (alpha, beta, gamma), R = Rz(gamma) Ry(beta) Rx(alpha).
+
+    .. math:: \alpha = \mathrm{atan2}(2(q_0 q_1 + q_2 q_3), 1 - 2(q_1^2 + q_2^2)),\;
+              \beta = \arcsin 2(q_0 q_2 - q_3 q_1),\;
+              \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
+
+    The patent's joint angle is pi - abs(alpha), which is right only for pure flexion about x:
+    ``inner_angle`` is the one to publish.
+    """
+    w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
+    alpha = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    gamma = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return _sequence(alpha, 2 * (w * y - z * x), gamma, locked=2 * np.arctan2(x, w))
+
+
+def grood_suntay(q_joint: ArrayLike) -> AngleSequence:
+    r"""Return (phi, theta, psi) of R = Rx(phi) Ry(theta) Rz(psi).
+
+    .. math:: \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
+              \psi = \mathrm{atan2}(-R_{01}, R_{00})
+
+    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in our axes; unsigned by side.
+    """
+    w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
+    phi = np.arctan2(2 * (w * x - y * z), 1 - 2 * (x * x + y * y))
+    psi = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z))
+    return _sequence(phi, 2 * (x * z + w * y), psi, locked=2 * np.arctan2(x, w))
+
+
+def _sequence(first: Array, sine: Array, last: Array, *, locked: Array) -> AngleSequence:
+    gimbal = np.abs(sine) > GIMBAL_SINE
+    first = np.where(gimbal, _wrapped(locked), first)
+    last = np.where(gimbal, 0.0, last)
+    middle = np.arcsin(np.clip(sine, -1.0, 1.0))  # rounding gives 1 + 1e-16, and that NaN
+    return AngleSequence(np.stack((first, middle, last), axis=-1), gimbal)
+
+
+def anatomical(angles: ArrayLike, *, flexion_sign: float, left: bool) -> Array:
+    """Return (flexion, adduction, internal rotation), rad, from ``grood_suntay`` angles.
+
+    Parameters
+    ----------
+    angles : array_like, shape (..., 3)
+        phi, theta, psi.
+    flexion_sign : float
+        +1 for hip and ankle, -1 for the knee, whose heel goes back.
+    left : bool
+        A left limb: adduction and rotation change sign, so that both sides read alike.
+    """
+    side = -1.0 if left else 1.0
+    return np.multiply(np.asarray(angles, dtype=np.float64), [flexion_sign, side, side])
+
+
+def included_angle(q_joint: ArrayLike) -> Array:
+    """Return the angle between the two bone axes, rad in [0, pi], shape (...); 0 when straight.
+
+    It is free of any choice of flexion axis. The inner angle of the joint is pi minus this.
+    """
+    turned = rotation.rotate(q_joint, _DOWN)
+    sine = np.hypot(turned[..., 0], turned[..., 1])
+    angle: Array = np.arctan2(sine, -turned[..., 2])
+    return angle
+
+
+def inner_angle(q_joint: ArrayLike) -> Array:
+    """Return the angle between the two segments, rad, shape (...): pi when straight."""
+    angle: Array = np.pi - included_angle(q_joint)
+    return angle
+
+
+def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
+    r"""Split a rotation: first a twist about `axis` of the distal frame, then a swing normal to it.
+
+    .. math:: \mathrm{twist} = 2\,\mathrm{atan2}(q_v \cdot a, q_0), \qquad
+              \mathrm{swing} = q_j \otimes \mathrm{twist}^*
+
+    Parameters
+    ----------
+    q_joint : array_like, shape (..., 4)
+    axis : array_like, shape (3,)
+        Unit vector.
+
+    Returns
+    -------
+    swing : ndarray, shape (..., 4)
+    twist : ndarray, shape (...)
+        rad in (-pi, pi].
+    """
+    q = np.asarray(q_joint, dtype=np.float64)
+    a = np.asarray(axis, dtype=np.float64)
+    twist = _wrapped(2.0 * np.arctan2(q[..., 1:] @ a, q[..., 0]))
+    return rotation.multiply(q, rotation.exp(-twist[..., None] * a)), twist
+
+
+def functional_axis(q_joint: ArrayLike) -> Array:
+    """Return the axis a joint mostly turned about: unit, shape (3,), pointing to the right.
+
+    First right singular vector of the joint's rotation vectors, shape (n, 4) in.
+    """
+    axis: Array = np.linalg.svd(rotation.log(q_joint), full_matrices=False)[2][0]
+    return -axis if axis[0] < 0.0 else axis
+
+
+def rates_matrix(angles: ArrayLike) -> Array:
+    r"""Return E with delta = E (d phi, d theta, d psi), delta the turn in distal axes.
+
+    .. math:: E = [\, R^T e_x,\; R_z(\psi)^T e_y,\; e_z \,]
+
+    Parameters
+    ----------
+    angles : array_like, shape (..., 3)
+        ``grood_suntay`` angles. Singular at abs(theta) = 90 degrees.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    _, theta, psi = np.moveaxis(np.asarray(angles, dtype=np.float64), -1, 0)
+    zero, one = np.zeros_like(psi), np.ones_like(psi)
+    rows = (
+        (np.cos(theta) * np.cos(psi), np.sin(psi), zero),
+        (-np.cos(theta) * np.sin(psi), np.cos(psi), zero),
+        (np.sin(theta), zero, one),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def joint_covariance(q_joint: ArrayLike, proximal: ArrayLike, distal: ArrayLike) -> Array:
+    r"""Return the covariance of the joint rotation in distal axes, rad^2, shape (..., 3, 3).
+
+    .. math:: \Sigma_j = \Sigma_{distal} + R^T \Sigma_{proximal} R
+
+    The segments' errors, each in its own axes, are taken as independent.
+    """
+    R = rotation.to_matrix(q_joint)
+    turned: Array = np.swapaxes(R, -1, -2) @ np.asarray(proximal) @ R
+    return np.asarray(distal, dtype=np.float64) + turned
+
+
+def angle_covariance(angles: ArrayLike, covariance: ArrayLike) -> Array:
+    r"""Return the covariance of ``grood_suntay`` angles, rad^2, shape (..., 3, 3).
+
+    .. math:: \Sigma_{angles} = E^{-1} \Sigma_j E^{-T}
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        abs(theta) is exactly 90 degrees.
+    """
+    inverse: Array = np.asarray(np.linalg.inv(rates_matrix(angles)), dtype=np.float64)
+    found: Array = inverse @ np.asarray(covariance, dtype=np.float64) @ np.swapaxes(inverse, -1, -2)
+    return found
+
+
+class JointReading(NamedTuple):
+    """The angles of one joint in one frame."""
+
+    angles: JointAngles
+    inner: float
+    """Angle between the segments, rad: pi when straight."""
+    gimbal: bool
+
+
+def read_joint(
+    q_proximal: Quaternion, q_distal: Quaternion, *, flexion_sign: float, left: bool
+) -> JointReading:
+    """Return anatomical and inner angle of one frame of plain tuples.
+
+    The same as ``anatomical(grood_suntay(...))`` and ``inner_angle``.
+    """
+    w, x, y, z = between_one(q_proximal, q_distal)
+    r02 = 2.0 * (x * z + w * y)
+    minus_r12 = 2.0 * (w * x - y * z)
+    r22 = 1.0 - 2.0 * (x * x + y * y)
+    gimbal = abs(r02) > GIMBAL_SINE
+    if gimbal:
+        phi, psi = _wrapped_one(2.0 * atan2(x, w)), 0.0
+    else:
+        phi = atan2(minus_r12, r22)
+        psi = atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
+    theta = asin(min(max(r02, -1.0), 1.0))
+    side = -1.0 if left else 1.0
+    angles = JointAngles(flexion_sign * phi, side * theta, side * psi)
+    return JointReading(angles, pi - atan2(hypot(r02, minus_r12), r22), gimbal)
+
+
+def _wrapped(angle: Array) -> Array:
+    """Return the angle in (-pi, pi]."""
+    wrapped: Array = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return wrapped
+
+
+def _wrapped_one(angle: float) -> float:
+    return pi - (pi - angle) % (2.0 * pi)
