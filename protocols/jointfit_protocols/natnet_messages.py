@@ -169,6 +169,14 @@ def _decode_plain(datagram: bytes, number: int) -> Message | Corrupt:
     return found
 
 
+def is_versioned(datagram: bytes) -> bool:
+    """Tell whether `datagram` is, by its header, a message whose layout needs the bitstream."""
+    if len(datagram) < HEADER.size:
+        return False
+    number, size = HEADER.unpack_from(datagram)
+    return number in _VERSIONED and size == len(datagram) - HEADER.size
+
+
 def encode(message: Message, version: Version = (3, 0)) -> bytes:
     """Return `message` as one datagram; frames and models are written in bitstream `version`.
 

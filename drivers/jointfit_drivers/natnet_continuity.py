@@ -1,0 +1,70 @@
+"""Frame numbers and stamps of one server: what was lost, repeated, late, begun anew. Law: pure."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+_REORDERED = 100
+"""Going back by less than this is a datagram that was overtaken; by more, a restart or a loop."""
+_LATE_RUN = 10
+"""So many late frames in a row are no reordering but a short loop of a recording."""
+
+
+class Step(NamedTuple):
+    """What one frame means for the stream."""
+
+    use: bool = True
+    lost: int = 0
+    restarted: bool = False
+
+
+_NEXT, _DROP, _RESTART = Step(), Step(use=False), Step(restarted=True)
+
+
+class Continuity:
+    """Judges each frame by its number and its stamp."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._ticks = 0
+        self._late_run = 0
+        self.duplicates = 0
+        """Frames dropped because their number was the last one's."""
+        self.late = 0
+        """Frames dropped because a later one had come."""
+
+    def forget(self) -> None:
+        """Begin anew with the next frame."""
+        self._number = None
+
+    def frame(self, number: int, ticks: int) -> Step:
+        """Return what a frame with this number and server stamp means.
+
+        Parameters
+        ----------
+        number : int
+            Frame number as sent.
+        ticks : int
+            A stamp of the server that grows with every frame.
+        """
+        step = self._judge(number, ticks)
+        if step.use:
+            self._number, self._ticks, self._late_run = number, ticks, 0
+        return step
+
+    def _judge(self, number: int, ticks: int) -> Step:
+        if self._number is None:
+            return _NEXT
+        ahead = number - self._number
+        if ahead > 0:
+            if ticks < self._ticks:
+                return _RESTART
+            return _NEXT if ahead == 1 else Step(lost=ahead - 1)
+        if ahead == 0:
+            self.duplicates += 1
+            return _DROP
+        self._late_run += 1
+        if ahead <= -_REORDERED or self._late_run >= _LATE_RUN:
+            return _RESTART
+        self.late += 1
+        return _DROP

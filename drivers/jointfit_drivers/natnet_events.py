@@ -1,0 +1,327 @@
+"""The pure half of the NatNet driver: datagrams in, optical frames and clock echoes out.
+
+Law: a function of the chunks fed; no clock, no socket. Datagrams of both directions may come, for
+a capture holds both; what a client says has no effect, except that the arrival of an echo request
+is the sending time of its answer. Frames wait for nothing: one that comes before its model is
+counted in `unpublished` and dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, cast
+
+from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_drivers.natnet_continuity import Continuity
+from jointfit_drivers.natnet_names import bind
+from jointfit_drivers.natnet_poses import Poses
+from jointfit_protocols.corrupt import Corrupt as WireCorrupt
+from jointfit_protocols.natnet_frame import (
+    FRAME_BITSTREAM_CHANGED,
+    FRAME_EDIT_MODE,
+    FRAME_MODEL_CHANGED,
+    FrameOfData,
+    supported,
+)
+from jointfit_protocols.natnet_messages import (
+    EchoRequest,
+    EchoResponse,
+    MessageId,
+    Response,
+    ServerInfo,
+    decode,
+    is_versioned,
+)
+from jointfit_protocols.natnet_model import ModelDefinition
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_drivers.natnet_names import Binding
+    from jointfit_drivers.natnet_settings import NatNetSettings
+    from jointfit_protocols.natnet_messages import Message
+
+_ECHO_LIMIT_NS = 10**9
+"""An answer older than this says nothing about the clock."""
+_PENDING_ECHOES = 8
+_NAMED_UNKNOWN = 16
+"""So many unknown ids are named in warnings; the rest is only counted."""
+_UNTOLD = (0, 0)
+_FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
+_ANNOUNCED = {
+    FRAME_MODEL_CHANGED: "the model list changed",
+    FRAME_BITSTREAM_CHANGED: "the bitstream version changed",
+}
+
+
+class NatNetEvents:
+    """Decoder of one NatNet server.
+
+    Parameters
+    ----------
+    settings : NatNetSettings
+        The names that rig.toml uses, the up axis, the latency of cameras without exposure stamp.
+    """
+
+    def __init__(self, settings: NatNetSettings) -> None:
+        self._wanted_version = settings.wanted_version
+        self._latency_ms = settings.latency_ms
+        self._wanted_markers = {
+            name: f"markers.{part}" for part, names in settings.markers.items() for name in names
+        }
+        bodies = {name: f"rigid_body.{part}" for part, name in settings.rigid_body.items()}
+        self._wanted_bodies = bodies | ({settings.plate: "plate"} if settings.plate else {})
+        self._poses = Poses(settings.up_axis)
+        self._continuity = Continuity()
+        self._info: ServerInfo | None = None
+        self._version = _UNTOLD
+        self._binding: Binding | None = None
+        self._asked: dict[int, int] = {}
+        self._announced = 0
+        self._live = self._stamped = True
+        self._named_unknown: set[int] = set()
+        self._messages = self._discarded = 0
+        self.unpublished = 0
+        """Frames that came before the model or the server's version was known."""
+        self.unknown_ids = 0
+        """Markers and bodies dropped because the model does not have their id."""
+        self.suspicious = 0
+        """Poses refused because their numbers are no pose."""
+        self._handlers: dict[type, Callable[[Chunk, Message], list[Decoded]]] = {
+            ServerInfo: self._server,
+            ModelDefinition: self._model,
+            EchoRequest: self._echo_request,
+            EchoResponse: self._echo,
+            Response: self._response,
+        }
+
+    @property
+    def tick_clock(self) -> TickClock | None:
+        """The server's high-resolution counter, once the server has said its frequency."""
+        hz = self._info.clock_hz if self._info is not None else None
+        return TickClock(0, None, hz) if hz else None
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages of any kind so far."""
+        return self._messages
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes of datagrams that were no message."""
+        return self._discarded
+
+    @property
+    def duplicates(self) -> int:
+        """Frames dropped because their number had been the last one's."""
+        return self._continuity.duplicates
+
+    @property
+    def late(self) -> int:
+        """Frames dropped because a later one had come."""
+        return self._continuity.late
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return what one datagram says; never raises."""
+        message = decode(chunk.data, self._version)
+        if type(message) is FrameOfData:
+            self._messages += 1
+            return self._frame(chunk, message)
+        if isinstance(message, WireCorrupt):
+            return self._unreadable(chunk, message)
+        self._messages += 1
+        handler = self._handlers.get(type(message))
+        return handler(chunk, message) if handler is not None else []
+
+    def flush(self) -> list[Decoded]:
+        """Return nothing: datagrams are whole."""
+        return []
+
+    def _unreadable(self, chunk: Chunk, corrupt: WireCorrupt) -> list[Decoded]:
+        """Count a datagram as lost, unless another bitstream than the one known explains it."""
+        if self._version == _UNTOLD and is_versioned(chunk.data):
+            self._messages += 1
+            self.unpublished += chunk.data.startswith(_FRAME)
+            return []
+        if is_versioned(chunk.data):
+            wanted = self._wanted_version
+            if wanted is not None and wanted != self._version:
+                frame = decode(chunk.data, wanted)
+                if isinstance(frame, FrameOfData):
+                    self._messages += 1
+                    return [*self._adopt(wanted), *self._frame(chunk, frame)]
+        self._discarded += corrupt.discarded
+        return [Corrupt(corrupt.discarded, corrupt.reason)]
+
+    # --- who and what -------------------------------------------------------------------------
+
+    def _server(self, _: Chunk, message: Message) -> list[Decoded]:
+        info, before = cast("ServerInfo", message), self._info
+        if info == before:
+            return []
+        self._info = info
+        out: list[Decoded] = [_introduced(info)]
+        if before is not None and info._replace(natnet_version=before.natnet_version) != before:
+            self._binding = None
+            self._continuity.forget()
+            out.append(DeviceEvent("restart", f"another server answers: {info.application}"))
+        return out + self._adopt(info.bitstream)
+
+    def _adopt(self, version: tuple[int, int]) -> list[Decoded]:
+        """Read frames and models as `version` from here on."""
+        before, self._version = self._version, version
+        name = f"{version[0]}.{version[1]}"
+        if not supported(version):
+            text = f"the server speaks NatNet {name}, 3.0 or newer is needed"
+            return [DeviceEvent("error", text, {"bitstream": name})]
+        if before in (_UNTOLD, version):
+            return []
+        return [DeviceEvent("setting", f"bitstream is {name} now", {"bitstream": name})]
+
+    def _response(self, _: Chunk, message: Message) -> list[Decoded]:
+        """Take the answer to ``Bitstream,x.y``; nothing else that is answered concerns us."""
+        command, *versions = cast("Response", message).text.split(",")
+        version = versions[0] if versions else ""
+        major, _dot, minor = version.partition(".")
+        known = command == "Bitstream" and major.isdecimal() and minor.isdecimal()
+        if not known or len(version) > len("99.99"):
+            return []
+        return self._adopt((int(major), int(minor)))
+
+    def _model(self, _: Chunk, message: Message) -> list[Decoded]:
+        model = cast("ModelDefinition", message)
+        binding = bind(model, self._wanted_markers, self._wanted_bodies)
+        before, self._binding = self._binding, binding
+        if before is not None and before.layout == binding.layout:
+            self._binding = binding = _sharing(binding, before)
+        if before is not None and before.complaints == binding.complaints:
+            complaints: tuple[str, ...] = ()
+        else:
+            complaints = binding.complaints
+        out: list[Decoded] = []
+        if before is None or before.layout is not binding.layout:
+            out.append(_described(binding, self.unpublished))
+        if not model.complete:
+            out.append(DeviceEvent("warning", "a description of unknown type ends the model list"))
+        unknown = {"unknown": list(binding.unknown), "known": list(binding.layout.markers)}
+        self._named_unknown.clear()
+        return out + [DeviceEvent("warning", text, unknown) for text in complaints]
+
+    # --- time ---------------------------------------------------------------------------------
+
+    def _echo_request(self, chunk: Chunk, message: Message) -> list[Decoded]:
+        """Remember when a recorded client asked; ours are not among the chunks."""
+        if len(self._asked) >= _PENDING_ECHOES:
+            del self._asked[next(iter(self._asked))]
+        self._asked[cast("EchoRequest", message).stamp] = chunk.t_ns
+        return []
+
+    def _echo(self, chunk: Chunk, message: Message) -> list[Decoded]:
+        stamp, ticks = cast("EchoResponse", message)
+        sent_ns = self._asked.pop(stamp, stamp)
+        if not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
+            return []
+        return [ClockEcho(sent_ns, chunk.t_ns, ticks)]
+
+    # --- frames -------------------------------------------------------------------------------
+
+    def _frame(self, chunk: Chunk, frame: FrameOfData) -> list[Decoded]:
+        step = self._continuity.frame(frame.number, frame.transmit)
+        if not step.use:
+            return []
+        out: list[Decoded] = []
+        if step.restarted:
+            out.append(DeviceEvent("restart", f"frame numbers began anew at {frame.number}"))
+        elif step.lost:
+            out.append(DeviceEvent("gap", f"{step.lost} frames lost", {"lost": step.lost}))
+        if frame.params != self._announced:
+            out += self._announce(frame.params)
+        binding = self._binding
+        if binding is None:
+            self.unpublished += 1
+            return out
+        found = self._poses.columns(frame, binding)
+        if found.suspicious or found.unknown:
+            out += self._doubts(found.suspicious, found.unknown)
+        out.append(
+            MocapFrame(
+                chunk.t_ns,
+                frame.number,
+                frame.exposure or self._exposure(frame, out),
+                binding.layout,
+                found.markers,
+                found.body_positions,
+                found.body_orientations,
+                self._live,
+            )
+        )
+        return out
+
+    def _exposure(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
+        """Return the exposure as configured, where the cameras do not stamp it."""
+        hz = self._info.clock_hz if self._info is not None else None
+        if not hz or not frame.transmit:
+            return None
+        if self._stamped:
+            self._stamped = False
+            text = f"no exposure stamps (USB cameras?): {self._latency_ms:g} ms before transmission"
+            out.append(DeviceEvent("warning", text, {"latency_ms": self._latency_ms}))
+        return frame.transmit - round(self._latency_ms * hz / 1000)
+
+    def _announce(self, params: int) -> list[Decoded]:
+        """Say what the frame's flags newly announce."""
+        risen, self._announced = params & ~self._announced, params
+        told: list[Decoded] = [
+            DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit
+        ]
+        live = not params & FRAME_EDIT_MODE
+        if live != self._live:
+            self._live = live
+            text = "live again" if live else "edit mode: what it plays is a recording"
+            told.append(DeviceEvent("setting", text, {"live": live}))
+        return told
+
+    def _doubts(self, suspicious: int, unknown: tuple[int, ...]) -> list[Decoded]:
+        self.suspicious += suspicious
+        self.unknown_ids += len(unknown)
+        new = [i for i in unknown if i not in self._named_unknown]
+        if not new or len(self._named_unknown) >= _NAMED_UNKNOWN:
+            return []
+        self._named_unknown.update(new)
+        names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
+        text = f"ids the model list does not have are dropped: {names}"
+        return [DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]})]
+
+
+def _sharing(binding: Binding, before: Binding) -> Binding:
+    """Return `binding` with the layout object of `before`, which equals its own."""
+    return replace(binding, layout=before.layout)
+
+
+def _introduced(info: ServerInfo) -> DeviceEvent:
+    firmware = ".".join(map(str, info.application_version))
+    natnet = ".".join(map(str, info.natnet_version))
+    transport = "multicast" if info.multicast else "unicast"
+    text = f"{info.application} {firmware}, NatNet {natnet}, {transport}"
+    data = {
+        "model": info.application,
+        "firmware": firmware,
+        "natnet": natnet,
+        "transport": transport,
+        "clock_hz": info.clock_hz,
+        "data_port": info.data_port,
+        "group": info.group,
+    }
+    return DeviceEvent("info", text, data)
+
+
+def _described(binding: Binding, unpublished: int) -> DeviceEvent:
+    layout = binding.layout
+    text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
+    data = {
+        "markers": list(layout.markers),
+        "bodies": list(layout.bodies),
+        "unpublished": unpublished,
+    }
+    return DeviceEvent("info", text, data)

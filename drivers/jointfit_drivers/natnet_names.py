@@ -1,0 +1,229 @@
+"""Which id in the frames is which name in rig.toml. Law: pure; names rule, ids and orders do not.
+
+A labeled marker has id ``model << 16 | member``. The model is a rigid body, a skeleton or an asset;
+the name of its member is, in this order: the marker name in the description (bitstream 4.0 on), the
+name at that place in the marker set of the model's name, or ``Marker1``, ``Marker2`` and so on.
+Markers of a set that belongs to no model are found by set and place; the set ``all`` repeats
+others.
+
+A marker may be written plainly (``T1``) where only one model has that name, and always with its
+model: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or as the server's list of all markers does,
+``Thigh_1``. The same holds for bones and bodies of assets. A column is called as rig.toml spells
+it, else plainly where that is unique, else ``Thigh/T1``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import MocapLayout
+from jointfit_protocols.natnet_model import (
+    AssetDescription,
+    BodyDescription,
+    MarkerSetDescription,
+    SkeletonDescription,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from jointfit_protocols.natnet_model import ModelDefinition
+
+Key = int | tuple[str, int]
+"""Id of a labeled marker or body, or set name and place in the set."""
+
+_EVERY = "all"
+_MEMBER_BITS = 16
+_MEMBER = (1 << _MEMBER_BITS) - 1
+
+
+class Entry(NamedTuple):
+    """One marker or body that the server knows."""
+
+    key: Key
+    owner: str
+    """Model or set it belongs to; empty for a rigid body."""
+    name: str
+    member: int
+    """Number in its owner, from 1."""
+
+    @property
+    def aliases(self) -> tuple[str, ...]:
+        """Other spellings than the plain name."""
+        if not self.owner:
+            return ()
+        joined = tuple(f"{self.owner}{mark}{self.name}" for mark in "/:_")
+        return (*joined, f"{self.owner}_{self.member}")
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """Columns of the frames to come, until the model changes again."""
+
+    layout: MocapLayout
+    markers: tuple[Key, ...]
+    """Key of each marker column."""
+    bodies: tuple[Key, ...]
+    """Key of each body column."""
+    known: frozenset[Key]
+    """Every id the model explains, refused ones included."""
+    loose_sets: frozenset[str]
+    """Marker sets whose positions must be taken from the sets themselves."""
+    complaints: tuple[str, ...]
+    """What a person must know: names of rig.toml that are unknown, ids given twice."""
+    unknown: tuple[str, ...]
+    """Names of rig.toml without a column."""
+
+
+def bind(model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str, str]) -> Binding:
+    """Return the columns for a model.
+
+    Parameters
+    ----------
+    model : ModelDefinition
+        The server's latest description.
+    markers, bodies : mapping of str to str
+        Names that rig.toml uses, and the key that does.
+    """
+    bodies_found, twice_bodies = _refuse_shared(_body_entries(model))
+    markers_found, twice = _refuse_shared(_marker_entries(model))
+    marker_columns = _columns("marker", markers_found, markers)
+    body_columns = _columns("rigid body", bodies_found, bodies)
+    loose = frozenset(entry.key[0] for entry in markers_found if isinstance(entry.key, tuple))
+    known = frozenset(e.key for e in (*bodies_found, *markers_found, *twice_bodies, *twice))
+    shared = [f"{e.owner}/{e.name}" if e.owner else e.name for e in twice_bodies]
+    if shared:
+        text = f"streaming id shared by {' and '.join(shared)}: all refused; give each its own"
+        marker_columns.complaints.append(text)
+    return Binding(
+        MocapLayout(tuple(marker_columns.names), tuple(body_columns.names)),
+        tuple(marker_columns.keys),
+        tuple(body_columns.keys),
+        known,
+        loose,
+        (*marker_columns.complaints, *body_columns.complaints),
+        (*marker_columns.unknown, *body_columns.unknown),
+    )
+
+
+def body_key(owner: int, member: int) -> int:
+    """Return the id of a bone or of an asset's body or marker as frames carry it."""
+    return owner << _MEMBER_BITS | (member & _MEMBER)
+
+
+# --- what the model holds ---------------------------------------------------------------------
+
+
+def _body_entries(model: ModelDefinition) -> list[Entry]:
+    found: list[Entry] = []
+    for item in model.descriptions:
+        if isinstance(item, BodyDescription):
+            found.append(Entry(item.id, "", item.name, 1))
+        elif isinstance(item, SkeletonDescription | AssetDescription):
+            inner = item.bones if isinstance(item, SkeletonDescription) else item.bodies
+            found += [
+                Entry(body_key(item.id, body.id), item.name, body.name, number)
+                for number, body in enumerate(inner, 1)
+            ]
+    return found
+
+
+def _marker_entries(model: ModelDefinition) -> list[Entry]:
+    sets = {m.name: m.markers for m in model.descriptions if isinstance(m, MarkerSetDescription)}
+    found: list[Entry] = []
+    owners = {_EVERY}
+    for item in model.descriptions:
+        if isinstance(item, BodyDescription):
+            owners.add(item.name)
+            names = _member_names(item, sets.get(item.name, ()))
+            found += _members(item.id, item.name, names)
+        elif isinstance(item, SkeletonDescription):
+            owners.add(item.name)
+            found += _members(item.id, item.name, sets.get(item.name, ()))
+        elif isinstance(item, AssetDescription):
+            owners.add(item.name)
+            found += [
+                Entry(body_key(item.id, m.id), item.name, m.name, number)
+                for number, m in enumerate(item.markers, 1)
+            ]
+    for name in sets.keys() - owners:
+        found += [Entry((name, i), name, text, i + 1) for i, text in enumerate(sets[name])]
+    return found
+
+
+def _member_names(body: BodyDescription, of_set: tuple[str, ...]) -> list[str]:
+    count = max(len(body.positions), len(of_set))
+    named = (body.markers, of_set)
+    return [
+        next((names[i] for names in named if i < len(names) and names[i]), f"Marker{i + 1}")
+        for i in range(count)
+    ]
+
+
+def _members(model: int, owner: str, names: Iterable[str]) -> list[Entry]:
+    return [Entry(body_key(model, i), owner, name, i) for i, name in enumerate(names, 1)]
+
+
+def _refuse_shared(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
+    """Split entries into those with an id of their own, and those that share one."""
+    count = Counter(entry.key for entry in entries)
+    own = [entry for entry in entries if count[entry.key] == 1]
+    return own, [entry for entry in entries if count[entry.key] > 1]
+
+
+# --- what rig.toml calls them -----------------------------------------------------------------
+
+
+class _Columns(NamedTuple):
+    names: list[str]
+    keys: list[Key]
+    complaints: list[str]
+    unknown: list[str]
+
+
+def _columns(what: str, entries: Sequence[Entry], wanted: Mapping[str, str]) -> _Columns:
+    found = _Columns([], [], [], [])
+    plain: defaultdict[str, list[Entry]] = defaultdict(list)
+    alias: defaultdict[str, list[Entry]] = defaultdict(list)
+    for entry in entries:
+        plain[entry.name].append(entry)
+        for spelling in entry.aliases:
+            alias[spelling].append(entry)
+    named: set[Key] = set()
+    problems: list[str] = []
+    for name, key in wanted.items():
+        fitting = plain.get(name) or alias.get(name) or []
+        if len(fitting) == 1:
+            found.names.append(name)
+            found.keys.append(fitting[0].key)
+            named.add(fitting[0].key)
+        else:
+            found.unknown.append(name)
+            problems.append(f"{what} {name!r} (mocap.{key}) " + _problem(name, fitting, plain))
+    for entry in entries:
+        if entry.key not in named:
+            found.names.append(_unused_name(entry, plain, found.names))
+            found.keys.append(entry.key)
+    if problems:
+        server = ", ".join(sorted(plain)) or "none"
+        found.complaints.append(f"{'; '.join(problems)}. The server has: {server}")
+    return found
+
+
+def _problem(name: str, fitting: list[Entry], plain: Mapping[str, list[Entry]]) -> str:
+    if fitting:
+        choices = " or ".join(repr(e.aliases[0]) if e.owner else repr(e.name) for e in fitting)
+        return f"is ambiguous: write {choices}"
+    near = get_close_matches(name, plain, n=1, cutoff=0.4)
+    return f"is not in the stream; did you mean {near[0]!r}?" if near else "is not in the stream"
+
+
+def _unused_name(entry: Entry, plain: Mapping[str, list[Entry]], used: list[str]) -> str:
+    """Return the plain name where it is unique, else one with the owner in it."""
+    full = f"{entry.owner}/{entry.name}" if entry.owner else entry.name
+    choices = [entry.name] if len(plain[entry.name]) == 1 else []
+    choices += [full, f"{full}#{entry.member}", f"{full}#{entry.key}"]
+    return next(name for name in choices if name not in used)

@@ -1,0 +1,45 @@
+"""What rig.toml says about a NatNet server. Law: a pydantic model and nothing else."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from jointfit_daemon.driver import MocapSettings
+
+
+class NatNetSettings(MocapSettings):
+    """The ``[mocap]`` table for OptiTrack Motive, or whatever else speaks NatNet 3 or 4."""
+
+    server: str = Field(description="address or name of the PC that runs Motive")
+    interface: str | None = Field(
+        None,
+        description="IPv4 address or name of our network card towards the cameras;"
+        " default: the one that leads to the server",
+    )
+    transport: Literal["auto", "unicast", "multicast"] = Field(
+        "auto", description="how frames come; `auto` does as the server announces"
+    )
+    command_port: int = Field(1510, ge=1, le=65535, description="command port of the server")
+    data_port: int | None = Field(
+        None, ge=1, le=65535, description="port of multicast frames; default: as announced"
+    )
+    bitstream: Literal["3.0", "3.1", "4.0", "4.1", "4.2"] | None = Field(
+        None, description="bitstream to ask a unicast 4.x server for; default: the server's own"
+    )
+    latency_ms: float = Field(
+        10.0,
+        ge=0,
+        le=1000,
+        description="from exposure to transmission, for cameras without exposure stamp (USB), ms",
+    )
+    silence_s: float = Field(5.0, gt=0, description="no frame for this long is a lost server, s")
+
+    @property
+    def wanted_version(self) -> tuple[int, int] | None:
+        """`bitstream` as numbers."""
+        if self.bitstream is None:
+            return None
+        major, minor = self.bitstream.split(".")
+        return int(major), int(minor)
