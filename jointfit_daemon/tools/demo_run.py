@@ -1,0 +1,235 @@
+"""The course of the demo: virtual hardware, the real daemon, a calibration, then joint angles.
+
+Law: sees the daemon only as any client does, over MQTT, and the truth only in the simulator's log.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.config import load_rig
+from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.tools.calibration_guide import CalibrationWatch, RequestRefused
+from jointfit_daemon.tools.demo_score import MeanSquare, Score, percentile
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.tools.demo_display import Display
+    from jointfit_daemon.tools.demo_processes import Child, Simulator
+    from jointfit_daemon.tools.demo_truth import TruthReader
+
+TOPICS = ("pose", "calibration", "calibration/progress", "bridge/health", "device/+/availability")
+CONNECT_S = 30.0
+SETTLE_S = 3.0
+PHASES = (("align", "plate", 20.0), ("static", "stand", 5.0), ("functional", "functional", 40.0))
+"""Phase, what the wearer does meanwhile, and for how long."""
+MOTIONS = ("walk", "squat", "sit_to_stand")
+MOTION_S = 8.0
+MATURE_NS = 300_000_000
+"""A pose is judged when its truth has been written for sure."""
+VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
+
+
+@dataclass(slots=True)
+class Demo:
+    """One run of the demo."""
+
+    folder: Path
+    rig: Rig
+    simulator: Simulator
+    daemon: Child
+    truth: TruthReader
+    display: Display
+    scale: float = 1.0
+    """Phases last this much longer."""
+    score: Score = field(default_factory=Score)
+    latencies_ms: list[float] = field(default_factory=list)
+    online: set[str] = field(default_factory=set)
+    _health: dict[str, Any] = field(default_factory=dict)
+    _healths: int = 0
+    _poses: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
+    _judging: bool = False
+    _static_ns: int = 0
+    _watch: CalibrationWatch | None = None
+
+    async def run(self, seconds: float) -> dict[str, Any]:
+        """Walk through it all; return the figures."""
+        async with MqttClient(self.rig.mqtt) as client:
+            await client.subscribe(*TOPICS)
+            listening = asyncio.create_task(self._listen(client), name="demo listener")
+            try:
+                await self._connect()
+                await self._calibrate(client)
+                await self._live(seconds)
+                sent = await self._finish()
+            finally:
+                listening.cancel()
+                await asyncio.wait([listening])
+        return self._figures(sent)
+
+    # --- what the daemon says ----------------------------------------------------------------
+
+    async def _listen(self, client: MqttClient) -> None:
+        async for topic, payload in client.messages():
+            now_us = time.time_ns() // 1000
+            if not isinstance(payload, dict):
+                continue
+            if topic == "pose":
+                self._pose(payload, now_us)
+            elif topic == "bridge/health":
+                self._health, self._healths = payload, self._healths + 1
+            elif topic == "calibration" and self._watch is not None:
+                self._watch.on_status(payload)
+            elif topic == "calibration/progress" and self._watch is not None:
+                self._watch.on_progress(payload)
+            elif topic.endswith("/availability"):
+                device = topic.split("/")[1]
+                online = payload.get("state") == "online"
+                (self.online.add if online else self.online.discard)(device)
+
+    def _pose(self, pose: dict[str, Any], now_us: int) -> None:
+        if not self._judging:
+            return
+        self.latencies_ms.append((now_us - pose["completed_us"]) / 1e3)
+        t_ns = pose["t_us"] * 1000 - _unix_minus_monotonic_ns()
+        self._poses.append((t_ns, pose))
+
+    def _judge(self) -> None:
+        """Compare the poses whose truth is known by now."""
+        self.truth.read()
+        mature = time.monotonic_ns() - MATURE_NS
+        while self._poses and self._poses[0][0] < mature:
+            t_ns, pose = self._poses.pop(0)
+            if (truth := self.truth.track.at(t_ns)) is not None:
+                self.score.add(pose, truth, self.rig.chain.joints[1])
+                self._shown = (pose, truth)
+                self.display.live(pose, truth, self._short())
+
+    # --- the course --------------------------------------------------------------------------
+
+    async def _connect(self) -> None:
+        wanted = {source.id for source in self.rig.sources}
+        async with asyncio.timeout(CONNECT_S):
+            while not wanted <= self.online:
+                self.daemon.check()
+                self.simulator.check()
+                share = len(self.online & wanted) / len(wanted)
+                self.display.step("connect", share, f"{len(self.online)} of {len(wanted)} sources")
+                await asyncio.sleep(0.1)
+        await asyncio.sleep(SETTLE_S)  # clocks settle
+
+    async def _calibrate(self, client: MqttClient) -> None:
+        self._watch = CalibrationWatch(self.display.step)
+        for phase, motion, wanted_s in PHASES:
+            await self.simulator.say(f"play {motion}")
+            await asyncio.sleep(SETTLE_S)
+            self._watch.begin()
+            arguments = {"phase": phase, "seconds": wanted_s * self.scale}
+            answer = await client.request("calibrate", arguments)
+            if answer.get("status") != "accepted":
+                raise RequestRefused(str((answer.get("error") or {}).get("message")))
+            self.display.step(phase, 0.0, "")
+            await self._watch.ended(phase)
+            if phase == "static":
+                self._static_ns = time.monotonic_ns() - 1_000_000_000
+
+    async def _live(self, seconds: float) -> None:
+        self._judging = True
+        began = time.monotonic()
+        played = -1
+        while (elapsed := time.monotonic() - began) < seconds:
+            self.daemon.check()
+            if int(elapsed / MOTION_S) > played:
+                played = int(elapsed / MOTION_S)
+                await self.simulator.say(f"play {MOTIONS[played % len(MOTIONS)]}")
+            self.display.step("live", elapsed / seconds, f"{seconds - elapsed:.0f} s to go")
+            await asyncio.sleep(0.1)
+            self._judge()
+
+    async def _finish(self) -> dict[str, Any]:
+        """Stop the streams first, so that every sample on its way arrives and is counted."""
+        self._judge()
+        self._judging = False
+        said = await self.simulator.quit()
+        wanted = {source.id for source in self.rig.sources}
+        before = self._healths
+        async with asyncio.timeout(15.0):
+            while self.online & wanted or self._healths < before + 2:
+                await asyncio.sleep(0.1)
+        sent: dict[str, Any] = said["sent"]
+        return sent
+
+    # --- figures -----------------------------------------------------------------------------
+
+    def _short(self) -> dict[str, object]:
+        rms, p50 = self.score.flexion.rms, percentile(self.latencies_ms[-500:], 0.5)
+        return {
+            "frames": self.score.frames,
+            "flexion RMSE": "—" if rms is None else f"{rms:.2f}°",
+            "latency": "—" if p50 is None else f"{p50:.1f} ms",
+        }
+
+    def _figures(self, sent: dict[str, Any]) -> dict[str, Any]:
+        devices = self._health.get("devices", {})
+        counts = {
+            key: sum(int(device.get(key) or 0) for device in devices.values())
+            for key in ("received", *VERDICTS, "pending")
+        }
+        counts["dropped"] += counts.pop("pending")
+        flexion = self.score.flexion.rms
+        return {
+            "frames": self.score.frames,
+            "knee_flexion_rmse_deg": _rounded(flexion),
+            **{
+                f"{name}_rmse_deg": _rounded(error.rms)
+                for name, error in self.score.segments.items()
+                if name in self.rig.chain.segments
+            },
+            "joint_center_error_mm": _rounded(self._center_error_mm()),
+            "latency_ms": {
+                "p50": _rounded(percentile(self.latencies_ms, 0.5)),
+                "p99": _rounded(percentile(self.latencies_ms, 0.99)),
+            },
+            "samples": counts,
+            "corrupt": sum(int(device.get("corrupt") or 0) for device in devices.values()),
+            "sent": sum(sent.values()),
+            "unaccounted": _unaccounted(sent, devices),
+            "within_2_sd_share": _rounded(self.score.covered / max(1, self.score.flexion.n)),
+        }
+
+    def _center_error_mm(self) -> float | None:
+        """RMS distance of the fitted joint centers from the true ones, in the static pose."""
+        stored = CalibrationStore(self.folder / "state", self.rig.calibration_store).latest()
+        truth = self.truth.track.at(self._static_ns)
+        if stored is None or truth is None:
+            return None
+        error = MeanSquare()
+        for name, joint in stored.calibration.joint.items():
+            if joint.center is not None and joint.source == "fit" and name in truth.centers:
+                error.add(1e3 * math.dist(joint.center, truth.centers[name]))
+        return error.rms
+
+
+def _unaccounted(sent: dict[str, Any], devices: dict[str, Any]) -> int:
+    """Samples without a verdict, and samples sent that never were received, or the reverse."""
+    lost = 0
+    for name, device in devices.items():
+        received = int(device.get("received") or 0)
+        verdicts = sum(int(device.get(key) or 0) for key in (*VERDICTS, "pending"))
+        lost += abs(received - verdicts) + abs(int(sent.get(name, 0)) - received)
+    return lost
+
+
+def _unix_minus_monotonic_ns() -> int:
+    return time.time_ns() - time.monotonic_ns()
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)

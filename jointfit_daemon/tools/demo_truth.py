@@ -1,0 +1,58 @@
+"""Reads the simulator's truth as it grows. Law: reads only; a line not finished yet waits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import orjson
+
+from jointfit_daemon.tools.demo_score import Truth, TruthTrack
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class TruthReader:
+    """Follows ``truth.jsonl``."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: BinaryIO | None = None
+        self._rest = b""
+        self.facts: dict[str, Any] = {}
+        self.track = TruthTrack()
+
+    def read(self) -> None:
+        """Take what has been written since the last time."""
+        if self._file is None:
+            if not self._path.exists():
+                return
+            self._file = self._path.open("rb")
+        *lines, self._rest = (self._rest + self._file.read()).split(b"\n")
+        for line in lines:
+            row = orjson.loads(line)
+            if "truth" in row:
+                self.facts = row
+            else:
+                self.track.add(_truth(row))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+def _truth(row: dict[str, Any]) -> Truth:
+    nan = float("nan")
+    centers = {
+        name: tuple(nan if x is None else x for x in center)
+        for name, center in row["joint_m"].items()
+    }
+    flexion = row["knee"]["flexion"]
+    return Truth(
+        row["t_ns"],
+        row["motion"],
+        {name: tuple(q) for name, q in row["q_world_segment"].items()},
+        centers,  # type: ignore[arg-type]  # three numbers by the log's contract
+        nan if flexion is None else flexion,
+    )
