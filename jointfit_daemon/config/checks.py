@@ -6,6 +6,7 @@ Law: each check returns its faults; none stops at the first.
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import CanBusSettings, MocapSettings
 
 _FORBIDDEN = "+#/"
+_FOLDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _LONGEST_M = 3.0  # no limb is longer; a length in millimetres is
 _LEAST_MARKERS = 3  # fewer do not define an orientation
 
@@ -48,10 +50,11 @@ def topic_base(key: str, base: str) -> list[Fault]:
 
 
 def folder_name(key: str, name: str) -> list[Fault]:
-    """Check a name that becomes one folder."""
-    if name in {"", ".", ".."} or "/" in name or not name.isprintable():
-        return [Fault(key, "must be the plain name of one folder, without /", name)]
-    return []
+    """Check a name that becomes one folder of the calibration store."""
+    if _FOLDER.fullmatch(name):
+        return []
+    allowed = "letters, digits, . _ and -, beginning with a letter or digit"
+    return [Fault(key, f"must be the plain name of one folder: {allowed}", name)]
 
 
 def chain(table: ChainTable) -> Iterator[Fault]:

@@ -1,0 +1,338 @@
+"""One connection to an MQTT broker. Law: the only module that knows aiomqtt and paho.
+
+Nothing of theirs leaves it: whatever goes wrong with a broker is ``BrokerLost``. A connection is
+used once; whoever wants another makes another.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import aiomqtt
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+    from types import TracebackType
+
+    from jointfit_daemon.config import MqttSettings
+
+log = logging.getLogger(__name__)
+
+PAYLOAD_VERSION = 1
+"""Raised when a key is removed or renamed or changes its unit or meaning."""
+
+KEEPALIVE_S = 5  # a frozen broker is noticed in half as much again
+ANSWER_S = 3.0  # a broker that takes longer over one packet is no use
+GOODBYE_S = 1.0  # leaving is worth that much
+_Properties: Any = (
+    Properties  # its constructor is not annotated, its attributes are made at run time
+)
+
+CREDENTIAL = "jointfitd.mqtt-password"
+_INCOMING = 64  # requests are rare; a flood of them must not grow
+_REFUSED = 0x80  # MQTT reason codes from here on are refusals
+
+_SOCKET_OPTIONS = (
+    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # else stalls of 40 ms
+    (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * KEEPALIVE_S),
+    (socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024),  # what hides in the kernel is lost unseen
+)
+
+
+class BrokerLost(Exception):  # noqa: N818 - named for what happened
+    """The broker is absent, refuses, fell silent or went away: worth another try."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """One message to publish. The properties travel with MQTT 5 only."""
+
+    topic: str
+    payload: bytes
+    qos: int = 0
+    retain: bool = False
+    expiry_s: int | None = None
+    """The broker drops it, undelivered, after this long."""
+    response_topic: str | None = None
+    correlation: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """One message received."""
+
+    topic: str
+    payload: bytes
+    retained: bool
+    response_topic: str | None = None
+    correlation: bytes | None = None
+
+
+def stop_if_cancelled() -> None:
+    """Raise the cancellation that Python 3.11's ``wait_for``, inside aiomqtt, may have lost.
+
+    It prefers a result that comes in the same instant. To be called in leaf tasks only: a task
+    that held a failed TaskGroup may look cancelled for ever.
+    """
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+class MqttConnection:
+    """A connection for as long as the ``async with`` block lasts.
+
+    Leaving by cancellation publishes `farewell` and disconnects in order; leaving by any other
+    error closes the socket at once, so that the broker publishes `will`.
+
+    Parameters
+    ----------
+    settings
+        Where, as whom, with which version.
+    identifier
+        Client id; a fixed one lets a new connection take over from its own dead predecessor.
+    will, farewell
+        Published by the broker when we vanish, and by us when we leave.
+
+    Raises
+    ------
+    BrokerLost
+        From any method: the message says what was tried.
+    """
+
+    def __init__(
+        self,
+        settings: MqttSettings,
+        identifier: str | None = None,
+        *,
+        will: Outgoing | None = None,
+        farewell: Outgoing | None = None,
+    ) -> None:
+        self._settings, self._identifier = settings, identifier
+        self._will, self._farewell = will, farewell
+        self._modern = settings.version == "5"
+        self._cached: dict[int | None, Any] = {}
+
+    async def __aenter__(self) -> Self:
+        self._client = self._new_client()
+        try:
+            await self._client.__aenter__()
+        except aiomqtt.MqttError as error:
+            self._client.abandon()
+            raise BrokerLost(f"{self._place()}: {error}{self._hint(error)}") from error
+        except BaseException:
+            self._client.abandon()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None or issubclass(kind, asyncio.CancelledError):
+                await self._leave()
+        finally:
+            self._client.abandon()
+
+    async def _leave(self) -> None:
+        """Say farewell and disconnect, each bounded; a clean disconnect takes the will back."""
+        self._client.timeout = GOODBYE_S
+        with contextlib.suppress(aiomqtt.MqttError, OSError):
+            if self._farewell is not None:
+                await self._publish(self._farewell)
+            await self._client.__aexit__(None, None, None)
+
+    async def publish(self, message: Outgoing) -> None:
+        """Publish; at QoS 1 returns when the broker has it, at QoS 0 when the kernel has it."""
+        try:
+            await self._publish(message)
+        except (aiomqtt.MqttError, ValueError) as error:
+            raise BrokerLost(f"{self._place()}: {message.topic}: {error}") from error
+        stop_if_cancelled()
+
+    async def _publish(self, message: Outgoing) -> None:
+        await self._client.publish(
+            message.topic,
+            message.payload,
+            message.qos,
+            message.retain,
+            self._properties(message) if self._modern else None,
+        )
+
+    async def subscribe(self, topics: Sequence[str]) -> list[str]:
+        """Subscribe at QoS 1 and return the topics that the broker refused.
+
+        With MQTT 5 a message that its sender wants retained arrives marked so, even fresh.
+        """
+        options = SubscribeOptions(qos=1, retainAsPublished=True)
+        asked: list[Any] = [(topic, options if self._modern else 1) for topic in topics]
+        try:
+            codes = await self._client.subscribe(asked)
+        except aiomqtt.MqttError as error:
+            raise BrokerLost(f"{self._place()}: cannot subscribe: {error}") from error
+        stop_if_cancelled()
+        values = [code if isinstance(code, int) else int(code.value) for code in codes]
+        return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
+
+    async def messages(self) -> AsyncIterator[Incoming]:
+        """Yield what arrives; beyond 64 unread messages the newest are discarded."""
+        arriving = self._client.messages
+        while True:
+            try:
+                message = await anext(arriving)
+            except aiomqtt.MqttError as error:
+                raise BrokerLost(f"{self._place()}: {error.__cause__ or error}") from error
+            except OSError as error:  # what the reader met
+                raise BrokerLost(f"{self._place()}: {error}") from error
+            stop_if_cancelled()
+            yield Incoming(
+                message.topic.value,
+                bytes(message.payload),
+                retained=bool(message.retain),
+                response_topic=getattr(message.properties, "ResponseTopic", None),
+                correlation=getattr(message.properties, "CorrelationData", None),
+            )
+
+    # --- making one --------------------------------------------------------------------------
+
+    def _new_client(self) -> _Client:
+        settings, will = self._settings, self._will
+        try:
+            context = _tls_context(settings)
+        except OSError as error:  # ssl.SSLError too
+            raise BrokerLost(f"{self._place()}: [mqtt.tls]: {error}") from error
+        version = aiomqtt.ProtocolVersion.V5 if self._modern else aiomqtt.ProtocolVersion.V311
+        return _Client(
+            settings.host,
+            settings.tcp_port,
+            username=settings.username,
+            password=password_of(settings),
+            identifier=self._identifier,
+            protocol=version,
+            will=None
+            if will is None
+            else aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
+            clean_session=None if self._modern else True,
+            timeout=ANSWER_S,
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=_INCOMING,
+            socket_options=_SOCKET_OPTIONS,
+            tls_context=context,
+        )
+
+    def _place(self) -> str:
+        return f"broker {self._settings.host}:{self._settings.tcp_port}"
+
+    def _hint(self, error: Exception) -> str:
+        if self._modern and "timed out" in str(error):
+            return (
+                " (no answer to MQTT 5; if this broker is older or keeps MQTT 5 on another port, "
+                'set version = "3.1.1" in [mqtt], or that port)'
+            )
+        return ""
+
+    def _properties(self, message: Outgoing) -> Any:
+        plain = message.response_topic is None and message.correlation is None
+        if plain and (cached := self._cached.get(message.expiry_s)) is not None:
+            return cached  # building one costs 40 us
+        made: Any = _Properties(PacketTypes.PUBLISH)
+        made.ContentType = "application/json"
+        made.UserProperty = ("v", str(PAYLOAD_VERSION))
+        if message.expiry_s is not None:
+            made.MessageExpiryInterval = message.expiry_s
+        if message.response_topic is not None:
+            made.ResponseTopic = message.response_topic
+        if message.correlation is not None:
+            made.CorrelationData = message.correlation
+        if plain:
+            self._cached[message.expiry_s] = made
+        return made
+
+
+class _Client(aiomqtt.Client):
+    """aiomqtt's client, which can also be dropped in the middle of connecting."""
+
+    _abandoned = False
+
+    def abandon(self) -> None:
+        """Close whatever is open, without a word; else a failed connect keeps it for seconds."""
+        self._abandoned = True
+        if self._misc_task is not None:
+            self._misc_task.cancel()
+        opened = self._client.socket()
+        if isinstance(opened, socket.socket) and opened.fileno() >= 0:
+            self._loop.remove_reader(opened.fileno())
+            self._loop.remove_writer(opened.fileno())
+            opened.close()
+
+    def _on_socket_open(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, sock: Any
+    ) -> None:
+        """Run in the thread that connects, perhaps after the connection was given up."""
+        if self._abandoned:
+            sock.close()
+            return
+        super()._on_socket_open(client, userdata, sock)
+
+
+def password_of(settings: MqttSettings) -> str | None:
+    """Return the password in the file that rig.toml or systemd names; None if there is none."""
+    path = settings.password_file
+    if path is None and (folder := os.environ.get("CREDENTIALS_DIRECTORY")) is not None:
+        path = f"{folder}/{CREDENTIAL}"
+    if path is None:
+        return None
+    try:
+        return Path(path).read_text(encoding="utf-8").rstrip("\r\n") or None
+    except OSError as error:
+        log.debug("mqtt: no password: %s", error)
+        return None
+
+
+def _tls_context(settings: MqttSettings) -> ssl.SSLContext | None:
+    tls = settings.tls
+    if tls is None:
+        return None
+    context = ssl.create_default_context(cafile=tls.ca)
+    if tls.cert is not None:
+        context.load_cert_chain(tls.cert, tls.key)
+    return context
+
+
+class LoopNoise:
+    """Loop exception handler that drops the two complaints aiomqtt causes at a disconnect.
+
+    They are an ``MqttError`` in a future that nobody awaits any more, and a bad file descriptor in
+    a callback on a socket just closed. They are counted; everything else is told as always.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Judge one complaint of the loop."""
+        error, message = context.get("exception"), str(context.get("message", ""))
+        late = isinstance(error, aiomqtt.MqttError) and "never retrieved" in message
+        closed = isinstance(error, OSError) and error.errno == 9 and _is_mqtt(context)  # noqa: PLR2004 - EBADF
+        if late or closed:
+            self.dropped += 1
+        else:
+            loop.default_exception_handler(context)
+
+
+def _is_mqtt(context: dict[str, Any]) -> bool:
+    return "aiomqtt" in repr(context.get("handle", "")) + repr(context.get("future", ""))
