@@ -89,13 +89,13 @@ class Noise:
 
     def __call__(self, data: bytes) -> bytes:
         """Return what arrives of `data`."""
-        if not self.on or self._random.random() < 0.7:  # noqa: PLR2004 - three in ten suffer
+        if not self.on or self._random.random() < 0.6:  # noqa: PLR2004 - four in ten suffer
             return data
         place = self._random.randrange(len(data))
         match self._random.randrange(4):
             case 0:
-                flipped = data[place] ^ 1 << self._random.randrange(8)
-                return data[:place] + bytes((flipped,)) + data[place + 1 :]
+                bit = self._random.choice((0x01, 0x10, 0x80, 0x80))  # signs are what hurts most
+                return data[:place] + bytes((data[place] ^ bit,)) + data[place + 1 :]
             case 1:
                 return data[:place]
             case 2:

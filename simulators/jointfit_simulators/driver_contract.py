@@ -208,14 +208,14 @@ class DriverContract(ABC):
             async with self._streaming(device, self.make_driver(tmp_path)) as (heard, first):
                 before = len(heard.measurements)
                 noise.on = True
-                for number in range(first, first + 100):
+                for number in range(first, first + 200):
                     self.send(device, number)
                     await asyncio.sleep(_PACE_S)
                 noise.on = False
                 await asyncio.sleep(0.3)  # silence ends what a broken length still waits for
-                self.send(device, first + 100)
+                self.send(device, first + 200)
                 await heard.settle()
-                clean = await self._send_all(device, heard, first + 101, 10)
+                clean = await self._send_all(device, heard, first + 201, 10)
             got = heard.measurements[before:]
             numbers = range(first, clean[-1] + 1)
             require(len(got) >= len(numbers) // 2, f"most samples survive, {len(got)} did")

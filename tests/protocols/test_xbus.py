@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jointfit_protocols import xbus
@@ -53,11 +53,15 @@ def test_the_cut_changes_nothing(wire: bytes, cuts: list[int]) -> None:
 
 
 @given(st.lists(st.binary(min_size=1, max_size=6000), max_size=3), st.binary(max_size=5000))
+@example([bytes(2050) + b"\xfa\xff\x36\x00\x99", bytes(4000)], b"")
+@example([bytes(2054) + b"\xfa\xff\x36\xff\xff\xff", bytes(4000)], b"")
+@example([b"\xfa\xff\x36\x00\x99" + bytes(2000), bytes(4000)], b"")
 def test_long_noise_is_reported_in_bounded_runs_whatever_the_cut(
     noise: list[bytes], tail: bytes
 ) -> None:
     whole, _ = decode([b"".join(noise) + tail])
     assert decode([*noise, tail])[0] == whole
+    assert decode([bytes([byte]) for byte in b"".join(noise) + tail])[0] == whole
     assert all(event.discarded <= MAX_MESSAGE for event in whole if isinstance(event, Corrupt))
 
 
@@ -77,6 +81,26 @@ def test_what_waits_is_bounded(chunks: list[bytes]) -> None:
     for chunk in chunks:
         decoder.feed(chunk)
         assert decoder.pending < MAX_MESSAGE
+
+
+@pytest.mark.parametrize(
+    ("wire", "reason"),
+    [
+        (b"abc", "no message starts here"),
+        (b"abc\xfa\xff\x36\x00\x99", "checksum"),
+        (b"\xfa\xff\x36\xff\xff\xff", "length outside 255..2048"),
+        (b"\xfa\xff\x36\x20abc", "cut off"),
+    ],
+)
+def test_a_run_is_named_for_its_first_real_fault(wire: bytes, reason: str) -> None:
+    assert decode([wire])[0] == [Corrupt(len(wire), reason)]
+
+
+@pytest.mark.parametrize("length", [0, 254, 2049, 65535])
+def test_a_length_no_message_has_is_not_waited_for(length: int) -> None:
+    decoder, good = XbusDecoder(), encode(0x36, b"good")
+    found = decoder.feed(b"\xfa\xff\x36\xff" + length.to_bytes(2, "big") + good)
+    assert [event.data for event in found if isinstance(event, XbusMessage)] == [b"good"]
 
 
 @given(st.integers(0, 255), st.binary(max_size=2048), st.integers(0, 255))
