@@ -29,7 +29,9 @@ from jointfit_daemon.config import ConfigError, load_rig
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.board import Board
 from jointfit_daemon.outputs.event_log import EventLog
-from jointfit_daemon.outputs.mqtt import MqttLink
+from jointfit_daemon.outputs.mqtt import LoopNoise
+from jointfit_daemon.outputs.outbox import Outbox
+from jointfit_daemon.outputs.publisher import MqttPublisher, command_of
 from jointfit_daemon.pipeline.core import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -44,12 +46,13 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.supervisor.fits import FitRunner
 from jointfit_daemon.supervisor.process import ProcessWatch
 from jointfit_daemon.supervisor.requests import parse_request
-from jointfit_daemon.supervisor.sources import SourceTasks
+from jointfit_daemon.supervisor.sources import SourceTasks, stop
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.pipeline.events import Event, Output
 
 log = logging.getLogger(__name__)
@@ -79,8 +82,10 @@ class Daemon:
         self._config, self._rig = config, rig
         self._core = Core()
         self._watch, self._systemd = ProcessWatch(), SystemdNotifier()
-        self._link = MqttLink(rig.mqtt, self._asked)
-        self._board = Board(rig, self._link)
+        self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
+        self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
+        self._board = Board(rig, self._outbox)
+        self._noise = LoopNoise()
         self._log: EventLog | None = None
         self._deadline: asyncio.TimerHandle | None = None
         self._deadline_ns: int | None = None
@@ -94,13 +99,14 @@ class Daemon:
     async def run(self) -> None:
         """Run until cancelled; an exception that is not a cancellation is a bug."""
         loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._noise)
         self._open_log()
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 self._sources = SourceTasks(self._tasks, self.deliver)
                 self._fits = FitRunner(self._tasks, self.deliver)
                 loop.add_signal_handler(signal.SIGHUP, self._hang_up)
-                self._tasks.create_task(self._link.run(), name="mqtt")
+                self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
                 self._configure(self._rig)
                 self._tasks.create_task(self._heartbeat(), name="heartbeat")
                 await self._sources.apply(self._rig.sources)
@@ -218,6 +224,7 @@ class Daemon:
     def _tell_health(self) -> None:
         health = self._core.health(time.monotonic_ns())
         health["process"] = self._watch.figures()
+        health["link"] = self._link.figures()
         if self._log is not None:
             health["recording"] = {"bytes": self._log.bytes_written, "file": self._log.path.name}
         self._board.health(health)
@@ -261,17 +268,29 @@ class Daemon:
             log.error("%s", text)  # noqa: TRY400 - the file's fault
             self._board.tell(Notice(time.monotonic_ns(), "reload", self._rig.name, text, "error"))
         else:
-            self._rig = rig
+            before, self._rig = self._rig, rig
+            if before.mqtt != rig.mqtt:
+                await self._move_to_broker(rig)
             self._board.configure(rig)
             self._configure(rig)
             await self._sources.apply(rig.sources)
-            await self._link.configure(rig.mqtt)
         self._systemd.ready()
+
+    async def _move_to_broker(self, rig: Rig) -> None:
+        """Leave the old broker in order and begin at the new one with everything retained."""
+        await stop([self._mqtt])
+        self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
+        self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
+        self._board = Board(rig, self._outbox)
+        self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
 
     # --- requests ----------------------------------------------------------------------------
 
-    def _asked(self, command: str, payload: bytes) -> None:
-        request = parse_request(command, payload, time.monotonic_ns())
+    def _asked(self, message: Incoming) -> None:
+        """Take one request from the broker: answered once, by the core or for it."""
+        command = command_of(message)
+        request = parse_request(command, message.payload, time.monotonic_ns())
+        self._board.asked(message, request.transaction)
         if isinstance(request, Reply):
             self._board.tell(request)
         else:
