@@ -6,7 +6,7 @@ it did not is part of the answer. A hinge shows its axis and nothing along it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from typing import TYPE_CHECKING
 
@@ -37,6 +37,7 @@ HUBER = 1.5
 _PASSES = 30
 _ROUNDED = 1e-4  # smallest radial scale, m
 _HOLD_M = 0.003
+_STEEP = 0.5  # smallest horizontal part of an unobserved direction to slide along
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,20 +212,29 @@ def _refused(start: Array, frames: int, reason: str) -> CenterOfRotation:
     return CenterOfRotation(np.asarray(start, float), wide, np.inf, frames, 0.0, none, reason)
 
 
-def slide(found: CenterOfRotation, target: Array) -> CenterOfRotation:
-    """Move a center along its unobserved directions to the point nearest `target`."""
-    if len(found.unseen) == 0:
+def slide_under(found: CenterOfRotation, above: Array | None) -> CenterOfRotation:
+    """Move a center along its unobserved directions to come straight over or under a point.
+
+    A hinge does not show where along its axis the joint is. Nearly vertical directions stay as they
+    are: nothing above or below says how high a joint is.
+
+    Parameters
+    ----------
+    found : CenterOfRotation
+        In coordinates whose z is vertical.
+    above : ndarray, shape (2,), or None
+        Horizontal place to come to, m; None: the center stays where its fit left it.
+    """
+    if len(found.unseen) == 0 or above is None:
         return found
-    along = found.unseen.T @ (found.unseen @ (target - found.center))
-    return CenterOfRotation(
-        found.center + along,
-        found.covariance,
-        found.residual_rms,
-        found.frames,
-        found.arc,
-        found.unseen,
-        found.refused,
-    )
+    steps = _pinv(found.unseen[:, :2].T) @ (above - found.center[:2])
+    return replace(found, center=found.center + steps @ found.unseen)
+
+
+def _pinv(A: Array) -> Array:
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    inverse = np.where(s > _STEEP, 1.0 / np.maximum(s, _STEEP), 0.0)
+    return np.asarray(Vt.T @ (inverse[:, None] * U.T))
 
 
 def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> CenterOfRotation:

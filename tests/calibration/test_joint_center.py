@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.joint_center import fit_center, slide
+from jointfit_daemon.calibration.joint_center import fit_center, slide_under
 
 CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])
 CENTER = np.array([0.1, -0.2, 0.9])
@@ -76,7 +76,7 @@ def test_a_hinge_shows_its_axis_and_leaves_the_rest_to_the_start() -> None:
     assert abs(found.unseen[0] @ axis) > 0.998
     off = found.center - CENTER
     assert np.linalg.norm(off - axis * (axis @ off)) < 3e-3
-    moved = slide(found, CENTER)
+    moved = slide_under(found, CENTER[:2])
     assert np.linalg.norm(moved.center - CENTER) < 3e-3
     assert np.sqrt(axis @ found.covariance @ axis) == pytest.approx(0.03, rel=0.05)
 
