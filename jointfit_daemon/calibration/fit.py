@@ -1,0 +1,304 @@
+"""The functional phase: from a static pose and a movement to a whole calibration.
+
+Law: pure; the optical system is the reference and is itself made of skin markers, so figures are
+distances from that reference, not from bones. Everything refused is refused at once, with remedies.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration import mount
+from jointfit_daemon.calibration.anatomy import SKIN_SD_M, Anatomy, JointFound, find_anatomy
+from jointfit_daemon.calibration.digest import trials_digest
+from jointfit_daemon.calibration.lags import SKIN, sensor_lags, usable_ns
+from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
+from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
+from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.calibration.result import (
+    Calibration,
+    JointCalibration,
+    SegmentCalibration,
+    SensorCalibration,
+    quaternion,
+    vector,
+)
+from jointfit_daemon.calibration.sampling import sensor_at
+from jointfit_daemon.calibration.static_pose import (
+    StaticPose,
+    fit_static,
+    sensor_calibration,
+    stored_cluster,
+)
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.calibration.alignment_phase import Alignment
+    from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
+    from jointfit_daemon.model import Chain, Quaternion
+    from jointfit_daemon.timing.lag import LagEstimate
+
+Array = NDArray[np.float64]
+
+MAX_FRAMES = 2000
+"""More frames than this of one movement repeat themselves; the fit takes every n-th."""
+MIN_FRAMES = 300
+MIN_SEEN = 0.5
+SKIN_LAG_NS = 8_000_000
+"""A lag found on skin that is nearer to the plate's than this says the same."""
+MISALIGNED = np.deg2rad(25.0)
+"""A heading that differs by more is no matter of skin; below, skin may be all of it."""
+MEANING = (
+    "RMS distance from the optical reference on the last part of the trial, after a fit to the"
+    " first part; the stored models were then fitted to all of it"
+)
+
+
+def fit_calibration(
+    static: StaticPose | CalibrationTrial,
+    functional: CalibrationTrial,
+    alignment: Alignment | None,
+    settings: CalibrationSettings,
+    chain: Chain,
+    *,
+    previous: Calibration | None = None,
+    software: str = "",
+    created_utc: str = "",
+    lag_ns: Mapping[str, int] | None = None,
+) -> Calibration:
+    """Calibrate a limb.
+
+    Parameters
+    ----------
+    static : StaticPose or CalibrationTrial
+        The static pose, or the trial to take it from.
+    functional : CalibrationTrial
+        The movement, with the optical system; sensor stamps not yet corrected for lag.
+    alignment : Alignment or None
+        None: all sensor worlds are taken for the optical one, and ``headings_from_static`` says so.
+    previous : Calibration, optional
+        Gives lags where this movement shows none.
+    lag_ns : mapping, optional
+        Lags known beforehand; the others are estimated.
+
+    Raises
+    ------
+    CalibrationRefused
+        No optical system or markers, too little seen or moved, sensors missing.
+    """
+    pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
+    tracks = _tracks(pose, functional, chain)
+    anatomy = find_anatomy(chain, tracks)
+    lags = _lags(chain, functional, tracks, lag_ns or {})
+    used_ns = {**_chosen_lags(usable_ns(lags), alignment, previous), **(lag_ns or {})}
+    sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
+    training, raw = _training(chain, functional, tracks, anatomy, sensors)
+    figures = judge(chain, training, settings.holdout_share)
+    models = fit_models(chain, training, settings.method)
+    notes = [*anatomy.notes, *_lag_notes(lags, used_ns)]
+    flags = [*anatomy.flags]
+    if alignment is None:
+        flags.append("headings_from_static")
+        notes += _heading_notes(chain, raw, training)
+    return Calibration(
+        method=settings.method,
+        joints=chain.joints,
+        segments=chain.segments,
+        chain_sensors=chain.sensors,
+        sensor=sensors,
+        segment={
+            name: SegmentCalibration(
+                quaternion(anatomy.q_static[name]), *anatomy.lengths[name], models[name]
+            )
+            for name in chain.segments
+        },
+        joint={name: _joint(found) for name, found in anatomy.joints.items()},
+        clusters={name: stored_cluster(cluster) for name, cluster in pose.clusters.items()},
+        flags=tuple(flags),
+        notes=tuple(notes),
+        quality={
+            "static": pose.quality,
+            "alignment": None if alignment is None else alignment.quality,
+            "lag": {name: _lag_figures(lag) for name, lag in lags.items()},
+            "anatomy": _anatomy_figures(anatomy),
+            "holdout": {"method": settings.method, **figures, "meaning": MEANING},
+        },
+        digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
+        software=software,
+        created_utc=created_utc,
+    )
+
+
+def _tracks(
+    pose: StaticPose, functional: CalibrationTrial, chain: Chain
+) -> dict[str, ClusterTrack]:
+    """Follow all body parts; refuse what makes a reference impossible."""
+    if functional.optical is None or len(functional.optical.t_ns) < MIN_FRAMES:
+        raise CalibrationRefused("functional: needs the optical system; check that it streams")
+    reasons = [
+        f"{segment}: no markers in the static pose; name them under markers.{segment} "
+        "and repeat the static pose in view of the cameras"
+        for segment in chain.segments
+        if segment not in pose.clusters
+    ]
+    tracks = track_clusters(functional.optical, pose.clusters)
+    for segment in chain.segments:
+        share = float(visible(tracks[segment].q).mean()) if segment in tracks else 1.0
+        if share < MIN_SEEN:
+            reasons.append(
+                f"{segment}: three markers were seen together in {100 * share:.0f} % of the trial; "
+                "at least 50 % are needed: add a marker or stay in view"
+            )
+    reasons += [
+        f"{sensor}: no data while moving; switch it on and repeat"
+        for group in chain.sensors
+        for sensor in group
+        if sensor not in functional.sensors
+    ]
+    if reasons:
+        raise CalibrationRefused(*reasons)
+    return tracks
+
+
+def _lags(
+    chain: Chain,
+    functional: CalibrationTrial,
+    tracks: Mapping[str, ClusterTrack],
+    known: Mapping[str, int],
+) -> dict[str, LagEstimate]:
+    out: dict[str, LagEstimate] = {}
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        track = tracks[segment]
+        unknown = {s: functional.sensors[s] for s in group if s not in known}
+        out |= sensor_lags(track.t_ns, track.q, unknown, SKIN)
+    return out
+
+
+def _chosen_lags(
+    moving: Mapping[str, int], alignment: Alignment | None, previous: Calibration | None
+) -> dict[str, int]:
+    """Return the lag of every sensor: of the plate unless this movement contradicts it.
+
+    Skin motion goes with the movement and shifts its lag by a few milliseconds; a plate has none.
+    """
+    plate = {} if alignment is None else alignment.sensors
+    lags = ({} if previous is None else previous.lag_ns) | dict(moving)
+    for name, item in plate.items():
+        known = item.lag_ns
+        if known is not None and abs(moving.get(name, known) - known) < SKIN_LAG_NS:
+            lags[name] = known
+    return lags
+
+
+def _lag_notes(lags: Mapping[str, LagEstimate], used_ns: Mapping[str, int]) -> list[str]:
+    return [
+        f"{name}: no lag from this movement ({lag.refused}); "
+        f"{used_ns.get(name, 0) / 1e6:.1f} ms used"
+        for name, lag in lags.items()
+        if lag.refused is not None
+    ]
+
+
+def _sensors(
+    chain: Chain,
+    pose: StaticPose,
+    alignment: Alignment | None,
+    anatomy: Anatomy,
+    lag_ns: Mapping[str, int],
+) -> dict[str, SensorCalibration]:
+    out = {}
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        q_static = quaternion(anatomy.q_static[segment])
+        for s in group:
+            world: Quaternion = (1.0, 0.0, 0.0, 0.0) if alignment is None else alignment.world(s)
+            out[s] = sensor_calibration(pose.sensors[s], world, q_static, lag_ns.get(s, 0))
+    return out
+
+
+def _training(
+    chain: Chain,
+    functional: CalibrationTrial,
+    tracks: Mapping[str, ClusterTrack],
+    anatomy: Anatomy,
+    sensors: Mapping[str, SensorCalibration],
+) -> tuple[LimbTraining, dict[str, Array]]:
+    """Return what models are fitted to, and the raw sensor orientations at the same instants."""
+    t_ns = next(iter(tracks.values())).t_ns
+    raw = {s: sensor_at(functional.sensors[s], t_ns, item.lag_ns) for s, item in sensors.items()}
+    reference = {
+        name: rotation.multiply(tracks[name].q, anatomy.q_static[name]) for name in chain.segments
+    }
+    whole = np.all([visible(q) for q in (*raw.values(), *reference.values())], axis=0)
+    rows = np.flatnonzero(whole)
+    if rows.size < MIN_FRAMES:
+        counts = {name: int(visible(q).sum()) for name, q in (raw | reference).items()}
+        raise CalibrationRefused(
+            f"functional: all sensors and segments together in {rows.size} frames, at least "
+            f"{MIN_FRAMES} are needed; seen of each: {counts}"
+        )
+    rows = rows[:: -(-rows.size // MAX_FRAMES)]
+    said = {
+        s: rotation.multiply(
+            rotation.multiply(item.q_optical_world, raw[s][rows]), item.q_sensor_segment
+        )
+        for s, item in sensors.items()
+    }
+    training = LimbTraining(said, {name: q[rows] for name, q in reference.items()})
+    return training, {s: q[rows] for s, q in raw.items()}
+
+
+def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTraining) -> list[str]:
+    """Say which worlds seem turned. No alignment: skin motion is part of the figure."""
+    notes = []
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        for s in group:
+            found = mount.fit_alignment("heading", raw[s], training.reference[segment])
+            turn = float(rotation.heading_of(found.q_world))
+            if abs(turn) > MISALIGNED:
+                notes.append(
+                    f"{s}: its world seems turned by about {np.rad2deg(turn):.0f} deg against the "
+                    "optical one; run the align phase"
+                )
+    return notes
+
+
+def _joint(found: JointFound | None) -> JointCalibration:
+    if found is None:
+        return JointCalibration(None, None, "unknown")
+    sd = float(np.sqrt(np.trace(found.covariance) / 3.0 + SKIN_SD_M**2))
+    residual = None if found.fit is None else found.fit.residual_rms
+    return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
+
+
+def _lag_figures(lag: LagEstimate) -> dict[str, Any]:
+    if lag.refused is not None:
+        return {"refused": lag.refused}
+    return {"lag_ns": round(lag.lag_ns), "sigma_ns": round(lag.sigma_ns), "r2": lag.r2}
+
+
+def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:
+    return {
+        "joints": {
+            name: {
+                "source": "unknown" if found is None else found.source,
+                "sd_m": _joint(found).sd,
+                "residual_rms_m": _joint(found).residual_rms,
+                "gap_rms_m": None if found is None else found.gap_rms,
+                "arc_rad": None if found is None or found.fit is None else found.fit.arc,
+                "unseen_directions": 0
+                if found is None or found.fit is None
+                else len(found.fit.unseen),
+            }
+            for name, found in anatomy.joints.items()
+        },
+        "lengths_m": {name: length for name, (length, _) in anatomy.lengths.items()},
+        "flexion_axes": {
+            name: {"rms_rad": axis.rms, "off_plane_rad": axis.off}
+            for name, axis in anatomy.axes.items()
+        },
+    }
