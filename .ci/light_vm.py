@@ -235,11 +235,13 @@ def stop(machine: subprocess.Popen[bytes]) -> int:
         except subprocess.TimeoutExpired:
             machine.kill()
             machine.wait()
-    try:
-        os.killpg(machine.pid, signal.SIGKILL)  # it calls setsid: whatever is left is in its group
-        say("killed what was left of the machine")
-    except (ProcessLookupError, PermissionError):
-        pass
+    for _ in range(100):  # it calls setsid: whatever is left is in its group
+        try:
+            os.killpg(machine.pid, signal.SIGKILL)
+        except (ProcessLookupError, PermissionError):
+            return 0
+        time.sleep(0.05)
+    say(f"process group {machine.pid} does not die")
     return 0
 
 

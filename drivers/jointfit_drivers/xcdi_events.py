@@ -64,7 +64,7 @@ class XcdiEvents:
         self._tick_clock = (
             None if self._configured is None else TickClock(self._configured, TICKS_MODULUS)
         )
-        self._measured = False
+        self._measured = self._has_time = False
         self._incomplete = self._timed = self._told_at_ns = 0
         self._refused = 0
         self._discarded = 0
@@ -129,7 +129,9 @@ class XcdiEvents:
     def _group(self, group: XcdiGroup, out: list[Decoded]) -> None:
         """Append the sample of `group`, after what its counter and time say."""
         ticks, counter = group.ticks, group.counter
-        broken = ticks is None or self._xcdi.incomplete != self._incomplete
+        self._has_time = self._has_time or ticks is not None
+        torn = ticks is None and self._has_time
+        broken = torn or self._xcdi.incomplete != self._incomplete
         self._incomplete = self._xcdi.incomplete
         step = self._continuity.group(ticks, counter, broken=broken)
         if step.shared:
