@@ -14,7 +14,8 @@ from jointfit_daemon.pipeline.events import Notice
 QUIET_NS = 1_000_000_000
 """A line a second and kind is what a person can read and a broker will not notice."""
 
-_LEVELS: dict[str, Literal["warning", "error"]] = {
+Level = Literal["info", "warning", "error"]
+_LEVELS: dict[str, Level] = {
     "warning": "warning",
     "error": "error",
     "restart": "warning",
@@ -45,7 +46,7 @@ class Bulletin:
                 now_ns, source, "gap", lost if isinstance(lost, int) else 1, item.text
             )
         kind = "clock" if item.kind == "restart" else "device"
-        level = _LEVELS.get(item.kind, "info")
+        level: Level = _LEVELS.get(item.kind, "info")
         return [Notice(now_ns, kind, source, item.text, level, dict(item.data))]
 
     def due(self, now_ns: int) -> list[Notice]:

@@ -6,7 +6,7 @@ give the same outputs, byte for byte: that is what makes a recording worth havin
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
@@ -58,6 +58,10 @@ class Core:
         self._mocap_ns: int | None = None
         self._mocap_used = self._mocap_idle = 0
         self._bulletin = Bulletin()
+        self._session: CalibrationSession
+        self._aligner: FrameAligner
+        self._fuser: LimbFuser
+        self._lag_ns: dict[str, int] = {}
 
     # --- events ------------------------------------------------------------------------------
 
@@ -154,7 +158,7 @@ class Core:
             return [Notice(event.t_ns, "device", event.source, event.text, "warning")]
         outputs = self._take(event.source, state, state.closed())
         self._aligner.lose(event.source)
-        level = "info" if event.reason == "removed" else "warning"
+        level: Literal["info", "warning"] = "info" if event.reason == "removed" else "warning"
         return [
             *outputs,
             DeviceStatus(event.source, online=False),

@@ -93,9 +93,7 @@ async def _lead(
         return dict(watch.status)
 
 
-async def _phase(
-    client: Any, watch: Any, name: str, seconds: float | None, *, force: bool
-) -> None:
+async def _phase(client: Any, watch: Any, name: str, seconds: float | None, *, force: bool) -> None:
     from jointfit_daemon.tools.calibration_guide import RequestRefused
 
     arguments: dict[str, object] = {"phase": name, "force": force}

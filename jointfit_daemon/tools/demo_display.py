@@ -107,9 +107,7 @@ class Display:
         flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
         true = None if truth is None else math.degrees(truth.flexion)
         difference = None if true is None or flexion is None else flexion - true
-        table.add_row(
-            "flexion", f"{_deg(flexion)} ± {_deg(sd)}", _deg(true), _deg(difference, "+")
-        )
+        table.add_row("flexion", f"{_deg(flexion)} ± {_deg(sd)}", _deg(true), _deg(difference, "+"))
         for name in ("adduction", "rotation", "inner"):
             table.add_row(name, _deg(knee.get(f"{name}_deg")), "", "")
         curves = Group(

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration.store import CalibrationStore
-from jointfit_daemon.config import load_rig
 from jointfit_daemon.outputs.mqtt_client import MqttClient
 from jointfit_daemon.tools.calibration_guide import CalibrationWatch, RequestRefused
 from jointfit_daemon.tools.demo_score import MeanSquare, Score, percentile
@@ -109,7 +108,6 @@ class Demo:
             t_ns, pose = self._poses.pop(0)
             if (truth := self.truth.track.at(t_ns)) is not None:
                 self.score.add(pose, truth, self.rig.chain.joints[1])
-                self._shown = (pose, truth)
                 self.display.live(pose, truth, self._short())
 
     # --- the course --------------------------------------------------------------------------
