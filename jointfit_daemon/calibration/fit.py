@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jointfit_daemon.calibration import mount
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, Anatomy, JointFound, find_anatomy
 from jointfit_daemon.calibration.digest import trials_digest
+from jointfit_daemon.calibration.judgement import better
 from jointfit_daemon.calibration.lags import SKIN, sensor_lags, usable_ns
 from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
 from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, Quaternion
     from jointfit_daemon.timing.lag import LagEstimate
+
+__all__ = ["better", "fit_calibration"]
 
 Array = NDArray[np.float64]
 

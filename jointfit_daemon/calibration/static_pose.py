@@ -201,7 +201,7 @@ def with_new_static(calibration: Calibration, pose: StaticPose) -> Calibration:
     assumed = False
     for name, segment in calibration.segment.items():
         turned = _turned(calibration.clusters.get(name), pose.clusters.get(name))
-        assumed |= turned is None
+        assumed |= turned is None and bool(calibration.clusters)
         q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
         q_now[name] = quaternion(q)
     owner = {

@@ -59,7 +59,7 @@ def test_a_plate_of_markers_serves_as_well() -> None:
     positions = np.asarray(np.stack([turned.apply(m) for m in PLATE], axis=1), dtype=np.float64)
     positions[::7, 2] = np.nan
     names = ("P1", "P2", "P3", "P4")
-    optical = optical_track(trial.optical.t_ns * 1e-9, positions, names)
+    optical = optical_track(trial.optical.t_ns.astype(np.float64) / 1e9, positions, names)
     settings = CalibrationSettings(markers={"plate": names})
     found = fit_alignment(replace(trial, optical=optical), settings)
     assert max(errors_deg(found, subject)) < 0.2

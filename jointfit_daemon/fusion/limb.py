@@ -1,0 +1,153 @@
+"""One aligned frame in, one LimbState out, whatever sensors are alive.
+
+Law: pure, in order of time, plain floats. Unknown is None; every degradation is a flag.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.calibration.anatomy import flexion_sign
+from jointfit_daemon.calibration.model_fit import neighbor
+from jointfit_daemon.fusion.segment import Fused, SegmentFuser
+from jointfit_daemon.fusion.skeleton import Reach, joint_positions, read_angles
+from jointfit_daemon.kinematics.rotation_scalar import multiply_one
+from jointfit_daemon.model import JointState, LimbState, SegmentState
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.model import Chain, Quaternion, Vector
+
+_NOBODY: frozenset[str] = frozenset()
+
+
+class LimbFuser:
+    """Turns aligned sensor orientations into the state of a limb.
+
+    Parameters
+    ----------
+    chain : Chain
+        Joints, segments and sensors of the rig.
+    calibration : Calibration or None
+        None, or one of another chain (flag ``other_chain``): every state is ``uncalibrated``.
+    """
+
+    def __init__(self, chain: Chain, calibration: Calibration | None) -> None:
+        self._chain = chain
+        known = calibration is not None and calibration.fits(chain)
+        self._calibration = calibration if known else None
+        self._standing: tuple[str, ...] = ("uncalibrated",)
+        if calibration is not None and not known:
+            self._standing = ("uncalibrated", "other_chain")
+        self._fusers: list[SegmentFuser] = []
+        self._reaches: list[Reach] = []
+        self._mounts: dict[str, tuple[Quaternion, Quaternion]] = {}
+        if self._calibration is not None:
+            self._prepare(self._calibration)
+
+    def _prepare(self, calibration: Calibration) -> None:
+        chain = self._chain
+        self._standing = calibration.flags
+        self._mounts = {
+            name: (item.q_optical_world, item.q_sensor_segment)
+            for name, item in calibration.sensor.items()
+        }
+        for i, segment in enumerate(chain.segments):
+            stored = calibration.segment[segment]
+            self._fusers.append(SegmentFuser(segment, chain.sensors[i], stored))
+            length, sd = stored.length, stored.length_sd
+            if i < len(chain.lengths) and chain.lengths[i] is not None:
+                length = chain.lengths[i]
+            self._reaches.append(Reach(length, sd or 0.0))
+        self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
+        self._signs = [flexion_sign(joint) for joint in chain.joints]
+
+    def fuse(
+        self,
+        t_ns: int,
+        completed_ns: int,
+        seq: int,
+        orientations: Mapping[str, Quaternion],
+        *,
+        extrapolated: frozenset[str] = _NOBODY,
+        optical_origin: Vector | None = None,
+        sync: str = "locked",
+        mode: str = "imu",
+    ) -> LimbState:
+        """Return the state of the limb at `t_ns`.
+
+        Parameters
+        ----------
+        t_ns, completed_ns, seq
+            Instant, arrival of what completed the frame, running number; handed through.
+        orientations : mapping of str to Quaternion
+            q_world_sensor of every sensor that is alive, each in its own world; unknown ids are
+            ignored.
+        extrapolated : frozenset of str
+            Sensors whose value is extrapolated beyond their last sample.
+        optical_origin : Vector, optional
+            Where the cameras see O1 now, m; wins over the configured origin.
+        sync, mode : str
+            Handed through; without a calibration the mode is ``uncalibrated``.
+
+        Notes
+        -----
+        Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
+        (a sample was extrapolated in time) and per segment ``one_sensor:``, ``untrained:`` (outside
+        the movements of the calibration), ``held:``, ``lost:``; ``gimbal`` last.
+        """
+        if self._calibration is None:
+            return self._uncalibrated(t_ns, completed_ns, seq, sync)
+        inputs = {
+            name: multiply_one(multiply_one(mount[0], orientations[name]), mount[1])
+            for name, mount in self._mounts.items()
+            if name in orientations
+        }
+        fused = [
+            fuser.fuse(t_ns, inputs, near)
+            for fuser, near in zip(self._fusers, self._neighbors, strict=True)
+        ]
+        flags = [*self._standing]
+        if extrapolated and not extrapolated.isdisjoint(inputs):
+            flags.append("extrapolating")
+        for one in fused:
+            flags += one.flags
+        joints = self._joints(fused, optical_origin, flags)
+        segments = tuple(
+            SegmentState(name, one.q, one.sd, one.used)
+            for name, one in zip(self._chain.segments, fused, strict=True)
+        )
+        return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
+
+    def _joints(
+        self, fused: list[Fused], optical_origin: Vector | None, flags: list[str]
+    ) -> tuple[JointState, ...]:
+        chain = self._chain
+        origin = optical_origin or chain.origin or (0.0, 0.0, 0.0)
+        places = joint_positions(origin, fused, self._reaches)
+        joints = []
+        for i, name in enumerate(chain.joints):
+            position, variance = places[i]
+            sd = None if variance is None else sqrt(variance)
+            state = None
+            if 0 < i < len(fused):
+                above, below = fused[i - 1], fused[i]
+                state = read_angles(above, below, sign=self._signs[i], left=chain.left_side)
+            if state is None:
+                joints.append(JointState(name, position, sd))
+                continue
+            if state.gimbal and "gimbal" not in flags:
+                flags.append("gimbal")
+            joints.append(
+                JointState(name, position, sd, state.angles, state.inner, state.flexion_sd)
+            )
+        return tuple(joints)
+
+    def _uncalibrated(self, t_ns: int, completed_ns: int, seq: int, sync: str) -> LimbState:
+        segments = tuple(SegmentState(name, None, None, ()) for name in self._chain.segments)
+        joints = tuple(JointState(name, None, None) for name in self._chain.joints)
+        mode = "uncalibrated"
+        return LimbState(seq, t_ns, completed_ns, mode, sync, self._standing, segments, joints)

@@ -1,0 +1,78 @@
+"""Joint positions and angles of one frame, with their standard deviations. Law: floats only.
+
+Orientation errors are taken as isotropic and independent between segments; what is kept of a
+position's covariance is its trace, which is all that a LimbState carries.
+"""
+
+from __future__ import annotations
+
+from math import cos, hypot
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.kinematics.joint_angles import read_joint
+from jointfit_daemon.kinematics.rotation_scalar import rotate_one
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.fusion.segment import Fused
+    from jointfit_daemon.model import JointAngles, Vector
+
+
+class Reach(NamedTuple):
+    """Length of a segment and its standard deviation, m."""
+
+    length: float | None
+    sd: float
+
+
+class AngleState(NamedTuple):
+    """Angles of one joint."""
+
+    angles: JointAngles
+    inner: float
+    """Between the two segments, rad: pi when straight."""
+    flexion_sd: float | None
+    """rad."""
+    gimbal: bool
+
+
+def joint_positions(
+    origin: Vector, fused: Sequence[Fused], reaches: Sequence[Reach]
+) -> list[tuple[Vector | None, float | None]]:
+    r"""Run the chain from O1 down; return position (m) and variance per axis (m²) of every joint.
+
+    .. math:: P_{i+1} = P_i - L\,R_i e_z, \qquad
+              \mathrm{tr}\,\Sigma_{i+1} = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
+
+    (algorithms B15, B11 with isotropic orientation errors). Below a segment whose orientation or
+    length is unknown everything is None.
+    """
+    place: Vector | None = origin
+    trace = 0.0
+    out: list[tuple[Vector | None, float | None]] = [(origin, 0.0)]
+    for one, reach in zip(fused, reaches, strict=True):
+        if place is None or one.q is None or one.sd is None or reach.length is None:
+            place = None
+            out.append((None, None))
+            continue
+        length = reach.length
+        dx, dy, dz = rotate_one(one.q, (0.0, 0.0, -length))
+        place = (place[0] + dx, place[1] + dy, place[2] + dz)
+        trace += 2.0 * (length * one.sd) ** 2 + reach.sd**2
+        out.append((place, trace / 3.0))
+    return out
+
+
+def read_angles(above: Fused, below: Fused, *, sign: float, left: bool) -> AngleState | None:
+    r"""Return the angles of one joint, or None where a segment's orientation is unknown.
+
+    With isotropic errors :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, whose
+    first entry is :math:`1 / \cos^2\theta` times the sum (algorithms B11; E of B16): the deviation
+    of flexion. It is None where the axes lock.
+    """
+    if above.q is None or below.q is None or above.sd is None or below.sd is None:
+        return None
+    angles, inner, gimbal = read_joint(above.q, below.q, flexion_sign=sign, left=left)
+    sd = None if gimbal else hypot(above.sd, below.sd) / cos(angles.adduction)
+    return AngleState(angles, inner, sd, gimbal)
