@@ -38,7 +38,6 @@ _WAITING = 64  # batches that a pump thread may be ahead of the loop
 _PUMP_S = 0.05  # how long a pump thread sleeps in one receive: bounds the time to close
 _RECEIVE_BYTES = 1 << 20  # holds about 1 400 frames; the default of 212 992 keeps 278
 _DROPS_EVERY_NS = 250_000_000
-_REFUSALS = (can.CanError, OSError, ValueError, TypeError, NotImplementedError, ImportError)
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55
 _MEMINFO = struct.Struct("9I")
 _DROPS = 8
@@ -135,7 +134,7 @@ class PythonCanBus:
             except asyncio.CancelledError:
                 making.add_done_callback(_shut)  # the thread cannot be cancelled: close its bus
                 raise
-        except _REFUSALS as error:
+        except Exception as error:  # a missing vendor library gives even NameError
             raise self._refused(error) from error
 
     def _make(self) -> can.BusABC:
@@ -206,9 +205,13 @@ class PythonCanBus:
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
             return DeviceMisconfigured(f"{channel}: {_unknown(kind, error)}")
-        if isinstance(error, (ValueError, TypeError)):
-            return DeviceMisconfigured(f"{channel} ({kind}): {error}: check its [can] table")
-        return self._numbered(error)
+        if isinstance(error, (can.CanError, OSError)):
+            return self._numbered(error)
+        said = f"{type(error).__name__}: {error}"
+        return DeviceMisconfigured(
+            f"{channel}: cannot be opened as {kind} ({said}): check its [can] table, and the "
+            "vendor's library"
+        )
 
     def _broken(self, error: Exception) -> Exception:
         """Name why the bus stopped; bugs stay what they are."""

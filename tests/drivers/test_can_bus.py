@@ -1,0 +1,479 @@
+"""Shared CAN buses: who gets what, what happens when one fails, what a user is told."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import can
+import pytest
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
+from jointfit_daemon.model import Chunk, Corrupt, ImuSample
+from jointfit_drivers.can_bus import shared_bus
+from jointfit_drivers.can_stamp import KernelStamps
+from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
+from jointfit_protocols.can_frame import CanFrame, frame_bits, unpack_frames
+from jointfit_protocols.xcdi import id_block
+from jointfit_simulators.can_wire import PythonCanWire, SlcanAdapter
+from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+S = 1_000_000_000
+
+
+def bus_at(folder: Path, **more: Any) -> CanBusSettings:
+    return CanBusSettings(interface="slcan", channel=str(folder / "adapter"), **more)
+
+
+def driver_of(name: str, bus: CanBusSettings, base: int = 0, silence_s: float = 2.0) -> XcdiImu:
+    ids = XcdiIdSettings(sample_time=base + 5, group_counter=base + 6, quaternion=base + 0x21)
+    return XcdiImu(
+        XcdiSettings(id=name, segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=silence_s)
+    )
+
+
+class Running:
+    """A driver at work, its chunks decoded."""
+
+    def __init__(self, driver: XcdiImu) -> None:
+        self.decoder = driver.decoder()
+        self.chunks: list[Chunk] = []
+        self.events: list[Any] = []
+        self.task = asyncio.create_task(driver.run(self._emit))
+
+    def _emit(self, chunk: Chunk) -> None:
+        self.chunks.append(chunk)
+        self.events += self.decoder.feed(chunk)
+
+    @property
+    def samples(self) -> list[ImuSample]:
+        return [event for event in self.events if isinstance(event, ImuSample)]
+
+    async def wait_for(self, count: int) -> None:
+        async with asyncio.timeout(5):
+            while len(self.samples) < count:
+                if self.task.done():
+                    self.task.result()
+                await asyncio.sleep(0.005)
+
+    async def cancel(self) -> None:
+        self.task.cancel()
+        await asyncio.wait({self.task})
+
+
+@asynccontextmanager
+async def serving(*devices: Any) -> AsyncIterator[None]:
+    tasks = [asyncio.create_task(device.run()) for device in devices]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        for device in devices:
+            device.unplug()
+
+
+async def opened(adapter: SlcanAdapter) -> None:
+    async with asyncio.timeout(5):
+        while not adapter.is_open:
+            await asyncio.sleep(0.005)
+        await asyncio.sleep(0.05)
+
+
+async def lost(running: Running, within_s: float = 1.0) -> str:
+    async with asyncio.timeout(within_s):
+        with pytest.raises(DeviceLost) as told:
+            await running.task
+    return str(told.value)
+
+
+def two_sensors(adapter: SlcanAdapter) -> tuple[XcdiDevice, XcdiDevice]:
+    return (
+        XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100))),
+        XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x200), first_counter=1000)),
+    )
+
+
+async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    devices = two_sensors(adapter)
+    async with serving(*devices):
+        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        await opened(adapter)
+        for number in range(50):
+            for device in devices:
+                device.push(number * 10_000_000, IDENTITY)
+            await asyncio.sleep(0.001)
+        for run in runs:
+            await run.wait_for(50)
+        assert [each.counter for each in runs[0].samples] == list(range(50))
+        assert [each.counter for each in runs[1].samples] == list(range(1000, 1050))
+        assert [run.decoder.foreign for run in runs] == [0, 0]
+        await runs[0].cancel()
+        assert adapter.is_open, "the bus stays open for the other"
+        await runs[1].cancel()
+        await asyncio.sleep(0.05)
+        assert not adapter.is_open, "the last one out closes it"
+
+
+async def test_an_unplugged_adapter_loses_all_and_gives_all_back(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    devices = two_sensors(adapter)
+    drivers = [driver_of("S3", bus, 0x100), driver_of("S4", bus, 0x200)]
+    async with serving(*devices):
+        runs = list(map(Running, drivers))
+        await opened(adapter)
+        adapter.unplug()
+        for run in runs:
+            assert "adapter" in await lost(run)
+        adapter.plug()
+        runs = list(map(Running, drivers))
+        await opened(adapter)
+        for number in range(10):
+            for device in devices:
+                device.push(number * 10_000_000, IDENTITY)
+        for run in runs:
+            await run.wait_for(10)
+            await run.cancel()
+
+
+async def test_a_silent_sensor_is_lost_alone_and_told_what_else_came(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    talks, _ = two_sensors(adapter)
+    async with serving(talks):
+        heard = Running(driver_of("S3", bus, 0x100))
+        silent = Running(driver_of("S4", bus, 0x200, silence_s=0.4))
+        await opened(adapter)
+        for number in range(60):
+            talks.push(number * 10_000_000, IDENTITY)
+            if silent.task.done():
+                break
+            await asyncio.sleep(0.01)
+        told = await lost(silent)
+        assert "S4" in told
+        assert "silent for 0.4 s" in told
+        assert not heard.task.done()
+        await heard.cancel()
+
+
+async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        run = Running(driver_of("S3", bus, 0x300, silence_s=0.5))
+        await opened(adapter)
+        for number in range(10):
+            device.push(number * 10_000_000, IDENTITY)
+        told = await lost(run)
+    assert "40 frames with others came" in told
+    assert "`ids`" in told
+
+
+async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        first = Running(driver_of("S3", bus))
+        await opened(adapter)
+        with pytest.raises(DeviceMisconfigured, match=r"S4.*0x\d+.*S3.*block of its own"):
+            await Running(driver_of("S4", bus)).task
+        device.push(0, IDENTITY)
+        await first.wait_for(1)
+        await first.cancel()
+
+
+async def test_lost_bytes_of_a_line_are_counted_by_one_device_only(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    async with serving(adapter):
+        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        await opened(adapter)
+        adapter.send_bytes(b"what is this\r")
+        await asyncio.sleep(0.1)
+        found = [event for run in runs for event in run.events]
+        assert found == [Corrupt(13, "no SLCAN line")]
+        for run in runs:
+            await run.cancel()
+
+
+async def test_a_bug_behind_one_device_hurts_no_other(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    devices = two_sensors(adapter)
+
+    def emit(_: Chunk) -> None:
+        raise ZeroDivisionError
+
+    async with serving(*devices):
+        good = Running(driver_of("S3", bus, 0x100))
+        bad = asyncio.create_task(driver_of("S4", bus, 0x200).run(emit))
+        await opened(adapter)
+        for device in devices:
+            device.push(0, IDENTITY)
+        with pytest.raises(ZeroDivisionError):
+            await bad
+        await good.wait_for(1)
+        await good.cancel()
+
+
+async def test_the_adapter_is_told_the_bit_rate(tmp_path: Path) -> None:
+    adapter = SlcanAdapter(tmp_path / "adapter")
+    async with serving(adapter):
+        run = Running(driver_of("S3", bus_at(tmp_path, bitrate=250_000)))
+        await opened(adapter)
+        assert adapter.bitrate == 250_000
+        await run.cancel()
+
+
+async def test_a_bit_rate_slcan_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DeviceMisconfigured, match=r"bit rate 83333.*1000000"):
+        await driver_of("S3", bus_at(tmp_path, bitrate=83_333)).run(lambda _: None)
+
+
+async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        run = Running(driver_of("S3", bus))
+        await opened(adapter)
+        await run.cancel()
+        adapter._open = True  # the host died without a word
+        for number in range(50):
+            device.push(number * 10_000_000, IDENTITY)
+        run = Running(driver_of("S3", bus))
+        await asyncio.sleep(0.2)
+        await opened(adapter)
+        device.push(50 * 10_000_000, IDENTITY)
+        await run.wait_for(1)
+        assert [each.counter for each in run.samples] == [50], "nothing stale"
+        await run.cancel()
+
+
+class Chatter:
+    """A GPS receiver: talks all the time, listens never."""
+
+    def __init__(self, link: Path) -> None:
+        self._line = PtyLine(link)
+        self.unplug = self._line.unplug
+
+    async def run(self) -> None:
+        while True:
+            self._line.write(b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M*47\r\n")
+            await asyncio.sleep(0.02)
+
+
+async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> None:
+    async with serving(Chatter(tmp_path / "adapter")):
+        with pytest.raises(DeviceMisconfigured, match="no SLCAN adapter answers at 115200 baud"):
+            await driver_of("S3", bus_at(tmp_path)).run(lambda _: None)
+
+
+async def test_a_bus_of_python_can_is_shared_too() -> None:
+    bus = CanBusSettings(interface="virtual", channel="shared")
+    wire = PythonCanWire("virtual", "shared")
+    devices = [XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(base))) for base in (0x100, 0x200)]
+    try:
+        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        async with shared_bus(bus) as opened_bus:
+            await asyncio.sleep(0.05)
+            began = time.monotonic_ns()
+            for number in range(100):
+                for device in devices:
+                    device.push(number * 10_000_000, IDENTITY)
+            for run in runs:
+                await run.wait_for(100)
+                assert began <= run.samples[0].arrival_ns <= time.monotonic_ns()
+            assert opened_bus.foreign == 0, "python-can filters for us"
+        for run in runs:
+            await run.cancel()
+    finally:
+        wire.unplug()
+
+
+class Broken(can.BusABC):
+    """Stands where a vendor's library stands; fails when read."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(channel="x")
+        self._error = error
+
+    @override
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        time.sleep(0.01)
+        raise self._error
+
+    @override
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (can.CanOperationError("adapter pulled out", 19), DeviceLost),
+        (can.CanOperationError("something of the vendor's"), DeviceLost),
+        (ValueError("the backend cannot parse a line"), DeviceLost),
+        (ZeroDivisionError(), ZeroDivisionError),
+    ],
+)
+async def test_what_a_pump_thread_meets_reaches_the_driver(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception]
+) -> None:
+    monkeypatch.setattr(can, "Bus", lambda **_: Broken(error))
+    bus = CanBusSettings(interface="virtual", channel="broken")
+    with pytest.raises(kind):
+        await driver_of("S3", bus).run(lambda _: None)
+
+
+async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
+    bus = CanBusSettings(interface="socketcna", channel="can0")
+    with pytest.raises(DeviceMisconfigured, match="did you mean 'socketcan'"):
+        await driver_of("S3", bus).run(lambda _: None)
+
+
+async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
+    bus = CanBusSettings(interface="kvaser", channel="0")
+    with pytest.raises(DeviceMisconfigured, match="opened as kvaser"):
+        await driver_of("S3", bus).run(lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "words"),
+    [
+        (97, DeviceMisconfigured, "no CAN in this kernel.*can_raw"),
+        (19, DeviceLost, "no such CAN interface"),
+    ],
+)
+async def test_kernels_without_can_and_absent_links(
+    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], words: str
+) -> None:
+    def refuse(_: str) -> None:
+        raise OSError(number, "as the kernel says it")
+
+    monkeypatch.setattr("jointfit_drivers.python_can_bus._require_interface", refuse)
+    with pytest.raises(kind, match=words):
+        await driver_of("S3", CanBusSettings(channel="can0")).run(lambda _: None)
+
+
+class Filtered(can.BusABC):
+    """SocketCAN as far as one test needs it: a descriptor, stamps, and an error told once."""
+
+    def __init__(self, **_: Any) -> None:
+        self.socket, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.down = False
+        super().__init__(channel="can0")
+
+    @override
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    @override
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            data = self.socket.recv(16)
+        except BlockingIOError:
+            return None, True
+        if data == b"down":
+            raise can.CanOperationError("Network is down", 100)
+        return can.Message(
+            arbitration_id=0x21,
+            is_extended_id=False,
+            data=data,
+            timestamp=time.time(),
+        ), True
+
+    @override
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+    @override
+    def shutdown(self) -> None:
+        super().shutdown()
+        self.socket.close()
+        self.far.close()
+
+
+async def test_a_link_that_goes_down_is_told_once_and_frames_before_it_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[Filtered] = []
+
+    def make(**words: Any) -> Filtered:
+        made.append(Filtered(**words))
+        return made[-1]
+
+    monkeypatch.setattr(can, "Bus", make)
+    monkeypatch.setattr("jointfit_drivers.python_can_bus._require_interface", lambda _: None)
+    chunks: list[Chunk] = []
+    driver = driver_of("S3", CanBusSettings(channel="can0"))
+    task = asyncio.create_task(driver.run(chunks.append))
+    await asyncio.sleep(0.02)
+    for number in range(100):
+        made[0].far.send(bytes([number] * 8))
+    made[0].far.send(b"down")
+    with pytest.raises(DeviceLost, match="ip link set can0 up"):
+        await task
+    found = [frame for chunk in chunks for frame in unpack_frames(chunk.data)]
+    assert [frame.data[0] for frame in found if isinstance(frame, CanFrame)] == list(range(100))
+    assert max(len(chunk.data) for chunk in chunks) <= 64 * 24
+
+
+# --- stamps -----------------------------------------------------------------------------------
+
+
+class Clocks:
+    def __init__(self) -> None:
+        self.monotonic, self.offset = 100 * S, 1_700_000_000 * S
+
+    def monotonic_ns(self) -> int:
+        return self.monotonic
+
+    def unix_ns(self) -> int:
+        return self.monotonic + self.offset
+
+
+def stamped(clocks: Clocks, stamps: KernelStamps, ago_ns: int, offset: int | None = None) -> int:
+    """Return how long ago the frame seems to have ended, ns, when it did `ago_ns` ago."""
+    unix = clocks.monotonic - ago_ns + (clocks.offset if offset is None else offset)
+    start = stamps.start_ns(unix / S, 8, extended=False)
+    return clocks.monotonic - start - frame_bits(8, extended=False) * 1000
+
+
+def test_a_kernel_stamp_becomes_the_monotonic_start_of_the_frame() -> None:
+    clocks = Clocks()
+    stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
+    stamps.pair()
+    assert stamped(clocks, stamps, 5_000_000) == pytest.approx(5_000_000, abs=300)
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600, 0.01])
+def test_a_stepped_wall_clock_moves_no_frame(step_s: float) -> None:
+    clocks = Clocks()
+    stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
+    stamps.pair()
+    before = clocks.offset
+    clocks.offset += round(step_s * S)
+    clocks.monotonic += 1_000_000
+    stamps.pair()
+    if abs(step_s) > 2:  # a small one cannot be told for frames that waited
+        assert stamped(clocks, stamps, 500_000, before) == pytest.approx(500_000, abs=300)
+    assert stamped(clocks, stamps, 200_000) == pytest.approx(200_000, abs=300)
+    assert stamps.unusable == 0
+
+
+def test_an_absurd_stamp_is_replaced_by_now_and_counted() -> None:
+    clocks = Clocks()
+    stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
+    stamps.pair()
+    assert stamped(clocks, stamps, 500 * S) == 0
+    assert stamps.unusable == 1
