@@ -1,4 +1,4 @@
-"""Warnings and errors of the log, on ``bridge/log``. Law: at most five a second, the rest counted."""
+"""Warnings and errors of the log, on ``bridge/log``. Law: five a second, the rest is counted."""
 
 from __future__ import annotations
 

@@ -1,0 +1,132 @@
+"""The daemon's command line. Law: exit 0 stopped as asked, 1 a bug, 2 usage or configuration.
+
+Starts light: what only a running daemon needs is imported once the configuration is known good.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import faulthandler
+import logging
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jointfit_daemon import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.config import Rig
+
+log = logging.getLogger("jointfit_daemon")
+
+EXIT_BUG, EXIT_USAGE = 1, 2
+LAST_WAIT_S = 2.0
+"""How long leaving may wait for a thread: a name lookup cannot be interrupted."""
+
+_JOURNAL_LEVEL = {"CRITICAL": 2, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``jointfitd`` and return its exit code."""
+    options = _parser().parse_args(arguments)
+    _start_logging(options.log_level)
+    from jointfit_daemon.config import ConfigError, load_rig
+
+    try:
+        rig = load_rig(options.config)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return EXIT_USAGE
+    if options.check:
+        print(describe(rig))
+        return 0
+    return _run(options.config, rig)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jointfitd",
+        description="Reads IMUs and motion capture, publishes joint angles over MQTT.",
+    )
+    parser.add_argument("--config", type=Path, required=True, metavar="rig.toml", help="the rig")
+    parser.add_argument("--check", action="store_true", help="check the rig and end")
+    parser.add_argument(
+        "--log-level",
+        choices=("debug", "info", "warning", "error"),
+        default="info",
+        help="least level to log (default: info)",
+    )
+    parser.add_argument("--version", action="version", version=f"jointfitd {__version__}")
+    return parser
+
+
+class _JournalFormatter(logging.Formatter):
+    """Prefixes every line with its level, as sd-daemon(3) has it; the journal has the time."""
+
+    def format(self, record: logging.LogRecord) -> str:  # type: ignore[explicit-override]  # Python 3.12's
+        """Return the record as the journal reads it."""
+        level = _JOURNAL_LEVEL.get(record.levelname, _JOURNAL_LEVEL["INFO"])
+        return "\n".join(f"<{level}>{line}" for line in super().format(record).splitlines())
+
+
+def _start_logging(level: str) -> None:
+    faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
+    handler = logging.StreamHandler(sys.stderr)
+    if "JOURNAL_STREAM" in os.environ or "INVOCATION_ID" in os.environ:
+        handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=level.upper(), handlers=[handler])
+    logging.getLogger("mqtt").setLevel(logging.ERROR)  # aiomqtt's: we tell its troubles ourselves
+
+
+def describe(rig: Rig) -> str:
+    """Return what a checked rig holds, a line each, for people."""
+    chain, mqtt = rig.chain, rig.mqtt
+    lines = [f"{rig.name}: good, {rig.output_rate_hz:g} limb states a second"]
+    for segment, sensors in zip(chain.segments, chain.sensors, strict=True):
+        alone = " (one sensor: no redundancy)" if len(sensors) == 1 else ""
+        lines.append(f"  {segment}: {', '.join(sensors)}{alone}")
+    lines.append(f"  joints: {', '.join(chain.joints)}")
+    for source in rig.sources:
+        where = getattr(source.settings, "port", None) or getattr(source.settings, "server", None)
+        lines.append(f"  {source.id}: {source.driver}{f' at {where}' if where else ''}")
+    if all(source.kind != "mocap" for source in rig.sources):
+        lines.append("  no [mocap]: runs on IMUs alone, calibrates by a static pose only")
+    lines.append(f"  mqtt {mqtt.version}: {mqtt.host}:{mqtt.tcp_port}, topics {mqtt.base}/…")
+    return "\n".join(lines)
+
+
+def _run(config: Path, rig: Rig) -> int:
+    from jointfit_daemon.supervisor import run_daemon
+
+    code = 0
+    with asyncio.Runner() as runner:
+        try:
+            runner.run(run_daemon(config, rig))
+        except Exception:
+            log.exception("a bug ends the daemon; please report it with what follows")
+            code = EXIT_BUG
+        _leave_within(LAST_WAIT_S, code)
+    return code
+
+
+def _leave_within(seconds: float, code: int) -> None:
+    """End the process even if one of its threads does not."""
+
+    def leave() -> None:
+        logging.shutdown()
+        os._exit(code)
+
+    last = threading.Timer(seconds, leave)
+    last.daemon = True
+    last.start()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
