@@ -1,0 +1,82 @@
+"""What a row of the accuracy table is made of.
+
+A module of ``bench/accuracy_rows`` has a tuple ``EXPERIMENTS``; nothing else is asked of it. Every
+experiment is deterministic: it draws from seeded generators and reads recordings, which lie beside
+the project and not in it. Where they are not, or a package only this bench needs is not installed,
+the row says so and is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One measured number and what it must keep."""
+
+    name: str
+    value: float
+    goal: float
+    """The value must not be above it."""
+    least: float = -float("inf")
+    """Nor below this."""
+    unit: str = "deg"
+
+    @property
+    def kept(self) -> bool:
+        return self.least <= self.value <= self.goal
+
+    @property
+    def goal_text(self) -> str:
+        if self.least == -float("inf"):
+            return f"≤ {self.goal:g}"
+        return (
+            f"{self.least:g} … {self.goal:g}" if self.goal < float("inf") else f"≥ {self.least:g}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """One row."""
+
+    id: str
+    title: str
+    run: Callable[[Path], list[Figure]]
+    """Given the folder of recordings, measures."""
+    recordings: tuple[str, ...] = ()
+    """Folders it reads there."""
+    packages: tuple[str, ...] = ()
+    """What must be installed beside the project."""
+
+    def missing(self, data: Path = DATA) -> str | None:
+        """Say what keeps this experiment from running; None if nothing does."""
+        absent = [name for name in self.recordings if not (data / name).is_dir()]
+        if absent:
+            return f"recordings are not here: {', '.join(str(data / name) for name in absent)}"
+        uninstalled = [name for name in self.packages if find_spec(name) is None]
+        return f"not installed: {', '.join(uninstalled)}" if uninstalled else None
+
+
+def near(name: str, value: float, expected: float, tolerance: float, unit: str = "deg") -> Figure:
+    """A figure that must reproduce another one."""
+    return Figure(name, value, round(expected + tolerance, 9), round(expected - tolerance, 9), unit)
+
+
+def find_experiments() -> list[Experiment]:
+    """Return all rows of ``bench/accuracy_rows``, in order of module and place."""
+    folder = Path(__file__).parent / "accuracy_rows"
+    found: list[Experiment] = []
+    for module in sorted(iter_modules([str(folder)]), key=lambda info: info.name):
+        found += import_module(f"bench.accuracy_rows.{module.name}").EXPERIMENTS
+    return found

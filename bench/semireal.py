@@ -1,0 +1,101 @@
+"""The semi-real knee: real skin motion and filter error on four virtual sensors, and a bone model.
+
+Loads `semireal_knee4imu` into the project's conventions and states errors the way its tables do.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.joint_angles import functional_axis, joint_rotation, swing_twist
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+FOLDER = "semireal_knee4imu"
+TRAINING_SHARE = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class KneeTrial:
+    """One movement, only frames in which everything was seen."""
+
+    sensors: tuple[Array, Array, Array, Array]
+    """S1, S2 on the thigh, S3, S4 on the shank: bone-aligned q_world_segment, shape (n, 4)."""
+    thigh: Array
+    shank: Array
+
+    def part(self, frames: slice) -> KneeTrial:
+        a, b, c, d = (q[frames] for q in self.sensors)
+        return KneeTrial((a, b, c, d), self.thigh[frames], self.shank[frames])
+
+    def turned(self, angle: float) -> KneeTrial:
+        """Return the same movement by a subject who faces elsewhere, rad about the vertical."""
+        turn = rotation.heading(angle)
+        a, b, c, d = (rotation.multiply(turn, q) for q in self.sensors)
+        return KneeTrial(
+            (a, b, c, d), rotation.multiply(turn, self.thigh), rotation.multiply(turn, self.shank)
+        )
+
+    def __len__(self) -> int:
+        return len(self.thigh)
+
+
+def load(data: Path, name: str) -> KneeTrial:
+    """Return a trial: ``squats1``, ``walking1`` or ``DJ1``."""
+    biases = json.loads((data / FOLDER / "static_bias.json").read_text())["q_bias"]
+    with np.load(data / FOLDER / f"{name}.npz", allow_pickle=False) as arrays:
+        columns = [
+            rotation.multiply(_unit(arrays[f"S{i}_quat"]), _unit(np.array(biases[f"S{i}"])))
+            for i in (1, 2, 3, 4)
+        ]
+        columns += [_unit(arrays["q_femur_r"]), _unit(arrays["q_tibia_r"])]
+    seen = np.all([np.isfinite(q).all(axis=1) for q in columns], axis=0)
+    # Y-up file: (w, x, y, z) becomes (w, z, x, y) when world and segment axes are renamed alike
+    a, b, c, d, thigh, shank = (q[seen][:, [0, 3, 1, 2]] for q in columns)
+    return KneeTrial((a, b, c, d), thigh, shank)
+
+
+def training_frames(trial: KneeTrial) -> int:
+    """Return how many frames the first 60 % are."""
+    return int(TRAINING_SHARE * len(trial))
+
+
+@dataclass(frozen=True, slots=True)
+class Judge:
+    """States errors: RMS degrees of thigh, shank and knee flexion about one functional axis."""
+
+    axis: Array
+
+    @staticmethod
+    def of(training: KneeTrial) -> Judge:
+        return Judge(functional_axis(joint_rotation(training.thigh, training.shank)))
+
+    def errors(self, said: tuple[Array, Array], truth: KneeTrial) -> tuple[float, float, float]:
+        thigh, shank = said
+        flexion = swing_twist(joint_rotation(thigh, shank), self.axis)[1]
+        expected = swing_twist(joint_rotation(truth.thigh, truth.shank), self.axis)[1]
+        off = np.pi - np.mod(np.pi - (flexion - expected), 2.0 * np.pi)
+        return (
+            _rms_degrees(rotation.angle_between(thigh, truth.thigh)),
+            _rms_degrees(rotation.angle_between(shank, truth.shank)),
+            _rms_degrees(off),
+        )
+
+
+def _unit(q: Array) -> Array:
+    return rotation.normalize(np.asarray(q, dtype=np.float64))
+
+
+def _rms_degrees(angles: Array | Sequence[float]) -> float:
+    return float(np.rad2deg(np.sqrt(np.mean(np.square(angles)))))
