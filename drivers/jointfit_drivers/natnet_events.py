@@ -15,6 +15,7 @@ from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, T
 from jointfit_drivers.natnet_continuity import Continuity
 from jointfit_drivers.natnet_names import bind
 from jointfit_drivers.natnet_poses import Poses
+from jointfit_drivers.natnet_terms import bitstream_response, same_instance
 from jointfit_protocols.corrupt import Corrupt as WireCorrupt
 from jointfit_protocols.natnet_frame import (
     FRAME_BITSTREAM_CHANGED,
@@ -162,7 +163,7 @@ class NatNetEvents:
             return []
         self._info = info
         out: list[Decoded] = [_introduced(info)]
-        if before is not None and info._replace(natnet_version=before.natnet_version) != before:
+        if before is not None and not same_instance(info, before):
             self._binding = None
             self._continuity.forget()
             out.append(DeviceEvent("restart", f"another server answers: {info.application}"))
@@ -181,13 +182,8 @@ class NatNetEvents:
 
     def _response(self, _: Chunk, message: Message) -> list[Decoded]:
         """Take the answer to ``Bitstream,x.y``; nothing else that is answered concerns us."""
-        command, *versions = cast("Response", message).text.split(",")
-        version = versions[0] if versions else ""
-        major, _dot, minor = version.partition(".")
-        known = command == "Bitstream" and major.isdecimal() and minor.isdecimal()
-        if not known or len(version) > len("99.99"):
-            return []
-        return self._adopt((int(major), int(minor)))
+        version = bitstream_response(cast("Response", message).text)
+        return [] if version is None else self._adopt(version)
 
     def _model(self, _: Chunk, message: Message) -> list[Decoded]:
         model = cast("ModelDefinition", message)

@@ -1,0 +1,70 @@
+"""OptiTrack Motive, and whatever else speaks NatNet 3 or 4 over UDP.
+
+Law: two halves. `NatNetEvents` is pure; `run` connects and hands on every datagram of the server,
+answers to the handshake included, so that a replay of the chunks sees all that was seen live.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_drivers.natnet_events import NatNetEvents
+from jointfit_drivers.natnet_session import Session
+from jointfit_drivers.natnet_settings import NatNetSettings
+from jointfit_drivers.natnet_socket import local_address
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit, Wire
+
+
+class NatNetMocap:
+    """One NatNet server: labeled markers and rigid bodies, stamped by its own clock."""
+
+    Settings: ClassVar[type[NatNetSettings]] = NatNetSettings
+    wire: ClassVar[Wire] = "datagram"
+
+    def __init__(self, settings: NatNetSettings) -> None:
+        self._settings = settings
+
+    def decoder(self) -> NatNetEvents:
+        """Return the pure half: datagrams in, optical frames in SI out."""
+        return NatNetEvents(self._settings)
+
+    async def run(self, emit: Emit) -> None:
+        """Connect to the server and read until cancelled.
+
+        Raises
+        ------
+        DeviceLost
+            No such host, no answer, nobody listening, no frame for ``silence_s``, another server
+            in its place; worth another try.
+        DeviceMisconfigured
+            Not a NatNet server, a bitstream that cannot be read, no such network card.
+        """
+        host = await self._resolve()
+        await Session(self._settings, host, self._local(host), emit).run()
+
+    async def _resolve(self) -> str:
+        """Return the numeric address of the server."""
+        name = self._settings.server
+        loop = asyncio.get_running_loop()
+        try:
+            found = await loop.getaddrinfo(name, None, family=socket.AF_INET)
+        except (OSError, UnicodeError) as error:
+            raise DeviceLost(f"NatNet server {name}: no such host: {error}") from error
+        return str(found[0][4][0])
+
+    def _local(self, host: str) -> str:
+        """Return the address of the network card to use."""
+        interface = self._settings.interface
+        try:
+            return local_address(host, interface)
+        except OSError as error:
+            if interface is None:
+                raise DeviceLost(f"NatNet server {host}: {error.strerror or error}") from error
+            raise DeviceMisconfigured(
+                f"mocap.interface = {interface!r}: no such network card with an IPv4 address"
+            ) from error
