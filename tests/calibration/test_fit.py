@@ -113,7 +113,7 @@ def test_the_correction_beats_the_mean_on_worn_sensors_in_three_seconds() -> Non
         assert np.rad2deg(of["anchored"]) < 5.0
     assert np.rad2deg(figures["flexion"]["knee"]["anchored"]) < 3.0
     for sensor in OWNER:
-        assert found.lag_ns[sensor] == pytest.approx(15e6, abs=2e6)
+        assert found.lag_ns[sensor] == pytest.approx(15e6, abs=0.5e6)
 
 
 def test_without_an_alignment_the_result_says_so_and_names_turned_worlds() -> None:

@@ -15,6 +15,7 @@ from jointfit_daemon.calibration.markers import (
     moving_template,
     rigid_fit,
     static_cluster,
+    steady_fit,
     track_cluster,
 )
 from jointfit_daemon.calibration.refused import CalibrationRefused
@@ -172,3 +173,20 @@ def test_a_template_is_learned_from_a_turning_plate() -> None:
     q, p, _ = rigid_fit(found, TEMPLATE[None])
     fitted = Rotation.from_quat(q[0], scalar_first=True).apply(found) + p[0]
     assert np.abs(fitted - TEMPLATE).max() < 5e-4
+
+
+def test_a_marker_that_comes_and_goes_makes_no_jump_where_skin_has_moved() -> None:
+    rng = np.random.default_rng(5)
+    shift = rng.normal(0, 0.008, TEMPLATE.shape)
+    drift = np.linspace(0.5, 1.0, 120)[:, None, None]
+    whole = TEMPLATE + shift * drift
+    gappy = whole.copy()
+    gappy[rng.uniform(size=120) < 0.2, 1] = np.nan
+    gappy[[0, -1]] = whole[[0, -1]]
+    q_whole, p_whole, _ = rigid_fit(TEMPLATE, whole)
+    q_plain, _, _ = rigid_fit(TEMPLATE, gappy)
+    q, p, _ = steady_fit(TEMPLATE, gappy)
+    plain = (q_plain - q_whole)[np.isnan(gappy).any(axis=(1, 2))]
+    assert np.abs(plain).max() > 5e-3  # the jump there would be
+    assert np.abs(q - q_whole).max() < 1e-5
+    assert np.abs(p - p_whole).max() < 1e-5
