@@ -70,6 +70,7 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
             "v": PAYLOAD_VERSION,
             "seq": state.seq,
             "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
+            "completed_us": (state.completed_ns + offset_ns) // _NS_PER_US,
             "age_ms": round((now_ns - state.t_ns) / _NS_PER_MS, 2),
             "mode": state.mode,
             "sync": state.sync,

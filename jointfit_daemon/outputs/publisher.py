@@ -89,7 +89,7 @@ class MqttPublisher:
         """
         life = self._outbox.life
         will = Outgoing(life, OFFLINE, 1, retain=True)
-        name = f"jointfitd/{self._settings.base}"  # fixed: takes over from its own dead predecessor
+        name = client_id(self._settings.base)
         async with MqttConnection(self._settings, name, will=will, farewell=will) as connection:
             self.connects, self.connected, self._said = self.connects + 1, True, ""
             log.info("mqtt: connected to %s:%d", self._settings.host, self._settings.tcp_port)
@@ -146,6 +146,16 @@ class MqttPublisher:
                 self._outbox.life,
                 self._settings.base,
             )
+
+
+def client_id(base: str) -> str:
+    """Return the daemon's client id: fixed, so that it takes over from its dead predecessor.
+
+    Only letters, digits and dashes: rumqttd breaks on a slash.
+    """
+    return "jointfitd-" + "".join(
+        letter if letter.isascii() and letter.isalnum() else "-" for letter in base
+    )
 
 
 def command_of(message: Incoming) -> str:
