@@ -121,6 +121,23 @@ def test_devices_without_time_are_stamped_evenly(delay: Delay, use: str, state: 
     assert clock.skew_ppm == pytest.approx(-1996, abs=10)
 
 
+@pytest.mark.parametrize("seconds", [3, 5])
+def test_a_young_clock_does_not_trust_its_slope(seconds: int) -> None:
+    for seed in range(12):
+        errors, _ = errors_of(DeviceClock(PERIOD), Device(seed).samples(6.5, latency_timer))
+        assert after(errors, seconds) < 0.45
+
+
+def test_a_better_estimate_is_approached_slowly_and_sigma_says_how_far_it_is() -> None:
+    samples = [(t, u, c, t + (4 if c < 1000 else 1) * MS) for t, u, c, _ in
+               Device(13, skew=0.0).samples(12, punctual)]  # fmt: skip
+    errors, stamps = errors_of(DeviceClock(PERIOD), samples)
+    steps = [b.t_ns - a.t_ns for a, b in pairwise(stamps[990:])]
+    assert max(abs(step - PERIOD) for step in steps) < 800e-6 * PERIOD  # and the skew
+    assert errors[-1] < errors[1000]
+    assert stamps[1005].sigma_ns > 2.5 * MS
+
+
 def test_sigma_is_honest() -> None:
     for seed in range(6):
         errors, stamps = errors_of(DeviceClock(PERIOD), Device(seed).samples(12, latency_timer))
@@ -174,6 +191,14 @@ def test_unwrapping_undoes_wrapping(modulus: int, gaps: list[float], jitter: flo
         assert last == true
 
 
+def test_half_a_turn_divides_forward_from_reordered() -> None:
+    assert unwrap(100, 256, 256, 0, S) == 356
+    assert unwrap(127, 256, 256, 0, S) == 383
+    assert unwrap(128, 256, 256, 0, S) == 128
+    assert unwrap(250, 259, 256, 0, S) == 250
+    assert unwrap(5, 1000, None, 0, 0) == 5
+
+
 def test_no_stamp_is_off_across_a_wrap_of_ticks() -> None:
     device = Device(5, first=(1 << 32) - 20_000_000)
     errors, stamps = errors_of(DeviceClock(PERIOD), device.samples(30, exponential))
@@ -224,7 +249,9 @@ def restarted(first: int, use: str = "ticks", gap: float = 0.4) -> tuple[DeviceC
     return clock, stamps
 
 
-@pytest.mark.parametrize("first", [0, 10_000, 79_000_000, 1 << 30, 3 << 30])
+@pytest.mark.parametrize(
+    "first", [0, 10_000, 79_000_000, 81_000_000, 100_000_000, 1 << 30, 3 << 30]
+)
 def test_after_a_restart_nothing_is_synced_before_it_has_settled(first: int) -> None:
     clock, stamps = restarted(first)
     assert clock.epoch == 1
@@ -246,6 +273,18 @@ def test_a_clock_that_jumps_while_its_counter_does_not_is_a_restart() -> None:
         )
         if k == 2000:
             assert clock.epoch == 1
+
+
+def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
+    """The device paused for 0.3 s and its clock with it, and no counter tells."""
+    clock = DeviceClock(PERIOD)
+    epochs = {}
+    for true, ticks, number, arrival in Device(14).samples(20, punctual):
+        pause = 300 * MS if number >= 1000 else 0
+        stamp = clock.feed_sample(ticks, None, arrival + pause, MICROSECONDS)
+        epochs[number] = stamp.epoch
+        assert number < 1300 or abs(stamp.t_ns - true - pause) < MS
+    assert (epochs[1150], epochs[1250], epochs[1999]) == (0, 1, 1)
 
 
 def test_a_gap_that_the_counter_shares_is_no_restart() -> None:
@@ -423,6 +462,19 @@ def test_echoes_map_the_server_at_once_and_better_later(seed: int) -> None:
     assert clock.skew_ppm == pytest.approx(-42, abs=1)
     assert clock.bound_ns == pytest.approx(440_000, abs=40_000)
     assert clock.state == "echo"
+
+
+def test_slow_and_lost_echoes_do_not_move_the_server_clock() -> None:
+    lan, all_of_them, some = Lan(3), DeviceClock(PERIOD), DeviceClock(PERIOD)
+    for number in range(60):
+        echo = lan.echo(START + number * S)
+        all_of_them.feed_echo(echo, SERVER)
+        if number % 3 != 1:
+            delay = 20 * MS if number % 3 else 0
+            some.feed_echo(ClockEcho(echo.sent_ns, echo.received_ns + delay, echo.ticks), SERVER)
+    now = START + 60 * S
+    a, b = (c.feed_sample(lan.ticks(now), 0, now + MS, SERVER) for c in (all_of_them, some))
+    assert abs(a.t_ns - b.t_ns) < 50_000
 
 
 def test_a_server_that_restarts_is_noticed_by_its_echo() -> None:

@@ -16,7 +16,12 @@ from jointfit_daemon.timing.lag import (
     estimate_lag_of_rates,
 )
 from jointfit_daemon.timing.lag_tracker import LagTracker
-from jointfit_daemon.timing.rates import Rates, rates_from_gyro, rates_from_orientations
+from jointfit_daemon.timing.rates import (
+    Interpolant,
+    Rates,
+    rates_from_gyro,
+    rates_from_orientations,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -275,6 +280,19 @@ def test_periodic_motion_is_ambiguous_in_a_wide_search() -> None:
     assert estimate_lag(t_ns, q, t_ns, q).refused is None  # mapped clocks: the near one is right
 
 
+def test_the_interpolant_follows_what_the_low_pass_lets_through() -> None:
+    t = np.arange(0, 2, 0.01)
+    waves = np.stack([np.sin(2 * np.pi * f * t) for f in (1, 4, 10)], axis=1)
+    track = Rates(t, waves, np.zeros(t.size, dtype=np.intp), 0.01, 1.0)
+    at = np.arange(0.1, 1.9, 0.0007)
+    value, slope, inside = Interpolant(track)(at)
+    assert inside.all()
+    for axis, f in enumerate((1, 4, 10)):
+        w = 2 * np.pi * f
+        assert value[:, axis] == pytest.approx(np.sin(w * at), abs=2e-3)
+        assert slope[:, axis] == pytest.approx(w * np.cos(w * at), abs=0.03 * w)
+
+
 # --- tracking ---------------------------------------------------------------------------------
 
 
@@ -308,6 +326,18 @@ def test_a_step_is_told_once_and_an_outlier_never() -> None:
     number, step_ns = steps[0]
     assert number - 21 < 8  # windows of 2.5 s: within 20 s
     assert step_ns / MS == pytest.approx(3.0, abs=0.5)
+
+
+def test_overlapping_windows_are_not_counted_twice() -> None:
+    last = {}
+    for window in (2.5, 10.0):
+        tracker = LagTracker(window_s=window, hop_s=2.5)
+        for k, estimate in enumerate(windows([4.0] * 20, 0.05)):
+            last[window] = tracker.feed(k * 2_500 * MS, estimate)
+    apart, overlapping = last[2.5], last[10.0]
+    assert apart is not None
+    assert overlapping is not None
+    assert overlapping.sigma_ns > 1.5 * apart.sigma_ns
 
 
 def test_a_refused_window_changes_nothing() -> None:
