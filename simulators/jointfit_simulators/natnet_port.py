@@ -1,0 +1,98 @@
+"""The socket of a simulated NatNet server. Law: loopback only; datagrams in and out, no meaning."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Address = tuple[str, int]
+
+LOOPBACK = "127.0.0.1"
+_MAX_DATAGRAM = 65_507
+
+
+class NatNetPort:
+    """A command socket on loopback that can be unplugged and plugged in again.
+
+    Parameters
+    ----------
+    command_port : int
+        0: any free one; the same again after `plug`.
+    data_port : int
+        Port announced for data; 0: any free one.
+    """
+
+    def __init__(self, command_port: int = 0, data_port: int = 0) -> None:
+        self.command_port = command_port
+        self.data_port = data_port or _free_port()
+        self._socket: socket.socket | None = None
+        self._handle: Callable[[bytes, Address], None] | None = None
+        self.plug()
+
+    def plug(self) -> None:
+        """Open the socket; on an open one it does nothing."""
+        if self._socket is not None:
+            return
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
+        opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        opened.bind((LOOPBACK, self.command_port))
+        self.command_port = opened.getsockname()[1]
+        self._socket = opened
+        if self._handle is not None:
+            asyncio.get_running_loop().add_reader(opened, self._readable)
+
+    def unplug(self) -> None:
+        """Close the socket: who sends here is refused from now on."""
+        opened, self._socket = self._socket, None
+        if opened is None:
+            return
+        with contextlib.suppress(RuntimeError):  # no loop: it is not being served
+            asyncio.get_running_loop().remove_reader(opened)
+        opened.close()
+
+    async def serve(self, handle: Callable[[bytes, Address], None]) -> None:
+        """Call `handle` with every datagram until cancelled, through unplugging and plugging."""
+        loop = asyncio.get_running_loop()
+        self._handle = handle
+        if self._socket is not None:
+            loop.add_reader(self._socket, self._readable)
+        try:
+            await loop.create_future()
+        finally:
+            self._handle = None
+            if self._socket is not None:
+                loop.remove_reader(self._socket)
+
+    def send(self, data: bytes, address: Address) -> bool:
+        """Send one datagram; tell whether it went."""
+        if self._socket is None:
+            return False
+        try:
+            self._socket.sendto(data, address)
+        except OSError:  # a client that is gone, a full queue: UDP loses it
+            return False
+        return True
+
+    def _readable(self) -> None:
+        while self._socket is not None and self._handle is not None:
+            try:
+                data, address = self._socket.recvfrom(_MAX_DATAGRAM)
+            except BlockingIOError:
+                return
+            except OSError:  # the ICMP answer of a client that is gone
+                continue
+            self._handle(data, address)
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
