@@ -12,26 +12,21 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
-from jointfit_daemon.model import Chunk
 from jointfit_drivers.can_bus import shared_bus
 from jointfit_drivers.xcdi_events import XcdiEvents
 from jointfit_protocols.can_frame import (
     EXTENDED_MAX,
-    RECORD_BYTES,
-    CanFrame,
-    pack_frames,
     unpack_frames,
 )
-from jointfit_protocols.candump import parse_candump
 from jointfit_protocols.xcdi import DataId, XcdiIds
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
+    from jointfit_daemon.model import Chunk
 
 log = logging.getLogger(__name__)
 
 _RAW_FRAMES = 20  # logged at debug level, so that a first real device can be judged from its log
-_CAPTURE_FRAMES = 64  # a chunk, as live
 
 
 class XcdiIdSettings(Settings):
@@ -156,31 +151,3 @@ class XcdiImu:
             emit(chunk)
 
         return emit_and_log
-
-    @staticmethod
-    def read_capture(capture: bytes) -> list[Chunk]:
-        """Return the chunks of a capture file: a ``candump -L`` log, or bare records.
-
-        For `jointfit decode`. Lines of the log that are no frames become records that the decoder
-        counts as discarded.
-        """
-        if capture.lstrip()[:1] not in {b"(", b"#"}:
-            return [Chunk(0, capture)]
-        chunks: list[Chunk] = []
-        frames: list[CanFrame] = []
-        for item in parse_candump(capture):
-            if isinstance(item, CanFrame):
-                frames.append(item)
-                if len(frames) == _CAPTURE_FRAMES:
-                    chunks.append(Chunk(item.t_ns, pack_frames(frames)))
-                    frames = []
-            else:
-                chunks.append(Chunk(frames[-1].t_ns if frames else 0, pack_frames(frames)))
-                frames = []
-                chunks.append(Chunk(chunks[-1].t_ns, _NO_RECORD))
-        if frames:
-            chunks.append(Chunk(frames[-1].t_ns, pack_frames(frames)))
-        return [chunk for chunk in chunks if chunk.data]
-
-
-_NO_RECORD = b"\xff" * RECORD_BYTES

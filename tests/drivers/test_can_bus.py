@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import socket
-import time
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-import can
 import pytest
-from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
-from jointfit_drivers.can_bus import shared_bus
-from jointfit_drivers.can_stamp import KernelStamps
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
-from jointfit_protocols.can_frame import CanFrame, frame_bits, unpack_frames
 from jointfit_protocols.xcdi import id_block
-from jointfit_simulators.can_wire import PythonCanWire, SlcanAdapter
+from jointfit_simulators.can_wire import SlcanAdapter
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
 
@@ -28,7 +21,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-S = 1_000_000_000
 
 
 def bus_at(folder: Path, **more: Any) -> CanBusSettings:
@@ -275,205 +267,3 @@ async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> No
     async with serving(Chatter(tmp_path / "adapter")):
         with pytest.raises(DeviceMisconfigured, match="no SLCAN adapter answers at 115200 baud"):
             await driver_of("S3", bus_at(tmp_path)).run(lambda _: None)
-
-
-async def test_a_bus_of_python_can_is_shared_too() -> None:
-    bus = CanBusSettings(interface="virtual", channel="shared")
-    wire = PythonCanWire("virtual", "shared")
-    devices = [XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(base))) for base in (0x100, 0x200)]
-    try:
-        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
-        async with shared_bus(bus) as opened_bus:
-            await asyncio.sleep(0.05)
-            began = time.monotonic_ns()
-            for number in range(100):
-                for device in devices:
-                    device.push(number * 10_000_000, IDENTITY)
-            for run in runs:
-                await run.wait_for(100)
-                assert began <= run.samples[0].arrival_ns <= time.monotonic_ns()
-            assert opened_bus.foreign == 0, "python-can filters for us"
-        for run in runs:
-            await run.cancel()
-    finally:
-        wire.unplug()
-
-
-class Broken(can.BusABC):
-    """Stands where a vendor's library stands; fails when read."""
-
-    def __init__(self, error: Exception) -> None:
-        super().__init__(channel="x")
-        self._error = error
-
-    @override
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        time.sleep(0.01)
-        raise self._error
-
-    @override
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        raise NotImplementedError
-
-
-@pytest.mark.parametrize(
-    ("error", "kind"),
-    [
-        (can.CanOperationError("adapter pulled out", 19), DeviceLost),
-        (can.CanOperationError("something of the vendor's"), DeviceLost),
-        (ValueError("the backend cannot parse a line"), DeviceLost),
-        (ZeroDivisionError(), ZeroDivisionError),
-    ],
-)
-async def test_what_a_pump_thread_meets_reaches_the_driver(
-    monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception]
-) -> None:
-    monkeypatch.setattr(can, "Bus", lambda **_: Broken(error))
-    bus = CanBusSettings(interface="virtual", channel="broken")
-    with pytest.raises(kind):
-        await driver_of("S3", bus).run(lambda _: None)
-
-
-async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
-    bus = CanBusSettings(interface="socketcna", channel="can0")
-    with pytest.raises(DeviceMisconfigured, match="did you mean 'socketcan'"):
-        await driver_of("S3", bus).run(lambda _: None)
-
-
-async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
-    bus = CanBusSettings(interface="kvaser", channel="0")
-    with pytest.raises(DeviceMisconfigured, match="opened as kvaser"):
-        await driver_of("S3", bus).run(lambda _: None)
-
-
-@pytest.mark.parametrize(
-    ("number", "kind", "words"),
-    [
-        (97, DeviceMisconfigured, "no CAN in this kernel.*can_raw"),
-        (19, DeviceLost, "no such CAN interface"),
-    ],
-)
-async def test_kernels_without_can_and_absent_links(
-    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], words: str
-) -> None:
-    def refuse(_: str) -> None:
-        raise OSError(number, "as the kernel says it")
-
-    monkeypatch.setattr("jointfit_drivers.python_can_bus._require_interface", refuse)
-    with pytest.raises(kind, match=words):
-        await driver_of("S3", CanBusSettings(channel="can0")).run(lambda _: None)
-
-
-class Filtered(can.BusABC):
-    """SocketCAN as far as one test needs it: a descriptor, stamps, and an error told once."""
-
-    def __init__(self, **_: Any) -> None:
-        self.socket, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket.setblocking(False)
-        self.down = False
-        super().__init__(channel="can0")
-
-    @override
-    def fileno(self) -> int:
-        return self.socket.fileno()
-
-    @override
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        try:
-            data = self.socket.recv(16)
-        except BlockingIOError:
-            return None, True
-        if data == b"down":
-            raise can.CanOperationError("Network is down", 100)
-        return can.Message(
-            arbitration_id=0x21,
-            is_extended_id=False,
-            data=data,
-            timestamp=time.time(),
-        ), True
-
-    @override
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        raise NotImplementedError
-
-    @override
-    def shutdown(self) -> None:
-        super().shutdown()
-        self.socket.close()
-        self.far.close()
-
-
-async def test_a_link_that_goes_down_is_told_once_and_frames_before_it_count(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    made: list[Filtered] = []
-
-    def make(**words: Any) -> Filtered:
-        made.append(Filtered(**words))
-        return made[-1]
-
-    monkeypatch.setattr(can, "Bus", make)
-    monkeypatch.setattr("jointfit_drivers.python_can_bus._require_interface", lambda _: None)
-    chunks: list[Chunk] = []
-    driver = driver_of("S3", CanBusSettings(channel="can0"))
-    task = asyncio.create_task(driver.run(chunks.append))
-    await asyncio.sleep(0.02)
-    for number in range(100):
-        made[0].far.send(bytes([number] * 8))
-    made[0].far.send(b"down")
-    with pytest.raises(DeviceLost, match="ip link set can0 up"):
-        await task
-    found = [frame for chunk in chunks for frame in unpack_frames(chunk.data)]
-    assert [frame.data[0] for frame in found if isinstance(frame, CanFrame)] == list(range(100))
-    assert max(len(chunk.data) for chunk in chunks) <= 64 * 24
-
-
-# --- stamps -----------------------------------------------------------------------------------
-
-
-class Clocks:
-    def __init__(self) -> None:
-        self.monotonic, self.offset = 100 * S, 1_700_000_000 * S
-
-    def monotonic_ns(self) -> int:
-        return self.monotonic
-
-    def unix_ns(self) -> int:
-        return self.monotonic + self.offset
-
-
-def stamped(clocks: Clocks, stamps: KernelStamps, ago_ns: int, offset: int | None = None) -> int:
-    """Return how long ago the frame seems to have ended, ns, when it did `ago_ns` ago."""
-    unix = clocks.monotonic - ago_ns + (clocks.offset if offset is None else offset)
-    start = stamps.start_ns(unix / S, 8, extended=False)
-    return clocks.monotonic - start - frame_bits(8, extended=False) * 1000
-
-
-def test_a_kernel_stamp_becomes_the_monotonic_start_of_the_frame() -> None:
-    clocks = Clocks()
-    stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
-    stamps.pair()
-    assert stamped(clocks, stamps, 5_000_000) == pytest.approx(5_000_000, abs=300)
-
-
-@pytest.mark.parametrize("step_s", [-3600, 3600, 0.01])
-def test_a_stepped_wall_clock_moves_no_frame(step_s: float) -> None:
-    clocks = Clocks()
-    stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
-    stamps.pair()
-    before = clocks.offset
-    clocks.offset += round(step_s * S)
-    clocks.monotonic += 1_000_000
-    stamps.pair()
-    if abs(step_s) > 2:  # a small one cannot be told for frames that waited
-        assert stamped(clocks, stamps, 500_000, before) == pytest.approx(500_000, abs=300)
-    assert stamped(clocks, stamps, 200_000) == pytest.approx(200_000, abs=300)
-    assert stamps.unusable == 0
-
-
-def test_an_absurd_stamp_is_replaced_by_now_and_counted() -> None:
-    clocks = Clocks()
-    stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
-    stamps.pair()
-    assert stamped(clocks, stamps, 500 * S) == 0
-    assert stamps.unusable == 1

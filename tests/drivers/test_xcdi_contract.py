@@ -79,7 +79,6 @@ class TestXcdiOnABusWithoutDescriptor(DriverContract):
     """python-can's in-process bus: read by a pump thread, as most vendors' libraries are."""
 
     registered_as = "xcdi"
-    has_noise = False
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
@@ -88,3 +87,7 @@ class TestXcdiOnABusWithoutDescriptor(DriverContract):
     @override
     def make_driver(self, folder: Path) -> Driver:
         return XcdiImu(settings("virtual", str(folder)))
+
+    # An in-process bus has no noise, and anything at all may share it.
+    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
+    test_a_wrong_device_is_named_not_retried = None  # type: ignore[assignment]

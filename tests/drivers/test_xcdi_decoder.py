@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from jointfit_daemon.driver import CanBusSettings
+from jointfit_daemon.files.candump import read_candump
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_drivers.xcdi_events import XcdiEvents
@@ -351,12 +352,9 @@ def test_a_candump_log_is_decoded() -> None:
     tape = Tape()
     tape.play(XcdiDevice(tape), range(100))
     log = "".join(f"({f.t_ns / 1e9:.6f}) can0 {f.can_id:03X}#{f.data.hex()}\n" for f in tape.frames)
-    driver = XcdiImu(settings())
-    decoder = driver.decoder()
+    decoder = XcdiImu(settings()).decoder()
     found = [
-        item
-        for chunk in driver.read_capture(log.encode() + b"cut li")
-        for item in decoder.feed(chunk)
+        item for chunk in read_candump(log.encode() + b"cut li") for item in decoder.feed(chunk)
     ]
     assert len(samples(found)) == 100
     assert decoder.messages == 400
