@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -12,14 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.model import ClockEcho, TickClock
+from jointfit_daemon.model import TickClock
 from jointfit_daemon.timing.clock import DeviceClock, Stamp
-from jointfit_daemon.timing.envelope import Envelope, lower_hull, straddling_edge
-from jointfit_daemon.timing.wrap import unwrap
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -171,32 +167,6 @@ def test_losses_of_a_device_without_time_are_found() -> None:
 
 
 # --- wraps ------------------------------------------------------------------------------------
-
-
-@given(
-    st.sampled_from([256, 1 << 16, 86_400_00]),
-    st.lists(st.floats(0, 90), min_size=1, max_size=20),
-    st.floats(-0.2, 0.2),
-)
-def test_unwrapping_undoes_wrapping(modulus: int, gaps: list[float], jitter: float) -> None:
-    turn_ns = modulus * MS
-    true = last = 5
-    for gap in gaps:
-        step = int(gap * modulus)
-        true += step
-        elapsed = max(0, step * MS + (int(jitter * turn_ns) if 4 * step > 2 * modulus else 0))
-        if modulus / 2 <= step and 4 * elapsed <= turn_ns:
-            continue
-        last = unwrap(true % modulus, last, modulus, elapsed, turn_ns)
-        assert last == true
-
-
-def test_half_a_turn_divides_forward_from_reordered() -> None:
-    assert unwrap(100, 256, 256, 0, S) == 356
-    assert unwrap(127, 256, 256, 0, S) == 383
-    assert unwrap(128, 256, 256, 0, S) == 128
-    assert unwrap(250, 259, 256, 0, S) == 250
-    assert unwrap(5, 1000, None, 0, 0) == 5
 
 
 def test_no_stamp_is_off_across_a_wrap_of_ticks() -> None:
@@ -368,177 +338,3 @@ def test_time_never_runs_backwards(
 def test_stamps_grow_with_device_time(seed: int, skew: float) -> None:
     _, stamps = errors_of(DeviceClock(PERIOD), Device(seed, skew=skew).samples(4, latency_timer))
     assert all(a.t_ns < b.t_ns for a, b in pairwise(stamps))
-
-
-# --- the envelope -----------------------------------------------------------------------------
-
-points = st.lists(
-    st.tuples(st.integers(0, 10**6), st.integers(-1000, 1000)), min_size=2, max_size=30
-)
-
-
-def supports(a: tuple[int, int], b: tuple[int, int], cloud: list[tuple[int, int]]) -> bool:
-    return all((b[0] - a[0]) * (y - a[1]) >= (b[1] - a[1]) * (u - a[0]) for u, y in cloud)
-
-
-@given(points, st.randoms())
-def test_the_edge_is_the_best_line_under_all_points(
-    cloud: list[tuple[int, int]], shuffle: np.random.Generator
-) -> None:
-    if len({u for u, _ in cloud}) < 2:
-        return
-    mean = sum(u for u, _ in cloud) / len(cloud)
-    a, b = straddling_edge(lower_hull(cloud), mean)
-    shuffled = list(cloud)
-    shuffle.shuffle(shuffled)
-    assert lower_hull(shuffled) == lower_hull(cloud)
-
-    def height(a: tuple[int, int], b: tuple[int, int]) -> float:
-        return a[1] + (b[1] - a[1]) * (mean - a[0]) / (b[0] - a[0])
-
-    assert supports(a, b, cloud)
-    candidates = [
-        height(p, q) for p in cloud for q in cloud if p[0] < q[0] and supports(p, q, cloud)
-    ]
-    assert height(a, b) == pytest.approx(max(candidates))
-
-
-@given(points, st.data())
-def test_delaying_a_point_off_the_hull_changes_nothing(
-    cloud: list[tuple[int, int]], data: st.DataObject
-) -> None:
-    hull = lower_hull(cloud)
-    off = [point for point in cloud if point not in hull]
-    if off:
-        u, y = data.draw(st.sampled_from(off))
-        later = [(u, y + data.draw(st.integers(1, 1000))) if p == (u, y) else p for p in cloud]
-        assert lower_hull(later) == hull
-
-
-def test_the_envelope_never_lies_above_a_point_of_its_window() -> None:
-    rng, envelope = np.random.default_rng(0), Envelope()
-    for k in range(2000):
-        y = int(rng.exponential(MS))
-        envelope.feed(k * PERIOD, y)
-        assert envelope.residual(k * PERIOD, y) >= -1e-3
-
-
-# --- echoes -----------------------------------------------------------------------------------
-
-SERVER_HZ = 3_312_787
-SERVER = TickClock(1, None, SERVER_HZ)
-
-
-class Lan:
-    """Round trips of 0.86 ms and exponential 0.1 ms each way, 1 % spikes of 20 ms; skew 42 ppm."""
-
-    def __init__(self, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
-
-    def ticks(self, t: float) -> int:
-        return int((t - START + 400 * S) * (1 + 42e-6) * SERVER_HZ / S)
-
-    def echo(self, t: int) -> ClockEcho:
-        there, back = 430_000 + self.rng.exponential(1e5, 2) + (self.rng.random(2) < 0.01) * 20e6
-        return ClockEcho(t, int(t + there + back), self.ticks(t + there))
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_echoes_map_the_server_at_once_and_better_later(seed: int) -> None:
-    lan, clock = Lan(seed), DeviceClock(PERIOD)
-    now, stamp = START, NO_STAMP
-    for number in range(70):
-        clock.feed_echo(lan.echo(now), SERVER)
-        now += 50 * MS if number < 10 else S + int(lan.rng.uniform(-0.2, 0.2) * S)
-        stamp = clock.feed_sample(lan.ticks(now), None, now + 6 * MS, SERVER)
-        if number >= 9:
-            assert stamp.synced
-            assert abs(stamp.t_ns - now) < 4 * stamp.sigma_ns
-        if number == 9:
-            assert abs(stamp.t_ns - now) < 0.1 * MS
-            assert stamp.sigma_ns < 50_000
-    assert abs(stamp.t_ns - now) < 60_000
-    assert stamp.sigma_ns < 20_000
-    assert clock.skew_ppm == pytest.approx(-42, abs=1)
-    assert clock.bound_ns == pytest.approx(440_000, abs=40_000)
-    assert clock.state == "echo"
-
-
-def test_slow_and_lost_echoes_do_not_move_the_server_clock() -> None:
-    lan, all_of_them, some = Lan(3), DeviceClock(PERIOD), DeviceClock(PERIOD)
-    for number in range(60):
-        echo = lan.echo(START + number * S)
-        all_of_them.feed_echo(echo, SERVER)
-        if number % 3 != 1:
-            delay = 20 * MS if number % 3 else 0
-            some.feed_echo(ClockEcho(echo.sent_ns, echo.received_ns + delay, echo.ticks), SERVER)
-    now = START + 60 * S
-    a, b = (c.feed_sample(lan.ticks(now), 0, now + MS, SERVER) for c in (all_of_them, some))
-    assert abs(a.t_ns - b.t_ns) < 50_000
-
-
-def test_a_server_that_restarts_is_noticed_by_its_echo() -> None:
-    lan, clock = Lan(0), DeviceClock(PERIOD)
-    for k in range(20):
-        clock.feed_echo(lan.echo(START + k * 50 * MS), SERVER)
-    clock.feed_echo(ClockEcho(START + S, START + S + MS, 5), SERVER)
-    assert clock.epoch == 1
-    assert clock.state == "settling"
-
-
-def test_echoes_before_anyone_knows_the_tick_rate_are_ignored() -> None:
-    clock = DeviceClock(PERIOD)
-    clock.feed_echo(ClockEcho(START, START + MS, 5))
-    assert clock.bound_ns is None
-
-
-def test_a_clock_without_fresh_echoes_is_stale() -> None:
-    lan, clock = Lan(0), DeviceClock(PERIOD)
-    for k in range(20):
-        clock.feed_echo(lan.echo(START + k * 50 * MS), SERVER)
-    for second in (1, 60):
-        clock.feed_sample(lan.ticks(START + second * S), 0, START + second * S + 6 * MS, SERVER)
-    assert clock.state == "stale"
-
-
-@pytest.fixture
-def capture(shared_data: Path) -> list[tuple[int, bytes]]:
-    """UDP payloads to or from the NatNet server with their packet times, ns."""
-    file = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data" / "raw" / "traffic.pcapng"
-    data, at, packets = file.read_bytes(), 0, []
-    while at < len(data):
-        kind, size = struct.unpack_from("<II", data, at)
-        if kind == 6:
-            high, low, length = struct.unpack_from("<III", data, at + 12)
-            packets.append((((high << 32) | low) * 1000, data[at + 28 : at + 28 + length][42:]))
-        at += size
-    return packets
-
-
-def test_the_real_capture_gives_its_known_timing(capture: list[tuple[int, bytes]]) -> None:
-    clock, passive = DeviceClock(S // 120), DeviceClock(S // 120)
-    sent: dict[bytes, int] = {}
-    echoes, transits = [], []
-    for t, payload in capture:
-        (kind,) = struct.unpack_from("<H", payload)
-        if kind == 12:
-            sent[payload[4:12]] = t
-        elif kind == 13:
-            (ticks,) = struct.unpack_from("<Q", payload, 12)
-            echoes.append(ClockEcho(sent[payload[4:12]], t, ticks))
-    for echo in echoes:
-        clock.feed_echo(echo, SERVER)
-    assert len(echoes) == 9
-    clock.feed_echo(echoes[-1], SERVER)  # the tenth completes the burst
-    for t, payload in capture:
-        if struct.unpack_from("<H", payload)[0] == 7:
-            (number,) = struct.unpack_from("<i", payload, 4)
-            (transmit,) = struct.unpack_from("<Q", payload, len(payload) - 14)
-            stamp = clock.feed_sample(transmit, number, t, SERVER)
-            transits.append((t - stamp.t_ns) / MS)
-            passive.feed_sample(transmit, None, t, SERVER)
-    assert len(transits) == 518
-    assert clock.skew_ppm == pytest.approx(42, abs=24)
-    assert np.median(transits) == pytest.approx(0.693, abs=0.06)
-    assert min(transits) == pytest.approx(0.416, abs=0.08)
-    assert passive.skew_ppm == pytest.approx(34, abs=25)
