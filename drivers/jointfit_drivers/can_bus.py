@@ -95,8 +95,6 @@ class SharedBus:
         """Take part: open the bus unless another device did."""
         self._users += 1
         async with self._lock:
-            if self._failed is not None:
-                await self._close()
             if self._backend is None:
                 backend = (SlcanBus if self._settings.interface == "slcan" else PythonCanBus)(
                     self._settings

@@ -54,6 +54,7 @@ class Continuity:
         self._ticks: int | None = None
         self._counter: int | None = None
         self._groups = 0  # since the last group that had time, as the counter says
+        self._uncounted = 0  # groups that came, or are known lost, since the last counter
         self._counted = False  # every group since then had a counter
         self._steps: list[float] = []
         self._period: float | None = None
@@ -80,28 +81,24 @@ class Continuity:
         count = self._count(counter)
         if count is not None and count > COUNTER_MODULUS // 2:
             return self._restart(ticks, counter)
-        lost = max(count - 1, 0) if count else 0
+        lost = 0 if count is None else max(count - 1 - self._uncounted, 0)
         self._groups += count or 0
         self._counted = self._counted and count is not None
         if ticks is None or self._ticks is None:
-            self._remember(ticks, counter)
-            return Step(lost)
+            return self._remember(ticks, counter, lost)
         d = (ticks - self._ticks) % TICKS_MODULUS
         groups = self._groups if self._counted else None
         if d >= TICKS_MODULUS // 2 or (groups is not None and (d == 0) != (groups == 0)):
             return self._restart(ticks, counter)
         if self._period is None:
             self._learn(d, groups)
-        else:
-            expected = round(d / self._period)
-            if not self._agree(expected, groups):
-                return self._restart(ticks, counter)
-            if groups is None:
-                lost = max(expected - 1, 0)
-                if counter is None and self._counter is not None:  # keep the count going
-                    self._counter = (self._counter + expected) % COUNTER_MODULUS
-        self._remember(ticks, counter)
-        return Step(lost)
+            return self._remember(ticks, counter, lost)
+        expected = round(d / self._period)
+        if not self._agree(expected, groups):
+            return self._restart(ticks, counter)
+        if count is None:
+            lost = max(expected - 1, 0)
+        return self._remember(ticks, counter, lost)
 
     def _count(self, counter: int | None) -> int | None:
         """Return the step of the counter; None where either end is missing."""
@@ -123,16 +120,17 @@ class Continuity:
             self._steps.clear()
 
     def _restart(self, ticks: int | None, counter: int | None) -> Step:
-        self._ticks = None
-        self._counter = None
-        self._period = None
+        self._ticks = self._counter = self._period = None
         self._steps.clear()
-        self._remember(ticks, counter)
+        self._remember(ticks, counter, 0)
         return Step(restarted=True)
 
-    def _remember(self, ticks: int | None, counter: int | None) -> None:
-        if counter is not None:
-            self._counter = counter
+    def _remember(self, ticks: int | None, counter: int | None, lost: int) -> Step:
+        if counter is None:
+            self._uncounted += 1 + lost  # its next step includes them
+        else:
+            self._counter, self._uncounted = counter, 0
         if ticks is not None:
             self._ticks, self._groups = ticks, 0
             self._counted = counter is not None
+        return Step(lost)

@@ -172,15 +172,20 @@ def test_a_lost_sample_time_costs_the_time_and_not_the_sample() -> None:
     assert not of_kind(found, "restart")
 
 
-def test_a_lost_counter_is_not_taken_for_lost_samples() -> None:
+@pytest.mark.parametrize("before", [3, 20])
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_lost_counter_is_not_taken_for_lost_samples(before: int, lost: int) -> None:
     tape = Tape()
     device = XcdiDevice(tape)
-    tape.play(device, range(20))
-    device.lose_frames(DataId.GROUP_COUNTER, 4)
-    tape.play(device, range(20, 40))
+    tape.play(device, range(before))
+    device.lose_frames(DataId.GROUP_COUNTER, 2)
+    tape.play(device, range(before, before + 2))
+    device.lose(lost)
+    device.lose_frames(DataId.GROUP_COUNTER, 2)
+    tape.play(device, range(before + 2, 40))
     found = decoded(tape)
-    assert len(samples(found)) == 40
-    assert not of_kind(found, "gap")
+    assert len(samples(found)) == 40 - lost
+    assert sum(gap.data["lost"] for gap in of_kind(found, "gap")) == lost  # type: ignore[misc]
     assert not of_kind(found, "restart")
 
 
@@ -214,7 +219,9 @@ def test_a_device_without_sample_time_works_and_says_so_once() -> None:
 
 
 @pytest.mark.parametrize("offset_ms", [0.3, 3, 5])
-@pytest.mark.parametrize("ahead", [(7, 300_000), (0, 0), (1, 0), (2, 40), (30_000, 2**31)])
+@pytest.mark.parametrize(
+    "ahead", [(7, 300_000), (0, 0), (1, 0), (2, 40), (0, 103), (30_000, 2**31)]
+)
 def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
     ahead: tuple[int, int], offset_ms: float
 ) -> None:
@@ -234,6 +241,17 @@ def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
     assert "two sensors" in told.text
     assert "block of its own" in told.text
     assert len(of_kind(found, "restart")) <= 3
+
+
+def test_two_sensors_that_speak_in_turn_frame_by_frame_are_found_out() -> None:
+    tape = Tape()
+    a, b = XcdiDevice(tape), XcdiDevice(tape, XcdiDeviceOptions(first_counter=500))
+    for number in range(200):
+        groups = [each.group(number * 10 * MS, IDENTITY) for each in (a, b)]
+        tape.frames += [frame for pair in zip(*groups, strict=True) for frame in pair]
+    found = decoded(tape)
+    assert len(samples(found)) < 30
+    assert len(of_kind(found, "warning")) == 1
 
 
 def test_interleaved_groups_of_two_sensors_on_one_identifier_are_found_out() -> None:

@@ -59,6 +59,14 @@ def test_a_broken_record_costs_no_other() -> None:
     assert [found[1][0], found[3][0]] == [RECORD_BYTES, 3]
 
 
+def test_sizes_flags_and_identifiers_that_cannot_be_are_corrupt() -> None:
+    good = bytearray(pack_frames([CanFrame(1, 0x21, b"12345678")]))
+    for place, value in ((12, 8), (13, 9), (9, 0x08), (11, 0x20)):
+        bad = bytearray(good)
+        bad[place] = value
+        assert isinstance(unpack_frames(bytes(bad))[0], Corrupt)
+
+
 def test_notes_of_the_host_keep_their_number() -> None:
     for note in (host_dropped(5, 4722), host_corrupt(5, 2**40)):
         (back,) = unpack_frames(pack_frames([note]))
