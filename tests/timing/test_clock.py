@@ -1,4 +1,4 @@
-"""Device time to host time: accuracy, settling, wraps, restarts; and what it costs."""
+"""Device time to host time: accuracy, settling, wraps, restarts."""
 
 from __future__ import annotations
 
