@@ -65,12 +65,11 @@ def test_a_pose_is_refused_by_sentences_that_say_what_to_do() -> None:
     (short,) = static_problems(good, 2.0)
     assert "2.0 s" in short
     assert "longer" in short
-    (loose,) = static_problems({**good, "S2": still(1.4 * DEG)}, 5.0)
+    slack = {**good, "S2": still(1.4 * DEG)}
+    (loose,) = static_problems(slack, 5.0, StaticLimits(spread=DEG))
     assert loose.startswith("S2")
     assert "1.4 deg" in loose
-    assert (
-        static_problems({**good, "S2": still(1.4 * DEG)}, 5.0, StaticLimits(spread=DEG * 2)) == ()
-    )
+    assert static_problems(slack, 5.0, StaticLimits(spread=2 * DEG)) == ()
 
 
 def test_a_sensor_that_slipped_is_told_from_a_pose_that_changed() -> None:
