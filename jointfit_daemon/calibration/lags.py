@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.trial import SensorTrack
 
-PLATE = LagSettings(max_sigma_ns=2e6, min_r2=0.9, min_rate=radians(10), min_valid=0.5)
+PLATE = LagSettings(
+    max_sigma_ns=2e6,
+    min_r2=0.9,
+    min_rate=radians(10),
+    min_acceleration=radians(60),
+    min_valid=0.5,
+)
 """A rigid body turned by hand: noise and occlusion are all that may spoil it."""
 SKIN = LagSettings(
     max_sigma_ns=5e6,
