@@ -36,7 +36,6 @@ from jointfit_protocols.natnet_messages import (
     decode,
     encode,
 )
-from jointfit_protocols.natnet_model import NAMES_FROM
 from jointfit_simulators.natnet_options import NatNetServerOptions
 from jointfit_simulators.natnet_port import NatNetPort
 from jointfit_simulators.natnet_stage import Stage, Stamps, model_definition
@@ -298,8 +297,7 @@ class NatNetServer:
         return Bare(MessageId.UNRECOGNIZED_REQUEST)
 
     def _describe(self, client: Client, address: Address) -> None:
-        named = client.version >= NAMES_FROM
-        model = model_definition(self._stage.bodies, named=named)
+        model = model_definition(self._stage.bodies, client.version)
         self._send(model, address, client.version)
         client.described = True
 

@@ -21,8 +21,10 @@ from jointfit_protocols.natnet_frame import (
     FrameOfData,
     Marker,
     MarkerSet,
+    Version,
 )
 from jointfit_protocols.natnet_model import (
+    NAMES_FROM,
     BodyDescription,
     MarkerSetDescription,
     ModelDefinition,
@@ -40,6 +42,7 @@ _HALF = math.sqrt(0.5)
 _SEEN = MARKER_POINT_CLOUD_SOLVED | MARKER_HAS_MODEL
 _FILLED = _SEEN | MARKER_OCCLUDED
 _SIZE, _RESIDUAL, _ERROR = 0.02, 2e-4, 2e-4
+_TURNED_FROM: Version = (4, 2)
 _ORIGIN: Vector = (0.0, 0.0, 0.0)
 _NOWHERE: Pose = (_ORIGIN, (1.0, 0.0, 0.0, 0.0))
 
@@ -68,15 +71,16 @@ class Stamps:
     params: int
 
 
-def model_definition(bodies: tuple[StagedBody, ...], *, named: bool) -> ModelDefinition:
+def model_definition(bodies: tuple[StagedBody, ...], version: Version) -> ModelDefinition:
     """Return the descriptions of `bodies` as Motive orders them.
 
     Parameters
     ----------
     bodies : tuple of StagedBody
         What the operator made.
-    named : bool
-        Marker names in the body descriptions (from bitstream 4.0).
+    version : (int, int)
+        From 4.0 bodies name their markers; from 4.2 they carry the offset quaternion that the one
+        client which knows 4.2 expects.
     """
     every = tuple(f"{body.name}_{i}" for body in bodies for i in range(1, len(body.markers) + 1))
     sets = [MarkerSetDescription(body.name, body.markers) for body in bodies]
@@ -86,7 +90,8 @@ def model_definition(bodies: tuple[StagedBody, ...], *, named: bool) -> ModelDef
             body.id,
             positions=body.positions or (_ORIGIN,) * len(body.markers),
             labels=(0,) * len(body.markers),
-            markers=body.markers if named else (),
+            markers=body.markers if version >= NAMES_FROM else (),
+            rotation=(0.0, 0.0, 0.0, 1.0) if version >= _TURNED_FROM else None,
         )
         for body in bodies
     ]

@@ -37,9 +37,10 @@ class Gossip:
         self.unplug, self.plug = self._port.unplug, self._port.plug
 
     async def run(self) -> None:
-        await self._port.serve(
-            lambda _, who: self._port.send(b"HTTP/1.1 400 what\r\n", who) or None
-        )
+        await self._port.serve(self._answer)
+
+    def _answer(self, _: bytes, address: tuple[str, int]) -> None:
+        self._port.send(b"HTTP/1.1 400 what\r\n", address)
 
 
 class TestNatNet(DriverContract):

@@ -1,0 +1,255 @@
+"""The simulated NatNet server, judged by an independent client and by its own codec."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import time
+from typing import TYPE_CHECKING, Any
+
+import natnet  # type: ignore[import-untyped]
+import pytest
+
+from jointfit_protocols.natnet_connect import Connect
+from jointfit_protocols.natnet_frame import FrameOfData
+from jointfit_protocols.natnet_messages import (
+    Bare,
+    Discovery,
+    EchoRequest,
+    EchoResponse,
+    Message,
+    MessageId,
+    Request,
+    Response,
+    ServerInfo,
+    decode,
+    encode,
+)
+from jointfit_protocols.natnet_model import ModelDefinition
+from jointfit_simulators.natnet_options import NatNetServerOptions
+from jointfit_simulators.natnet_server import NatNetServer
+from jointfit_simulators.natnet_stage import StagedBody
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+THIGH = StagedBody("Thigh", ("T1", "T2", "T3"), 7)
+SHANK = StagedBody("Shank", ("S1", "S2"), 8)
+HALF = 0.5**0.5
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+PLACES = {"T1": (1.0, 2.0, 3.0), "T2": None, "T3": (0.5, 0.25, 0.125), "S1": (0.0, 0.0, 1.0)}
+POSES = {"Thigh": ((1.0, 2.0, 3.0), UPRIGHT), "Shank": None}
+
+
+@contextlib.asynccontextmanager
+async def serving(**options: Any) -> AsyncIterator[NatNetServer]:
+    server = NatNetServer(NatNetServerOptions(bodies=(THIGH, SHANK), **options))
+    task = asyncio.create_task(server.run())
+    await server.ready.wait()
+    try:
+        yield server
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        server.unplug()
+
+
+class Caller:
+    """A client that says what it is told and hears one datagram after another."""
+
+    def __init__(self, server: NatNetServer) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.connect(("127.0.0.1", server.command_port))
+        self.version = server.bitstream
+
+    async def ask(self, message: Message) -> object:
+        self.socket.send(encode(message))
+        return await self.hear()
+
+    async def hear(self) -> object:
+        async with asyncio.timeout(2):
+            data = await asyncio.get_running_loop().sock_recv(self.socket, 65536)
+        return decode(data, self.version)
+
+
+@contextlib.asynccontextmanager
+async def calling(**options: Any) -> AsyncIterator[tuple[NatNetServer, Caller]]:
+    async with serving(**options) as server:
+        caller = Caller(server)
+        with contextlib.closing(caller.socket):
+            yield server, caller
+
+
+def listen(server: NatNetServer, multicast: bool) -> tuple[Any, list[Any]]:
+    """Connect with the independent client; return the model and at least five frames."""
+    client = natnet.NatNetClient(
+        "127.0.0.1",
+        "127.0.0.1",
+        use_multicast=multicast,
+        command_port=server.command_port,
+        data_port=server.data_port,
+    )
+    models: list[Any] = []
+    frames: list[Any] = []
+    client.on_data_description_received_event.handlers.append(models.append)
+    client.on_data_frame_received_event.handlers.append(frames.append)
+    try:
+        client.connect()
+        client.request_modeldef()
+        until = time.monotonic() + 5
+        while (len(frames) < 5 or not models) and time.monotonic() < until:
+            client.update_sync()
+            time.sleep(0.005)
+    finally:
+        client.shutdown()
+    return models[0], frames
+
+
+@pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
+@pytest.mark.parametrize("version", [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2)])
+async def test_an_independent_client_reads_models_and_frames(
+    version: tuple[int, int], multicast: bool
+) -> None:
+    transport = "multicast" if multicast else "unicast"
+    async with serving(bitstream=version, transport=transport) as server:
+        hearing = asyncio.create_task(asyncio.to_thread(listen, server, multicast))
+        while not hearing.done():
+            server.push(time.monotonic_ns(), PLACES, POSES)
+            await asyncio.sleep(0.005)
+        model, frames = await hearing
+    assert [(body.name, body.id_num) for body in model.rigid_bodies] == [("Thigh", 7), ("Shank", 8)]
+    assert [s.name for s in model.marker_sets] == ["Thigh", "Shank", "all"]
+    assert len(frames) >= 5
+    thigh, shank = frames[-1].rigid_bodies
+    assert thigh.pos == (1.0, 3.0, -2.0)  # y up on the wire
+    assert thigh.rot == pytest.approx((-HALF, 0.0, 0.0, HALF), abs=1e-7)
+    assert (thigh.tracking_valid, shank.tracking_valid) == (True, False)
+    assert [(m.model_id, m.marker_id) for m in frames[-1].labeled_markers] == [
+        (7, 1),
+        (7, 3),
+        (8, 1),
+    ]
+    assert frames[-1].labeled_markers[0].pos == (1.0, 3.0, -2.0)
+    numbers = [frame.prefix.frame_number for frame in frames]
+    assert numbers == sorted(numbers)
+    stamp = frames[-1].suffix.stamp_camera_mid_exposure
+    assert abs(stamp * 100 - time.monotonic_ns()) < 5e9
+
+
+@pytest.mark.parametrize(
+    "connect",
+    [Connect(0), Connect(5), Connect(264, "x"), Connect(269, "x"), Connect(271, "Ping")],
+)
+async def test_every_form_of_connect_is_answered(connect: Connect) -> None:
+    async with calling() as (server, caller):
+        info = await caller.ask(connect)
+    assert isinstance(info, ServerInfo)
+    assert (info.application, info.clock_hz, info.multicast) == ("Motive", 10_000_000, False)
+    assert info.data_port == server.data_port
+
+
+async def test_discovery_is_answered_but_makes_no_client() -> None:
+    async with calling() as (server, caller):
+        assert isinstance(await caller.ask(Discovery(Connect(264))), ServerInfo)
+        assert server.clients == ()
+
+
+async def test_requests_are_answered_and_unknown_ones_named_so() -> None:
+    async with calling(rate_hz=200.0) as (_, caller):
+        assert await caller.ask(Request("FrameRate")) == Response(b"\0\0HC")
+        assert await caller.ask(Request("Dance")) == Bare(MessageId.UNRECOGNIZED_REQUEST)
+
+
+async def test_the_echo_tells_a_clock_with_offset_and_skew() -> None:
+    async with calling(clock_hz=3_312_787, device_ns=lambda ns: ns + ns // 20_000 + 10**12) as (
+        _,
+        caller,
+    ):
+        before = time.monotonic_ns()
+        echo = await caller.ask(EchoRequest(42))
+        after = time.monotonic_ns()
+    assert isinstance(echo, EchoResponse)
+    assert echo.stamp == 42
+    shown = echo.ticks * 10**9 / 3_312_787
+    assert before * 1.00005 + 1e12 - 1e3 <= shown <= after * 1.00005 + 1e12 + 1e3
+
+
+async def test_no_frame_comes_before_the_model_was_answered() -> None:
+    async with calling() as (server, caller):
+        await caller.ask(Connect(0))
+        server.push(0, PLACES, POSES)
+        assert isinstance(await caller.ask(Bare(MessageId.REQUEST_MODELDEF)), ModelDefinition)
+        server.push(0, PLACES, POSES)
+        assert isinstance(await caller.hear(), FrameOfData)
+        assert server.sent == 1
+
+
+async def test_a_client_that_never_asks_for_the_model_gets_frames_after_a_while() -> None:
+    async with calling() as (server, caller):
+        await caller.ask(Connect(0))
+        await asyncio.sleep(0.06)
+        server.push(0, PLACES, POSES)
+        assert isinstance(await caller.hear(), FrameOfData)
+
+
+async def test_a_silent_client_is_dropped_and_told() -> None:
+    async with calling(keepalive_s=0.05) as (server, caller):
+        await caller.ask(Connect(0))
+        await asyncio.sleep(0.06)
+        server.push(0, PLACES, POSES)
+        assert await caller.hear() == Bare(MessageId.DISCONNECTBYTIMEOUT)
+        assert server.clients == ()
+
+
+@pytest.mark.parametrize(("hiding", "count", "params"), [("missing", 2, 10), ("filled", 3, 11)])
+async def test_what_is_hidden_looks_as_it_does_in_real_frames(
+    hiding: str, count: int, params: int
+) -> None:
+    async with calling(hiding=hiding) as (server, caller):
+        await caller.ask(Connect(0))
+        await caller.ask(Bare(MessageId.REQUEST_MODELDEF))
+        places = {"T1": (1.0, 2.0, 3.0), "T2": (4.0, 5.0, 6.0), "T3": (0.0, 0.0, 1.0)}
+        server.push(0, places, POSES)
+        await caller.hear()
+        server.push(0, places | {"T2": None}, {"Thigh": None})
+        frame = await caller.hear()
+    assert isinstance(frame, FrameOfData)
+    assert len(frame.markers) == count
+    assert frame.markers[1].params == params
+    body = frame.bodies[0]
+    assert (body.x, body.y, body.z, body.params) == (1.0, 3.0, -2.0, 0)  # frozen, bit 0 clear
+
+
+async def test_a_unicast_client_may_choose_its_bitstream_from_4_0_on() -> None:
+    async with calling(bitstream=(4, 0)) as (server, caller):
+        await caller.ask(Connect(0))
+        await caller.ask(Bare(MessageId.REQUEST_MODELDEF))
+        answer = await caller.ask(Request("Bitstream,4.1"))
+        assert isinstance(answer, Response)
+        assert answer.text == "Bitstream,4.1"
+        server.push(0, PLACES, POSES)
+        caller.version = (4, 1)
+        frame = await caller.hear()
+        assert isinstance(frame, FrameOfData)
+        assert frame.params & 8
+
+
+@pytest.mark.parametrize("knob", ["loss", "duplication", "reordering", "hostile"])
+async def test_the_network_can_be_as_bad_as_asked(knob: str) -> None:
+    async with calling(**{knob: 0.5}) as (server, caller):
+        await caller.ask(Connect(0))
+        await caller.ask(Bare(MessageId.REQUEST_MODELDEF))
+        for _ in range(60):
+            server.push(0, PLACES, POSES)
+        heard = [await caller.hear() for _ in range(server.sent)]
+    numbers = [frame.number for frame in heard if isinstance(frame, FrameOfData)]
+    seen = {
+        "loss": len(numbers) < 50,
+        "duplication": len(numbers) > 70 and len(set(numbers)) == 60,
+        "reordering": numbers != sorted(numbers) and len(set(numbers)) >= 59,
+        "hostile": len(heard) == 60 and len(numbers) < 50,
+    }
+    assert seen[knob]
