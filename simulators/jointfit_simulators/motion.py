@@ -74,6 +74,8 @@ def stand(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stand upright, swaying by tenths of a degree."""
     coordinates = upright(style, t)
     coordinates[:, LEG_ANGLES] += style.sway.at(t)
+    hip, knee = coordinates[:, HIP], coordinates[:, KNEE]
+    coordinates[:, ANKLE] = np.array([1, -1, -1]) * knee - hip  # the sole stays flat
     ground(style, coordinates)
     return coordinates
 

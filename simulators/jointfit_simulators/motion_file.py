@@ -1,4 +1,4 @@
-"""Motions from files: joint angles over time, as TOML keys or NPZ arrays.
+"""Motions from files: joint angles over time, as TOML keys, NPZ arrays or OpenSim kinematics.
 
 TOML, degrees, clinical signs, one table a key; a smooth curve is laid through them::
 
@@ -11,6 +11,9 @@ TOML, degrees, clinical signs, one table a key; a smooth curve is laid through t
     pelvis = [0, 0, 0]              # heading, tilt, list
 
 NPZ, radians: ``t`` (n,) seconds and any of ``hip knee ankle pelvis`` (n, 3).
+
+MOT or STO: the coordinates of OpenSim's lower-limb models, right leg. Their axes (x forward, y up,
+z right) are ours renamed; their pelvis turns by tilt, list, rotation in this order.
 """
 
 from __future__ import annotations
@@ -21,7 +24,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from jointfit_simulators.limb import ANKLE, HIP, KNEE, PELVIS_TURN
+from jointfit_daemon.files.sto import read_sto
+from jointfit_simulators.limb import ANKLE, HIP, KNEE, PELVIS_POSITION, PELVIS_TURN
+from jointfit_simulators.orientation import Rotation
 from jointfit_simulators.posture import Style, upright
 
 if TYPE_CHECKING:
@@ -31,14 +36,17 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.motion import Motion
 
-_PARTS = {"hip": HIP, "knee": KNEE, "ankle": ANKLE, "pelvis": PELVIS_TURN}
+_ANGLES = {"hip": HIP, "knee": KNEE, "ankle": ANKLE, "pelvis": PELVIS_TURN}
+_PARTS = {**_ANGLES, "position": PELVIS_POSITION}
 
 
 def _read_toml(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     keys = table.get("key", [])
     t_s = np.array([key["t_s"] for key in keys], dtype=np.float64)
-    angles = {part: np.radians([key.get(part, (0.0, 0.0, 0.0)) for key in keys]) for part in _PARTS}
+    angles = {
+        part: np.radians([key.get(part, (0.0, 0.0, 0.0)) for key in keys]) for part in _ANGLES
+    }
     return t_s, angles, bool(table.get("loop", False))
 
 
@@ -51,15 +59,42 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.flo
     return t_s, angles, False
 
 
+def _read_opensim(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+    table = read_sto(path)
+    unit = np.pi / 180 if table.in_degrees else 1.0
+
+    def columns(*names: str) -> NDArray[np.float64]:
+        return np.column_stack([table.column(name) for name in names])
+
+    hip = unit * columns("hip_flexion_r", "hip_adduction_r", "hip_rotation_r")
+    turn = Rotation.from_euler(
+        "XYZ", unit * columns("pelvis_tilt", "pelvis_list", "pelvis_rotation")
+    )
+    angles = {
+        "hip": hip,
+        "knee": unit * columns("knee_angle_r") * [1, 0, 0],
+        "ankle": unit * columns("ankle_angle_r") * [1, 0, 0],
+        "pelvis": np.unwrap(turn.as_euler("ZXY"), axis=0),
+        "position": columns("pelvis_tz", "pelvis_tx", "pelvis_ty"),
+    }
+    return table.t_s, angles, False
+
+
+_READERS = {".toml": _read_toml, ".npz": _read_npz, ".mot": _read_opensim, ".sto": _read_opensim}
+
+
 def motion_from_file(path: Path, style: Style) -> Motion:
     """Return the motion a file describes; curves between its keys have two continuous derivatives.
 
     Raises
     ------
     ValueError
-        Fewer than two keys, times that do not increase, or a loop whose ends differ.
+        A file of another kind, fewer than two keys, times that do not increase, or a loop whose
+        ends differ.
     """
-    t_s, angles, loop = (_read_toml if path.suffix == ".toml" else _read_npz)(path)
+    if path.suffix.lower() not in _READERS:
+        raise ValueError(f"{path}: a motion is read from {', '.join(_READERS)}")
+    t_s, angles, loop = _READERS[path.suffix.lower()](path)
     if not len(t_s) > 1 or np.any(np.diff(t_s) <= 0):
         raise ValueError(f"{path}: needs at least two keys with increasing t_s")
     ends: Literal["periodic", "clamped"] = "periodic" if loop else "clamped"

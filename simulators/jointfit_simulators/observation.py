@@ -36,6 +36,8 @@ class Observation(NamedTuple):
     """q_base_sensor of each sensor, mount and soft tissue included, shape (n, 4)."""
     markers: NDArray[np.float64]
     """Marker positions on the skin, m, shape (m, markers, 3); NaN where never recorded."""
+    bones: Mapping[str, tuple[Rotation, NDArray[np.float64]]]
+    """Orientation and origin (m) of bones that the cameras can see as bodies; else empty."""
     truth: Truth
 
 
@@ -55,8 +57,8 @@ class Subject(Protocol):
         """Markers of each rigid body in the body's own frame, m, shape (markers, 3)."""
 
     @property
-    def bone_bodies(self) -> Mapping[str, str]:
-        """Rigid bodies streamed as the reference bones of a recording, and their segments."""
+    def visible_bones(self) -> tuple[str, ...]:
+        """Segments whose bones the cameras stream as bodies: the reference of a recording."""
 
     @property
     def facts(self) -> Mapping[str, object]:

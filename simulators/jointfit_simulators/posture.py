@@ -52,7 +52,7 @@ def person(geometry: LegGeometry, random: np.random.Generator) -> Style:
     """Return a person with habits drawn from `random`."""
     return Style(
         geometry,
-        sway=Wander(random, 9, low_hz=0.05, high_hz=0.3, rms=np.radians(0.12)),
+        sway=Wander(random, 9, low_hz=0.05, high_hz=0.3, rms=np.radians(0.08)),
         variability=Wander(random, 9, low_hz=0.05, high_hz=0.7, rms=np.radians(1.5)),
     )
 

@@ -56,7 +56,9 @@ class _Person:
     knobs: Knobs
     reference: NDArray[np.float64]
 
-    def skin(self, purpose: str, part: str, rms: float, vectors: int = 1) -> SoftTissue:
+    def skin(
+        self, purpose: str, part: str, rms: float, *, vectors: int = 1, common_share: float = 0.0
+    ) -> SoftTissue:
         """Return skin that moves `vectors` points on `part` by `rms`, m or rad."""
         return SoftTissue(
             self.knobs.random(f"{purpose} {part}"),
@@ -66,6 +68,7 @@ class _Person:
             random_share=self.knobs.soft_tissue_random_share,
             knee_share=self.knobs.soft_tissue_knee_share,
             reference=self.reference,
+            common_share=common_share,
         )
 
 
@@ -86,7 +89,7 @@ class Wearer:
         Sensor ids and the segment each is worn on.
     """
 
-    bone_bodies: Mapping[str, str] = {}
+    visible_bones: tuple[str, ...] = ()
     """None: nobody sees this person's bones."""
 
     def __init__(
@@ -134,11 +137,15 @@ class Wearer:
     def _place_markers(self, knobs: Knobs, body: _Person) -> None:
         self._templates = skin_templates(knobs.random("markers"), self.geometry)
         self.templates = {**self._templates, "plate": plate_template()}
-        common = np.sqrt(knobs.marker_common_share) * knobs.marker_soft_tissue_mm / 1e3
-        single = np.sqrt(1 - knobs.marker_common_share) * knobs.marker_soft_tissue_mm / 1e3
-        self._cluster_skin = {part: body.skin("cluster", part, common) for part in PARTS}
         self._marker_skin = {
-            part: body.skin("markers", part, single, len(CLUSTERS[part])) for part in PARTS
+            part: body.skin(
+                "markers",
+                part,
+                knobs.marker_soft_tissue_mm / 1e3,
+                vectors=len(CLUSTERS[part]),
+                common_share=knobs.marker_common_share,
+            )
+            for part in PARTS
         }
 
     @property
@@ -186,7 +193,7 @@ class Wearer:
             for (sensor, part), cut in zip(self.sensors.items(), cuts, strict=False)
         ]
         markers = self._markers(t_s[cuts[-2]], coordinates[cuts[-2]], _cut(pose, cuts[-2]))
-        return Observation(seen, markers, _truth(coordinates[cuts[-1]], _cut(pose, cuts[-1])))
+        return Observation(seen, markers, {}, _truth(coordinates[cuts[-1]], _cut(pose, cuts[-1])))
 
     def _sensor(
         self,
@@ -217,9 +224,7 @@ class Wearer:
             _carried(
                 pose.orientations[part],
                 pose.origins[part],
-                self._templates[part]
-                + self._cluster_skin[part].at(t_s, coordinates)
-                + self._marker_skin[part].at(t_s, coordinates),
+                self._templates[part] + self._marker_skin[part].at(t_s, coordinates),
             )
             for part in PARTS
         ]

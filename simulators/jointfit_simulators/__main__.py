@@ -1,0 +1,159 @@
+"""``jointfit-sim``: virtual hardware on a command line.
+
+Law: nothing but JSON lines on stdout. One when all is ready, one for every ``status``, ``{"error":
+…}`` for a command that was not understood, and one with the counts of all that was sent at the end.
+
+``jointfit-sim play --directory DIR`` reads commands from stdin, one a line: ``play NAME``,
+``unplug ID``, ``plug ID``, ``reboot ID``, ``occlude on|off``, ``mocap stop|start``, ``pause
+on|off``, ``status``, ``quit``. ID is a sensor, or ``can0`` for the bus adapter. The end of stdin
+changes nothing; SIGTERM and SIGINT quit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import dataclasses
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import orjson
+
+from jointfit_simulators.motion import MOTIONS
+from jointfit_simulators.programme import UnknownMotion, parse_programme
+from jointfit_simulators.replayed import Replayed
+from jointfit_simulators.rig_file import RigOptions
+from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
+from jointfit_simulators.settings import Knobs, knobs_from_toml, perfect, turn
+from jointfit_simulators.trial import read_recording
+from jointfit_simulators.wearer import SENSORS, Wearer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_simulators.observation import Subject
+
+USAGE = 2
+_COMMAND_BYTES = 4096
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jointfit-sim", description="Virtual hardware: a moving leg as real bytes."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("knobs", help="list every knob with its default")
+    commands.add_parser("motions", help="list every motion")
+    play = commands.add_parser("play", help="play a scene until told to quit")
+    play.add_argument("--directory", type=Path, required=True, help="for ports, rig.toml, truth")
+    play.add_argument("--programme", help="NAME:SECONDS,…; the last one goes on (default stand)")
+    play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
+    play.add_argument("--knobs", type=Path, help="TOML file of knobs")
+    play.add_argument("--perfect", action="store_true", help="no imperfection but those --set")
+    play.add_argument("--rate", type=float, help="IMU samples a second")
+    play.add_argument("--seed", type=int, help="seed of all dice")
+    play.add_argument("--no-mocap", action="store_true", help="no optical system")
+    play.add_argument("--can", default="slcan", help="slcan, or INTERFACE:CHANNEL of python-can")
+    play.add_argument("--motion", action="append", default=[], metavar="NAME=FILE",
+                      help="a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
+    play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
+                      help="a recorded trial: .npz or .sto, with .trc and .json")  # fmt: skip
+    for field in dataclasses.fields(RigOptions):
+        play.add_argument(
+            f"--{field.name.replace('_', '-')}",
+            type=type(field.default),
+            default=field.default,
+            help=f"for rig.toml (default {field.default})",
+        )
+    return parser
+
+
+def _knobs(options: argparse.Namespace) -> Knobs:
+    knobs = knobs_from_toml(options.knobs) if options.knobs else Knobs()
+    if options.perfect:
+        knobs = perfect(knobs)
+    named = {"rate_hz": options.rate, "seed": options.seed}
+    settings = [f"{name}={value}" for name, value in named.items() if value is not None]
+    return turn(knobs, settings + options.settings)
+
+
+def _subject(options: argparse.Namespace, knobs: Knobs) -> Subject:
+    steps = parse_programme(options.programme or "stand")
+    if options.trial:
+        recording = read_recording(options.trial)
+        return Replayed(recording, SENSORS, steps, transition_s=knobs.transition_s)
+    files = dict(motion.split("=", 1) for motion in options.motion)
+    return Wearer(knobs, steps, motion_files={name: Path(path) for name, path in files.items()})
+
+
+def _say(line: dict[str, object]) -> None:
+    sys.stdout.buffer.write(
+        orjson.dumps(line, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+    )
+    sys.stdout.buffer.flush()
+
+
+async def _obey(scene: Scene) -> None:
+    """Read commands from stdin until it ends."""
+    reader = asyncio.StreamReader(limit=_COMMAND_BYTES)
+    try:
+        transport, _ = await asyncio.get_running_loop().connect_read_pipe(
+            lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
+        )
+    except (ValueError, OSError):  # a plain file or /dev/null: there is nobody to obey
+        return
+    try:
+        while line := await reader.readline():
+            _answer(scene, line.decode(errors="replace").strip())
+    finally:
+        transport.close()
+
+
+def _answer(scene: Scene, line: str) -> None:
+    try:
+        answer = scene.command(line) if line else None
+    except BadCommand as error:
+        answer = {"error": str(error)}
+    if answer is not None:
+        _say(answer)
+
+
+async def _play(options: argparse.Namespace) -> None:
+    knobs = _knobs(options)
+    rig = RigOptions(
+        **{field.name: getattr(options, field.name) for field in dataclasses.fields(RigOptions)}
+    )
+    hardware = SceneOptions(
+        options.directory.absolute(), mocap=not options.no_mocap, can=options.can, rig=rig
+    )
+    subject = _subject(options, knobs)
+    scene = Scene(knobs, subject, hardware, now_ns=time.monotonic_ns())
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, scene.stop)
+    async with asyncio.TaskGroup() as tasks:
+        obeying = tasks.create_task(_obey(scene), name="commands")
+        await scene.run(_say)
+        obeying.cancel()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``jointfit-sim``; return its exit code."""
+    options = _parser().parse_args(arguments)
+    if options.command == "knobs":
+        _say(dataclasses.asdict(Knobs()))
+    elif options.command == "motions":
+        _say({"motions": list(MOTIONS)})
+    else:
+        try:
+            asyncio.run(_play(options))
+        except (ValueError, UnknownMotion, OSError) as error:
+            print(f"jointfit-sim: {error}", file=sys.stderr)
+            return USAGE
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""The rig.toml with which a daemon finds a scene: ready to use, nothing to fill in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+_PROXIMAL, _DISTAL = "pelvis", "foot"
+
+
+@dataclass(frozen=True, slots=True)
+class RigOptions:
+    """What the scene does not know."""
+
+    name: str = "demo"
+    output_rate_hz: float = 100.0
+    mqtt_host: str = "localhost"
+    mqtt_port: int = 1883
+    mqtt_base: str = "jointfit/demo"
+    mqtt_version: str = "5"
+    method: str = "anchored"
+    store: str = "demo"
+    align_s: float = 30.0
+    static_s: float = 5.0
+    functional_s: float = 30.0
+
+
+def rig_toml(
+    options: RigOptions,
+    *,
+    devices: Sequence[str],
+    mocap: str,
+    clusters: Mapping[str, tuple[str, ...]],
+    bones: Sequence[str],
+    plate: bool,
+) -> str:
+    """Return the text of a rig.toml.
+
+    Parameters
+    ----------
+    options
+        Names, broker, calibration.
+    devices
+        ``[[imu]]`` and ``[can.*]`` tables.
+    mocap
+        First lines of ``[mocap]`` (driver, server); empty: no optical system.
+    clusters
+        Markers of each body part.
+    bones
+        Segments whose rigid body is the reference instead of markers.
+    plate
+        Whether the optical system knows the plate.
+    """
+    parts = [name for name in (_PROXIMAL, _DISTAL) if name in clusters and mocap]
+    ends = [f'{end} = "{name}"' for end, name in zip(_ends(parts), parts, strict=True)]
+    tables = [
+        f'[rig]\nname = "{options.name}"\noutput_rate_hz = {options.output_rate_hz:g}\n',
+        "\n".join(
+            [
+                "[chain]",
+                'joints = ["hip", "knee", "ankle"]',
+                'segments = ["thigh", "shank"]',
+                'side = "right"',
+                *ends,
+                "",
+            ]
+        ),
+        *devices,
+    ]
+    if mocap:
+        tables.append("\n".join([mocap, *_bodies(clusters, bones, plate=plate), ""]))
+    tables.append(
+        f'[calibration]\nstore = "{options.store}"\nmethod = "{options.method}"\n'
+        f"align_s = {options.align_s:g}\nstatic_s = {options.static_s:g}\n"
+        f"functional_s = {options.functional_s:g}\n"
+    )
+    tables.append(
+        f'[mqtt]\nhost = "{options.mqtt_host}"\nport = {options.mqtt_port}\n'
+        f'base = "{options.mqtt_base}"\nversion = "{options.mqtt_version}"\n'
+    )
+    return "\n".join(tables)
+
+
+def _ends(parts: Sequence[str]) -> list[str]:
+    return ["proximal" if part == _PROXIMAL else "distal" for part in parts]
+
+
+def _bodies(
+    clusters: Mapping[str, tuple[str, ...]], bones: Sequence[str], *, plate: bool
+) -> list[str]:
+    lines = ['plate = "Plate"'] if plate else []
+    for part, names in clusters.items():
+        if part not in {"plate", "other", *bones}:
+            listed = ", ".join(f'"{name}"' for name in names)
+            lines.append(f"markers.{part} = [{listed}]")
+    return lines + [f'rigid_body.{bone} = "{bone.capitalize()}"' for bone in bones]

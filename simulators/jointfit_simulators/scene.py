@@ -1,0 +1,235 @@
+"""A whole scene: somebody moves, sensors and cameras report it as bytes, the truth is written.
+
+Law: wiring and commands only; what moves, errs and is encoded lives in other modules.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jointfit_simulators.cameras import Cameras
+from jointfit_simulators.clocks import Ticker
+from jointfit_simulators.hardware import WIRES, mocap_table, optical_server, wire_up
+from jointfit_simulators.optical_stream import OpticalStream
+from jointfit_simulators.orientation import to_wxyz
+from jointfit_simulators.player import Player
+from jointfit_simulators.programme import UnknownMotion
+from jointfit_simulators.rig_file import RigOptions, rig_toml
+from jointfit_simulators.truth_log import TruthLog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from jointfit_simulators.natnet_server import NatNetServer
+    from jointfit_simulators.observation import Subject
+    from jointfit_simulators.settings import Knobs
+    from jointfit_simulators.streams import ImuStream
+
+RIG_FILE = "rig.toml"
+TRUTH_FILE = "truth.jsonl"
+LINGER_S = 0.3
+"""Ports stay open this long after the last byte, so that it can be read."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which hardware there is."""
+
+    directory: Path
+    mocap: bool = True
+    can: str = "slcan"
+    wires: Mapping[str, str] = dataclasses.field(default_factory=lambda: WIRES)
+    rig: RigOptions = dataclasses.field(default_factory=RigOptions)
+
+
+class BadCommand(ValueError):  # noqa: N818 - named for what happened
+    """A command that means nothing; the message says what would."""
+
+
+class Scene:
+    """Virtual hardware at work.
+
+    Parameters
+    ----------
+    knobs
+        Imperfections.
+    subject
+        Who wears the sensors.
+    options
+        Which hardware there is.
+    now_ns
+        Host time at which the subject's time is 0.
+    """
+
+    def __init__(
+        self, knobs: Knobs, subject: Subject, options: SceneOptions, *, now_ns: int
+    ) -> None:
+        self._options, self._subject = options, subject
+        options.directory.mkdir(parents=True, exist_ok=True)
+        self._hardware = wire_up(
+            knobs,
+            subject.sensors,
+            options.directory,
+            wires=options.wires,
+            can=options.can,
+            now_ns=now_ns,
+        )
+        cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
+        ticker = Ticker(knobs, "mocap", latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
+        self._server: NatNetServer | None = None
+        if options.mocap:
+            self._server = optical_server(knobs, subject.clusters, cameras.bodies, ticker.clock)
+        self._optical = OpticalStream(knobs, cameras, ticker, self._server)
+        self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
+        self._player = Player(
+            subject, self._hardware.streams, self._optical, self._truth, origin_ns=now_ns
+        )
+        self._quit = asyncio.Event()
+        self._verbs: dict[str, Callable[[str], None]] = {
+            "play": self._play,
+            "unplug": lambda name: self._plugs(name)[0](),
+            "plug": lambda name: self._plugs(name)[1](),
+            "reboot": lambda name: self._stream(name).device.power_cycle(),
+            "occlude": lambda word: setattr(cameras, "covered", _on(word)),
+            "mocap": lambda word: setattr(self._optical, "running", _on(word)),
+            "pause": lambda word: setattr(self._player, "paused", _on(word or "on")),
+            "quit": lambda _: self._quit.set(),
+        }
+
+    def _facts(self, knobs: Knobs, now_ns: int) -> dict[str, object]:
+        cameras, streams = self._optical.cameras, self._hardware.streams
+        return {
+            "t_ns": now_ns,
+            "knobs": dataclasses.asdict(knobs),
+            "sensors": dict(self._subject.sensors),
+            "optical_heading_rad": cameras.heading_rad,
+            "sensor_heading_rad": {n: s.sensor.heading_rad for n, s in streams.items()},
+            "q_optical_sensorworld": {
+                n: to_wxyz(cameras.world * s.sensor.world.inv()) for n, s in streams.items()
+            },
+            "clocks": {
+                n: {"boot_ns": s.ticker.clock.boot_ns, "skew": s.ticker.clock.skew}
+                for n, s in streams.items()
+            },
+            **self._subject.facts,
+        }
+
+    async def run(self, say: Callable[[dict[str, object]], None]) -> None:
+        """Play until `stop`; then send nothing more, linger, and close everything.
+
+        Parameters
+        ----------
+        say
+            Told where everything is when all is ready, and what was sent when nothing more is.
+        """
+        async with asyncio.TaskGroup() as tasks:
+            serving = [
+                tasks.create_task(stream.device.run(), name=f"device {name}")
+                for name, stream in self._hardware.streams.items()
+            ]
+            if self._server is not None:
+                serving.append(tasks.create_task(self._server.run(), name="natnet"))
+                await self._server.ready.wait()
+            rig = self._write_rig()
+            playing = tasks.create_task(self._player.run(), name="player")
+            truth = self._options.directory / TRUTH_FILE
+            ports = self._hardware.ports
+            say({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
+            await self._quit.wait()
+            playing.cancel()
+            self._player.finish()
+            say(self.account())
+            await asyncio.sleep(LINGER_S)
+            for task in serving:
+                task.cancel()
+        self.close()
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._quit.set()
+
+    def close(self) -> None:
+        """Close the truth and unplug everything."""
+        self._truth.close()
+        for stream in self._hardware.streams.values():
+            stream.device.unplug()
+        if self._server is not None:
+            self._server.unplug()
+
+    def _write_rig(self) -> Path:
+        path = self._options.directory / RIG_FILE
+        text = rig_toml(
+            self._options.rig,
+            devices=self._hardware.tables,
+            mocap=mocap_table(self._server) if self._server else "",
+            clusters=self._subject.clusters,
+            bones=self._subject.visible_bones,
+            plate="plate" in self._subject.templates,
+        )
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    def command(self, line: str) -> dict[str, object] | None:
+        """Obey one line; return the answer of ``status``.
+
+        Raises
+        ------
+        BadCommand
+            No such command, motion, sensor or word.
+        """
+        verb, _, rest = line.strip().partition(" ")
+        if verb == "status":
+            return self.status()
+        if verb not in self._verbs:
+            raise BadCommand(f"no command {verb!r}; there are: {', '.join(self._verbs)}, status")
+        try:
+            self._verbs[verb](rest.strip())
+        except UnknownMotion as error:
+            raise BadCommand(str(error)) from error
+        return None
+
+    def _play(self, name: str) -> None:
+        self._player.play(name)
+
+    def _stream(self, name: str) -> ImuStream:
+        try:
+            return self._hardware.streams[name]
+        except KeyError:
+            known = ", ".join(self._hardware.streams)
+            raise BadCommand(f"no sensor {name!r}; there are: {known}") from None
+
+    def _plugs(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
+        found = self._hardware.bus if name == "can0" and self._hardware.bus else self._stream(name)
+        return found.unplug, found.plug
+
+    def status(self) -> dict[str, object]:
+        """Return what is going on, as JSON values."""
+        return {
+            "t_ns": time.monotonic_ns(),
+            "motion": self._player.motion(),
+            "devices": {n: s.status() for n, s in self._hardware.streams.items()},
+            "mocap": {"sent": self._optical.sent, "running": self._optical.running},
+            "left_out_ms": self._player.left_out_ns / 1e6,
+        }
+
+    def account(self) -> dict[str, object]:
+        """Return what was sent in all, as JSON values."""
+        streams = self._hardware.streams
+        return {
+            "sent": {**{n: s.device.sent for n, s in streams.items()}, "mocap": self._optical.sent},
+            "dropped_out": {n: s.dropped_out for n, s in streams.items()},
+            "refused": {n: s.refused for n, s in streams.items()},
+            "unheard": {n: s.unheard for n, s in streams.items()},
+        }
+
+
+def _on(word: str) -> bool:
+    words = {"on": True, "start": True, "off": False, "stop": False}
+    if word not in words:
+        raise BadCommand(f"{word!r}: expected {' or '.join(words)}")
+    return words[word]

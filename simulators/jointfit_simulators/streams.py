@@ -1,0 +1,140 @@
+"""From poses to samples on a wire: one stream a device, planned in blocks, sent one by one.
+
+Law: a sample is stamped with its true instant, however late it reaches the wire; every sample
+taken while the device measures is sent, dropped by the knob, or refused by a full line, and
+counted as such.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Protocol, cast
+
+import numpy as np
+
+from jointfit_simulators.clocks import NS, Ticker
+from jointfit_simulators.imu_device import ImuDevice
+from jointfit_simulators.sensors import OrientationSensor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_simulators.imu_device import Quaternion
+    from jointfit_simulators.settings import Knobs
+
+
+class WornDevice(ImuDevice, Protocol):
+    """A virtual IMU with the faults this scene plays."""
+
+    def lose(self, count: int) -> None:
+        """Lose the next `count` samples: they take a counter value and are not sent."""
+
+    def power_cycle(self) -> None:
+        """Lose power for a moment: clock and counter begin anew."""
+
+    def unplug(self) -> None:
+        """Take its wire away."""
+
+    def plug(self) -> None:
+        """Put it back."""
+
+
+class ImuStream:
+    """One worn sensor: its error, its clock, its device.
+
+    Parameters
+    ----------
+    knobs
+        Everything that is wrong with it.
+    name
+        Its id.
+    device
+        Where samples go.
+    latency_ms
+        Least delay of its transport.
+    shared_wire
+        Others use its wire: unplugging it means that it falls silent.
+    now_ns
+        Host time at which the run begins.
+    """
+
+    def __init__(
+        self,
+        knobs: Knobs,
+        name: str,
+        device: WornDevice,
+        *,
+        latency_ms: float,
+        shared_wire: bool,
+        now_ns: int,
+    ) -> None:
+        self.name, self.device = name, device
+        self.sensor = OrientationSensor(knobs, name)
+        self.ticker = Ticker(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
+        self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
+        self._unplugged = False
+        self._waiting: deque[tuple[int, Quaternion | None]] = deque()
+        self.dropped_out = 0
+        """Samples taken while measuring and never sent, as the knob wants it."""
+        self.unheard = 0
+        """Samples that nobody could hear: unplugged, paused, or not told to measure."""
+        self.refused = 0
+        """Samples the line had no room for."""
+
+    def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
+        """Take the samples of a block; return their true host instants."""
+        rate_hz = self.device.rate_hz or self._fallback_hz
+        self._taken = self.ticker.samples(begin_ns, end_ns, NS / rate_hz)
+        return self._taken.host_ns
+
+    def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
+        """Give the planned samples their orientations; return when each is due on the wire."""
+        said = self.sensor.report(t_s, q_base_sensor)
+        lost = self._taken.dropped | ~np.isfinite(said[:, 0])
+        for stamp, q, never in zip(
+            self._taken.device_ns.tolist(), said.tolist(), lost.tolist(), strict=True
+        ):
+            self._waiting.append((stamp, None if never else cast("Quaternion", tuple(q))))
+        return cast("list[int]", self._taken.due_ns.tolist())
+
+    def emit(self, *, heard: bool = True) -> None:
+        """Put the next sample on the wire, or drop it where nobody is to hear it."""
+        stamp, q = self._waiting.popleft()
+        if self._unplugged or not heard or not self.device.streaming:
+            self.unheard += 1
+            return
+        if q is None:
+            self.dropped_out += 1
+            self.device.lose(1)
+            self.device.push(stamp, (1.0, 0.0, 0.0, 0.0))
+            return
+        before = self.device.sent
+        self.device.push(stamp, q)
+        self.refused += self.device.sent == before
+
+    def forget(self) -> None:
+        """Drop what is planned and not sent."""
+        self._waiting.clear()
+
+    def unplug(self) -> None:
+        """Take the device off its wire."""
+        self._unplugged = True
+        if not self._shared:
+            self.device.unplug()
+
+    def plug(self) -> None:
+        """Put it back."""
+        self._unplugged = False
+        if not self._shared:
+            self.device.plug()
+
+    def status(self) -> dict[str, object]:
+        """Return the counters, as JSON values."""
+        return {
+            "streaming": self.device.streaming and not self._unplugged,
+            "rate_hz": self.device.rate_hz,
+            "sent": self.device.sent,
+            "dropped_out": self.dropped_out,
+            "refused": self.refused,
+            "unheard": self.unheard,
+        }

@@ -1,0 +1,147 @@
+"""A recorded trial in place of a made-up person: its sensors, its bones, its markers.
+
+Law: what was recorded is played as it is, between its samples interpolated; soft tissue and mounts
+are in the recording, so nothing is added to them here. Two motions: ``trial`` plays the recording
+once and holds its end; ``stand`` holds the static pose, which is the sensors' bias where that is
+known (so that every segment is upright by definition), else the first instant of the recording.
+
+Files, told apart by their ends: ``.npz`` (jointfit_daemon.files.npz) or a ``.sto`` of quaternions
+for the sensors, ``.trc`` for the markers, ``.json`` for the biases (``{"q_bias": {"S1": [w, x, y,
+z]}}``). All of them y up, as OpenSim writes them, but for NPZ that say otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.npz import (
+    OrientationTrial,
+    quaternions_z_up,
+    read_orientations_npz,
+    vectors_z_up,
+)
+from jointfit_daemon.files.sto import read_orientations_sto
+from jointfit_daemon.files.trc import MarkerTrajectories, read_trc
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+BONES = {"femur": "thigh", "tibia": "shank", "thigh": "thigh", "shank": "shank"}
+"""Bone names of recordings (without their side) and the segments of the rig."""
+
+OPENCAP_CLUSTERS = {
+    "pelvis": ("r.ASIS", "L.ASIS", "r.PSIS", "L.PSIS"),
+    "thigh": ("r_thigh1", "r_thigh2", "r_thigh3", "r_thigh4"),
+    "shank": ("r_sh2", "r_sh3", "r_sh4", "r_shank_antsup"),
+    "foot": ("r_calc", "r_5meta", "r_toe"),
+}
+"""Marker clusters of the right leg in OpenCap's laboratory recordings."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All that was recorded of one trial, z up, on one time line that begins at 0."""
+
+    orientations: OrientationTrial
+    markers: MarkerTrajectories | None = None
+    biases: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """q_sensor_segment of the static pose, by sensor."""
+
+    @property
+    def seconds(self) -> float:
+        """Length of the trial."""
+        return float(self.orientations.t_s[-1])
+
+
+def read_recording(paths: Sequence[Path]) -> Recording:
+    """Return the trial that several files describe together.
+
+    Raises
+    ------
+    ValueError
+        No file has sensors, two have, or a file is of no known kind.
+    """
+    orientations: list[OrientationTrial] = []
+    markers: MarkerTrajectories | None = None
+    biases: dict[str, NDArray[np.float64]] = {}
+    for path in paths:
+        match path.suffix.lower():
+            case ".npz":
+                orientations.append(read_orientations_npz(path))
+            case ".sto":
+                orientations.append(_sensors_of_sto(path))
+            case ".trc":
+                markers = read_trc(path)
+            case ".json":
+                table = json.loads(path.read_text(encoding="utf-8"))["q_bias"]
+                biases = {name: quaternions_z_up(q) for name, q in table.items()}
+            case other:
+                raise ValueError(f"{path}: no trial is read from {other!r} files")
+    if len(orientations) != 1:
+        raise ValueError(f"a trial needs one .npz or .sto with sensors, got {len(orientations)}")
+    return Recording(_from_zero(orientations[0]), markers, biases)
+
+
+def _sensors_of_sto(path: Path) -> OrientationTrial:
+    table = read_orientations_sto(path)
+    sensors = {
+        name: quaternions_z_up(table.quaternions[:, i]) for i, name in enumerate(table.names)
+    }
+    return OrientationTrial(table.t_s, sensors, {}, {})
+
+
+def _from_zero(trial: OrientationTrial) -> OrientationTrial:
+    return OrientationTrial(trial.t_s - trial.t_s[0], trial.sensors, trial.bones, trial.origins)
+
+
+class Track:
+    """Vectors or quaternions over time, read between their samples.
+
+    Straight lines between neighbours; of unit quaternions, made continuous first, that is within
+    1e-5 rad of the shortest arc while neighbours are less than 5 degrees apart.
+
+    Parameters
+    ----------
+    t_s
+        Shape (n,), s, increasing.
+    values
+        Shape (n, 3) or (n, 4); NaN makes the two intervals beside it unknown.
+    rotation
+        Whether the values are unit quaternions.
+    """
+
+    def __init__(
+        self, t_s: NDArray[np.float64], values: NDArray[np.float64], *, rotation: bool
+    ) -> None:
+        self._t_s, self._values, self._rotation = t_s, values, rotation
+        if rotation:
+            turned = np.sum(values[1:] * values[:-1], axis=1) < 0
+            self._values = values * np.append(1.0, np.cumprod(np.where(turned, -1.0, 1.0)))[:, None]
+
+    def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values at instants of shape (n,); the ends are held."""
+        right = np.clip(np.searchsorted(self._t_s, t_s, side="right"), 1, len(self._t_s) - 1)
+        begin, end = self._t_s[right - 1], self._t_s[right]
+        share = np.clip((t_s - begin) / (end - begin), 0.0, 1.0)[:, None]
+        before, after = self._values[right - 1], self._values[right]
+        found = np.where(
+            share == 0, before, np.where(share == 1, after, 0.0)
+        )  # NaN only where needed
+        between = ((share > 0) & (share < 1))[:, 0]
+        found[between] = ((1 - share) * before + share * after)[between]
+        if self._rotation:
+            found /= np.linalg.norm(found, axis=1, keepdims=True)
+        return found
+
+
+def marker_track(markers: MarkerTrajectories) -> Track:
+    """Return all markers as one track, z up, flat: shape (n, 3 * markers)."""
+    flat = vectors_z_up(markers.positions).reshape(len(markers.t_s), -1)
+    return Track(markers.t_s - markers.t_s[0], flat, rotation=False)
