@@ -49,7 +49,7 @@ def test_bones_close_the_chain_that_textbook_matrices_give(
 ) -> None:
     coordinates = np.zeros((1, COORDINATES))
     coordinates[0, PELVIS_POSITION] = position
-    for part, found in zip(
+    for columns, found in zip(
         (PELVIS_TURN, HIP, KNEE, ANKLE), np.reshape(angles, (4, 3)), strict=True
     ):
         coordinates[0, columns] = found
