@@ -8,7 +8,7 @@ proximal joint center. What could not be found is None and said in `notes`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import radians
 from typing import TYPE_CHECKING
@@ -24,6 +24,7 @@ from jointfit_daemon.calibration.joint_center import (
 )
 from jointfit_daemon.calibration.markers import visible
 from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.calibration.stance import stand_straight
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
@@ -44,6 +45,9 @@ CONFIGURED_SD_M = 0.01
 """Standard deviation given to a configured length."""
 SKIN_SD_M = 0.005
 """Systematic part of any center found through skin; no residual shows it (algorithms C12)."""
+SKIN_RADIAL_M = 0.003
+"""Part of a marker's 5 mm of skin motion that lies along its radius and repeats with posture; over
+a short arc it moves the center by the inverse of that arc."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -167,8 +171,23 @@ def _fit_centers(
     out: dict[str, JointFound | None] = dict.fromkeys(chain.joints)
     for joint, fit in settled.items():
         gap = carried_gap(*jointed[joint], fit.center)
-        out[joint] = JointFound(fit.center, fit.covariance, "fit", fit, gap)
-    return out, notes
+        covariance = fit.covariance + SKIN_RADIAL_M**2 * fit.leverage
+        out[joint] = JointFound(fit.center, covariance, "fit", fit, gap)
+    return _plumbed(out), notes
+
+
+def _plumbed(found: dict[str, JointFound | None]) -> dict[str, JointFound | None]:
+    """Let the static pose, in which the wearer stood straight, say what the movement did not."""
+    straight = stand_straight(
+        [joint and joint.center for joint in found.values()],
+        [joint and joint.covariance for joint in found.values()],
+    )
+    return {
+        name: joint
+        if joint is None or pair is None
+        else replace(joint, center=pair[0], covariance=pair[1])
+        for (name, joint), pair in zip(found.items(), straight, strict=True)
+    }
 
 
 def _distance(chain: Chain, joint: str, others: list[str]) -> int:

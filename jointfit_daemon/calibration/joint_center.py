@@ -55,6 +55,9 @@ class CenterOfRotation:
     """Angle that the markers went through about the center, rad (4 times the RMS direction)."""
     unseen: Array
     """Unit directions in which nothing was observed, shape (0..2, 3)."""
+    leverage: Array
+    """Covariance of the center for every m² of radial skin motion that goes with posture, shape
+    (3, 3): such motion repeats, so no number of frames averages it away."""
     refused: str | None = None
     """Why the center must not be used; None if it may."""
 
@@ -178,7 +181,8 @@ def _judged(m: Array, basis: Array, v: Array, seen: Mask, w: Array) -> CenterOfR
     arc = 4.0 * float(np.sqrt(np.einsum("tja,tja->", w[..., None] * J, J) / max(w.sum(), 1e-12)))
     radius = float(np.median(np.linalg.norm(v - m, axis=-1)[seen]))
     rms = float(np.sqrt((e[seen] ** 2).mean()))
-    return CenterOfRotation(m, C, rms, frames, arc, unseen, _objection(arc, radius, shown))
+    lever = basis @ np.linalg.pinv(H / max(float(w.sum()), 1e-12)) @ basis.T
+    return CenterOfRotation(m, C, rms, frames, arc, unseen, lever, _objection(arc, radius, shown))
 
 
 def _persistence(e: Array, seen: Mask) -> float:
@@ -209,7 +213,8 @@ def _objection(arc: float, radius: float, shown: Array) -> str | None:
 def _refused(start: Array, frames: int, reason: str) -> CenterOfRotation:
     wide = np.eye(3)
     none = np.zeros((0, 3))
-    return CenterOfRotation(np.asarray(start, float), wide, np.inf, frames, 0.0, none, reason)
+    at = np.asarray(start, float)
+    return CenterOfRotation(at, wide, np.inf, frames, 0.0, none, np.zeros((3, 3)), reason)
 
 
 def slide_under(found: CenterOfRotation, above: Array | None) -> CenterOfRotation:

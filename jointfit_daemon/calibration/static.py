@@ -40,8 +40,9 @@ class StaticLimits:
 
     still_s: float = 3.0
     """Least time of still frames, s."""
-    spread: float = np.deg2rad(1.0)
-    """Largest robust spread of one sensor, rad."""
+    spread: float = np.deg2rad(1.5)
+    """Largest robust spread of one sensor, rad. A still wearer is within 1 degree; a good filter
+    that wanders by 1 degree adds its own."""
     disagreement: float = np.deg2rad(3.0)
     """Largest difference, rad, between how sensors of one segment changed since the last pose."""
 
