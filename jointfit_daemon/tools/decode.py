@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
@@ -12,7 +13,6 @@ from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, Mo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from jointfit_daemon.driver import Decoder, Driver
     from jointfit_daemon.model import Decoded

@@ -27,8 +27,12 @@ if TYPE_CHECKING:
 TOPICS = ("pose", "calibration", "calibration/progress", "bridge/health", "device/+/availability")
 CONNECT_S = 30.0
 SETTLE_S = 3.0
-PHASES = (("align", "plate", 20.0), ("static", "stand", 5.0), ("functional", "functional", 40.0))
-"""Phase, what the wearer does meanwhile, and for how long."""
+PHASES = (
+    ("align", (("plate", 20.0),)),
+    ("static", (("stand", 5.0),)),
+    ("functional", (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0))),
+)
+"""Phases, and what the wearer does in them for how long, s: what the daemon asks a person to do."""
 MOTIONS = ("walk", "squat", "sit_to_stand")
 MOTION_S = 8.0
 MATURE_NS = 300_000_000
@@ -46,8 +50,6 @@ class Demo:
     daemon: Child
     truth: TruthReader
     display: Display
-    scale: float = 1.0
-    """Phases last this much longer."""
     score: Score = field(default_factory=Score)
     latencies_ms: list[float] = field(default_factory=list)
     online: set[str] = field(default_factory=set)
@@ -125,18 +127,28 @@ class Demo:
 
     async def _calibrate(self, client: MqttClient) -> None:
         self._watch = CalibrationWatch(self.display.step)
-        for phase, motion, wanted_s in PHASES:
-            await self.simulator.say(f"play {motion}")
+        for phase, motions in PHASES:
+            await self.simulator.say(f"play {motions[0][0]}")
             await asyncio.sleep(SETTLE_S)
             self._watch.begin()
-            arguments = {"phase": phase, "seconds": wanted_s * self.scale}
-            answer = await client.request("calibrate", arguments)
+            wanted_s = sum(seconds for _, seconds in motions)
+            answer = await client.request("calibrate", {"phase": phase, "seconds": wanted_s})
             if answer.get("status") != "accepted":
                 raise RequestRefused(str((answer.get("error") or {}).get("message")))
             self.display.step(phase, 0.0, "")
-            await self._watch.ended(phase)
+            moving = asyncio.create_task(self._move(motions), name="demo wearer")
+            try:
+                await self._watch.ended(phase)
+            finally:
+                moving.cancel()
+                await asyncio.wait([moving])
             if phase == "static":
                 self._static_ns = time.monotonic_ns() - 1_000_000_000
+
+    async def _move(self, motions: tuple[tuple[str, float], ...]) -> None:
+        for name, seconds in motions:
+            await self.simulator.say(f"play {name}")
+            await asyncio.sleep(seconds)
 
     async def _live(self, seconds: float) -> None:
         self._judging = True
