@@ -14,7 +14,7 @@ it, else plainly where that is unique, else ``Thigh/T1``.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, NamedTuple
@@ -29,12 +29,14 @@ from jointfit_protocols.natnet_model import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from types import UnionType
 
     from jointfit_protocols.natnet_model import ModelDefinition
 
 Key = int | tuple[str, int]
 """Id of a labeled marker or body, or set name and place in the set."""
 
+_MODELS = BodyDescription | SkeletonDescription | AssetDescription
 _EVERY = "all"
 _MEMBER_BITS = 16
 _MEMBER = (1 << _MEMBER_BITS) - 1
@@ -88,15 +90,16 @@ def bind(model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str
     markers, bodies : mapping of str to str
         Names that rig.toml uses, and the key that does.
     """
-    bodies_found, twice_bodies = _refuse_shared(_body_entries(model))
-    markers_found, twice = _refuse_shared(_marker_entries(model))
+    shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, BodyDescription)
+    all_bodies, all_markers = _body_entries(model), _marker_entries(model)
+    bodies_found = [e for e in all_bodies if e.owner or e.key not in shared_bodies]
+    markers_found = [e for e in all_markers if _model_of(e.key) not in shared]
     marker_columns = _columns("marker", markers_found, markers)
     body_columns = _columns("rigid body", bodies_found, bodies)
     loose = frozenset(entry.key[0] for entry in markers_found if isinstance(entry.key, tuple))
-    known = frozenset(e.key for e in (*bodies_found, *markers_found, *twice_bodies, *twice))
-    shared = [f"{e.owner}/{e.name}" if e.owner else e.name for e in twice_bodies]
-    if shared:
-        text = f"streaming id shared by {' and '.join(shared)}: all refused; give each its own"
+    known = frozenset(entry.key for entry in (*all_bodies, *all_markers))
+    for names in shared.values():
+        text = f"streaming id shared by {' and '.join(names)}: refused; give each its own"
         marker_columns.complaints.append(text)
     return Binding(
         MocapLayout(tuple(marker_columns.names), tuple(body_columns.names)),
@@ -167,11 +170,17 @@ def _members(model: int, owner: str, names: Iterable[str]) -> list[Entry]:
     return [Entry(body_key(model, i), owner, name, i) for i, name in enumerate(names, 1)]
 
 
-def _refuse_shared(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
-    """Split entries into those with an id of their own, and those that share one."""
-    count = Counter(entry.key for entry in entries)
-    own = [entry for entry in entries if count[entry.key] == 1]
-    return own, [entry for entry in entries if count[entry.key] > 1]
+def _shared_ids(model: ModelDefinition, kinds: type | UnionType) -> dict[Key | None, list[str]]:
+    """Return the ids that several models of these kinds have, and whose they are."""
+    names: defaultdict[Key | None, list[str]] = defaultdict(list)
+    for item in model.descriptions:
+        if isinstance(item, kinds) and isinstance(item, _MODELS):
+            names[item.id].append(item.name)
+    return {number: found for number, found in names.items() if len(found) > 1}
+
+
+def _model_of(key: Key) -> int | None:
+    return key >> _MEMBER_BITS if isinstance(key, int) else None
 
 
 # --- what rig.toml calls them -----------------------------------------------------------------
