@@ -104,7 +104,7 @@ def test_segments_joints_and_flexion_follow_the_bones(
     assert knee_joint is not None
     assert ankle is not None
     assert np.linalg.norm(knee_joint) == pytest.approx(LENGTH["thigh"], abs=0.01)
-    assert np.linalg.norm(np.subtract(ankle, knee_joint)) == pytest.approx(0.40, abs=0.01)
+    assert np.linalg.norm(np.subtract(ankle, knee_joint)) == pytest.approx(0.40, abs=0.015)  # skin
     straight = last.joints[1].inner
     assert straight is not None
     assert np.degrees(straight) == pytest.approx(180 - wanted[-1], abs=4)
