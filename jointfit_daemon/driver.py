@@ -48,12 +48,15 @@ class Settings(BaseModel):
 class CanBusSettings(Settings):
     """One ``[can.NAME]`` table: a bus that several devices may share."""
 
-    model_config = ConfigDict(frozen=True, extra="allow")  # further keys go to python-can as they are
+    # Further keys go to python-can as they are.
+    model_config = ConfigDict(frozen=True, extra="allow")
 
-    interface: str = Field("socketcan", description="python-can interface name, or `slcan` (our own codec)")
+    interface: str = Field(
+        "socketcan", description="python-can interface, or `slcan` (our own codec)"
+    )
     channel: str = Field(description="`can0`, or the serial port of an SLCAN adapter")
-    bitrate: int = Field(1_000_000, gt=0, description="bit/s; ignored where the kernel set it already")
-    baud: int = Field(115_200, gt=0, description="speed of the serial port of an SLCAN adapter, baud")
+    bitrate: int = Field(1_000_000, gt=0, description="bit/s; ignored where the kernel set it")
+    baud: int = Field(115_200, gt=0, description="speed of an SLCAN adapter's serial port, baud")
 
 
 class ImuSettings(Settings):
@@ -62,7 +65,7 @@ class ImuSettings(Settings):
     id: str = Field(description="name of the sensor; becomes an MQTT topic")
     segment: str = Field(description="the segment of [chain] it is worn on")
     driver: str = Field(description="driver name, as `jointfit check` lists them")
-    rate_hz: float = Field(100.0, gt=0, le=2000, description="samples per second asked of the device")
+    rate_hz: float = Field(100.0, gt=0, le=2000, description="samples per second asked of it")
     silence_s: float = Field(1.0, gt=0, description="no byte for this long is a lost device")
 
 

@@ -60,7 +60,7 @@ class ImuSample(NamedTuple):
     q_native: Quaternion
     """As sent, scaled but neither turned nor normalised."""
     ticks: int | None
-    """Device time as sent, in ticks of the decoder's ``tick_clock``; None if the device has none."""
+    """Device time as sent, in ticks of the decoder's ``tick_clock``; None if it has none."""
     counter: int | None
     """Sequence number as sent; None if the device has none."""
     status: int | None = None

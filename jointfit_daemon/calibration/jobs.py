@@ -8,6 +8,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon import __version__
+from jointfit_daemon.calibration.alignment_phase import AlignedSensor, Alignment, fit_alignment
+from jointfit_daemon.calibration.fit import better, fit_calibration
+from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only, with_new_static
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,8 +35,6 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
         ``quality`` and what the kind gives: ``alignment``, ``calibration`` (dicts), ``worse`` (why
         the stored calibration is better); or ``refused`` with the reason alone.
     """
-    from jointfit_daemon.calibration.refused import CalibrationRefused
-
     try:
         return _JOBS[kind](payload)
     except CalibrationRefused as refusal:
@@ -40,8 +43,6 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
 
 def _alignment(payload: Mapping[str, Any]) -> Any:
     """Return the alignment of this session, else the one of the calibration in force, else None."""
-    from jointfit_daemon.calibration.alignment_phase import AlignedSensor, Alignment
-
     if payload.get("alignment") is not None:
         return Alignment.from_dict(payload["alignment"])
     previous = _previous(payload)
@@ -57,8 +58,6 @@ def _alignment(payload: Mapping[str, Any]) -> Any:
 
 
 def _previous(payload: Mapping[str, Any]) -> Any:
-    from jointfit_daemon.calibration.result import Calibration
-
     stored = payload.get("previous")
     if stored is None:
         return None
@@ -67,19 +66,11 @@ def _previous(payload: Mapping[str, Any]) -> Any:
 
 
 def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
-    from jointfit_daemon.calibration.alignment_phase import fit_alignment
-
     found = fit_alignment(payload["trial"], payload["settings"])
     return {"alignment": found.to_dict(), "quality": found.quality}
 
 
 def _static(payload: Mapping[str, Any]) -> dict[str, Any]:
-    from jointfit_daemon.calibration.static_pose import (
-        fit_static,
-        fit_static_only,
-        with_new_static,
-    )
-
     chain, settings = payload["chain"], payload["settings"]
     pose = fit_static(payload["static"], settings, chain)
     result: dict[str, Any] = {"quality": pose.quality}
@@ -94,8 +85,6 @@ def _static(payload: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
-    from jointfit_daemon.calibration.fit import better, fit_calibration
-
     found = fit_calibration(
         payload["static"],
         payload["functional"],

@@ -86,9 +86,7 @@ class Core:
             return self._request(event)
         if isinstance(event, JobFinished):
             return self._job_finished(event)
-        if isinstance(event, CalibrationStored):
-            return self._stored(event)
-        return []
+        return self._stored(event) if isinstance(event, CalibrationStored) else []
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -96,7 +94,7 @@ class Core:
         return None if self._rig is None else self._aligner.next_deadline_ns
 
     def health(self, now_ns: int) -> dict[str, object]:
-        """Return the counters and clocks of every device: the part of ``bridge/health`` known here."""
+        """Return counters and clocks of every device: the part of ``bridge/health`` known here."""
         if self._rig is None:
             return {"devices": {}, "frames": {}, "calibration": {}}
         mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
@@ -157,7 +155,8 @@ class Core:
         if state is None or not state.open:
             return [Notice(event.t_ns, "device", event.source, event.text, "warning")]
         outputs = self._take(event.source, state, state.closed())
-        self._aligner.lose(event.source)
+        if state.source.kind == "imu":
+            self._aligner.lose(event.source)
         level: Literal["info", "warning"] = "info" if event.reason == "removed" else "warning"
         return [
             *outputs,
@@ -194,7 +193,7 @@ class Core:
     def _told(self, source: str, state: SourceState, item: Corrupt | DeviceEvent) -> list[Output]:
         if isinstance(item, DeviceEvent) and item.kind == "info":
             return [DeviceInfo(source, state.info)]
-        if isinstance(item, DeviceEvent) and item.kind == "restart":
+        if isinstance(item, DeviceEvent) and item.kind == "restart" and state.source.kind == "imu":
             self._aligner.reset(source)
         return list(self._bulletin.add(self._now_ns, source, item))
 

@@ -143,7 +143,8 @@ class CalibrationStatus:
 
     t_ns: int
     phase: str
-    """``uncalibrated`` | ``align`` | ``aligned`` | ``static`` | ``functional`` | ``fitting`` | ``calibrated`` | ``aborted``."""
+    """``uncalibrated``, ``align``, ``aligned``, ``static``, ``functional``, ``fitting``,
+    ``calibrated`` or ``aborted``."""
     text: str
     version: int | None = None
     quality: Mapping[str, object] = field(default_factory=dict)

@@ -248,7 +248,7 @@ class CalibrationSession:
             return [CalibrationStatus(t_ns, "posed", "static pose taken", self.version, quality)]
         keep = result.get("worse")
         if keep is not None and not self._force:
-            text = f"the stored calibration stays, the new one is worse: {keep}; force = true overrides"
+            text = f"the stored calibration stays, the new one is worse: {keep}; force overrides"
             return [
                 Notice(t_ns, "calibration", kind, text, "warning", {"quality": quality}),
                 CalibrationStatus(t_ns, self.phase, text, self.version, quality),

@@ -80,7 +80,7 @@ class SourceState:
         return [] if decoder is None else self._take(decoder.flush(), decoder)
 
     def feed(self, chunk: Chunk) -> list[Stamped | Corrupt | DeviceEvent]:
-        """Return what `chunk` completed, stamped. Chunks of a source that is not open are ignored."""
+        """Return what `chunk` completed, stamped; nothing while the source is not open."""
         decoder = self._decoder
         if decoder is None:
             return []

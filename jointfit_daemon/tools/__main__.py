@@ -9,7 +9,7 @@ from jointfit_daemon.tools import calibrate, check, decode, demo, schema
 
 app = typer.Typer(
     name="jointfit",
-    help="Tools around jointfitd: check a rig, calibrate it, decode captures, see it all in a demo.",
+    help="Tools around jointfitd: check a rig, calibrate it, decode captures, see a demo.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -1,4 +1,4 @@
-"""`jointfit check`: is this rig.toml right, and what would the daemon do with it?"""
+"""`jointfit check`: whether a rig.toml is right, and what the daemon would do with it."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def decode(
         list[str] | None, typer.Option("--set", help="A driver setting, KEY=VALUE (TOML value).")
     ] = None,
 ) -> None:
-    """Decode a capture of any registered protocol: as a table of counts, JSON lines, or a summary."""
+    """Decode a capture of any registered protocol: a table of counts, JSON lines or a summary."""
     import orjson
 
     from jointfit_daemon.driver import UnknownDriver, find_driver

@@ -1,4 +1,4 @@
-"""The processes of a demo: virtual hardware and the real daemon. Law: starts, talks, stops; no more."""
+"""The processes of a demo: virtual hardware and the real daemon. Law: starts, talks, stops."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ class Demo:
         wanted = {source.id for source in self.rig.sources}
         before = self._healths
         async with asyncio.timeout(15.0):
-            while self.online & wanted or self._healths < before + 2:
+            while self.online & wanted or self._healths < before + 2:  # noqa: ASYNC110 - two facts
                 await asyncio.sleep(0.1)
         sent: dict[str, Any] = said["sent"]
         return sent
@@ -228,7 +228,7 @@ class Demo:
 
 
 def _unaccounted(sent: dict[str, Any], devices: dict[str, Any]) -> int:
-    """Samples without a verdict, and samples sent that never were received, or the reverse."""
+    """Count samples without a verdict, and samples sent but not received, or the reverse."""
     lost = 0
     for name, device in devices.items():
         received = int(device.get("received") or 0)
