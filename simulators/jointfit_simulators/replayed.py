@@ -148,7 +148,7 @@ class Replayed:
         place, _ = self._place(cameras)
         markers = np.empty((len(cameras), 0, 3))
         if self._markers is not None:
-            recorded = self._markers.at(place).reshape(len(cameras), -1, 3)
+            recorded = self._markers.at(place).reshape(len(cameras), len(self._columns), 3)
             markers = recorded[:, self._columns]
         bones = {name: self._bone(name, cameras) for name in self._bones}
         return Observation(seen, markers, bones, self._truth(truth))

@@ -1,0 +1,136 @@
+"""A recorded trial is played as it was recorded, and its static pose stands upright."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.files.npz import read_orientations_npz
+from jointfit_simulators.cameras import Cameras
+from jointfit_simulators.programme import Step, UnknownMotion, parse_programme
+from jointfit_simulators.replayed import Replayed
+from jointfit_simulators.settings import Knobs, perfect
+from jointfit_simulators.trial import Track, read_recording
+from jointfit_simulators.truth_log import TruthLog
+from jointfit_simulators.wearer import SENSORS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NONE = np.empty(0)
+
+
+@pytest.fixture
+def squats(shared_data: Path) -> list[Path]:
+    semireal = shared_data / "semireal_knee4imu"
+    opencap = shared_data / "opencap_subject4/trc/squats1.trc"
+    return [semireal / "squats1.npz", semireal / "static_bias.json", opencap]
+
+
+def test_sensors_bones_and_markers_are_those_of_the_files(squats: list[Path]) -> None:
+    recorded = read_orientations_npz(squats[0])
+    subject = Replayed(read_recording(squats), SENSORS, [Step("trial", 1.0)], transition_s=1.5)
+    t = recorded.t_s - recorded.t_s[0] + 1.5  # the trial begins when it has faded in
+    found = subject.observe([t] * 4, t, t)
+    for name, q in zip(SENSORS, found.sensors, strict=True):
+        said = Rotation.from_quat(q, scalar_first=True)
+        was = Rotation.from_quat(recorded.sensors[name], scalar_first=True)
+        assert np.degrees((said.inv() * was).magnitude()).max() < 1e-4
+    knee = np.degrees(found.truth.knee[:, 0])
+    assert (knee.min(), knee.max()) == pytest.approx((7.3, 104.5), abs=0.06)
+    np.testing.assert_allclose(found.truth.joints["knee"], recorded.origins["tibia_r"], atol=1e-6)
+    assert np.all(np.isnan(found.truth.joints["ankle"]))
+    thigh = found.bones["thigh"][0].inv() * found.truth.orientations["thigh"]
+    assert thigh.magnitude().max() < 1e-9
+    assert found.markers.shape == (len(t), 51, 3)
+    lateral_knee = [*sum(subject.clusters.values(), ())].index("r_knee")
+    with np.load(squats[0]) as arrays:
+        there = arrays["m_r_knee"][:, [2, 0, 1]]
+    apart = np.linalg.norm(found.markers[:, lateral_knee] - there, axis=1)
+    assert np.median(apart) < 0.002
+
+
+def test_between_samples_the_recording_is_interpolated(squats: list[Path]) -> None:
+    recorded = read_orientations_npz(squats[0])
+    track = Track(recorded.t_s, recorded.sensors["S3"], rotation=True)
+    middle = (recorded.t_s[:-1] + recorded.t_s[1:]) / 2
+    said = Rotation.from_quat(track.at(middle), scalar_first=True)
+    was = Rotation.from_quat(recorded.sensors["S3"], scalar_first=True)
+    halfway = was[:-1] * Rotation.from_rotvec((was[:-1].inv() * was[1:]).as_rotvec() / 2)
+    assert np.degrees((said.inv() * halfway).magnitude()).max() < 1e-3
+
+
+def test_with_its_biases_the_static_pose_is_upright(squats: list[Path]) -> None:
+    subject = Replayed(read_recording(squats), SENSORS, parse_programme("stand:9,trial"))
+    t = np.arange(0.0, 5.0, 0.1)
+    found = subject.observe([t] * 4, t, t)
+    assert found.truth.orientations["thigh"].magnitude().max() < 1e-9
+    bias = json.loads(squats[1].read_text())["q_bias"]["S1"]
+    q_bias = Rotation.from_quat(np.array(bias)[[0, 3, 1, 2]], scalar_first=True)
+    said = Rotation.from_quat(found.sensors[0], scalar_first=True)
+    assert (said * q_bias).magnitude().max() < 1e-9  # q_sensor q_bias = q_segment = identity
+
+
+def test_nothing_jumps_between_standing_and_the_trial(squats: list[Path]) -> None:
+    subject = Replayed(read_recording(squats), SENSORS, parse_programme("stand:2,trial:12,stand"))
+    t = np.arange(0.0, 18.0, 0.005)
+    found = subject.observe([t] * 4, t, t)
+    for q in found.sensors:
+        said = Rotation.from_quat(q, scalar_first=True)
+        assert np.degrees((said[:-1].inv() * said[1:]).magnitude()).max() < 2.5
+    assert [subject.motion_at(x) for x in (1.0, 3.0, 15.0)] == ["stand", "trial", "stand"]
+
+
+def test_a_missing_marker_makes_a_missing_sample_not_a_made_up_one(shared_data: Path) -> None:
+    walking = shared_data / "semireal_knee4imu/walking1.npz"
+    recorded = read_orientations_npz(walking)
+    subject = Replayed(read_recording([walking]), SENSORS, [Step("trial", 1.0)], transition_s=1.0)
+    t = recorded.t_s - recorded.t_s[0] + 1.0
+    found = subject.observe([t] * 4, NONE, NONE)
+    missing = [int(np.isnan(q[:, 0]).sum()) for q in found.sensors]
+    assert missing[0] == missing[2] == missing[3] == 0
+    assert 3 <= missing[1] <= 6  # a gap's neighbours may fall a rounding error into it
+
+
+def test_reference_bones_are_streamed_as_bodies(squats: list[Path]) -> None:
+    subject = Replayed(read_recording(squats), SENSORS, [Step("trial", 1.0)])
+    cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
+    t = np.arange(2.0, 8.0, 0.1)
+    observation = subject.observe([NONE] * 4, t, t)
+    seen = cameras.see(observation)
+    assert cameras.bodies == ("Thigh", "Shank")
+    body = Rotation.from_quat(seen.body_orientations[:, 1], scalar_first=True)
+    apart = body.inv() * observation.truth.orientations["shank"]
+    assert apart.magnitude().max() < 1e-9
+
+
+def test_files_that_make_no_trial_are_refused(tmp_path: Path, squats: list[Path]) -> None:
+    with pytest.raises(ValueError, match="got 0"):
+        read_recording(squats[1:])
+    with pytest.raises(ValueError, match=r"'\.txt'"):
+        read_recording([tmp_path / "a.txt"])
+    with pytest.raises(UnknownMotion, match="a trial has: stand, trial"):
+        Replayed(read_recording(squats), SENSORS, [Step("walk", 1.0)])
+
+
+def test_the_truth_log_tells_no_future_and_writes_unknown_as_null(
+    tmp_path: Path, squats: list[Path]
+) -> None:
+    subject = Replayed(read_recording(squats), SENSORS, [Step("trial", 1.0)])
+    t_ns = np.arange(0, 10**9, 10**7)
+    truth = subject.observe([NONE] * 4, NONE, t_ns / 1e9).truth
+    log = TruthLog(tmp_path / "truth.jsonl", {"lengths_m": {}})
+    log.add(t_ns, ["trial"] * len(t_ns), truth, Rotation.identity())
+    log.advance(500_000_000)
+    first, *rows = map(json.loads, (tmp_path / "truth.jsonl").read_text().splitlines())
+    log.close()
+    assert first == {"truth": 1, "lengths_m": {}}
+    assert [row["t_ns"] for row in rows] == list(range(0, 500_000_001, 10**7))
+    assert rows[0]["joint_m"]["ankle"] == [None, None, None]
+    assert set(rows[0]["q_world_segment"]) == {"thigh", "shank"}
+    assert set(rows[0]["knee"]) == {"flexion", "adduction", "rotation"}
+    assert rows[0]["included"] == pytest.approx(np.pi - abs(rows[0]["knee"]["flexion"]), abs=0.05)

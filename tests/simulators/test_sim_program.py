@@ -1,0 +1,253 @@
+"""The program as its users run it: one ready line, commands on stdin, an honest account."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import time
+from collections import Counter
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.config.load import load_rig
+from jointfit_daemon.model import Corrupt, ImuSample, MocapFrame
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from jointfit_daemon.config.rig import Source
+    from jointfit_daemon.model import Chunk, Decoded
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
+
+
+class Sim:
+    """A running ``jointfit-sim play``."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.process = process
+
+    async def line(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        async with asyncio.timeout(20):
+            found: dict[str, Any] = json.loads(await self.process.stdout.readline())
+        return found
+
+    async def tell(self, command: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{command}\n".encode())
+        await self.process.stdin.drain()
+
+    async def ask(self, command: str = "status") -> dict[str, Any]:
+        await self.tell(command)
+        return await self.line()
+
+
+def close_pipes(process: Any) -> None:
+    """Close what asyncio leaves to the garbage collector: its pipes would outlive the test."""
+    process._transport.close()
+
+
+@asynccontextmanager
+async def playing(directory: Path, *options: str) -> AsyncIterator[tuple[Sim, dict[str, Any]]]:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "jointfit_simulators", "play",
+        "--directory", str(directory), *options,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    sim = Sim(process)
+    try:
+        yield sim, await sim.line()
+    finally:
+        if process.returncode is None:
+            process.terminate()
+        await process.wait()
+        close_pipes(process)
+
+
+async def listen(source: Source, heard: list[Decoded]) -> None:
+    driver = source.driver_class(source.settings)
+    decoder = driver.decoder()
+
+    def emit(chunk: Chunk) -> None:
+        heard.extend(decoder.feed(chunk))
+
+    await driver.run(emit)
+
+
+def counts(heard: dict[str, list[Decoded]]) -> dict[str, int]:
+    return {
+        name: sum(isinstance(item, ImuSample | MocapFrame) for item in items)
+        for name, items in heard.items()
+    }
+
+
+async def quiet(sim: Sim, heard: dict[str, list[Decoded]]) -> Counter[str]:
+    """Pause until nothing is under way; return what was sent and not heard by then.
+
+    Shorter than the silence after which a driver gives a device up.
+    """
+    await sim.tell("pause on")
+    await asyncio.sleep(0.4)
+    status = await sim.ask()
+    await sim.tell("pause off")
+    sent = Counter({name: device["sent"] for name, device in status["devices"].items()})
+    sent["mocap"] = status["mocap"]["sent"]
+    sent.subtract(counts(heard))
+    return sent
+
+
+async def test_every_sample_sent_is_heard_by_the_real_drivers(tmp_path: Path) -> None:
+    async with playing(tmp_path, "--programme", "walk") as (sim, ready):
+        rig = load_rig(tmp_path / "rig.toml")
+        assert ready["ready"] is True
+        assert ready["rig"] == str(tmp_path / "rig.toml")
+        heard: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
+        async with asyncio.TaskGroup() as tasks:
+            listening = [
+                tasks.create_task(listen(source, heard[source.id])) for source in rig.sources
+            ]
+            await asyncio.sleep(1.5)  # until all have their handshakes and the optical model
+            at_first = await quiet(sim, heard)
+            before = counts(heard)
+            await asyncio.sleep(3.0)
+            at_last = await quiet(sim, heard)
+            for task in listening:
+                task.cancel()
+        await sim.tell("quit")
+        account = await sim.line()
+        assert await sim.process.wait() == 0
+    assert at_first == at_last
+    assert all(at_first[name] <= 3 for name in ("S1", "S2", "S3", "S4"))
+    assert min(n - before[name] for name, n in counts(heard).items()) > 200
+    assert sum(account["dropped_out"].values()) > 0
+    assert sum(account["refused"].values()) == 0
+    assert not any(isinstance(item, Corrupt) for items in heard.values() for item in items)
+
+
+async def test_what_is_heard_is_the_truth_when_nothing_is_imperfect(tmp_path: Path) -> None:
+    async with playing(tmp_path, "--perfect", "--programme", "squat", "--rate", "200") as (sim, _):
+        rig = load_rig(tmp_path / "rig.toml")
+        heard: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
+        async with asyncio.TaskGroup() as tasks:
+            listening = [
+                tasks.create_task(listen(source, heard[source.id])) for source in rig.sources
+            ]
+            await asyncio.sleep(3.0)
+            for task in listening:
+                task.cancel()
+        await sim.tell("quit")
+        await sim.line()
+    first, *truth = map(json.loads, (tmp_path / "truth.jsonl").read_text().splitlines())
+    t_ns = np.array([row["t_ns"] for row in truth])
+    for name, segment in first["sensors"].items():
+        samples = [item for item in heard[name] if isinstance(item, ImuSample)]
+        boot = first["clocks"][name]["boot_ns"]
+        ticks = np.unwrap([float(s.ticks or 0) for s in samples], period=2.0**32)
+        wraps = np.round((samples[0].arrival_ns - boot) / 1e5 / 2**32 - ticks[0] / 2**32)
+        at_ns = boot + (ticks + wraps * 2**32) * 1e5
+        said = Rotation.from_quat([s.q_world_sensor for s in samples], scalar_first=True)
+        near = np.clip(np.searchsorted(t_ns, at_ns), 1, len(t_ns) - 1)
+        near -= at_ns - t_ns[near - 1] < t_ns[near] - at_ns
+        was = Rotation.from_quat(
+            [truth[i]["q_world_segment"][segment] for i in near], scalar_first=True
+        )
+        apart = np.degrees((said.inv() * was).magnitude())
+        assert apart.max() < 1.5  # 5 ms of a squat
+        assert np.median(apart) < 0.5
+
+
+async def test_commands_change_the_scene_and_bad_ones_are_answered(tmp_path: Path) -> None:
+    async with playing(tmp_path, "--no-mocap") as (sim, _):
+        assert (await sim.ask())["motion"] == "stand"
+        await sim.tell("play walk")
+        await sim.tell("unplug S1")
+        await asyncio.sleep(0.5)
+        assert (await sim.ask())["motion"] == "walk"
+        assert not (tmp_path / "ttyS1").is_symlink()
+        await sim.tell("plug S1")
+        await sim.ask()
+        assert (tmp_path / "ttyS1").exists()
+        await sim.tell("unplug can0")
+        await sim.ask()
+        assert not (tmp_path / "ttyCAN0").is_symlink()
+        for command, hint in (
+            ("hop", "no command 'hop'"),
+            ("play hop", "no motion 'hop'"),
+            ("unplug S9", "no sensor 'S9'"),
+            ("occlude maybe", "expected on or"),
+        ):
+            assert hint in (await sim.ask(command))["error"]
+        for command in ("reboot S3", "occlude on", "mocap stop", "mocap start", "pause off", ""):
+            await sim.tell(command)
+        assert (await sim.ask())["motion"] == "walk"
+
+
+async def test_the_truth_is_written_while_it_happens(tmp_path: Path) -> None:
+    async with playing(tmp_path, "--no-mocap", "--programme", "stand:1,walk") as _:
+        await asyncio.sleep(2.5)
+        lines = (tmp_path / "truth.jsonl").read_text().splitlines()
+        now_ns = time.monotonic_ns()
+        rows = [json.loads(line) for line in lines[1:-1]]
+        assert rows[-1]["t_ns"] <= now_ns
+        assert now_ns - rows[-1]["t_ns"] < 500_000_000  # 0.2 s, on an idle machine
+        steps = np.diff([row["t_ns"] for row in rows])
+        assert set(steps.tolist()) == {10_000_000}
+        assert {row["motion"] for row in rows} == {"stand", "walk"}
+        first = json.loads(lines[0])
+        assert first["lengths_m"] == {"thigh": 0.42, "shank": 0.4}
+        assert first["knobs"]["dropout"] == 0.005
+        hip, knee, ankle = (np.array(rows[-1]["joint_m"][j]) for j in ("hip", "knee", "ankle"))
+        assert np.linalg.norm(hip - knee) == pytest.approx(0.42)
+        assert np.linalg.norm(knee - ankle) == pytest.approx(0.40)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_a_signal_ends_it_with_its_account(tmp_path: Path, number: signal.Signals) -> None:
+    async with playing(tmp_path) as (sim, _):
+        os.kill(sim.process.pid, number)
+        assert set(await sim.line()) == {"sent", "dropped_out", "refused", "unheard"}
+        assert await sim.process.wait() == 0
+    assert not (tmp_path / "ttyS1").is_symlink()
+
+
+async def test_a_recorded_trial_plays_from_the_command_line(
+    tmp_path: Path, shared_data: Path
+) -> None:
+    semireal = shared_data / "semireal_knee4imu"
+    files = [semireal / "squats1.npz", semireal / "static_bias.json"]
+    markers = shared_data / "opencap_subject4/trc/squats1.trc"
+    options = ["--perfect", "--programme", "stand:1,trial", "--trial", *map(str, [*files, markers])]
+    async with playing(tmp_path, *options):
+        rig = load_rig(tmp_path / "rig.toml")
+        assert dict(rig.calibration.rigid_bodies) == {"thigh": "Thigh", "shank": "Shank"}
+        assert rig.calibration.markers["foot"] == ("r_calc", "r_5meta", "r_toe")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--set", "dropot=1"], "did you mean 'dropout'"),
+        (["--programme", "hop:3"], "no motion 'hop'"),
+        (["--trial", "nothing.npz"], "nothing.npz"),
+    ],
+)
+async def test_a_wrong_command_line_exits_2_and_says_why(
+    tmp_path: Path, options: list[str], message: str
+) -> None:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "jointfit_simulators", "play", "--directory", str(tmp_path), *options,
+        stdin=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    _, said = await process.communicate()
+    close_pipes(process)
+    assert process.returncode == 2
+    assert message in said.decode()
