@@ -1,0 +1,124 @@
+"""A stream accounts for every sample, and what the device stamps is when it was taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jointfit_simulators.clocks import NS
+from jointfit_simulators.settings import Knobs, perfect, turn
+from jointfit_simulators.streams import ImuStream
+from jointfit_simulators.trial import Track
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+NOW = 5 * 10**12
+
+
+class Listed:
+    """A device that keeps what it sends, and whose line is full when asked to be."""
+
+    rate_hz = 100.0
+
+    def __init__(self) -> None:
+        self.streaming, self.full = True, False
+        self.kept: list[tuple[int, tuple[float, ...]]] = []
+        self.lost = self._to_lose = 0
+        self.plugged = True
+
+    @property
+    def sent(self) -> int:
+        return len(self.kept)
+
+    def push(self, device_ns: int, q_world_sensor: tuple[float, float, float, float]) -> None:
+        if self._to_lose:
+            self._to_lose -= 1
+            self.lost += 1
+        elif not self.full:
+            self.kept.append((device_ns, q_world_sensor))
+
+    def lose(self, count: int) -> None:
+        self._to_lose += count
+
+    def power_cycle(self) -> None: ...
+
+    def unplug(self) -> None:
+        self.plugged = False
+
+    def plug(self) -> None:
+        self.plugged = True
+
+    async def run(self) -> None: ...
+
+
+def stream(knobs: Knobs, device: Listed, *, shared: bool = False) -> ImuStream:
+    return ImuStream(knobs, "S1", device, latency_ms=2.0, shared_wire=shared, now_ns=NOW)
+
+
+def play(source: ImuStream, seconds: int, begin_s: int = 0, *, heard: bool = True) -> int:
+    """Send so many seconds of standing upright; return how many samples were taken."""
+    begin = NOW + begin_s * NS
+    instants = source.plan(begin, begin + seconds * NS)
+    assert np.all((instants >= begin) & (instants < begin + seconds * NS))
+    due = source.fill(instants / NS, np.tile(UPRIGHT, (len(instants), 1)))
+    for _ in due:
+        source.emit(heard=heard)
+    return len(due)
+
+
+@pytest.mark.parametrize("skew", [0, 50])
+def test_every_sample_is_sent_dropped_or_refused(skew: int) -> None:
+    device = Listed()
+    source = stream(turn(perfect(Knobs()), ["dropout=0.1", f"clock_skew_ppm={skew}"]), device)
+    taken = play(source, 20)
+    device.full = True
+    taken += play(source, 5, 20)
+    assert taken == pytest.approx(2500, abs=1)
+    assert source.dropped_out == device.lost == pytest.approx(250, rel=0.25)
+    assert source.refused == pytest.approx(450, rel=0.1)
+    assert device.sent + source.dropped_out + source.refused == taken
+    assert source.unheard == 0
+
+
+def test_what_nobody_hears_is_counted_apart() -> None:
+    device = Listed()
+    source = stream(perfect(Knobs()), device, shared=True)
+    source.unplug()
+    unheard = play(source, 1)
+    assert device.plugged  # others are on that wire
+    source.plug()
+    unheard += play(source, 1, 1, heard=False)
+    device.streaming = False
+    unheard += play(source, 1, 2)
+    assert (device.sent, source.unheard) == (0, unheard)
+
+
+def test_a_wire_of_its_own_is_taken_away() -> None:
+    device = Listed()
+    source = stream(perfect(Knobs()), device)
+    source.unplug()
+    assert not device.plugged
+    source.plug()
+    assert device.plugged
+
+
+def test_stamps_are_the_devices_own_time_of_the_true_instant() -> None:
+    device = Listed()
+    source = stream(turn(perfect(Knobs()), ["clock_skew_ppm=50", "latency_jitter_ms=5"]), device)
+    instants = source.plan(NOW, NOW + 10 * NS)
+    for _ in source.fill(instants / NS, np.tile(UPRIGHT, (len(instants), 1))):
+        source.emit()
+    clock = source.ticker.clock
+    shown = [clock.device_ns(int(t)) for t in instants]
+    assert np.abs(np.subtract([stamp for stamp, _ in device.kept], shown)).max() <= 2
+    assert clock.skew != 0
+
+
+def test_a_track_of_either_sign_is_one_rotation() -> None:
+    t = np.linspace(0.0, 1.0, 40)
+    turns = Rotation.from_rotvec(np.outer(t, [0.3, 2.0, -0.5]))
+    quaternions = turns.as_quat(scalar_first=True)
+    flipped = quaternions * np.where(np.arange(40) % 3, 1.0, -1.0)[:, None]
+    between = np.linspace(0.01, 0.99, 100)
+    one, other = (Track(t, q, rotation=True).at(between) for q in (quaternions, flipped))
+    np.testing.assert_allclose(np.abs(np.sum(one * other, axis=1)), 1.0, atol=1e-12)
