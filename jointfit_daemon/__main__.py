@@ -10,8 +10,8 @@ import asyncio
 import faulthandler
 import logging
 import os
+import signal
 import sys
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -104,7 +104,9 @@ def describe(rig: Rig) -> str:
 
 def _run(config: Path, rig: Rig) -> int:
     from jointfit_daemon.supervisor import run_daemon
+    from jointfit_daemon.supervisor.last_resort import leave_within
 
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon takes it: no reload yet
     code = 0
     with asyncio.Runner() as runner:
         try:
@@ -112,20 +114,8 @@ def _run(config: Path, rig: Rig) -> int:
         except Exception:
             log.exception("a bug ends the daemon; please report it with what follows")
             code = EXIT_BUG
-        _leave_within(LAST_WAIT_S, code)
+        leave_within(LAST_WAIT_S, code, "a thread")
     return code
-
-
-def _leave_within(seconds: float, code: int) -> None:
-    """End the process even if one of its threads does not."""
-
-    def leave() -> None:
-        logging.shutdown()
-        os._exit(code)
-
-    last = threading.Timer(seconds, leave)
-    last.daemon = True
-    last.start()
 
 
 if __name__ == "__main__":

@@ -110,9 +110,10 @@ class Reporter:
             for joint in state.joints:
                 self._outbox.stream(f"{self._base}/joint/{joint.name}", encode_joint(joint, t_us))
 
-    def event(self, notice: Notice) -> None:
-        """Publish one change of state on ``bridge/event``."""
-        said = {"kind": notice.kind, "id": notice.id, "level": notice.level, "text": notice.text}
+    def event(self, notice: Notice, level: str | None = None) -> None:
+        """Publish one change of state on ``bridge/event``, at its own level or at `level`."""
+        said = {"kind": notice.kind, "id": notice.id, "level": level or notice.level}
+        said |= {"text": notice.text}
         payload = self._stamped(said | {"data": notice.data}, notice.t_ns)
         self._outbox.event(f"{self._base}/bridge/event", payload)
 

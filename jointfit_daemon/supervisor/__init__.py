@@ -1,4 +1,4 @@
-"""The async shell: start, retry, stop, reload, tell systemd. Moves events and time, decides nothing."""
+"""The async shell: start, retry, stop, reload, tell systemd. Law: moves events, decides nothing."""
 
 from jointfit_daemon.supervisor.daemon import run_daemon
 

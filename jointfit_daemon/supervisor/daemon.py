@@ -4,67 +4,72 @@ Law: cancellation is the only way out. What happens between an event and its out
 this file moves them.
 
     task             what it does                                      ends
+    core time        ticks the core when nothing else does             never
     source ID        runs one driver, retries it                       with the rig
-    mqtt             keeps the broker link, answers requests           never
-    heartbeat        ticks the core, feeds the watchdog, tells health  never
+    mqtt             keeps the broker link, hands on requests          with its settings
+    health           tells health, status and the watchdog             never
+    recording        writes the event log                              when the disk is full
     fit KIND         one calibration fit in a worker process           with its result
     store            writes one calibration                            when it is on disk
-    reload           reads rig.toml again on SIGHUP                    when it is in force
+    reload           reads rig.toml again on SIGHUP                    never
 """
 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
-import datetime
 import logging
-import os
+import math
 import signal
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import ConfigError, load_rig
-from jointfit_daemon.model import LimbState
-from jointfit_daemon.outputs.board import Board
 from jointfit_daemon.outputs.event_log import EventLog
+from jointfit_daemon.outputs.log_topic import LogTopic
 from jointfit_daemon.outputs.mqtt import LoopNoise
 from jointfit_daemon.outputs.outbox import Outbox
-from jointfit_daemon.outputs.publisher import MqttPublisher, command_of
+from jointfit_daemon.outputs.publisher import MqttPublisher
+from jointfit_daemon.outputs.reporter import Reporter
 from jointfit_daemon.pipeline.core import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
     CalibrationStored,
     CancelJob,
     Configured,
+    DeviceStatus,
     FitJob,
     Notice,
     Reply,
-    Tick,
 )
+from jointfit_daemon.supervisor import calibrations
 from jointfit_daemon.supervisor.fits import FitRunner
+from jointfit_daemon.supervisor.heart import Heart
+from jointfit_daemon.supervisor.last_resort import leave_within
 from jointfit_daemon.supervisor.process import ProcessWatch
-from jointfit_daemon.supervisor.requests import parse_request
+from jointfit_daemon.supervisor.requests import reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
+from jointfit_daemon.supervisor.watchdog import Progress
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Incoming
-    from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.events import Output
+    from jointfit_daemon.supervisor.heart import CoreLike
 
 log = logging.getLogger(__name__)
 
-HEARTBEAT_S = 0.1
-STUCK_S = 3.0
-"""Sensors stream and no frame came out for this long: the watchdog is no longer fed."""
-
-
-def state_directory() -> Path:
-    """Return where calibrations are kept: systemd's choice, else ./state."""
-    return Path(os.environ.get("STATE_DIRECTORY", "state").split(":")[0])
+LOOK_S = 0.1
+"""How often the process looks at itself."""
+HEALTH_SOON_S = 0.5
+"""Health follows a device that came or went by this much, so that losses show in time."""
+STOP_S = 4.8
+"""Stopping is promised in five seconds, whatever hangs."""
+_LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
 
 class Daemon:
@@ -72,27 +77,45 @@ class Daemon:
 
     Parameters
     ----------
-    config : Path
+    config
         rig.toml, read again at every reload.
-    rig : Rig
+    rig
         What it said at the start.
+    core
+        The pure core.
     """
 
-    def __init__(self, config: Path, rig: Rig) -> None:
+    def __init__(self, config: Path, rig: Rig, core: CoreLike) -> None:
         self._config, self._rig = config, rig
-        self._core = Core()
-        self._watch, self._systemd = ProcessWatch(), SystemdNotifier()
-        self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
-        self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
-        self._board = Board(rig, self._outbox)
+        self._heart = Heart(core, self._send)
+        self._process, self._systemd = ProcessWatch(), SystemdNotifier()
+        self._progress = Progress()
         self._noise = LoopNoise()
-        self._log: EventLog | None = None
-        self._deadline: asyncio.TimerHandle | None = None
-        self._deadline_ns: int | None = None
-        self._frame_s = time.monotonic()
+        self._asking: Incoming | None = None
+        self._online: set[str] = set()
+        self._health_due_s = 0.0
+        self._hung_up = asyncio.Event()
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._fits: FitRunner
+        self._mqtt: asyncio.Task[None]
+        self._use_broker(rig)
+
+    def _use_broker(self, rig: Rig) -> None:
+        self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
+        self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
+        self._reporter = Reporter(rig, self._outbox)
+
+    async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
+        """Leave the old broker in order; the new one gets all that was retained."""
+        await stop([self._mqtt])
+        known = self._outbox.retained
+        self._use_broker(rig)
+        for topic, payload in known.items():
+            leaf = topic.removeprefix(before.mqtt.base)
+            if payload and not leaf.startswith("/bridge/"):
+                self._outbox.retain(rig.mqtt.base + leaf, payload)
+        self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
 
     # --- life --------------------------------------------------------------------------------
 
@@ -100,219 +123,207 @@ class Daemon:
         """Run until cancelled; an exception that is not a cancellation is a bug."""
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._noise)
-        self._open_log()
+        loop.add_signal_handler(signal.SIGHUP, self._hung_up.set)
+        warnings = LogTopic(self._log_line)
+        logging.getLogger().addHandler(warnings)
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                self._sources = SourceTasks(self._tasks, self.deliver)
-                self._fits = FitRunner(self._tasks, self.deliver)
-                loop.add_signal_handler(signal.SIGHUP, self._hang_up)
-                self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
-                self._configure(self._rig)
-                self._tasks.create_task(self._heartbeat(), name="heartbeat")
-                await self._sources.apply(self._rig.sources)
-                self._systemd.ready()
-                log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
-                await self._until_cancelled()
+                await self._start(self._tasks)
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    self._systemd.stopping()
+                    await self._sources.stop()
         finally:
+            logging.getLogger().removeHandler(warnings)
             loop.remove_signal_handler(signal.SIGHUP)
-            if self._log is not None:
-                self._log.close()
 
-    async def _until_cancelled(self) -> None:
-        try:
-            await asyncio.Event().wait()
-        finally:
-            self._systemd.stopping()
-            await self._sources.stop()
-            self._tell_health()
+    async def _start(self, tasks: asyncio.TaskGroup) -> None:
+        self._sources = SourceTasks(tasks, self._heart.feed)
+        self._fits = FitRunner(tasks, self._heart.feed)
+        self._open_log(tasks)
+        self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
+        self._configure(self._rig)
+        tasks.create_task(self._heart.run(), name="core time")
+        tasks.create_task(self._look_after(), name="health")
+        tasks.create_task(self._reload_when_asked(), name="reload")
+        await self._sources.apply(self._rig.sources)
+        self._systemd.ready()
+        log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
 
-    def _open_log(self) -> None:
+    def _open_log(self, tasks: asyncio.TaskGroup) -> None:
         recording = self._rig.recording
         if recording is None:
             return
-        now = datetime.datetime.now(datetime.UTC)
-        folder = state_directory() / recording.directory
-        path = folder / f"{now:%Y%m%dT%H%M%S.%fZ}.events.jsonl"
+        folder = calibrations.state_directory() / recording.directory
         try:
-            self._log = EventLog(path)
+            self._heart.log = EventLog(folder, self._rig.name)
         except OSError as fault:
-            log.error("no recording: %s: %s", path, fault.strerror)  # noqa: TRY400 - not a bug
+            self._tell("recording", f"nothing is recorded: {folder}: {fault.strerror}", "error")
+        else:
+            log.info("recording events in %s", self._heart.log.path)
+            tasks.create_task(self._heart.log.run(), name="recording")
 
-    # --- events and outputs ------------------------------------------------------------------
+    def _log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
+        self._reporter.log_line(level, name, text, suppressed)
 
-    def deliver(self, event: Event) -> None:
-        """Feed one event to the core and send what comes out."""
-        if self._log is not None:
-            self._record(event)
-        outputs = self._core.feed(event)
-        for output in outputs:
-            self._send(output)
-        self._arm()
+    def _tell(self, kind: str, text: str, level: str = "info") -> None:
+        """Tell what only the shell knows, on the log and on ``bridge/event``."""
+        log.log(_LEVELS[level], "%s: %s", kind, text)
+        notice = Notice(time.monotonic_ns(), kind, self._rig.name, text)
+        self._reporter.event(notice, level)
 
-    def _record(self, event: Event) -> None:
-        try:
-            if self._log is not None:
-                self._log.event(event)
-        except OSError as fault:  # a full disk ends the recording, not the daemon
-            log.error("recording stopped: %s", fault.strerror)  # noqa: TRY400 - not a bug
-            self._log = None
+    # --- outputs of the core -----------------------------------------------------------------
 
     def _send(self, output: Output) -> None:
-        if isinstance(output, LimbState):
-            self._frame_s = time.monotonic()
-            if self._log is not None:
-                self._log.state(output)
-            self._board.pose(output)
-        elif isinstance(output, FitJob):
-            self._fits.start(output)
-        elif isinstance(output, CancelJob):
-            self._fits.cancel()
-        elif isinstance(output, CalibrationReady):
-            self._tasks.create_task(self._store(output.calibration), name="store")
-        else:
-            if isinstance(output, Notice):
-                level = logging.getLevelName(output.level.upper())
-                log.log(level, "%s: %s", output.id, output.text)
-            self._board.tell(output)
+        match output:
+            case FitJob():
+                self._fits.start(output)
+            case CancelJob():
+                self._fits.cancel()
+            case CalibrationReady(calibration):
+                self._tasks.create_task(self._store(calibration), name="store")
+            case Reply():
+                self._answer(output)
+            case Notice():
+                log.log(_LEVELS[output.level], "%s: %s", output.id, output.text)
+            case DeviceStatus():
+                self._came_or_went(output)
+        self._reporter.handle(output)
 
-    def _arm(self) -> None:
-        """Set the timer for the core's deadline; the heartbeat covers what is further away."""
-        due_ns = self._core.next_deadline_ns
-        if due_ns == self._deadline_ns:
-            return
-        if self._deadline is not None:
-            self._deadline.cancel()
-        self._deadline, self._deadline_ns = None, due_ns
-        if due_ns is not None:
-            loop = asyncio.get_running_loop()
-            self._deadline = loop.call_at(due_ns / 1e9, self._due)
-
-    def _due(self) -> None:
-        self._deadline, self._deadline_ns = None, None
-        try:
-            self.deliver(Tick(time.monotonic_ns()))
-        except Exception as bug:  # noqa: BLE001 - in a callback it would only reach a log
-            self._fail(bug)
-
-    def _fail(self, bug: BaseException) -> None:
-        async def raise_it() -> None:
-            raise bug
-
-        self._tasks.create_task(raise_it(), name="bug")
-
-    async def _heartbeat(self) -> None:
-        loop = asyncio.get_running_loop()
-        told_s = loop.time()
-        watchdog_s = self._systemd.watchdog_s
-        fed_s = 0.0
-        while True:
-            due = loop.time() + HEARTBEAT_S
-            await asyncio.sleep(HEARTBEAT_S)
-            now_s = loop.time()
-            self._watch.late(now_s - due)
-            self.deliver(Tick(time.monotonic_ns()))
-            if watchdog_s is not None and now_s - fed_s > watchdog_s / 3 and not self._stuck():
-                fed_s = now_s
-                self._systemd.alive()
-            if now_s - told_s >= self._rig.mqtt.health_s or self._board.health_wanted(now_s):
-                told_s = now_s
-                self._tell_health()
-
-    def _stuck(self) -> bool:
-        return self._board.online_imus > 0 and time.monotonic() - self._frame_s > STUCK_S
-
-    def _tell_health(self) -> None:
-        health = self._core.health(time.monotonic_ns())
-        health["process"] = self._watch.figures()
-        health["link"] = self._link.figures()
-        if self._log is not None:
-            health["recording"] = {"bytes": self._log.bytes_written, "file": self._log.path.name}
-        self._board.health(health)
-        imus = sum(source.kind == "imu" for source in self._rig.sources)
-        broker = "broker connected" if self._link.connected else "no broker"
-        self._systemd.status(f"{self._board.online_imus} of {imus} IMUs, {broker}")
-
-    # --- configuration and calibration -------------------------------------------------------
-
-    def _configure(self, rig: Rig) -> None:
-        stored = CalibrationStore(state_directory(), rig.calibration_store).latest()
-        calibration = None if stored is None else stored.calibration
-        version = None if stored is None else stored.version
-        if stored is not None:
-            for note in stored.notes:
-                log.warning("calibration: %s", note)
-        self.deliver(Configured(time.monotonic_ns(), rig, calibration, version))
+    def _came_or_went(self, status: DeviceStatus) -> None:
+        (self._online.add if status.online else self._online.discard)(status.id)
+        self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
 
     async def _store(self, calibration: Calibration) -> None:
-        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        dated = dataclasses.replace(calibration, created_utc=now)
-        store = CalibrationStore(state_directory(), self._rig.calibration_store)
         try:
-            version = await asyncio.to_thread(store.save, dated)
+            version = await asyncio.to_thread(calibrations.save, self._rig, calibration)
         except OSError as fault:
-            text = f"calibration in force but not stored: {fault}"
-            log.error("%s", text)  # noqa: TRY400 - a full disk is not a bug
-            self._board.tell(Notice(time.monotonic_ns(), "calibration", "store", text, "error"))
+            self._tell("calibration", f"in force but not stored: {fault}", "error")
             return
-        self.deliver(CalibrationStored(time.monotonic_ns(), version))
-
-    def _hang_up(self) -> None:
-        self._tasks.create_task(self._reload(), name="reload")
-
-    async def _reload(self) -> None:
-        self._systemd.reloading()
-        try:
-            rig = load_rig(self._config)
-        except ConfigError as fault:
-            text = f"reload refused, the running configuration stays: {fault}"
-            log.error("%s", text)  # noqa: TRY400 - the file's fault
-            self._board.tell(Notice(time.monotonic_ns(), "reload", self._rig.name, text, "error"))
-        else:
-            before, self._rig = self._rig, rig
-            if before.mqtt != rig.mqtt:
-                await self._move_to_broker(rig)
-            self._board.configure(rig)
-            self._configure(rig)
-            await self._sources.apply(rig.sources)
-        self._systemd.ready()
-
-    async def _move_to_broker(self, rig: Rig) -> None:
-        """Leave the old broker in order and begin at the new one with everything retained."""
-        await stop([self._mqtt])
-        self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
-        self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
-        self._board = Board(rig, self._outbox)
-        self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
+        self._heart.feed(CalibrationStored(time.monotonic_ns(), version))
 
     # --- requests ----------------------------------------------------------------------------
 
     def _asked(self, message: Incoming) -> None:
         """Take one request from the broker: answered once, by the core or for it."""
-        command = command_of(message)
-        request = parse_request(command, message.payload, time.monotonic_ns())
-        self._board.asked(message, request.transaction)
-        if isinstance(request, Reply):
-            self._board.tell(request)
-        else:
-            self.deliver(request)
+        request = request_of(message)
+        self._asking = message
+        try:
+            if isinstance(request, Reply):
+                self._answer(request)
+            else:
+                self._heart.feed(request)
+        finally:
+            self._asking = None
+
+    def _answer(self, reply: Reply) -> None:
+        """Answer where the caller wants it; the core answers while it takes the request."""
+        asked = self._asking
+        topic = None if asked is None else reply_topic(asked)
+        self._reporter.reply(reply, topic, None if asked is None else asked.correlation)
+
+    # --- health ------------------------------------------------------------------------------
+
+    async def _look_after(self) -> None:
+        loop = asyncio.get_running_loop()
+        watchdog_s, fed_s = self._systemd.watchdog_s or math.inf, loop.time()
+        self._health_due_s = loop.time() + HEALTH_SOON_S
+        while True:
+            due = loop.time() + LOOK_S
+            await asyncio.sleep(LOOK_S)
+            now_s = loop.time()
+            self._process.late(now_s - due)
+            if now_s - fed_s > watchdog_s / 3 and self._at_work():
+                fed_s = now_s
+                self._systemd.alive()
+            if now_s >= self._health_due_s:
+                self._health_due_s = now_s + self._rig.mqtt.health_s
+                self._tell_health()
+
+    def _at_work(self) -> bool:
+        health = self._heart.core.health(time.monotonic_ns())
+        imus = frozenset(source.id for source in self._rig.sources if source.kind == "imu")
+        return self._progress.made(health, self._heart.states, imus)
+
+    def _tell_health(self) -> None:
+        health = self._heart.core.health(time.monotonic_ns())
+        health["process"] = self._process.figures()
+        health["link"] = self._link.figures() | {"noise": self._noise.dropped}
+        if self._heart.log is not None:
+            health["recording"] = self._heart.log.figures()
+        self._reporter.health(health)
+        imus = [source.id for source in self._rig.sources if source.kind == "imu"]
+        missing = [name for name in imus if name not in self._online]
+        words = [f"{len(imus) - len(missing)} of {len(imus)} IMUs"]
+        words += [f"missing {', '.join(missing)}"] if missing else []
+        words += [] if self._link.connected else ["no broker"]
+        self._systemd.status(", ".join(words))
+
+    # --- configuration -----------------------------------------------------------------------
+
+    def _configure(self, rig: Rig) -> None:
+        found = calibrations.stored(rig)
+        for complaint in found.complaints:
+            self._tell("calibration", complaint, "warning")
+        now_ns = time.monotonic_ns()
+        self._heart.feed(Configured(now_ns, rig, found.calibration, found.version))
+
+    async def _reload_when_asked(self) -> None:
+        while True:
+            await self._hung_up.wait()
+            self._hung_up.clear()
+            self._systemd.reloading()
+            try:
+                rig = await asyncio.to_thread(load_rig, self._config)
+            except ConfigError as fault:
+                self._tell("reload", f"refused, the running rig stays: {fault}", "error")
+            else:
+                await self._change_to(rig)
+            self._systemd.ready()
+
+    async def _change_to(self, rig: Rig) -> None:
+        """Put `rig` in force; what did not change goes on."""
+        before, self._rig = self._rig, rig
+        if before.recording != rig.recording:
+            self._tell("reload", "[recording] changes at the next start", "warning")
+        await self._sources.retire(rig.sources)
+        self._reporter.configure(rig)  # clears what is gone, before anything is carried over
+        if before.mqtt != rig.mqtt:
+            await self._move_to_broker(before, rig)
+        self._online &= {source.id for source in rig.sources}
+        self._configure(rig)
+        await self._sources.apply(rig.sources)
+        log.info("%s: reloaded, %d sources", rig.name, len(rig.sources))
 
 
-async def run_daemon(config: Path, rig: Rig) -> None:
-    """Run the daemon until SIGTERM or SIGINT."""
+async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreLike] = Core) -> None:
+    """Run the daemon until SIGTERM or SIGINT.
+
+    Parameters
+    ----------
+    config
+        rig.toml, read again on SIGHUP.
+    rig
+        What it says now.
+    core
+        Makes the core.
+    """
     main = asyncio.current_task()
     loop = asyncio.get_running_loop()
     stopping = False
 
-    def stop() -> None:
+    def stop_once() -> None:
         nonlocal stopping
         if not stopping and main is not None:
             stopping = True
+            leave_within(STOP_S, 1, "stopping")
             main.cancel()
 
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop)
+        loop.add_signal_handler(number, stop_once)
     try:
-        await Daemon(config, rig).run()
+        await Daemon(config, rig, core()).run()
     except asyncio.CancelledError:
         if not stopping:
             raise

@@ -1,6 +1,7 @@
 """Runs fits in a worker process, so that acquisition does not stall while a calibration is fitted.
 
-Law: one job at a time; a job that is cancelled, or outlives the daemon, is killed.
+Law: one job at a time; a job that is cancelled, or outlives the daemon, is killed. Results pass
+through JSON, so a replay, which reads them from the event log, sees the same values.
 """
 
 from __future__ import annotations
@@ -8,12 +9,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import pickle  # noqa: S403 - parent and child only
+import pickle
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import orjson
 
 from jointfit_daemon.pipeline.events import JobFinished
+from jointfit_daemon.supervisor.worker import HEADER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,10 +28,19 @@ log = logging.getLogger(__name__)
 
 PATIENCE_S = 300.0
 """A fit that takes longer than this is given up: the wearer will have taken the sensors off."""
+_LAST_WORDS = 4000  # characters of a worker's standard error worth logging
 
 
 class FitRunner:
-    """Starts the worker for a job and delivers ``JobFinished``."""
+    """Starts the worker for a job and delivers ``JobFinished``.
+
+    Parameters
+    ----------
+    tasks
+        Owns the task of every job.
+    deliver
+        Feeds one event to the core.
+    """
 
     def __init__(self, tasks: asyncio.TaskGroup, deliver: Callable[[Event], None]) -> None:
         self._tasks, self._deliver = tasks, deliver
@@ -45,43 +58,51 @@ class FitRunner:
             self._running = None
 
     async def _run(self, job: FitJob) -> None:
-        result, error = None, None
+        began = time.monotonic()
         try:
             async with asyncio.timeout(PATIENCE_S):
-                result = await _in_worker(job)
+                answer = await _in_worker(job)
         except TimeoutError:
-            error = f"not done after {PATIENCE_S:g} s"
-        except WorkerFailed as failed:
-            error = str(failed)
-            log.error("fit %s: %s", job.kind, failed)  # noqa: TRY400 - the traceback is the worker's
-        self._deliver(JobFinished(time.monotonic_ns(), job.job, result, error))
+            answer = {"error": f"not done after {PATIENCE_S:g} s"}
+        error = answer.get("error")
+        took_s = time.monotonic() - began
+        log.info("fit %s: %s, %.1f s", job.kind, "failed" if error else "done", took_s)
+        self._deliver(JobFinished(time.monotonic_ns(), job.job, answer.get("result"), error))
 
 
-class WorkerFailed(Exception):  # noqa: N818 - named for what happened
-    """The worker ended without a result; the text is the end of what it said."""
-
-
-async def _in_worker(job: FitJob) -> dict[str, object]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-m",
-        "jointfit_daemon.supervisor.worker",
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
+async def _in_worker(job: FitJob) -> dict[str, Any]:
+    # Pickling minutes of samples takes tens of milliseconds: not in the loop's way.
+    words = await asyncio.to_thread(pickle.dumps, (job.kind, dict(job.payload)))
+    command = [sys.executable, "-m", "jointfit_daemon.supervisor.worker"]
+    pipe = asyncio.subprocess.PIPE
+    worker = await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
     try:
-        # Pickling minutes of samples takes tens of milliseconds: not in the loop's way.
-        words = await asyncio.to_thread(pickle.dumps, (job.kind, dict(job.payload)))
-        out, said = await process.communicate(words)
+        async with asyncio.TaskGroup() as pipes:
+            answer = pipes.create_task(_read(worker.stdout), name="fit result")
+            said = pipes.create_task(_read(worker.stderr), name="fit words")
+            pipes.create_task(_write(worker.stdin, words), name="fit job")
+        code = await worker.wait()
     finally:
-        if process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
-    if process.returncode != 0:
-        lines = said.decode("utf-8", "replace").strip().splitlines()
-        log.error("the worker's traceback:\n%s", "\n".join(lines))
-        raise WorkerFailed(lines[-1] if lines else f"worker ended with {process.returncode}")
-    result: dict[str, object] = pickle.loads(out)  # noqa: S301 - written by our child
-    return result
+        with contextlib.suppress(ProcessLookupError):
+            worker.kill()
+        await worker.wait()
+        if worker.stdin is not None:
+            worker.stdin.close()
+    if text := said.result()[-_LAST_WORDS:].decode("utf-8", "replace").strip():
+        log.warning("fit %s: the worker said:\n%s", job.kind, text)
+    if not answer.result():
+        return {"error": f"the worker ended with {code} and without a result"}
+    found: dict[str, Any] = orjson.loads(answer.result())
+    return found
+
+
+async def _read(pipe: asyncio.StreamReader | None) -> bytes:
+    return b"" if pipe is None else await pipe.read()
+
+
+async def _write(pipe: asyncio.StreamWriter | None, words: bytes) -> None:
+    """Send the job and leave the pipe open: the worker dies when it closes."""
+    if pipe is not None:
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it ended: told by _read
+            pipe.write(HEADER.pack(len(words)) + words)
+            await pipe.drain()

@@ -1,60 +1,94 @@
-"""Requests from outside: validated with every fault told, then handed to the core.
+"""Requests as they come over MQTT, checked.
 
-Law: nothing a stranger sends can raise; a request that is not understood is answered, not run.
+Law: nothing a stranger sends can raise; every fault is told at once; one answer each, always.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import time
+from typing import TYPE_CHECKING, Any, Literal
 
 import orjson
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jointfit_daemon.config.faults import Fault, faults_of, nearest
+from jointfit_daemon.outputs.publisher import command_of
 from jointfit_daemon.pipeline.events import Reply, Request
 
+if TYPE_CHECKING:
+    from jointfit_daemon.outputs.mqtt import Incoming
 
-class CalibrateRequest(BaseModel):
+LONGEST_BYTES = 16 * 1024  # a request is a line of JSON
+_NOT_IN_TOPICS = ("#", "+", "\0")
+
+
+class _Arguments(BaseModel):
+    """Base of every request: unknown keys are refused, text is no number."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    transaction: str = Field("", max_length=256, description="the caller's mark, sent back")
+
+
+class CalibrateArguments(_Arguments):
     """``bridge/request/calibrate``."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    transaction: str = Field("", max_length=256, description="repeated in the answer")
     phase: Literal["align", "static", "functional", "abort"] = Field(
-        description="which phase begins; `abort` ends the one that runs"
+        description="the phase to begin, or `abort`"
     )
     seconds: float | None = Field(
-        None, gt=0, le=600, description="length of the phase instead of rig.toml's, s"
+        None, gt=0, le=600, description="length of the phase, s; default: as in rig.toml"
     )
-    force: bool = Field(False, description="replace the stored calibration even by a worse one")
+    force: bool = Field(False, description="store the result even if it is worse than the last")
 
 
-COMMANDS: dict[str, type[CalibrateRequest]] = {"calibrate": CalibrateRequest}
+COMMANDS: dict[str, type[_Arguments]] = {"calibrate": CalibrateArguments}
 
 
-def parse_request(command: str, payload: bytes, t_ns: int) -> Request | Reply:
-    """Return the request, or the answer that says all that is wrong with it."""
-    try:
-        words = orjson.loads(payload or b"{}")
-    except orjson.JSONDecodeError as fault:
-        return _refused(command, "", "payload", f"not JSON: {fault}")
-    if not isinstance(words, dict):
-        return _refused(command, "", "payload", f"expected an object, got {type(words).__name__}")
-    transaction = str(words.get("transaction", ""))
+def request_of(message: Incoming) -> Request | Reply:
+    """Return the request in `message`, or the reply that says all that is wrong with it."""
+    command = command_of(message)
+    table, fault = _table(message.payload)
+    given = table.get("transaction")
+    transaction = given if isinstance(given, str) else ""
     model = COMMANDS.get(command)
     if model is None:
-        known = ", ".join(COMMANDS)
-        return _refused(command, transaction, "command", f"unknown {command!r}; known: {known}")
+        known = f"no such request; known: {', '.join(COMMANDS)}"
+        fault = Fault("command", known, command, nearest(command, COMMANDS))
+    if fault is not None or model is None:
+        return _refusal(command, transaction, [fault] if fault is not None else [])
     try:
-        asked = model.model_validate(words)
-    except ValidationError as faults:
-        details = faults.errors(include_url=False)
-        keys = ", ".join(".".join(map(str, fault["loc"])) for fault in details)
-        text = "; ".join(f"{'.'.join(map(str, f['loc']))}: {f['msg']}" for f in details)
-        return _refused(command, transaction, keys, text)
-    arguments = asked.model_dump(exclude={"transaction"}, exclude_none=True)
-    return Request(t_ns, command, asked.transaction, arguments)
+        arguments = model.model_validate(table)
+    except ValidationError as error:
+        return _refusal(command, transaction, faults_of(error, model, command))
+    values = arguments.model_dump(exclude={"transaction"}, exclude_none=True)
+    return Request(time.monotonic_ns(), command, transaction, values)
 
 
-def _refused(command: str, transaction: str, key: str, message: str) -> Reply:
-    error = {"key": key, "message": message}
+def _table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
+    if len(payload) > LONGEST_BYTES:
+        return {}, Fault("payload", f"longer than {LONGEST_BYTES} bytes")
+    try:
+        table = orjson.loads(payload or b"{}")
+    except orjson.JSONDecodeError as error:
+        return {}, Fault("payload", f"is not JSON: {error}")
+    if not isinstance(table, dict):
+        return {}, Fault("payload", "expected a JSON object", table)
+    return table, None
+
+
+def reply_topic(message: Incoming) -> str | None:
+    """Return where the caller wants its answer; None: on the usual topic."""
+    topic = message.response_topic or ""
+    usable = topic and topic[0] != "$" and not any(bad in topic for bad in _NOT_IN_TOPICS)
+    return topic if usable else None
+
+
+def _refusal(command: str, transaction: str, faults: list[Fault]) -> Reply:
+    lines = [{"key": fault.key, "message": fault.text()} for fault in faults]
+    error: dict[str, Any] = {
+        "key": ", ".join(line["key"] for line in lines),
+        "message": "; ".join(line["message"] for line in lines),
+        "faults": lines,
+    }
     return Reply(command, transaction, "error", {}, error)

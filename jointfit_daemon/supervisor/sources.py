@@ -94,8 +94,8 @@ class SourceTasks:
         self._tasks, self._deliver = tasks, deliver
         self._running: dict[str, tuple[Source, asyncio.Task[None]]] = {}
 
-    async def apply(self, sources: Iterable[Source]) -> None:
-        """Run exactly these; a source whose settings are the same keeps its port."""
+    async def retire(self, sources: Iterable[Source]) -> None:
+        """Stop those that are not among these; one whose settings are the same keeps its port."""
         wanted = {source.id: source for source in sources}
         gone = [
             self._running.pop(name)[1]
@@ -103,6 +103,11 @@ class SourceTasks:
             if wanted.get(name) != source
         ]
         await stop(gone)
+
+    async def apply(self, sources: Iterable[Source]) -> None:
+        """Run exactly these."""
+        wanted = {source.id: source for source in sources}
+        await self.retire(wanted.values())
         for name, source in wanted.items():
             if name not in self._running:
                 task = self._tasks.create_task(

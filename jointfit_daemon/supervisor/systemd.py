@@ -10,6 +10,8 @@ import os
 import socket
 import time
 
+PATIENCE_S = 0.1
+
 
 class SystemdNotifier:
     """Tells systemd how the service is; does nothing outside systemd."""
@@ -56,5 +58,6 @@ class SystemdNotifier:
             contextlib.suppress(OSError),  # systemd itself restarts now and then
             socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as notify,
         ):
+            notify.settimeout(PATIENCE_S)  # a manager that does not read must not stop the loop
             notify.connect(self._address)
             notify.sendall(text.encode())

@@ -1,0 +1,62 @@
+"""The calibration store as the daemon uses it. Law: a bad file costs a calibration, not the run."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.calibration.store import CalibrationStore, CalibrationUnreadable
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.config import Rig
+
+
+class Found(NamedTuple):
+    """What the store has for a rig."""
+
+    calibration: Calibration | None
+    version: int | None
+    complaints: tuple[str, ...]
+
+
+def state_directory() -> Path:
+    """Return where the daemon keeps what outlives it: systemd's choice, else ./state."""
+    return Path(os.environ.get("STATE_DIRECTORY", "state").split(":")[0])
+
+
+def store_of(rig: Rig) -> CalibrationStore:
+    """Return the rig's store."""
+    return CalibrationStore(state_directory() / "calibrations", rig.calibration_store)
+
+
+def stored(rig: Rig) -> Found:
+    """Return the newest calibration that belongs to the rig's limb; never raises for a bad file."""
+    try:
+        latest = store_of(rig).latest()
+    except (CalibrationUnreadable, OSError) as error:
+        return Found(None, None, (f"no stored calibration can be read: {error}",))
+    if latest is None:
+        return Found(None, None, ())
+    if not latest.calibration.fits(rig.chain):
+        text = (
+            f"version {latest.version} in store {rig.calibration_store!r} is of another limb or "
+            "other sensors than rig.toml: calibrate again, or name its own store"
+        )
+        return Found(None, None, (*latest.notes, text))
+    return Found(latest.calibration, latest.version, latest.notes)
+
+
+def save(rig: Rig, calibration: Calibration) -> int:
+    """Write a new version, with the date, and return its number.
+
+    Raises
+    ------
+    OSError
+        The medium is full, read-only or gone.
+    """
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return store_of(rig).save(dataclasses.replace(calibration, created_utc=now))
