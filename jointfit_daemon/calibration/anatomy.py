@@ -179,8 +179,8 @@ def _fit_centers(
 def _plumbed(found: dict[str, JointFound | None]) -> dict[str, JointFound | None]:
     """Let the static pose, in which the wearer stood straight, say what the movement did not."""
     straight = stand_straight(
-        [joint and joint.center for joint in found.values()],
-        [joint and joint.covariance for joint in found.values()],
+        [None if joint is None else joint.center for joint in found.values()],
+        [None if joint is None else joint.covariance for joint in found.values()],
     )
     return {
         name: joint

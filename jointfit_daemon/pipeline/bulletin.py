@@ -1,4 +1,4 @@
-"""Turns what wires do into notices, at most one a second for each kind and device.
+"""Turns what wires do into notices, at most one in ten seconds for each kind and device.
 
 Law: nothing is lost by the limit: what is held back is summed into the next notice.
 """
@@ -11,8 +11,8 @@ from typing import Literal
 from jointfit_daemon.model import Corrupt, DeviceEvent
 from jointfit_daemon.pipeline.events import Notice
 
-QUIET_NS = 1_000_000_000
-"""A line a second and kind is what a person can read and a broker will not notice."""
+QUIET_NS = 10_000_000_000
+"""Every drop-out is counted in health; a line each ten seconds and kind is enough for a log."""
 
 Level = Literal["info", "warning", "error"]
 _LEVELS: dict[str, Level] = {

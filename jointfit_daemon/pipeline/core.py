@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.fusion import LimbFuser, OpticalOrigin
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline.bulletin import Bulletin
 from jointfit_daemon.pipeline.events import (
@@ -33,7 +33,7 @@ from jointfit_daemon.timing.align import FrameAligner, StreamSpec
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.model import LimbState
+    from jointfit_daemon.model import LimbState, Vector
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.timing.align import AlignedFrame
     from jointfit_daemon.timing.clock import Stamp
@@ -61,6 +61,8 @@ class Core:
         self._session: CalibrationSession
         self._aligner: FrameAligner
         self._fuser: LimbFuser
+        self._optical_origin: OpticalOrigin | None = None
+        self._origin: Vector | None = None
         self._lag_ns: dict[str, int] = {}
 
     # --- events ------------------------------------------------------------------------------
@@ -137,6 +139,9 @@ class Core:
         rig, calibration = self._rig, self._session.calibration
         if rig is not None:
             self._fuser = LimbFuser(rig.chain, calibration)
+            self._optical_origin, self._origin = None, None
+            if calibration is not None and calibration.fits(rig.chain):
+                self._optical_origin = OpticalOrigin(rig.chain, calibration)
             self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
 
     # --- sources -----------------------------------------------------------------------------
@@ -216,9 +221,14 @@ class Core:
         if isinstance(frame, ImuSample):
             return
         self._mocap_ns = self._now_ns
-        if self._session.collecting and frame.live:
-            self._mocap_used += 1
+        wanted = frame.live and self._session.collecting
+        if wanted:
             self._session.add_mocap(item.stamp.t_ns, frame)
+        if frame.live and self._optical_origin is not None:
+            wanted = True
+            self._origin = self._optical_origin.locate(frame)
+        if wanted:
+            self._mocap_used += 1
         else:
             self._mocap_idle += 1
 
@@ -243,6 +253,7 @@ class Core:
             self._seq,
             frame.orientations,
             extrapolated=frame.extrapolated,
+            optical_origin=self._origin if fresh else None,
             sync="locked" if frame.synced else "settling",
             mode="imu+mocap" if fresh else "imu",
         )

@@ -32,12 +32,20 @@ def health_of(
     """
     devices = {}
     for name, state in sources.items():
-        verdicts = dict(mocap) if state.source.kind == "mocap" else aligner.counts(name)
+        verdicts = _mocap(state, mocap) if state.source.kind == "mocap" else aligner.counts(name)
         devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state)}
     return {
         "devices": devices,
         "calibration": {"phase": session.phase, "version": session.version},
     }
+
+
+def _mocap(state: SourceState, counted: Mapping[str, int]) -> dict[str, int]:
+    """Camera frames are used or idle as they come; those nobody could name yet were dropped."""
+    unpublished = state.counts.unpublished
+    nothing = dict.fromkeys(("decimated", "late", "duplicate", "pending"), 0)
+    received = state.counts.received + unpublished
+    return {**nothing, **counted, "received": received, "dropped": unpublished}
 
 
 def _wire(state: SourceState, now_ns: int) -> dict[str, object]:

@@ -46,6 +46,8 @@ class WireCounts:
     """Times the device's clock began anew."""
     opened: int = 0
     """Times the source was opened; all but the first are reconnects."""
+    unpublished: int = 0
+    """Frames decoded before the device had said what is in them; received, and dropped."""
 
 
 @dataclass(slots=True)
@@ -59,6 +61,7 @@ class SourceState:
     last_arrival_ns: int | None = None
     counts: WireCounts = field(default_factory=WireCounts)
     info: Mapping[str, object] = field(default_factory=dict)
+    _unpublished: int = 0
     _decoder: Decoder | None = None
 
     @classmethod
@@ -69,7 +72,7 @@ class SourceState:
     def opened(self) -> None:
         """Begin anew with a fresh decoder: what was half received will never be completed."""
         driver = self.source.driver_class(self.source.settings)
-        self._decoder = driver.decoder()
+        self._decoder, self._unpublished = driver.decoder(), 0
         self.open = True
         self.counts.opened += 1
 
@@ -126,3 +129,7 @@ class SourceState:
             self.counts.lost += lost if isinstance(lost, int) else 0
         elif item.kind == "info":
             self.info = {**self.info, **item.data}
+            unpublished = item.data.get("unpublished", 0)  # the decoder's total so far
+            if isinstance(unpublished, int):
+                self.counts.unpublished += unpublished - self._unpublished
+                self._unpublished = unpublished

@@ -37,6 +37,8 @@ MOTIONS = ("walk", "squat", "sit_to_stand")
 MOTION_S = 8.0
 MATURE_NS = 300_000_000
 """A pose is judged when its truth has been written for sure."""
+CALIBRATIONS = "state/calibrations"
+"""Where the demo's daemon keeps its calibrations, below the demo's folder."""
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 
 
@@ -216,7 +218,7 @@ class Demo:
 
     def _center_error_mm(self) -> float | None:
         """RMS distance of the fitted joint centers from the true ones, in the static pose."""
-        stored = CalibrationStore(self.folder / "state", self.rig.calibration_store).latest()
+        stored = CalibrationStore(self.folder / CALIBRATIONS, self.rig.calibration_store).latest()
         truth = self.truth.track.at(self._static_ns)
         if stored is None or truth is None:
             return None
