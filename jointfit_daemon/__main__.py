@@ -34,7 +34,6 @@ _JOURNAL_LEVEL = {"CRITICAL": 2, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jointfitd`` and return its exit code."""
     options = _parser().parse_args(arguments)
-    _start_logging(options.log_level)
     from jointfit_daemon.config import ConfigError, load_rig
 
     try:
@@ -45,6 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.check:
         print(describe(rig))
         return 0
+    _start_logging(options.log_level)
     return _run(options.config, rig)
 
 
