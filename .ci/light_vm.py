@@ -11,7 +11,7 @@ Exit status: that of pytest; 1 if a test was skipped or none ran; 90 if the gues
 as pytest's end; 124 at the time limit; 2 if the machine cannot be started at all.
 """
 
-# ruff: noqa: S108, T201 - the guest's folders are named, not used here; this is a command
+# ruff: noqa: S108 - the guest's folders are named, not used here
 
 from __future__ import annotations
 
