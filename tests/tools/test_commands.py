@@ -1,0 +1,72 @@
+"""The commands as a user types them: answers on stdout, faults with their remedy, exit codes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import orjson
+import pytest
+from typer.testing import CliRunner
+
+from jointfit_daemon import __version__
+from jointfit_daemon.tools.__main__ import app
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "knee.toml"
+run = CliRunner().invoke
+
+
+def test_the_version_is_the_packages() -> None:
+    assert run(app, ["--version"]).stdout.strip() == __version__
+
+
+@pytest.mark.parametrize("command", ["check", "demo", "calibrate", "decode", "schema"])
+def test_every_command_explains_itself(command: str) -> None:
+    result = run(app, [command, "--help"])
+    assert result.exit_code == 0
+    assert "Usage" in result.stdout
+
+
+def test_the_example_rig_is_right_and_its_sources_are_listed() -> None:
+    result = run(app, ["check", str(EXAMPLE)])
+    assert result.exit_code == 0
+    for name in ("S1", "S2", "S3", "S4", "mocap"):
+        assert name in result.stdout
+
+
+def test_a_wrong_rig_is_told_with_every_fault_and_exit_code_2(tmp_path: Path) -> None:
+    wrong = tmp_path / "rig.toml"
+    text = EXAMPLE.read_text("utf-8")
+    wrong.write_text(text.replace('driver = "xbus"', 'driver = "xbuz"').replace("baud =", "bawd ="))
+    result = run(app, ["check", str(wrong)])
+    assert result.exit_code == 2
+    assert "xbus" in result.stderr
+
+
+def test_check_speaks_json_to_programs(tmp_path: Path) -> None:
+    assert orjson.loads(run(app, ["check", str(EXAMPLE), "--json"]).stdout)["ok"] is True
+    missing = run(app, ["check", str(tmp_path / "none.toml"), "--json"])
+    assert missing.exit_code == 2
+    assert orjson.loads(missing.stdout)["ok"] is False
+
+
+def test_the_schema_names_the_keys_of_rig_and_drivers() -> None:
+    text = run(app, ["schema"]).stdout
+    schema = orjson.loads(text)
+    assert schema["properties"]["rig"]
+    for key in ("output_rate_hz", "reset_if_stuck", "sample_time_unit", "up_axis"):
+        assert key in text
+
+
+def test_calibrating_without_a_broker_says_where_it_looked(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    text = EXAMPLE.read_text("utf-8").replace('host = "localhost"', 'host = "127.0.0.1"\nport = 9')
+    rig.write_text(text)
+    result = run(app, ["calibrate", str(rig), "--yes", "--phase", "static"])
+    assert result.exit_code == 1
+    assert "127.0.0.1:9" in result.stderr
+
+
+def test_an_unknown_phase_is_refused_before_anything_is_sent() -> None:
+    result = run(app, ["calibrate", str(EXAMPLE), "--phase", "dance"])
+    assert result.exit_code == 2
+    assert "functional" in result.stderr

@@ -1,0 +1,86 @@
+"""The demo's judge: truth between its rows, errors against it, promises kept or missed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.tools.demo import BOUNDS, missed_bounds
+from jointfit_daemon.tools.demo_score import MeanSquare, Score, Truth, TruthTrack, percentile
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def truth(t_ns: int, flexion: float) -> Truth:
+    half = flexion / 2
+    shank = (math.cos(half), -math.sin(half), 0.0, 0.0)
+    centers = {"knee": (0.0, 0.0, t_ns / 1e9)}
+    return Truth(t_ns, "walk", {"thigh": IDENTITY, "shank": shank}, centers, flexion)
+
+
+def pose(flexion_deg: float | None, sd_deg: float = 1.0) -> dict[str, Any]:
+    return {
+        "segments": {"thigh": {"q": list(IDENTITY)}},
+        "joints": {"knee": {"flexion_deg": flexion_deg, "sd_deg": sd_deg}},
+    }
+
+
+def test_truth_is_interpolated_between_rows_and_unknown_outside() -> None:
+    track = TruthTrack()
+    track.add(truth(0, 0.0))
+    track.add(truth(10, 1.0))
+    middle = track.at(5)
+    assert middle is not None
+    assert middle.flexion == pytest.approx(0.5)
+    assert middle.orientations["shank"][0] == pytest.approx(math.cos(0.25))
+    assert track.at(-1) is None
+    assert track.at(11) is None
+
+
+@given(st.lists(st.floats(-50, 50), min_size=1))
+def test_the_score_is_the_root_mean_square_of_the_flexion_errors(errors: list[float]) -> None:
+    score = Score()
+    for error in errors:
+        score.add(pose(math.degrees(0.7) + error), truth(0, 0.7), "knee")
+    expected = math.sqrt(sum(error**2 for error in errors) / len(errors))
+    assert score.flexion.rms == pytest.approx(expected, abs=1e-6)
+
+
+def test_an_unknown_knee_is_counted_and_not_scored_as_zero() -> None:
+    score = Score()
+    score.add(pose(None), truth(0, 0.7), "knee")
+    assert (score.unknown, score.flexion.n, score.frames) == (1, 0, 1)
+
+
+def figures(**changed: object) -> dict[str, Any]:
+    good = {"knee_flexion_rmse_deg": 1.0, "unaccounted": 0, "latency_ms": {"p50": 1, "p99": 10}}
+    return good | changed
+
+
+def test_figures_within_all_promises_miss_none() -> None:
+    assert missed_bounds(figures()) == []
+
+
+@pytest.mark.parametrize(
+    "worse",
+    [
+        {"knee_flexion_rmse_deg": BOUNDS["knee_flexion_rmse_deg"] + 0.01},
+        {"knee_flexion_rmse_deg": None},
+        {"knee_flexion_rmse_deg": math.nan},
+        {"unaccounted": 1},
+        {"latency_ms": {"p50": 1, "p99": 61.0}},
+        {"latency_ms": {"p50": None, "p99": None}},
+    ],
+)
+def test_a_promise_that_is_broken_or_unknown_is_named(worse: dict[str, object]) -> None:
+    assert len(missed_bounds(figures(**worse))) == 1
+
+
+def test_percentiles_of_nothing_are_unknown() -> None:
+    assert percentile([], 0.5) is None
+    assert MeanSquare().rms is None
+    assert percentile([3.0, 1.0, 2.0], 0.99) == 3.0
