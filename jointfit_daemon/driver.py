@@ -87,7 +87,11 @@ class MocapSettings(Settings):
 
 
 class Decoder(Protocol):
-    """The pure half of a driver. Never raises on input."""
+    """The pure half of a driver. Never raises on input.
+
+    One that decodes frames it does not hand on counts them, so that none is lost unseen:
+    ``unpublished`` (nobody has said yet what is in them), ``duplicates``, ``late``, all int.
+    """
 
     @property
     def tick_clock(self) -> TickClock | None:

@@ -12,6 +12,8 @@ receive errors, and each error is told once only.
 from __future__ import annotations
 
 import asyncio
+import time
+from collections import deque
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
 
 CanKey = tuple[int, bool]
 """Identifier, and whether it is a 29-bit one."""
+
+_UNCLAIMED = 512  # frames nobody wanted yet: a third of a second of four sensors at 400 Hz
+_CLAIM_NS = 300_000_000  # older ones belong to nobody; the devices of a rig begin together
 
 
 class Backend(Protocol):
@@ -81,6 +86,7 @@ class SharedBus:
         self._settings = settings
         self._backend: Backend | None = None
         self._failed: Exception | None = None
+        self._unclaimed: deque[tuple[int, CanFrame]] = deque(maxlen=_UNCLAIMED)
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
         self._users = 0
         self._subscribers: list[_Subscriber] = []
@@ -145,6 +151,7 @@ class SharedBus:
         try:
             async with limit:
                 self._route()
+                self._claim(subscriber)
                 await ended
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
@@ -178,6 +185,22 @@ class SharedBus:
         if self._backend is not None and self._failed is None:
             self._backend.listen(self._routes)
 
+    def _claim(self, subscriber: _Subscriber) -> None:
+        """Give a device what came for it just before it began to listen.
+
+        The first device of a rig opens the bus, and the others' frames are there at once.
+        """
+        waiting, self._unclaimed = self._unclaimed, deque(maxlen=_UNCLAIMED)
+        now_ns = time.monotonic_ns()
+        for t_ns, frame in waiting:
+            if now_ns - t_ns > _CLAIM_NS:
+                continue
+            if (frame.can_id, frame.extended) in subscriber.ids:
+                self.foreign -= 1
+                subscriber.take(t_ns, [frame])
+            else:
+                self._unclaimed.append((t_ns, frame))
+
     def _deliver(self, t_ns: int, frames: list[CanFrame]) -> None:
         """Give every frame to whom it belongs."""
         shares: dict[_Subscriber, list[CanFrame]] = {}
@@ -190,6 +213,7 @@ class SharedBus:
             subscriber = self._routes.get((frame.can_id, frame.extended))
             if subscriber is None or frame.remote:
                 self.foreign += 1
+                self._unclaimed.append((t_ns, frame))
             else:
                 shares.setdefault(subscriber, []).append(frame)
         for subscriber, mine in shares.items():

@@ -41,11 +41,17 @@ def health_of(
 
 
 def _mocap(state: SourceState, counted: Mapping[str, int]) -> dict[str, int]:
-    """Camera frames are used or idle as they come; those nobody could name yet were dropped."""
-    unpublished = state.counts.unpublished
-    nothing = dict.fromkeys(("decimated", "late", "duplicate", "pending"), 0)
-    received = state.counts.received + unpublished
-    return {**nothing, **counted, "received": received, "dropped": unpublished}
+    """Camera frames are used or idle as they come; the decoder withheld the others."""
+    withheld = state.withheld()
+    return {
+        **counted,
+        "received": state.counts.received + sum(withheld.values()),
+        "decimated": 0,
+        "late": withheld["late"],
+        "duplicate": withheld["duplicates"],
+        "dropped": withheld["unpublished"],
+        "pending": 0,
+    }
 
 
 def _wire(state: SourceState, now_ns: int) -> dict[str, object]:

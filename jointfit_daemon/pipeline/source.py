@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock import Stamp
 
 _NS = 1_000_000_000
+WITHHELD = ("unpublished", "duplicates", "late")
+"""Counters a decoder may have of what it decoded and did not hand on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +48,6 @@ class WireCounts:
     """Times the device's clock began anew."""
     opened: int = 0
     """Times the source was opened; all but the first are reconnects."""
-    unpublished: int = 0
-    """Frames decoded before the device had said what is in them; received, and dropped."""
 
 
 @dataclass(slots=True)
@@ -61,7 +61,7 @@ class SourceState:
     last_arrival_ns: int | None = None
     counts: WireCounts = field(default_factory=WireCounts)
     info: Mapping[str, object] = field(default_factory=dict)
-    _unpublished: int = 0
+    _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
 
     @classmethod
@@ -72,7 +72,7 @@ class SourceState:
     def opened(self) -> None:
         """Begin anew with a fresh decoder: what was half received will never be completed."""
         driver = self.source.driver_class(self.source.settings)
-        self._decoder, self._unpublished = driver.decoder(), 0
+        self._decoder = driver.decoder()
         self.open = True
         self.counts.opened += 1
 
@@ -80,7 +80,18 @@ class SourceState:
         """Return what the decoder still gives up, and forget it."""
         decoder, self._decoder = self._decoder, None
         self.open = self.online = False
-        return [] if decoder is None else self._take(decoder.flush(), decoder)
+        if decoder is None:
+            return []
+        taken = self._take(decoder.flush(), decoder)
+        for name in WITHHELD:
+            self._withheld[name] += getattr(decoder, name, 0)
+        return taken
+
+    def withheld(self) -> dict[str, int]:
+        """Return how many decoded frames never left the decoders, by why (see ``Decoder``)."""
+        return {
+            name: count + getattr(self._decoder, name, 0) for name, count in self._withheld.items()
+        }
 
     def feed(self, chunk: Chunk) -> list[Stamped | Corrupt | DeviceEvent]:
         """Return what `chunk` completed, stamped; nothing while the source is not open."""
@@ -129,7 +140,3 @@ class SourceState:
             self.counts.lost += lost if isinstance(lost, int) else 0
         elif item.kind == "info":
             self.info = {**self.info, **item.data}
-            unpublished = item.data.get("unpublished", 0)  # the decoder's total so far
-            if isinstance(unpublished, int):
-                self.counts.unpublished += unpublished - self._unpublished
-                self._unpublished = unpublished
