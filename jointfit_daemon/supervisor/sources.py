@@ -45,13 +45,17 @@ class _Life:
             self._deliver(SourceOpened(chunk.t_ns, self._source))
         self._deliver(ChunkArrived(self._source, chunk))
 
-    def closed(self, reason: Literal["lost", "misconfigured", "removed"], text: str) -> bool:
-        """Tell the end of the source unless that was said already; return whether it was news."""
-        news = self._open or text != self._said
-        if news:
+    def closed(self, reason: Literal["lost", "misconfigured"], text: str) -> None:
+        """Tell the end of the source, unless it never began and the same was said before."""
+        if self._open or text != self._said:
             self._deliver(SourceClosed(time.monotonic_ns(), self._source, reason, text))
         self._open, self._said = False, text
-        return news
+
+    def removed(self) -> None:
+        """Tell the end of a source that nobody wants any more; one that never began just goes."""
+        if self._open:
+            self._deliver(SourceClosed(time.monotonic_ns(), self._source, "removed", "stopped"))
+            self._open = False
 
 
 async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None:
@@ -62,18 +66,17 @@ async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None
         began = loop.time()
         try:
             await source.driver_class(source.settings).run(life.emit)
-            life.closed("lost", f"{source.id}: ended by itself")
+            life.closed("lost", "its driver ended by itself")
         except DeviceLost as lost:
             if loop.time() - began > HEALTHY_S:
                 delay = FIRST_RETRY_S
-            if life.closed("lost", str(lost)):  # a line when something changes, not one an attempt
-                log.warning("%s: lost, trying again: %s", source.id, lost)
+            life.closed("lost", str(lost))  # the core tells it, on the log too
         except DeviceMisconfigured as wrong:
             life.closed("misconfigured", str(wrong))
             log.error("%s: stopped until its settings change: %s", source.id, wrong)  # noqa: TRY400
             return
         except asyncio.CancelledError:
-            life.closed("removed", f"{source.id}: stopped")
+            life.removed()
             raise
         await asyncio.sleep(random.uniform(0, delay))  # noqa: S311 - full jitter: no retry in step
         delay = min(2 * delay, LAST_RETRY_S)

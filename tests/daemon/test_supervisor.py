@@ -170,7 +170,6 @@ async def test_a_lost_device_is_tried_again_and_told_once_a_reason(table: dict[s
         ("SourceOpened", ""),
         ("ChunkArrived", ""),
         ("SourceClosed", "unplugged"),
-        ("SourceClosed", "S1: stopped"),
     ]
 
 
