@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.calibration.alignment_phase import Alignment
+    from jointfit_daemon.calibration.segment_model import SegmentModel
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, Quaternion
     from jointfit_daemon.timing.lag import LagEstimate
@@ -114,12 +115,7 @@ def fit_calibration(
         segments=chain.segments,
         chain_sensors=chain.sensors,
         sensor=sensors,
-        segment={
-            name: SegmentCalibration(
-                quaternion(anatomy.q_static[name]), *anatomy.lengths[name], models[name]
-            )
-            for name in chain.segments
-        },
+        segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
         clusters={name: stored_cluster(cluster) for name, cluster in pose.clusters.items()},
         flags=tuple(flags),
@@ -268,6 +264,11 @@ def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTrainin
                     "optical one; run the align phase"
                 )
     return notes
+
+
+def _segment(name: str, anatomy: Anatomy, models: Mapping[str, SegmentModel]) -> SegmentCalibration:
+    q_static = quaternion(anatomy.q_static[name])
+    return SegmentCalibration(q_static, *anatomy.lengths[name], models)
 
 
 def _joint(found: JointFound | None) -> JointCalibration:

@@ -1,0 +1,132 @@
+"""What the pages promise: links lead somewhere, rigs load, commands exist."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.tools.__main__ import app
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "examples").rglob("*.md")),
+]
+EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
+FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ +(.+?) *$", re.MULTILINE)
+
+every_page = pytest.mark.parametrize(
+    "page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix()
+)
+
+
+@cache
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def prose_of(page: Path) -> str:
+    """Return the page without its code blocks."""
+    return FENCE.sub("", text_of(page))
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return [body for kind, body in FENCE.findall(text_of(page)) if kind == language]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the names of the headings, as GitHub and mkdocs make them."""
+    plain = (re.sub(r"[^\w\- ]", "", title.lower()) for title in HEADING.findall(prose_of(page)))
+    return {re.sub(r" +", "-", title.strip()) for title in plain}
+
+
+def broken_links(page: Path) -> list[str]:
+    broken = []
+    for link in LINK.findall(prose_of(page)):
+        if re.match(r"[a-z]+:", link):  # another site
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+    return broken
+
+
+@every_page
+def test_every_link_inside_the_project_leads_somewhere(page: Path) -> None:
+    assert broken_links(page) == []
+
+
+def test_a_link_into_nothing_is_noticed(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# A head, two\n[a](#a-head-two) [b](#gone) [c](gone.md) [d](http://x/)")
+    assert broken_links(page) == ["#gone", "gone.md"]
+
+
+def whole_rigs(page: Path) -> list[str]:
+    """Return the TOML blocks that are a rig by themselves."""
+    return [body for body in blocks(page, "toml") if "[rig]" in body and "[[imu]]" in body]
+
+
+def load(text: str) -> Rig:
+    return parse_rig(tomllib.loads(text))
+
+
+@pytest.mark.parametrize(
+    ("page", "number"),
+    [(page, number) for page in PAGES for number, _ in enumerate(whole_rigs(page))],
+    ids=lambda value: value.name if isinstance(value, Path) else str(value),
+)
+def test_every_rig_in_the_pages_loads(page: Path, number: int) -> None:
+    assert load(whole_rigs(page)[number]).sources
+
+
+def test_the_readme_shows_a_rig() -> None:
+    assert whole_rigs(ROOT / "README.md")
+
+
+def test_the_parts_of_the_rig_guide_are_one_rig() -> None:
+    rig = load("\n".join(blocks(ROOT / "docs" / "rig.md", "toml")))
+    assert {source.id for source in rig.sources} == {"S1", "S3", "mocap"}
+
+
+@every_page
+def test_every_json_payload_in_the_pages_is_json(page: Path) -> None:
+    for body in blocks(page, "json"):
+        json.loads(body)
+
+
+@every_page
+def test_every_make_target_and_command_a_page_names_exists(page: Path) -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"(?:^|`)make ([a-z][a-z-]*)", text_of(page), re.MULTILINE):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+    group = get_command(app)
+    known = set(getattr(group, "commands", {}))
+    said = re.findall(r"(?:^|`)jointfit ([a-z]+)", text_of(page), re.MULTILINE)
+    assert set(said) <= known
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("rig", EXAMPLES, ids=lambda rig: rig.name)
+def test_the_daemon_accepts_every_example(rig: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "jointfit_daemon", "--config", str(rig), "--check"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,150 @@
+"""What CONTRIBUTING.md says of the house and no linter checks."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = (
+    "jointfit_daemon",
+    "drivers/jointfit_drivers",
+    "protocols/jointfit_protocols",
+    "simulators/jointfit_simulators",
+)
+SHIPPED = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+TOOLING = [path for room in ("bench", ".ci") for path in sorted((ROOT / room).rglob("*.py"))]
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+DRIVERS = ROOT / "drivers" / "jointfit_drivers"
+MOST_LINES = 400
+MOST_LINES_OF_A_FUNCTION = 50
+VAGUE = {"util", "utils", "misc", "common", "helper", "helpers", "manager", "base"}
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def project() -> dict[str, dict[str, dict[str, str]]]:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    found: dict[str, dict[str, dict[str, str]]] = tomllib.loads(text)["project"]
+    return found
+
+
+def test_no_file_is_two_rooms() -> None:
+    counted = {name_of(path): len(path.read_text().splitlines()) for path in SHIPPED + TOOLING}
+    assert {name: lines for name, lines in counted.items() if lines > MOST_LINES} == {}
+
+
+def lines_of(function: Function) -> int:
+    """Return the lines of a function from its name to its end, without its docstring."""
+    first, lines = function.body[0], (function.end_lineno or 0) - function.lineno + 1
+    if ast.get_docstring(function, clean=False) is not None:
+        lines -= (first.end_lineno or 0) - first.lineno + 1
+    return lines
+
+
+def test_no_function_is_a_paragraph_without_full_stops() -> None:
+    counted = {
+        f"{name_of(path)}:{node.name}": lines_of(node)
+        for path in SHIPPED + TOOLING
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, Function)
+    }
+    too_long = {name: lines for name, lines in counted.items() if lines > MOST_LINES_OF_A_FUNCTION}
+    assert too_long == {}
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    assert [
+        name_of(path) for path in SHIPPED + TOOLING if not ast.get_docstring(tree_of(path))
+    ] == []
+
+
+def test_no_name_says_nothing() -> None:
+    vague = [name_of(path) for path in SHIPPED if VAGUE & set(path.stem.split("_"))]
+    assert vague == []
+
+
+def imported_drivers(path: Path) -> set[str]:
+    """Return the modules of jointfit_drivers that a module of it imports."""
+    found: set[str] = set()
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        found |= {name.split(".")[1] for name in names if name.startswith("jointfit_drivers.")}
+    return {name for name in found if (DRIVERS / f"{name}.py").exists()}
+
+
+def test_a_driver_uses_its_own_helpers_and_the_shared_ports_only() -> None:
+    families = set(project()["entry-points"]["jointfit.drivers"])
+
+    def family(module: str) -> str | None:
+        """Return the driver that a module belongs to: its name, or its name and more."""
+        head = module.partition("_")[0]
+        return head if head in families else None
+
+    crossing = [
+        f"{path.stem} imports {other}"
+        for path in sorted(DRIVERS.glob("*.py"))
+        for other in sorted(imported_drivers(path))
+        if family(other) not in {None, family(path.stem)}
+    ]
+    assert crossing == []
+
+
+def test_every_driver_is_in_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    drivers = project()["entry-points"]["jointfit.drivers"]
+    assert [name for name in drivers if f"| `{name}` |" not in readme] == []
+
+
+NOQA = re.compile(r"# noqa(?!: [A-Z0-9, ]+ - \w)")
+IGNORE = re.compile(r"# type: ignore(?!\[[a-z, -]+\] +# \w)")
+
+
+@pytest.mark.parametrize(
+    ("rule", "paths"),
+    [(NOQA, SHIPPED + TOOLING + TESTS), (IGNORE, SHIPPED + TOOLING)],
+    ids=["noqa", "type-ignore"],
+)
+def test_every_silenced_rule_has_its_reason(rule: re.Pattern[str], paths: list[Path]) -> None:
+    found = [
+        f"{name_of(path)}:{number}"
+        for path in paths
+        if path != Path(__file__).resolve()
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if rule.search(line)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("folder", ["drivers", "protocols", "simulators", "tests", "bench"])
+def test_a_folder_is_no_package(folder: str) -> None:
+    assert not list((ROOT / folder).glob("__init__.py"))
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_package_says_that_it_is_typed(package: str) -> None:
+    assert (ROOT / package / "py.typed").is_file()
+
+
+def test_test_files_have_names_of_their_own() -> None:
+    names = [path.name for path in TESTS if path.name.startswith("test_")]
+    assert sorted(names) == sorted(set(names))
