@@ -39,6 +39,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock import Stamp
 
 _NS = 1_000_000_000
+_CLOSED: dict[str, Literal["info", "warning", "error"]] = {
+    "removed": "info",
+    "lost": "warning",
+    "misconfigured": "error",
+}
 MOCAP_FRESH_NS = 200_000_000
 """A rig whose optical system spoke within this time runs in mode ``imu+mocap``."""
 
@@ -55,11 +60,14 @@ class Core:
         self._sources: dict[str, SourceState] = {}
         self._now_ns = 0
         self._seq = 0
+        self._verdicts: dict[str, dict[str, int]] = {}
+        """Counts of aligners that a reload replaced."""
         self._mocap_ns: int | None = None
         self._mocap_used = self._mocap_idle = 0
         self._bulletin = Bulletin()
         self._session: CalibrationSession
         self._aligner: FrameAligner
+        self._aligned: tuple[str, ...] = ()
         self._fuser: LimbFuser
         self._optical_origin: OpticalOrigin | None = None
         self._origin: Vector | None = None
@@ -100,9 +108,15 @@ class Core:
         if self._rig is None:
             return {"devices": {}, "frames": {}, "calibration": {}}
         mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
-        return health_of(self._sources, self._aligner, self._session, mocap, now_ns) | {
+        verdicts = {"mocap": mocap} | {name: self._counts(name) for name in self._aligned}
+        return health_of(self._sources, verdicts, self._session, now_ns) | {
             "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames}
         }
+
+    def _counts(self, name: str) -> dict[str, int]:
+        """Return the verdicts on a sensor's samples since the daemon started."""
+        counts = self._aligner.counts(name)
+        return {key: n + self._verdicts.get(name, {}).get(key, 0) for key, n in counts.items()}
 
     # --- configuration -----------------------------------------------------------------------
 
@@ -120,7 +134,7 @@ class Core:
             outputs += self._session.abort(event.t_ns, "the rig was reloaded")
             outputs.append(Notice(event.t_ns, "reload", rig.name, "configuration reloaded"))
         if before is None or _frame_layout(before) != _frame_layout(rig):
-            self._aligner = _aligner(rig)
+            self._replace_aligner(rig)
         self._session = CalibrationSession(
             rig.chain,
             rig.calibration,
@@ -134,6 +148,14 @@ class Core:
             CalibrationStatus(event.t_ns, self._session.phase, text, event.calibration_version)
         )
         return outputs
+
+    def _replace_aligner(self, rig: Rig) -> None:
+        """Begin a new grid of frames; samples that waited get their verdict, counts go on."""
+        if self._aligned:
+            self._aligner.close()
+        self._verdicts |= {name: self._counts(name) for name in self._aligned}
+        self._aligner = _aligner(rig)
+        self._aligned = tuple(source.id for source in rig.sources if source.kind == "imu")
 
     def _use_calibration(self) -> None:
         rig, calibration = self._rig, self._session.calibration
@@ -157,12 +179,12 @@ class Core:
 
     def _closed(self, event: SourceClosed) -> list[Output]:
         state = self._sources.get(event.source)
+        level = _CLOSED[event.reason]
         if state is None or not state.open:
-            return [Notice(event.t_ns, "device", event.source, event.text, "warning")]
+            return [Notice(event.t_ns, "device", event.source, event.text, level)]
         outputs = self._take(event.source, state, state.closed())
         if state.source.kind == "imu":
             self._aligner.lose(event.source)
-        level: Literal["info", "warning"] = "info" if event.reason == "removed" else "warning"
         return [
             *outputs,
             DeviceStatus(event.source, online=False),

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.pipeline.session import CalibrationSession
     from jointfit_daemon.pipeline.source import SourceState
-    from jointfit_daemon.timing.align import FrameAligner
 
 _NS_PER_MS = 1e6
 _NS_PER_US = 1e3
@@ -20,9 +19,8 @@ _NS_PER_US = 1e3
 
 def health_of(
     sources: Mapping[str, SourceState],
-    aligner: FrameAligner,
+    counted: Mapping[str, Mapping[str, int]],
     session: CalibrationSession,
-    mocap: Mapping[str, int],
     now_ns: int,
 ) -> dict[str, object]:
     """Return the health of every device and of the calibration, as JSON-able values.
@@ -32,7 +30,9 @@ def health_of(
     """
     devices = {}
     for name, state in sources.items():
-        verdicts = _mocap(state, mocap) if state.source.kind == "mocap" else aligner.counts(name)
+        verdicts = counted[name]
+        if state.source.kind == "mocap":
+            verdicts = _mocap(state, verdicts)
         devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state)}
     return {
         "devices": devices,

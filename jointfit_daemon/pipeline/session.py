@@ -10,6 +10,7 @@ what it wants to be told; it never fits anything itself and never blocks acquisi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -144,7 +145,10 @@ class CalibrationSession:
             self._movement.look(self._latest)
             errors = self._movement.predicted_center_errors(elapsed)
             data: dict[str, object] = {
-                "arc_rad": self._movement.arcs(),
+                "arc_deg": {
+                    joint: round(math.degrees(arc), 1)
+                    for joint, arc in self._movement.arcs().items()
+                },
                 "predicted_center_error_m": errors,
             }
             return elapsed / phase.wanted_s, "keep moving", data
