@@ -1,23 +1,42 @@
 """Print the installed distributions as constraints: what CI and `make` install, exactly.
 
 A constraint installs nothing by itself: a line for something that a machine does not need is
-without effect there.
+without effect there. But every line must fit every Python that the project supports: Debian 12
+has 3.11.2, and a release that wants 3.11.5 cannot be installed there.
 """
 
-from importlib.metadata import distributions
+import sys
+import tomllib
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
 
+from packaging.specifiers import SpecifierSet
+
+PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 SKIP = {"jointfitd", "pip", "setuptools", "wheel"}
 
 
+def name_of(dist: Distribution) -> str:
+    """Return the normalised name."""
+    return dist.metadata["Name"].lower().replace("_", "-")
+
+
 def main() -> None:
-    """Print one sorted line a distribution, but for the tools that every environment brings."""
+    """Print one sorted line a distribution; end with 1 where one is too new for our Python."""
+    project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
+    oldest = project["requires-python"].removeprefix(">=") + ".0"
+    locked = sorted((dist for dist in distributions() if name_of(dist) not in SKIP), key=name_of)
+    wrong = [
+        f"{name_of(dist)} {dist.version} needs Python {wanted}: install an older release first"
+        for dist in locked
+        if (wanted := dist.metadata.json.get("requires_python"))
+        and not SpecifierSet(str(wanted)).contains(oldest)
+    ]
+    if wrong:
+        sys.exit("\n".join(wrong))
     print("# Written by `make lock`: exact versions for CI and `make`, read as pip constraints.")
-    pins = {
-        dist.metadata["Name"].lower().replace("_", "-"): dist.version for dist in distributions()
-    }
-    for name, version in sorted(pins.items()):
-        if name not in SKIP:
-            print(f"{name}=={version}")
+    for dist in locked:
+        print(f"{name_of(dist)}=={dist.version}")
 
 
 if __name__ == "__main__":
