@@ -27,6 +27,9 @@ def demo(
     keep: Annotated[
         Path | None, typer.Option(help="Keep rig, logs, calibration and truth in this folder.")
     ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Save the last state of the display as SVG.")
+    ] = None,
 ) -> None:
     """Show the main job on simulated hardware: no device, no broker, no root needed.
 
@@ -41,7 +44,8 @@ def demo(
         folder = keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         options = ["--seed", str(seed), *(w for k in knob or [] for w in ("--set", k))]
-        figures = asyncio.run(_run(folder.resolve(), seconds, options, headless=headless))
+        run = _run(folder.resolve(), seconds, options, headless=headless, picture=picture)
+        figures = asyncio.run(run)
     missed = missed_bounds(figures)
     figures["missed"] = missed
     if headless:
@@ -63,7 +67,7 @@ def missed_bounds(figures: dict[str, Any]) -> list[str]:
 
 
 async def _run(
-    folder: Path, seconds: float, options: list[str], *, headless: bool
+    folder: Path, seconds: float, options: list[str], *, headless: bool, picture: Path | None
 ) -> dict[str, Any]:
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.demo_display import Display
@@ -81,7 +85,10 @@ async def _run(
                 rig = load_rig(rig_file)
                 async with daemon(folder, rig_file) as process:
                     run = Demo(folder, rig, limb, process, truth, display)
-                    return await run.run(seconds)
+                    figures = await run.run(seconds)
+            if picture is not None:
+                display.save(picture)
+            return figures
     finally:
         truth.close()
 

@@ -6,6 +6,7 @@ Law: takes what it shows as arguments; on a terminal it redraws, elsewhere it pr
 from __future__ import annotations
 
 import math
+import os
 import sys
 from collections import deque
 from typing import TYPE_CHECKING, Any, Self
@@ -19,6 +20,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from jointfit_daemon.tools.demo_score import Truth
 
@@ -81,6 +83,13 @@ class Display:
     def _draw(self) -> None:
         if self._live is not None:
             self._live.update(self.render())
+
+    def save(self, path: Path) -> None:
+        """Write the picture as it is now to an SVG file."""
+        with open(os.devnull, "w", encoding="utf-8") as nowhere:  # noqa: PTH123 - no path
+            console = Console(record=True, width=96, file=nowhere)
+            console.print(self.render())
+            console.save_svg(str(path), title="make demo")
 
     def render(self) -> Group:
         """Return the whole picture."""
