@@ -24,7 +24,6 @@ _NICE = 10  # the samples come first
 
 def main() -> int:
     """Run the one job that the parent sends."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the sensors need the other core
     with contextlib.suppress(OSError):  # refused under a system-call filter
         os.nice(_NICE)
     answer_fd = os.dup(sys.stdout.fileno())
@@ -34,7 +33,7 @@ def main() -> int:
     words = source.read(length)
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
-        from jointfit_daemon.calibration.jobs import run_job  # noqa: PLC0415 - after the environment
+        from jointfit_daemon.calibration.jobs import run_job  # noqa: PLC0415 - its fault is an answer
 
         kind, payload = pickle.loads(words)  # noqa: S301 - written by our parent
         answer: dict[str, object] = {"result": run_job(kind, payload)}
