@@ -149,6 +149,8 @@ class Chain:
     """Body part before O1 (pelvis), seen by markers only; None if the rig has none."""
     distal: str | None = None
     """Body part after the last joint (foot), seen by markers only; None if the rig has none."""
+    static_axes: bool = False
+    """Segment axes are the world's in the static pose; else they come from centers and flexion."""
 
 
 class JointAngles(NamedTuple):

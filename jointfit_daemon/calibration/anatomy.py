@@ -2,8 +2,9 @@
 
 Law: everything is in the static world, the optical world while the wearer stood still, where all
 body parts share coordinates. A segment's z goes from its distal to its proximal joint center, x to
-the wearer's right along the flexion axis found while moving, y = z cross x; its origin is the
-proximal joint center. What could not be found is None and said in `notes`.
+the wearer's right along the flexion axis found while moving, y = z cross x (or, with static axes,
+all are the world's while standing); its origin is the proximal joint center. What could not be
+found is None and said in `notes`.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ SKIN_RADIAL_M = 0.003
 a short arc it moves the center by the inverse of that arc."""
 
 _UP = np.array([0.0, 0.0, 1.0])
+_STANDING = rotation.IDENTITY
+"""With static axes every segment stands unrotated, as the patent has it (q_O = 1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +139,7 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
         if x is None:  # a lone segment: nothing can tell which way it faces
             flags.append("facing_unknown")
             x = np.array([1.0, 0.0, 0.0])
-        q_static[segment] = _frame(segment, x, z[i])
+        q_static[segment] = _STANDING.copy() if chain.static_axes else _frame(segment, x, z[i])
         lengths[segment] = _length(chain, i, *ends[i])
     return Anatomy(joints, q_static, lengths, axes, tuple(dict.fromkeys(flags)), tuple(notes))
 

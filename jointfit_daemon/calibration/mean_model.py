@@ -15,6 +15,7 @@ from jointfit_daemon.calibration.segment_model import (
     cross_validated_sd,
 )
 from jointfit_daemon.calibration.weighted_mean import fuse, fuse_one, fusion_weights
+from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -62,6 +63,14 @@ class MeanModel(SegmentModel):
     def read(cls, data: Mapping[str, Any]) -> MeanModel:
         """Return the model of its JSON form."""
         return cls(tuple(data["weights"]), data["residual_sd"])
+
+
+def plain_mean(training: SegmentTraining) -> MeanModel:
+    """Return the mean with equal weights: the baseline that learns nothing but its own error."""
+    weights = (1.0 / len(training.sensors),) * len(training.sensors)
+    said = fuse(training.sensors, weights)
+    angles = rotation.angle_between(said, training.q_reference)
+    return MeanModel(weights, float(np.sqrt(np.mean(angles**2) / 3.0)))
 
 
 def fit_mean(training: SegmentTraining) -> MeanModel:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.anchored import AnchoredModel, fit_anchored
-from jointfit_daemon.calibration.mean_model import MeanModel, fit_mean
+from jointfit_daemon.calibration.mean_model import MeanModel, fit_mean, plain_mean
 from jointfit_daemon.calibration.patent import PatentModel, fit_patent
 from jointfit_daemon.calibration.segment_model import (
     Prediction,
@@ -48,9 +48,10 @@ def fit_segment(
     ----------
     method : {"anchored", "patent12", "patent6", "mean"}
         ``anchored`` without a neighbour gives the weighted mean: it has nothing else to look at.
+        ``mean`` weighs all sensors alike.
     sensors : sequence of array_like, shape (n, 4)
-        q_world_segment as each sensor says it through its static mount. Any number: the mean
-        weighs each, the regressions have a column for each, ``anchored`` a difference for each.
+        q_world_segment as each sensor says it through its static mount. Any number: means
+        weigh each, the regressions have a column for each, ``anchored`` a difference for each.
     q_other : array_like, shape (n, 4), or None
         The same of one sensor of the neighbouring segment.
     q_reference : array_like, shape (n, 4)
@@ -69,6 +70,8 @@ def fit_segment(
         return fit_patent(method, training)
     if method == "anchored" and training.q_other is not None:
         return fit_anchored(training)
-    if method in {"mean", "anchored"}:
+    if method == "anchored":
         return fit_mean(training)
+    if method == "mean":
+        return plain_mean(training)
     raise ValueError(f"method {method!r}; known: anchored, patent12, patent6, mean")

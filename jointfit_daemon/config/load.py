@@ -273,6 +273,7 @@ def _chain(table: ChainTable, sources: Sequence[Source]) -> Chain:
         lengths=tuple(table.lengths_m.get(segment) for segment in table.segments),
         proximal=table.proximal,
         distal=table.distal,
+        static_axes=table.axes == "static",
     )
 
 

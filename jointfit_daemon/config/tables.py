@@ -42,6 +42,11 @@ class ChainTable(Settings):
     distal: str | None = Field(
         None, description="body part after the last joint, seen by markers only (foot)"
     )
+    axes: Literal["anatomical", "static"] = Field(
+        "anatomical",
+        description="axes of the segments: `anatomical` from joint centers and the flexion axis; "
+        "`static` those of the optical world while the wearer stood still, facing its +y",
+    )
     origin_m: tuple[float, float, float] | None = Field(
         None, description="fixed position of the first joint in the world, m"
     )

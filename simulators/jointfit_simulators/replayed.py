@@ -1,12 +1,14 @@
 """Whoever was recorded: a `Subject` that plays a `Recording`.
 
 Law: nothing is added to the recording. The blend between standing and the trial is made up and
-belongs to neither.
+belongs to neither, nor does the pose held after its end: cameras see no bones then, and the truth
+gives no positions, so nobody is trained on it or judged by it.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,7 +26,17 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.trial import Recording
 
-_MOTIONS = ("stand", "trial")
+_STAND = "stand"
+_MOTION = re.compile(r"stand|trial(@(?P<begin>[\d.]*)-(?P<end>[\d.]*))?")
+_ROUNDING_S = 1e-6  # of instants that came through nanoseconds
+
+
+class _Switch(NamedTuple):
+    start_s: float
+    name: str
+    begin_s: float
+    end_s: float
+    """Part of the recording."""
 
 
 class Replayed:
@@ -37,7 +49,8 @@ class Replayed:
     sensors
         Sensor ids and the segment each is worn on.
     steps
-        ``stand`` and ``trial`` in any order; the last one goes on for ever.
+        ``stand``, ``trial`` and ``trial@A-B`` (its seconds A to B; either may be left out) in any
+        order; the last one goes on for ever.
     start_s
         Instant of the first step.
     transition_s
@@ -78,12 +91,29 @@ class Replayed:
             if name.split("_")[0] in BONES and name in trial.origins
         }
         self.visible_bones = tuple(self._bones)
+        self._foothold = self._standing_origins()
         self._markers = marker_track(recording.markers) if recording.markers else None
         self.clusters = self._known_clusters(clusters or OPENCAP_CLUSTERS)
-        self._switches: list[tuple[float, str]] = []
+        self._switches: list[_Switch] = []
         for step in steps:
             self.play(step.name, start_s)
             start_s += step.seconds
+
+    def _standing_origins(self) -> Mapping[str, NDArray[np.float64]]:
+        """Return where each bone's origin is while standing: as in the first frame, straightened.
+
+        Each bone hangs where it hung on the one before, so that the joints stay whole.
+        """
+        first = np.zeros(1)
+        found: dict[str, NDArray[np.float64]] = {}
+        above: tuple[Rotation, NDArray[np.float64], NDArray[np.float64]] | None = None
+        for name, (turns, origins) in self._bones.items():
+            turn, origin = from_wxyz(turns.at(first)[0]), origins.at(first)[0]
+            found[name] = origin
+            if above is not None and self._recording.biases:
+                found[name] = above[2] + above[0].inv().apply(origin - above[1])
+            above = (turn, origin, found[name])
+        return found
 
     def _known_clusters(
         self, clusters: Mapping[str, tuple[str, ...]]
@@ -103,20 +133,26 @@ class Replayed:
         return {"trial_s": self._recording.seconds, "bones": list(self._bones)}
 
     def play(self, name: str, t_s: float) -> None:
-        """Stand, or begin the trial anew; UnknownMotion for anything else."""
-        if name not in _MOTIONS:
-            raise UnknownMotion(f"no motion {name!r}; a trial has: {', '.join(_MOTIONS)}")
-        self._switches = [s for s in self._switches if s[0] < t_s] + [(t_s, name)]
+        """Stand, or begin the trial or a part of it anew; UnknownMotion for anything else."""
+        part = _MOTION.fullmatch(name)
+        if part is None:
+            raise UnknownMotion(f"no motion {name!r}; a trial has: stand, trial, trial@FROM-TO (s)")
+        whole_s = self._recording.seconds
+        begin_s, end_s = float(part["begin"] or 0.0), min(float(part["end"] or whole_s), whole_s)
+        if not begin_s < end_s:
+            raise UnknownMotion(f"no motion {name!r}; the trial is {whole_s:g} s long")
+        self._switches = [s for s in self._switches if s.start_s < t_s]
+        self._switches.append(_Switch(t_s, name, begin_s, end_s))
 
     def motion_at(self, t_s: float) -> str:
         """Return the name of the motion at an instant."""
-        return self._switch(t_s)[1]
+        return self._switch(t_s).name
 
     def forget_before(self, t_s: float) -> None:
         """Nothing to forget: switches are few."""
 
-    def _switch(self, t_s: float) -> tuple[float, str]:
-        begun = [switch for switch in self._switches if switch[0] <= t_s]
+    def _switch(self, t_s: float) -> _Switch:
+        begun = [switch for switch in self._switches if switch.start_s <= t_s]
         return begun[-1] if begun else self._switches[0]
 
     def _place(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -125,17 +161,33 @@ class Replayed:
         The recording itself begins when it has faded in.
         """
         place, share = np.zeros_like(t_s), np.zeros_like(t_s)
-        before = (0.0, "stand")
-        for start, name in self._switches:
-            begun = t_s >= start
-            fade = smootherstep((t_s[begun] - start) / self._transition_s)
-            if name == "trial":
-                place[begun] = t_s[begun] - start - self._transition_s
-                share[begun] = np.maximum(fade, share[begun] if before[1] == "trial" else 0.0)
+        before = _STAND
+        for start_s, name, begin_s, end_s in self._switches:
+            begun = t_s >= start_s
+            fade = smootherstep((t_s[begun] - start_s) / self._transition_s)
+            if name == _STAND:
+                share[begun] = 0.0 if before == _STAND else 1 - fade
             else:
-                share[begun] = 1 - fade if before[1] == "trial" else 0.0
-            before = (start, name)
-        return np.clip(place, 0.0, self._recording.seconds), share
+                played = begin_s + t_s[begun] - start_s - self._transition_s
+                place[begun] = np.clip(played, begin_s, end_s)
+                share[begun] = np.maximum(fade, 0.0 if before == _STAND else share[begun])
+            before = name
+        return place, share
+
+    def _made_up(self, t_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return when neither the static pose nor the recording is played."""
+        made_up = np.zeros(len(t_s), dtype=np.bool_)
+        before = _STAND
+        for start_s, name, begin_s, end_s in self._switches:
+            begun = t_s >= start_s
+            since = t_s[begun] - start_s - self._transition_s
+            blending = since < -_ROUNDING_S
+            if name == _STAND:
+                made_up[begun] = blending & (before != _STAND)
+            else:
+                made_up[begun] = blending | (since > end_s - begin_s + _ROUNDING_S)
+            before = name
+        return made_up
 
     def observe(
         self,
@@ -162,8 +214,10 @@ class Replayed:
         turns, origins = self._bones[name]
         upright = np.array([1.0, 0.0, 0.0, 0.0])
         still = upright if self._recording.biases else turns.at(np.zeros(1))[0]
-        place, _ = self._place(t_s)
-        return from_wxyz(self._faded(turns, still, t_s)), origins.at(place)
+        place, share = self._place(t_s)
+        where = share[:, None] * origins.at(place) + (1 - share[:, None]) * self._foothold[name]
+        where[self._made_up(t_s)] = np.nan
+        return from_wxyz(self._faded(turns, still, t_s)), where
 
     def _faded(
         self, track: Track, still: NDArray[np.float64], t_s: NDArray[np.float64]

@@ -22,6 +22,7 @@ class RigOptions:
     mqtt_base: str = "jointfit/demo"
     mqtt_version: str = "5"
     method: str = "anchored"
+    axes: str = "anatomical"
     store: str = "demo"
     align_s: float = 30.0
     static_s: float = 5.0
@@ -64,6 +65,7 @@ def rig_toml(
                 'joints = ["hip", "knee", "ankle"]',
                 'segments = ["thigh", "shank"]',
                 'side = "right"',
+                f'axes = "{options.axes}"',
                 *ends,
                 "",
             ]

@@ -113,7 +113,7 @@ def test_files_that_make_no_trial_are_refused(tmp_path: Path, squats: list[Path]
         read_recording(squats[1:])
     with pytest.raises(ValueError, match=r"'\.txt'"):
         read_recording([tmp_path / "a.txt"])
-    with pytest.raises(UnknownMotion, match="a trial has: stand, trial"):
+    with pytest.raises(UnknownMotion, match="a trial has: stand, trial, trial@FROM-TO"):
         Replayed(read_recording(squats), SENSORS, [Step("walk", 1.0)])
 
 
