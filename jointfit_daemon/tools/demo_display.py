@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.tools.demo_score import Truth
 
-WIDTH = 60
+WIDTH = 72
+SPARSE = 10
+"""Frames from one column of the curves to the next: seven seconds of 100 Hz fill the width."""
 _BARS = "▁▂▃▄▅▆▇█"
 STEPS = ("connect", "align", "static", "functional", "live")
 _SAYS = {
@@ -45,6 +47,7 @@ class Display:
         self._headless = headless
         self._step, self._done, self._text = "connect", 0.0, ""
         self._said = ""
+        self._frame = 0
         self._pose: Mapping[str, Any] = {}
         self._truth: Truth | None = None
         self._figures: Mapping[str, object] = {}
@@ -74,8 +77,9 @@ class Display:
     ) -> None:
         """Show the newest pose beside the truth at its instant."""
         self._pose, self._truth, self._figures = pose, truth, figures
+        self._frame += 1
         flexion = _knee(pose).get("flexion_deg")
-        if isinstance(flexion, int | float) and truth is not None:
+        if self._frame % SPARSE == 0 and isinstance(flexion, int | float) and truth is not None:
             self._estimated.append(float(flexion))
             self._true.append(math.degrees(truth.flexion))
         self._draw()
