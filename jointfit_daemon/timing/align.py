@@ -154,9 +154,13 @@ class FrameAligner:
 
     def _begin(self) -> bool:
         """Choose the next frame; skip those no stream can serve. False if there is none yet."""
-        starts = [
-            start for _, s in self._items if (start := s.serves_from(self._t_next)) is not None
-        ]
+        starts: list[int] = []
+        for _, stream in self._items:
+            start = stream.serves_from(self._t_next)
+            if start is None:
+                stream.settle()
+            else:
+                starts.append(start)
         if not starts:
             return False
         first = -(-min(starts) // self._period_ns)

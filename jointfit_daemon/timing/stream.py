@@ -224,6 +224,11 @@ class Stream:
         """Stop waiting for this stream until a sample comes."""
         self._waited_for = False
 
+    def settle(self) -> None:
+        """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
+        if self._samples and not self._waited_for:
+            self.reset()
+
     def reset(self) -> None:
         """Forget all samples; what no frame used is dropped."""
         samples = self._samples

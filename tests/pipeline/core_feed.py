@@ -1,0 +1,168 @@
+"""Feeds the real core with bytes of simulated arrival: two Xbus and two XCDI sensors, cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import Chunk, LimbState
+from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened, Tick
+from jointfit_protocols.can_frame import CanFrame, pack_frames
+from jointfit_protocols.mtdata2 import Item, encode_items
+from jointfit_protocols.natnet_frame import FrameOfData
+from jointfit_protocols.natnet_messages import ServerInfo
+from jointfit_protocols.natnet_messages import encode as encode_natnet
+from jointfit_protocols.natnet_model import BodyDescription, ModelDefinition
+from jointfit_protocols.xbus import MessageId
+from jointfit_protocols.xbus import encode as encode_xbus
+from jointfit_protocols.xcdi import DataId, quaternion_counts
+from jointfit_protocols.xcdi import encode as encode_xcdi
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from jointfit_daemon.pipeline.events import Event, Output
+
+MS = 1_000_000
+PERIOD_NS = 10 * MS
+BEGIN_NS = 5_000_000_000
+XBUS, XCDI = ("S1", "S3"), ("S2", "S4")
+SENSORS = ("S1", "S2", "S3", "S4")
+DELAYS_NS = {"S1": 2 * MS, "S2": MS, "S3": 3 * MS, "S4": 4 * MS, "mocap": 6 * MS}
+IDS = {"S2": (0x205, 0x206, 0x221), "S4": (0x405, 0x406, 0x421)}
+_VERSION = (3, 0)
+_NOWHERE = (0.0, 0.0, 0.0)
+
+
+def table(**head: Any) -> dict[str, Any]:
+    """Return a rig.toml of five sources."""
+    imus: list[dict[str, Any]] = []
+    for name, segment in zip(SENSORS, ("thigh", "thigh", "shank", "shank"), strict=True):
+        imu: dict[str, Any] = {"id": name, "segment": segment}
+        if name in XBUS:
+            imu |= {"driver": "xbus", "port": f"/dev/tty{name}", "baud": 921600}
+        else:
+            keys = ("sample_time", "group_counter", "quaternion")
+            ids = dict(zip(keys, IDS[name], strict=True))
+            imu |= {"driver": "xcdi", "can": "can0", "ids": ids, "sample_time_unit": "100us"}
+        imus.append(imu)
+    return {
+        "rig": {"name": "r", "output_rate_hz": 100} | head,
+        "chain": {"joints": ["hip", "knee", "ankle"], "segments": ["thigh", "shank"]},
+        "imu": imus,
+        "can": {"can0": {"interface": "socketcan", "channel": "can0"}},
+        "mocap": {
+            "driver": "natnet",
+            "server": "127.0.0.1",
+            "rigid_body": {"thigh": "Thigh", "shank": "Shank"},
+        },
+    }
+
+
+def orientation(name: str, number: int) -> tuple[float, float, float, float]:
+    """Return where a sensor points: each turns by 60 deg/s at most, about its own axis."""
+    half = 0.5 * math.sin(0.02 * number + len(name) + ord(name[-1]))
+    axis = [0.0, 0.0, 0.0]
+    axis[ord(name[-1]) % 3] = math.sin(half)
+    return math.cos(half), axis[0], axis[1], axis[2]
+
+
+def xbus_bytes(name: str, number: int) -> bytes:
+    """Return sample `number` of an Xbus sensor."""
+    items: list[tuple[int, Any]] = [
+        (Item.PACKET_COUNTER, number % 65536),
+        (Item.SAMPLE_TIME_FINE, number * 100),
+        (Item.QUATERNION, orientation(name, number)),
+    ]
+    return encode_xbus(MessageId.MT_DATA2, encode_items(items))
+
+
+def xcdi_bytes(name: str, number: int, t_ns: int) -> bytes:
+    """Return the three records of sample `number` of an XCDI sensor."""
+    time_id, counter_id, quaternion_id = IDS[name]
+    rows = (
+        (time_id, DataId.SAMPLE_TIME, (number * 100,)),
+        (counter_id, DataId.GROUP_COUNTER, (number % 65536,)),
+        (quaternion_id, DataId.QUATERNION, quaternion_counts(orientation(name, number))),
+    )
+    return pack_frames(
+        [CanFrame(t_ns, number, encode_xcdi(kind, counts)) for number, kind, counts in rows]
+    )
+
+
+def camera_bytes(number: int) -> bytes:
+    """Return camera frame `number`, without anything in it."""
+    ticks = number * 100_000
+    return encode_natnet(FrameOfData(number, 0.0, ticks, ticks + 1, ticks + 2), _VERSION)
+
+
+def camera_hello(t_ns: int) -> list[Event]:
+    """Return what a server says first."""
+    info = ServerInfo("Motive", (2, 1, 0, 0), (3, 0, 0, 0), 10_000_000)
+    bodies = tuple(
+        BodyDescription(name, number, -1, _NOWHERE, (), (), ())
+        for number, name in enumerate(("Thigh", "Shank"), 1)
+    )
+    words = (encode_natnet(info, _VERSION), encode_natnet(ModelDefinition(bodies), _VERSION))
+    return [ChunkArrived("mocap", Chunk(t_ns, word)) for word in words]
+
+
+def chunk(name: str, number: int, delay_ns: int | None = None) -> ChunkArrived:
+    """Return sample `number` of any source as it arrives."""
+    t_ns = BEGIN_NS + number * PERIOD_NS + (DELAYS_NS[name] if delay_ns is None else delay_ns)
+    if name == "mocap":
+        return ChunkArrived(name, Chunk(t_ns, camera_bytes(number)))
+    data = xbus_bytes(name, number) if name in XBUS else xcdi_bytes(name, number, t_ns)
+    return ChunkArrived(name, Chunk(t_ns, data))
+
+
+def opening(*, mocap: bool = True) -> list[Event]:
+    """Return the events before the first sample."""
+    rig = parse_rig(table())
+    events: list[Event] = [Configured(BEGIN_NS, rig, None)]
+    events += [SourceOpened(BEGIN_NS, source.id) for source in rig.sources]
+    return events + (camera_hello(BEGIN_NS) if mocap else [])
+
+
+def arrival_ns(event: Event) -> int:
+    """Return when an event happens."""
+    return event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
+
+
+@dataclass
+class Bench:
+    """A core with a perfect shell: it hears its deadlines on the nanosecond."""
+
+    core: Core = field(default_factory=Core)
+    fed: list[Event] = field(default_factory=list)
+    out: list[Output] = field(default_factory=list)
+    states: list[LimbState] = field(default_factory=list)
+    said_ns: dict[int, int] = field(default_factory=dict)
+    """When each frame came out, by the instant it is true for."""
+
+    def feed(self, events: Iterable[Event]) -> None:
+        """Feed events in order, and Ticks between them as the core asks for."""
+        for event in events:
+            self.wait_until(arrival_ns(event))
+            self._give(event, arrival_ns(event))
+
+    def wait_until(self, t_ns: int) -> None:
+        """Let time go on to `t_ns`."""
+        while (due_ns := self.core.next_deadline_ns) is not None and due_ns < t_ns:
+            self._give(Tick(due_ns), due_ns)
+
+    def _give(self, event: Event, now_ns: int) -> None:
+        self.fed.append(event)
+        for output in self.core.feed(event):
+            self.out.append(output)
+            if isinstance(output, LimbState):
+                self.states.append(output)
+                self.said_ns[output.t_ns] = now_ns
+
+    def devices(self) -> dict[str, Any]:
+        """Return the core's counters of every device."""
+        found: Any = self.core.health(arrival_ns(self.fed[-1]))["devices"]
+        return dict(found)
