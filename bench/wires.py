@@ -1,0 +1,114 @@
+"""Bytes as simulated devices would send them, made by our own encoders, ahead of any measurement.
+
+Law: every function here is deterministic and returns chunks in order of arrival.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Chunk
+from jointfit_protocols import mtdata2, slcan, xbus, xcdi
+from jointfit_protocols.can_frame import CanFrame, pack_frames
+from jointfit_protocols.natnet_messages import ServerInfo, encode
+from jointfit_simulators.natnet_stage import Stage, StagedBody, Stamps, model_definition
+from jointfit_simulators.placement import CLUSTERS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.model import Quaternion
+
+NS = 1_000_000_000
+TICK_NS = 100_000
+"""Sample time fine of an MTi."""
+BITSTREAM = (3, 1)
+_SERVER = ServerInfo("Motive", (2, 3, 0, 0), (3, 1, 0, 0), 10_000_000)
+
+
+def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[bytes]:
+    """Counter, time, status and quaternion: what a configured MTi sends."""
+    quaternion = mtdata2.real_id(mtdata2.Item.QUATERNION)
+    return [
+        xbus.encode(
+            xbus.MessageId.MT_DATA2,
+            mtdata2.encode_items(
+                [
+                    (mtdata2.Item.PACKET_COUNTER, k & 0xFFFF),
+                    (mtdata2.Item.SAMPLE_TIME_FINE, k * period_ns // TICK_NS),
+                    (mtdata2.Item.STATUS_WORD, 2),
+                    (quaternion, q),
+                ]
+            ),
+        )
+        for k, q in enumerate(orientations)
+    ]
+
+
+def xcdi_frames(
+    orientations: Sequence[Quaternion], period_ns: int, ids: xcdi.XcdiIds, start_ns: int = 0
+) -> list[list[CanFrame]]:
+    """Three frames a sample: time, counter, quaternion."""
+    return [
+        [
+            CanFrame(start_ns + k * period_ns, can_id, xcdi.encode(data_id, counts))
+            for can_id, data_id, counts in (
+                (ids.sample_time, xcdi.DataId.SAMPLE_TIME, (k * period_ns // TICK_NS,)),
+                (ids.group_counter, xcdi.DataId.GROUP_COUNTER, (k & 0xFFFF,)),
+                (ids.quaternion, xcdi.DataId.QUATERNION, xcdi.quaternion_counts(q)),
+            )
+        ]
+        for k, q in enumerate(orientations)
+    ]
+
+
+def xbus_chunks(
+    orientations: Sequence[Quaternion], period_ns: int, start_ns: int = 0
+) -> list[Chunk]:
+    """One chunk a sample."""
+    messages = xbus_messages(orientations, period_ns)
+    return [Chunk(start_ns + k * period_ns, data) for k, data in enumerate(messages)]
+
+
+def xcdi_chunks(
+    orientations: Sequence[Quaternion], period_ns: int, ids: xcdi.XcdiIds, start_ns: int = 0
+) -> list[Chunk]:
+    """One chunk of three records a sample."""
+    groups = xcdi_frames(orientations, period_ns, ids, start_ns)
+    return [Chunk(start_ns + k * period_ns, pack_frames(group)) for k, group in enumerate(groups)]
+
+
+def slcan_lines(groups: Sequence[Sequence[CanFrame]]) -> list[bytes]:
+    """The frames of each sample as an SLCAN adapter writes them."""
+    return [b"".join(slcan.encode_frame(frame) for frame in group) for group in groups]
+
+
+def natnet_opening() -> list[bytes]:
+    """What a server says before frames mean anything."""
+    return [encode(_SERVER), encode(model_definition(_bodies(), BITSTREAM), BITSTREAM)]
+
+
+def natnet_datagrams(count: int, period_ns: int) -> list[bytes]:
+    """Frames of a leg: every marker seen, every body tracked."""
+    stage = Stage(_bodies(), "y", "missing")
+    found = []
+    for k in range(count):
+        ticks = k * period_ns // 100
+        stamps = Stamps(k, k * period_ns / NS, ticks, ticks + 46_000, ticks + 60_000, 0)
+        sway = 0.1 * math.sin(k / 20)
+        markers = {
+            name: (sway + 0.03 * i, 0.2 * i, 0.4 + sway)
+            for i, name in enumerate(name for names in CLUSTERS.values() for name in names)
+        }
+        turn = (math.cos(sway), math.sin(sway), 0.0, 0.0)
+        bodies = {body.name: ((sway, 0.0, 1.0), turn) for body in _bodies()}
+        found.append(encode(stage.frame(stamps, markers, bodies), BITSTREAM))
+    return found
+
+
+def _bodies() -> tuple[StagedBody, ...]:
+    return tuple(
+        StagedBody(part.capitalize(), names, number)
+        for number, (part, names) in enumerate(CLUSTERS.items(), 1)
+    )

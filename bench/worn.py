@@ -1,0 +1,138 @@
+"""A worn leg without wires: trials, a calibration and a stream of samples, in milliseconds.
+
+Law: the simulator's wearer and sensors on one clock. The same knobs and seed as a `jointfit-sim`
+process give the same person with the same mounts, so a calibration made here fits its hardware.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
+from jointfit_daemon.config.load import parse_rig
+from jointfit_simulators.cameras import CameraFrames, Cameras
+from jointfit_simulators.placement import CLUSTERS
+from jointfit_simulators.programme import Step
+from jointfit_simulators.rig_file import RigOptions, rig_toml
+from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.settings import Knobs
+from jointfit_simulators.wearer import SENSORS, Wearer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.model import Quaternion
+
+    Array = NDArray[np.float64]
+
+NS = 1_000_000_000
+MOVES = ("functional", "walk", "squat", "sit_to_stand")
+PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
+_LEAD_S = 2.0  # a blend between two motions is over
+
+
+@dataclass(frozen=True)
+class Phases:
+    """The three trials of a calibration."""
+
+    align: CalibrationTrial
+    static: CalibrationTrial
+    functional: CalibrationTrial
+
+
+@cache
+def phases(seed: int = 1, rate_hz: float = 100.0) -> Phases:
+    """Return the trials of one wearer: 22 s of plate, 7 s of standing, 60 s of movement."""
+    knobs = Knobs(seed=seed, rate_hz=rate_hz)
+    steps = [Step("plate", PLATE_S), Step("stand", STAND_S)]
+    steps += [Step(name, FUNCTIONAL_S / len(MOVES)) for name in MOVES]
+    wearer = Wearer(knobs, steps)
+    end_s = PLATE_S + STAND_S + FUNCTIONAL_S
+    imu_s = np.arange(0.0, end_s, 1 / rate_hz)
+    camera_s = np.arange(0.0, end_s, 1 / knobs.mocap_hz)
+    seen = wearer.observe([imu_s] * len(SENSORS), camera_s, imu_s[:1])
+    said = {
+        name: OrientationSensor(knobs, name).report(imu_s, q)
+        for name, q in zip(SENSORS, seen.sensors, strict=True)
+    }
+    cameras = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz)
+    frames = cameras.see(seen)
+
+    def cut(begin_s: float, length_s: float) -> CalibrationTrial:
+        low, high = begin_s + _LEAD_S, begin_s + length_s
+        now = (imu_s >= low) & (imu_s < high)
+        sensors = {name: SensorTrack(_ns(imu_s[now]), q[now]) for name, q in said.items()}
+        shot = (camera_s >= low) & (camera_s < high)
+        return CalibrationTrial(sensors, _track(cameras, frames, camera_s, shot))
+
+    return Phases(
+        cut(0.0, PLATE_S),
+        cut(PLATE_S, STAND_S),
+        cut(PLATE_S + STAND_S - _LEAD_S, FUNCTIONAL_S + _LEAD_S),
+    )
+
+
+def _ns(t_s: Array) -> NDArray[np.int64]:
+    return np.round(t_s * NS).astype(np.int64)
+
+
+def _track(
+    cameras: Cameras, frames: CameraFrames, camera_s: Array, shot: NDArray[np.bool_]
+) -> OpticalTrack:
+    return OpticalTrack(
+        _ns(camera_s[shot]),
+        cameras.markers,
+        frames.markers[shot],
+        cameras.bodies,
+        frames.body_positions[shot],
+        frames.body_orientations[shot],
+    )
+
+
+def fitted(rig: Rig, seed: int = 1) -> Calibration:
+    """Return the calibration that `rig` would make of this wearer."""
+    trials = phases(seed)
+    settings = rig.calibration
+    alignment = fit_alignment(trials.align, settings)
+    return fit_calibration(trials.static, trials.functional, alignment, settings, rig.chain)
+
+
+def bench_rig(rate_hz: float = 100.0) -> Rig:
+    """Return the rig of the simulator's leg, with ports that nobody opens."""
+    tables = ['[can.can0]\ninterface = "slcan"\nchannel = "/dev/null"\n']
+    for number, (name, segment) in enumerate(SENSORS.items(), 1):
+        head = f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\nrate_hz = {rate_hz:g}\n'
+        if number % 2:
+            tables.append(f'{head}driver = "xbus"\nport = "/dev/{name}"\n')
+            continue
+        block = number << 8
+        ids = f"sample_time = {block + 5}, group_counter = {block + 6}, quaternion = {block + 33}"
+        tables.append(f'{head}driver = "xcdi"\ncan = "can0"\nids = {{ {ids} }}\n')
+    text = rig_toml(
+        RigOptions(name="bench"),
+        devices=tables,
+        mocap='[mocap]\ndriver = "natnet"\nserver = "127.0.0.1"\nup_axis = "y"',
+        clusters=CLUSTERS,
+        bones=(),
+        plate=True,
+    )
+    return parse_rig(tomllib.loads(text))
+
+
+def walking(sensor: str, rate_hz: float, seconds: float) -> list[Quaternion]:
+    """Return what one sensor says of a walk, q_world_sensor."""
+    knobs = Knobs(rate_hz=rate_hz)
+    t_s = np.arange(0.0, seconds, 1 / rate_hz)
+    streams = [t_s if name == sensor else t_s[:0] for name in SENSORS]
+    seen = Wearer(knobs, [Step("walk", seconds)]).observe(streams, t_s[:1], t_s[:1])
+    q = seen.sensors[list(SENSORS).index(sensor)]
+    return [tuple(row) for row in OrientationSensor(knobs, sensor).report(t_s, q).tolist()]
