@@ -11,8 +11,14 @@ import logging
 import random
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.outputs.mqtt import BrokerLost, Incoming, MqttConnection, Outgoing
-from jointfit_daemon.outputs.mqtt import password_of as _password_of
+from jointfit_daemon.outputs.mqtt import (
+    BrokerLost,
+    Incoming,
+    MqttConnection,
+    Outgoing,
+    password_of,
+    stop_if_cancelled,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -64,16 +70,17 @@ class MqttPublisher:
 
     async def run(self) -> None:
         """Connect, serve, and begin again, until cancelled."""
-        if self._settings.username is not None and _password_of(self._settings) is None:
+        if self._settings.username is not None and password_of(self._settings) is None:
             log.warning(
                 "mqtt: user %s has no password file: trying without", self._settings.username
             )
         while True:
+            attempt = asyncio.create_task(self._serve(), name="mqtt connection")  # see _serve
             try:
-                async with asyncio.TaskGroup() as attempt:  # in a task of its own: see _serve
-                    attempt.create_task(self._serve(), name="mqtt connection")
+                await attempt  # no TaskGroup: it forgets a cancellation that meets a loss
             except* BrokerLost as lost:
                 self._tell(_first(lost))
+            stop_if_cancelled()
             await asyncio.sleep(random.uniform(*_RETRY_S))  # noqa: S311 - no secret
 
     def _tell(self, reason: str) -> None:
