@@ -1,7 +1,7 @@
 """The align phase: all sensors on one plate that the cameras see, turned by hand.
 
 Law: each sensor's world gets its rotation to the optical world from here or from nowhere; skin
-motion never decides it (algorithms B7). What the movement did not show is refused with the reason.
+motion never decides it. What the movement did not show is refused with the reason.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def fit_center(points: Array, start: Array) -> CenterOfRotation:
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    Gauss-Newton with Huber weights, radii profiled out (algorithms C14).
+    Gauss-Newton with Huber weights, radii profiled out (Halvorsen 2003; Chang and Pollard 2007).
     Directions that the movement does not show (least direction changes below `MIN_DIRECTION_RAD`,
     or not above noise) are left at `start`: noise would pull them to the markers' own plane with
     false confidence. The covariance is the inverse information times (1+r)/(1-r), r the residuals'
@@ -264,7 +264,7 @@ def common_center(parent: ClusterTrack, child: ClusterTrack) -> tuple[Array, flo
     .. math:: \min \sum_t |R_1 c_1 + t_1 - R_2 c_2 - t_2|^2
 
     Treats both body parts alike, needs three markers on each. Directions with singular values below
-    a tenth of the next are set to zero motion (SARA's case; Ehrig et al. 2006, 2007; C14, C15).
+    a tenth of the next are set to zero motion (SARA's case; Ehrig et al. 2006, 2007).
 
     Returns
     -------

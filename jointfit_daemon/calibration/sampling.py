@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MAX_GAP_SAMPLES = 3.5
-"""Widest gap bridged, in median sample periods: three missing samples are not bridged (B14)."""
+"""Widest gap bridged, in median sample periods: three missing samples are not bridged."""
 
 
 def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64]) -> Array:

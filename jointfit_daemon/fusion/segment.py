@@ -4,7 +4,7 @@ Law: no jump, and no silence unsaid.
 
 The order is: the model trained for exactly the sensors alive, the plain mean of them, the last
 orientation for a fifth of a second, nothing. When the set alive changes, the difference between
-what was said and what is now to be said fades over a quarter of a second (algorithms B12).
+what was said and what is now to be said fades over a quarter of a second.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:
     """Return the mean of a few orientations that lie within 90° of each other, equal weights.
 
     Sum of the quaternions on the first one's side, normalised: for two it is the eigenvector mean
-    exactly (B8 with equal weights), for more it differs in the third order of their distances.
+    exactly (Markley et al. 2007, equal weights), for more it differs in the third order of their distances.
     """
     first = orientations[0]
     w, x, y, z = first

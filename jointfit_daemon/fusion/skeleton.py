@@ -45,7 +45,7 @@ def joint_positions(
     .. math:: P_{i+1} = P_i - L\,R_i e_z, \qquad
               \mathrm{tr}\,\Sigma_{i+1} = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
 
-    (algorithms B15, B11 with isotropic orientation errors). Below a segment whose orientation or
+    First-order propagation with isotropic orientation errors. Below a segment whose orientation or
     length is unknown everything is None.
     """
     place: Vector | None = origin
@@ -68,7 +68,7 @@ def read_angles(above: Fused, below: Fused, *, sign: float, left: bool) -> Angle
     r"""Return the angles of one joint, or None where a segment's orientation is unknown.
 
     With isotropic errors :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, whose
-    first entry is :math:`1 / \cos^2\theta` times the sum (algorithms B11; E of B16): the deviation
+    first entry is :math:`1 / \cos^2\theta` times the sum (first-order propagation through the Grood-Suntay rates matrix E): the deviation
     of flexion. It is None where the axes lock.
     """
     if above.q is None or below.q is None or above.sd is None or below.sd is None:
