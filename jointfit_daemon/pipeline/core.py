@@ -45,7 +45,7 @@ _CLOSED: dict[str, Literal["info", "warning", "error"]] = {
     "misconfigured": "error",
 }
 MOCAP_FRESH_NS = 200_000_000
-"""A rig whose optical system spoke within this time runs in mode ``imu+mocap``."""
+"""A rig whose cameras gave a live frame within this time runs in mode ``imu+mocap``."""
 
 
 class Core:
@@ -128,7 +128,11 @@ class Core:
             for source in rig.sources
             if (state := self._sources.get(source.id)) is not None and state.source == source
         }
-        self._sources = {s.id: kept.get(s.id) or SourceState.of(s) for s in rig.sources}
+        self._sources = {
+            s.id: kept.get(s.id) or SourceState.of(s, self._sources.get(s.id)) for s in rig.sources
+        }
+        if all(source.kind != "mocap" for source in rig.sources):
+            self._mocap_used = self._mocap_idle = 0
         outputs: list[Output] = []
         if before is not None:
             outputs += self._session.abort(event.t_ns, "the rig was reloaded")
@@ -153,9 +157,11 @@ class Core:
         """Begin a new grid of frames; samples that waited get their verdict, counts go on."""
         if self._aligned:
             self._aligner.close()
-        self._verdicts |= {name: self._counts(name) for name in self._aligned}
+        known = {name: self._counts(name) for name in self._aligned}
         self._aligner = _aligner(rig)
         self._aligned = tuple(source.id for source in rig.sources if source.kind == "imu")
+        # one that is gone takes its counts along: it may come back, and begins at nothing then
+        self._verdicts = {name: known[name] for name in self._aligned if name in known}
 
     def _use_calibration(self) -> None:
         rig, calibration = self._rig, self._session.calibration
@@ -207,7 +213,7 @@ class Core:
             if not isinstance(item, Stamped):
                 outputs += self._told(source, state, item)
                 continue
-            if not state.online:
+            if state.open and not state.online:  # not by what a closing decoder still gives up
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, "device", source, "streaming"))
@@ -242,7 +248,8 @@ class Core:
         frame = item.measurement
         if isinstance(frame, ImuSample):
             return
-        self._mocap_ns = self._now_ns
+        if frame.live:
+            self._mocap_ns = self._now_ns
         wanted = frame.live and self._session.collecting
         if wanted:
             self._session.add_mocap(item.stamp.t_ns, frame)

@@ -65,9 +65,15 @@ class SourceState:
     _decoder: Decoder | None = None
 
     @classmethod
-    def of(cls, source: Source) -> SourceState:
-        """Return the state of a source that has not been opened yet."""
-        return cls(source=source, clock=DeviceClock(round(_NS / source.rate_hz)))
+    def of(cls, source: Source, before: SourceState | None = None) -> SourceState:
+        """Return the state of a source not opened yet; `before` had its name and gives its counts.
+
+        Verdicts on its samples go on, too: a count that began anew would contradict them.
+        """
+        state = cls(source=source, clock=DeviceClock(round(_NS / source.rate_hz)))
+        if before is not None:
+            state.counts, state._withheld = before.counts, before.withheld()
+        return state
 
     def opened(self) -> None:
         """Begin anew with a fresh decoder: what was half received will never be completed."""

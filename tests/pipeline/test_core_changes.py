@@ -1,0 +1,182 @@
+"""The core while devices come, go, change and restart: counts agree, and what is told is so."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import pytest
+
+from jointfit_daemon.calibration.jobs import run_job
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import Chunk
+from jointfit_daemon.pipeline.events import (
+    CalibrationReady,
+    ChunkArrived,
+    Configured,
+    DeviceStatus,
+    FitJob,
+    JobFinished,
+    Request,
+    SourceClosed,
+    SourceOpened,
+)
+from jointfit_protocols.natnet_frame import FrameOfData
+from jointfit_protocols.natnet_messages import encode
+from tests.pipeline import core_feed
+from tests.pipeline.core_feed import (
+    BEGIN_NS,
+    MS,
+    PERIOD_NS,
+    SENSORS,
+    Bench,
+    arrival_ns,
+    camera_hello,
+    chunk,
+    opening,
+    table,
+    xbus_bytes,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.pipeline.events import Event
+
+VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
+
+
+def samples(names: Iterable[str], first: int, end: int) -> list[Event]:
+    found: list[Event] = [chunk(name, number) for name in names for number in range(first, end)]
+    return sorted(found, key=arrival_ns)
+
+
+def at(number: int) -> int:
+    return BEGIN_NS + number * PERIOD_NS
+
+
+def accounted(bench: Bench) -> None:
+    for name, device in bench.devices().items():
+        assert device["received"] == sum(device[key] for key in VERDICTS), (name, device)
+
+
+def test_a_sample_that_a_closing_decoder_gives_up_does_not_bring_the_device_back() -> None:
+    bench = Bench()
+    bench.feed([*opening(), *samples(SENSORS, 0, 20)])
+    # the start of a message that never ended hides a whole one until the decoder gives it up
+    hiding = b"\xfa\xff\x36\xf0" + xbus_bytes("S1", 20)
+    bench.feed([ChunkArrived("S1", Chunk(at(20), hiding)), SourceClosed(at(21), "S1", "lost", "x")])
+    assert bench.devices()["S1"]["received"] == 21
+    assert bench.devices()["S1"]["online"] is False
+    assert [o.online for o in bench.out if isinstance(o, DeviceStatus) and o.id == "S1"] == [
+        True,
+        False,
+    ]
+    bench.feed([SourceOpened(at(22), "S1"), *samples(["S1"], 22, 24)])
+    assert bench.out[-1] != DeviceStatus("S1", online=False)
+    assert [o.online for o in bench.out if isinstance(o, DeviceStatus) and o.id == "S1"][-1] is True
+
+
+def test_a_reload_that_changes_a_port_keeps_the_counts_in_agreement() -> None:
+    bench = Bench()
+    bench.feed([*opening(), *samples((*SENSORS, "mocap"), 0, 20)])
+    moved = table()
+    moved["imu"][0]["port"] = "/dev/ttyOther"
+    moved["mocap"]["server"] = "127.0.0.2"
+    bench.feed([SourceClosed(at(21), name, "removed", "stopped") for name in ("S1", "mocap")])
+    bench.feed([Configured(at(21), parse_rig(moved), None)])
+    bench.feed([SourceOpened(at(21), "S1"), *samples(SENSORS, 22, 40)])
+    assert bench.devices()["S1"]["received"] == 38
+    accounted(bench)
+
+
+def test_a_device_that_is_taken_out_and_put_back_begins_at_nothing() -> None:
+    bench = Bench()
+    bench.feed([*opening(), *samples((*SENSORS, "mocap"), 0, 20)])
+    without = table()
+    del without["imu"][1], without["mocap"]
+    bench.feed([SourceClosed(at(21), name, "removed", "stopped") for name in ("S2", "mocap")])
+    bench.feed([Configured(at(21), parse_rig(without), None)])
+    bench.feed([Configured(at(22), parse_rig(table()), None)])
+    bench.feed([SourceOpened(at(22), name) for name in ("S2", "mocap")])
+    bench.feed([*camera_hello(at(22)), *samples((*SENSORS, "mocap"), 23, 40)])
+    assert bench.devices()["S2"]["received"] == bench.devices()["mocap"]["received"] == 17
+    accounted(bench)
+
+
+# --- shapes of limbs ----------------------------------------------------------------------------
+
+
+def shaped(worn: dict[str, str], *, mocap: bool = False) -> dict[str, Any]:
+    """Return a rig of some of the four sensors, each worn on a segment of its own choice."""
+    rig = table()
+    segments = list(dict.fromkeys(worn.values()))
+    rig["chain"] = {"joints": [f"J{i}" for i in range(len(segments) + 1)], "segments": segments}
+    rig["imu"] = [imu | {"segment": worn[imu["id"]]} for imu in rig["imu"] if imu["id"] in worn]
+    if mocap:
+        rig["mocap"]["rigid_body"] = {segment: segment.title() for segment in segments}
+    else:
+        del rig["mocap"]
+    return rig
+
+
+def still(names: Iterable[str], first: int, end: int) -> list[Event]:
+    """Return what sensors send that do not turn: one orientation under running numbers."""
+    turning = core_feed.orientation
+    with patch.object(core_feed, "orientation", lambda name, _: turning(name, 0)):
+        return samples(names, first, end)
+
+
+def calibrated_by_standing(rig_table: dict[str, Any]) -> tuple[Bench, Calibration]:
+    """Stand still before a core without cameras; return it and what the worker made of it."""
+    rig, bench = parse_rig(rig_table), Bench()
+    names = [source.id for source in rig.sources]
+    bench.feed([Configured(BEGIN_NS, rig, None), *(SourceOpened(BEGIN_NS, n) for n in names)])
+    bench.feed(still(names, 0, 20))
+    bench.feed([Request(at(20), "calibrate", "t", {"phase": "static"})])
+    bench.feed(still(names, 20, 700))
+    (job,) = [output for output in bench.out if isinstance(output, FitJob)]
+    result = run_job(job.kind, job.payload)
+    bench.feed([JobFinished(at(700), job.job, result, None)])
+    bench.feed(still(names, 701, 720))
+    (ready,) = [output for output in bench.out if isinstance(output, CalibrationReady)]
+    return bench, ready.calibration
+
+
+@pytest.mark.parametrize(
+    "worn",
+    [
+        {"S1": "thigh"},
+        {"S1": "thigh", "S2": "thigh"},
+        {"S1": "thigh", "S3": "shank"},
+        {"S1": "thigh", "S2": "shank", "S3": "foot"},
+        {"S1": "thigh", "S2": "thigh", "S3": "shank", "S4": "foot"},
+    ],
+)
+def test_limbs_of_any_shape_are_calibrated_by_standing_still(worn: dict[str, str]) -> None:
+    bench, _ = calibrated_by_standing(shaped(worn))
+    state = bench.states[-1]
+    assert state.mode == "imu"
+    assert [set(segment.used) for segment in state.segments] == [
+        {name for name, on in worn.items() if on == segment.name} for segment in state.segments
+    ]
+    assert len(state.joints) == len(state.segments) + 1
+    accounted(bench)
+
+
+@pytest.mark.parametrize(("params", "mode"), [(0, "imu+mocap"), (4, "imu")])
+def test_only_live_cameras_make_the_optical_mode(params: int, mode: str) -> None:
+    worn = {"S1": "thigh", "S3": "shank"}
+    _, calibration = calibrated_by_standing(shaped(worn))
+    rig, bench = parse_rig(shaped(worn, mocap=True)), Bench()
+    bench.feed([Configured(BEGIN_NS, rig, calibration)])
+    bench.feed([SourceOpened(BEGIN_NS, source.id) for source in rig.sources])
+    bench.feed(camera_hello(BEGIN_NS))
+    frames: list[Event] = []
+    for number in range(1, 20):
+        ticks = number * 100_000
+        frame = FrameOfData(number, 0.0, ticks, ticks + 1, ticks + 2, params)
+        frames.append(ChunkArrived("mocap", Chunk(at(number) + 6 * MS, encode(frame, (3, 0)))))
+    bench.feed(sorted([*frames, *samples(worn, 0, 20)], key=arrival_ns))
+    assert bench.states[-1].mode == mode
