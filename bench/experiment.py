@@ -8,11 +8,13 @@ the row says so and is left out.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
+from shutil import which
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -42,7 +44,9 @@ class Figure:
         if self.least == -float("inf"):
             return f"≤ {self.goal:g}"
         return (
-            f"{self.least:g} … {self.goal:g}" if self.goal < float("inf") else f"≥ {self.least:g}"
+            f"{self.least:.4g} … {self.goal:.4g}"
+            if self.goal < float("inf")
+            else f"≥ {self.least:g}"
         )
 
 
@@ -58,6 +62,8 @@ class Experiment:
     """Folders it reads there."""
     packages: tuple[str, ...] = ()
     """What must be installed beside the project."""
+    programs: tuple[str, ...] = ()
+    """What it runs as a process: such a row is measured by ``tests/system``, not as a unit test."""
 
     def missing(self, data: Path = DATA) -> str | None:
         """Say what keeps this experiment from running; None if nothing does."""
@@ -65,6 +71,8 @@ class Experiment:
         if absent:
             return f"recordings are not here: {', '.join(str(data / name) for name in absent)}"
         uninstalled = [name for name in self.packages if find_spec(name) is None]
+        path = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
+        uninstalled += [name for name in self.programs if which(name, path=path) is None]
         return f"not installed: {', '.join(uninstalled)}" if uninstalled else None
 
 

@@ -92,6 +92,14 @@ def test_what_nobody_saw_is_unknown_and_said() -> None:
     assert tilt_deg(found.q_static["thigh"], Subject(1)) < 5.0
 
 
+def test_with_static_axes_every_segment_stands_unrotated() -> None:
+    subject = Subject(1)
+    found = anatomy(subject, replace(CHAIN, static_axes=True))
+    for segment in CHAIN.segments:
+        assert found.q_static[segment].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert found.lengths == anatomy(subject).lengths
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_axis_sign_follows_the_joint(sign: float) -> None:
     subject = Subject(2)

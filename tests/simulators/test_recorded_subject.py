@@ -134,3 +134,40 @@ def test_the_truth_log_tells_no_future_and_writes_unknown_as_null(
     assert set(rows[0]["q_world_segment"]) == {"thigh", "shank"}
     assert set(rows[0]["knee"]) == {"flexion", "adduction", "rotation"}
     assert rows[0]["included"] == pytest.approx(np.pi - abs(rows[0]["knee"]["flexion"]), abs=0.05)
+
+
+def test_a_part_of_the_trial_is_played_at_its_place(squats: list[Path]) -> None:
+    recorded = read_orientations_npz(squats[0])
+    steps = parse_programme("stand:2,trial@8.06-9:9")
+    subject = Replayed(read_recording(squats), SENSORS, steps, transition_s=1.0)
+    t = 3.0 + np.arange(0.0, 0.95, 0.02)  # the blend is over at 3 s
+    found = subject.observe([t] * 4, t, t)
+    first = round(8.06 * 50)
+    was = Rotation.from_quat(recorded.sensors["S2"][first : first + len(t)], scalar_first=True)
+    said = Rotation.from_quat(found.sensors[1], scalar_first=True)
+    assert np.degrees((said.inv() * was).magnitude()).max() < 1e-4
+    with pytest.raises(UnknownMotion, match=r"13\.44 s long"):
+        subject.play("trial@13.5-", 20.0)
+
+
+def test_cameras_see_bones_standing_and_recorded_but_never_made_up(squats: list[Path]) -> None:
+    steps = parse_programme("stand:2,trial@0-4:8,stand")
+    subject = Replayed(read_recording(squats), SENSORS, steps, transition_s=1.0)
+    cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
+    t = np.array([1.0, 1.99, 2.01, 2.5, 2.99, 3.0, 5.0, 7.0, 7.01, 9.9, 10.5, 11.01])
+    seen = cameras.see(subject.observe([NONE] * 4, t, t)).body_positions[:, :, 0]
+    visible = [True, True, False, False, False, True, True, True, False, False, False, True]
+    assert np.isfinite(seen).all(axis=1).tolist() == visible
+
+
+def test_standing_the_shank_hangs_on_the_thigh_where_it_hung_in_the_trial(
+    squats: list[Path],
+) -> None:
+    recorded = read_orientations_npz(squats[0])
+    subject = Replayed(read_recording(squats), SENSORS, parse_programme("stand"))
+    t = np.array([1.0])
+    found = subject.observe([NONE] * 4, t, t)
+    (_, hip), (_, knee) = found.bones["thigh"], found.bones["shank"]
+    femur = Rotation.from_quat(recorded.bones["femur_r"][0], scalar_first=True)
+    offset = femur.inv().apply(recorded.origins["tibia_r"][0] - recorded.origins["femur_r"][0])
+    np.testing.assert_allclose(knee - hip, offset[None], atol=1e-9)

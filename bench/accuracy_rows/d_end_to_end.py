@@ -1,0 +1,59 @@
+"""Rows E2E-*: the recorded trials as bytes through the real daemon give the offline figures.
+
+Every figure stands beside the offline figure that this bench measures on the same frames, which is
+its expected value; a tenth of a degree is allowed.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+from bench import end_to_end
+from bench.accuracy_rows.b_redundant_sensors import NAMES, KneeModels, Squats
+from bench.experiment import Experiment, Figure, near
+from bench.semireal import FOLDER, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from bench.end_to_end import Played
+    from jointfit_daemon.calibration.trial import Method
+
+METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
+WALKERS: tuple[Method, ...] = ("patent12", "anchored")
+ALLOWED_DEG = 0.1
+
+
+@cache
+def _played(data: Path) -> dict[tuple[str, Method], Played]:
+    """Return all runs; they share one half minute of real time."""
+    return end_to_end.run(data, METHODS, WALKERS)
+
+
+def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Figure]]:
+    def run(data: Path) -> list[Figure]:
+        knee = Squats(data)
+        held = knee.held if trial == "squats" else load(data, "walking1")
+        figures = []
+        for method in methods:
+            offline = knee.judge.errors(KneeModels(method, [knee.training]).predict(held), held)
+            live = _played(data)[trial, method]
+            figures += [
+                near(f"{method}: {name} (offline {expected:.3f})", said, expected, ALLOWED_DEG)
+                for name, said, expected in zip(NAMES, live.errors, offline, strict=True)
+            ]
+            frames = float(live.frames)
+            figures.append(near(f"{method}: poses judged", frames, float(len(held)), 0.0, ""))
+        return figures
+
+    return run
+
+
+EXPERIMENTS = (
+    Experiment("E2E-squats", "squats hold-out, bytes to MQTT", _beside("squats", METHODS),
+               (FOLDER,), programs=("mosquitto",)),
+    Experiment("E2E-walk", "walking, bytes to MQTT, trained on squats",
+               _beside("walking", WALKERS), (FOLDER,), programs=("mosquitto",)),
+)  # fmt: skip

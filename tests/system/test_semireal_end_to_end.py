@@ -1,0 +1,59 @@
+"""Real squats as bytes through the real daemon give the figures that were measured offline.
+
+Nothing is tuned to pass: the scene has no imperfections but those of the recording, the optical
+system streams the reference bones, segments keep the axes of the static pose (the patent's), and
+the daemon calibrates itself on the first 60 %.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bench import end_to_end
+from bench.accuracy_rows.b_redundant_sensors import KneeModels, Squats
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bench.end_to_end import Played
+    from jointfit_daemon.calibration.trial import Method
+    from tests.broker_fixture import MosquittoBroker
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+METHODS: tuple[Method, ...] = ("patent12", "mean")
+
+
+@pytest.fixture(scope="module")
+def knee(shared_data: Path) -> Squats:
+    return Squats(shared_data)
+
+
+@pytest.fixture
+def played(shared_data: Path, mosquitto: MosquittoBroker) -> dict[tuple[str, Method], Played]:
+    mosquitto.stop()  # the run starts its own; without mosquitto this test is skipped
+    return end_to_end.run(shared_data, METHODS)
+
+
+def test_squats_as_bytes_give_the_offline_figures(
+    knee: Squats, played: dict[tuple[str, Method], Played]
+) -> None:
+    for method in METHODS:
+        live = played["squats", method]
+        assert live.frames == len(knee.held) == 270
+        models = KneeModels(method, [knee.training])
+        offline = knee.judge.errors(models.predict(knee.held), knee.held)
+        assert live.errors == pytest.approx(offline, abs=0.1), method
+        devices = live.health["devices"]
+        assert {name: device["lost"] for name, device in devices.items()} == dict.fromkeys(
+            devices, 0
+        )
+        assert sum(device["corrupt"] for device in devices.values()) == 0
+        # the daemon's own judge saw these squats, too: it says what it would do unseen
+        assert live.calibration.method == method
+        assert live.calibration.joint["knee"].source == "fit"
+    published = played["squats", "patent12"].errors
+    assert published == pytest.approx((3.45, 2.81, 2.11), abs=0.1)
+    assert played["squats", "mean"].errors == pytest.approx((9.29, 9.61, 3.21), abs=0.1)
