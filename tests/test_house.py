@@ -115,7 +115,7 @@ def test_every_driver_is_in_the_readme() -> None:
     assert [name for name in drivers if f"| `{name}` |" not in readme] == []
 
 
-NOQA = re.compile(r"# noqa(?!: [A-Z0-9, ]+ - \w)")
+NOQA = re.compile(r"# noqa(?!: [A-Z0-9, ]+ - \S)")
 IGNORE = re.compile(r"# type: ignore(?!\[[a-z, -]+\] +# \w)")
 
 

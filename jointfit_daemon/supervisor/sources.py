@@ -73,7 +73,7 @@ async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None
             life.closed("lost", str(lost))  # the core tells it, on the log too
         except DeviceMisconfigured as wrong:
             life.closed("misconfigured", str(wrong))
-            log.error("%s: stopped until its settings change: %s", source.id, wrong)  # noqa: TRY400
+            log.error("%s: stopped until its settings change: %s", source.id, wrong)  # noqa: TRY400 - it says enough
             return
         except asyncio.CancelledError:
             life.removed()

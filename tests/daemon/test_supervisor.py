@@ -138,7 +138,7 @@ class Script:
         if step == "wait":
             await asyncio.Event().wait()
         if step == "send then go":
-            from jointfit_daemon.model import Chunk  # noqa: PLC0415
+            from jointfit_daemon.model import Chunk  # noqa: PLC0415 - here only
 
             emit(Chunk(1, b"x"))
             raise DeviceLost("unplugged")
@@ -520,7 +520,7 @@ async def test_a_cancelled_fit_is_killed_and_not_heard_of() -> None:
 
 
 async def test_a_request_to_nobody_is_harmless(mosquitto: MosquittoBroker) -> None:
-    from jointfit_daemon.config import MqttSettings  # noqa: PLC0415
+    from jointfit_daemon.config import MqttSettings  # noqa: PLC0415 - here only
 
     async with MqttConnection(MqttSettings(host="127.0.0.1", port=mosquitto.port)) as connection:
         await connection.publish(Outgoing("x/bridge/request/calibrate", b"{}", 1))

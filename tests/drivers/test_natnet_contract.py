@@ -47,6 +47,7 @@ class TestNatNet(DriverContract):
     registered_as = "natnet"
     measurement = MocapFrame
     has_noise = False  # a UDP checksum tells damaged datagrams apart before we see them
+    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
     options = NatNetServerOptions(bodies=(THIGH,), bitstream=(3, 1))
     _devices: list[Any]
 
@@ -96,19 +97,20 @@ class TestNatNet41(TestNatNet):
 
 def multicast_works() -> bool:
     """Whether loopback carries multicast on this machine."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
+    lo, group = socket.inet_aton("127.0.0.1"), "239.255.42.99"
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as said,
+    ):
         heard.settimeout(0.5)
         heard.bind(("", 0))
-        lo = socket.inet_aton("127.0.0.1")
-        heard.setsockopt(
-            socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton("239.255.42.99") + lo
-        )
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as said:
-            said.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, lo)
-            said.sendto(b"?", ("239.255.42.99", heard.getsockname()[1]))
         try:
+            join = socket.inet_aton(group) + lo
+            heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, join)
+            said.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, lo)
+            said.sendto(b"?", (group, heard.getsockname()[1]))
             return heard.recv(9) == b"?"
-        except TimeoutError:
+        except OSError:
             return False
 
 
