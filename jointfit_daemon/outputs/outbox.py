@@ -48,6 +48,11 @@ class Outbox:
         return len(self._unsent) + len(self._events) + len(self._streams)
 
     @property
+    def unsaid(self) -> bool:
+        """Whether state or an event waits, or is on its way."""
+        return bool(self._unsent or self._events)
+
+    @property
     def retained(self) -> dict[str, bytes]:
         """Last value of every retained topic."""
         return dict(self._state)

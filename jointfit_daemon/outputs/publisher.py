@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 ONLINE, OFFLINE = b'{"state":"online"}', b'{"state":"offline"}'
 ECHO_S = 5.0  # own "online" comes back within this, or the broker does not let it pass
+_LOOK_S = 0.01
 _RETRY_S = (0.3, 0.6)  # a refused connect costs nothing, a longer wait costs the user a second
 
 
@@ -82,6 +83,12 @@ class MqttPublisher:
                 self._tell(_first(lost))
             stop_if_cancelled()
             await asyncio.sleep(random.uniform(*_RETRY_S))  # noqa: S311 - no secret
+
+    async def emptied(self, within_s: float) -> None:
+        """Wait until the broker has all state and events; not for long, nor without a broker."""
+        until = asyncio.get_running_loop().time() + within_s
+        while self.connected and self._outbox.unsaid and asyncio.get_running_loop().time() < until:
+            await asyncio.sleep(_LOOK_S)
 
     def _tell(self, reason: str) -> None:
         if reason != self._said:  # a line when something changes, not one per attempt

@@ -67,6 +67,8 @@ LOOK_S = 0.1
 """How often the process looks at itself."""
 HEALTH_SOON_S = 0.5
 """Health follows a device that came or went by this much, so that losses show in time."""
+FAREWELL_S = 0.5
+"""How long a stop may wait for the broker to take the last words."""
 STOP_S = 4.8
 """Stopping is promised in five seconds, whatever hangs."""
 _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
@@ -134,6 +136,7 @@ class Daemon:
                 finally:
                     self._systemd.stopping()
                     await self._sources.stop()
+                    await self._link.emptied(FAREWELL_S)  # that the devices went, among others
         finally:
             logging.getLogger().removeHandler(warnings)
             loop.remove_signal_handler(signal.SIGHUP)
