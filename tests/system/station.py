@@ -135,7 +135,7 @@ class Listener:
 
 def sensors_in(pose: dict[str, Any]) -> set[str]:
     """Return which sensors a pose was made from."""
-    return {sensor for part in pose["segments"].values() for sensor in part["sensors"]}
+    return {sensor for part in pose["segments"].values() for sensor in part["used"]}
 
 
 def knee_angles(poses: list[dict[str, Any]]) -> list[float]:

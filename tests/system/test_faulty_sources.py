@@ -1,0 +1,245 @@
+"""One daemon with almost everything wrong: each fault is named with its remedy, the rest runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import math
+import os
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
+from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
+from jointfit_daemon.config import load_rig
+from jointfit_daemon.tools.demo_processes import daemon
+from jointfit_protocols.xcdi import XcdiIds
+from jointfit_simulators.can_wire import SlcanAdapter
+from jointfit_simulators.natnet_options import NatNetServerOptions
+from jointfit_simulators.natnet_server import NatNetServer
+from jointfit_simulators.natnet_stage import StagedBody
+from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from tests.system.station import BASE, Listener, knee_angles, listening, sensors_in
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+    from tests.broker_fixture import MosquittoBroker
+
+pytestmark = pytest.mark.system
+
+RATE_HZ = 100
+NMEA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+MODEM = b"AT+CGMI\r\r\nERROR\r\n"
+MODEM_EVERY = 40
+SHARED = XcdiIds(0x105, 0x106, 0x121, status_word=None, error=None)
+MARKERS = ("T1", "T2", "T3", "C1", "C2", "C3")
+
+RIG = """
+[rig]
+name = "faulty"
+[chain]
+joints = ["hip", "knee", "ankle"]
+segments = ["thigh", "shank"]
+{imus}
+[can.can0]
+interface = "slcan"
+channel = "{folder}/can"
+[[imu]]
+id = "twin"
+segment = "thigh"
+driver = "xcdi"
+can = "can0"
+ids = {{ sample_time = 0x105, group_counter = 0x106, quaternion = 0x121 }}
+[[imu]]
+id = "mute"
+segment = "shank"
+driver = "xcdi"
+can = "can0"
+ids = {{ sample_time = 0x305, group_counter = 0x306, quaternion = 0x321 }}
+[mocap]
+driver = "natnet"
+server = "127.0.0.1"
+command_port = {mocap}
+markers.thigh = ["T1", "T2", "Thigh3"]
+markers.shank = ["C1", "C2", "C3"]
+[mqtt]
+host = "127.0.0.1"
+port = {mqtt}
+base = "{base}"
+health_s = 0.5
+"""
+IMU = """
+[[imu]]
+id = "{name}"
+segment = "{segment}"
+driver = "xbus"
+port = "{folder}/{name}"
+baud = 921600
+"""
+
+
+def _modem_in_between() -> Callable[[bytes], bytes]:
+    sent = 0
+
+    def noise(message: bytes) -> bytes:
+        nonlocal sent
+        sent += 1
+        return MODEM + message if sent % MODEM_EVERY == 0 else message
+
+    return noise
+
+
+@dataclass
+class Hardware:
+    """The devices at the daemon's ports; none is as its rig.toml says but good and modem."""
+
+    folder: Path
+    server: NatNetServer = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.good = XbusDevice(self.folder / "good")
+        self.modem = XbusDevice(self.folder / "modem", wire_noise=_modem_in_between())
+        self.slow = XbusDevice(
+            self.folder / "slow", options=XbusDeviceOptions(baud=115_200, measures_at_once=True)
+        )
+        self.gps, self.taken = PtyLine(self.folder / "gps"), PtyLine(self.folder / "taken")
+        self.bus = SlcanAdapter(self.folder / "can")
+        self.twins = [
+            XcdiDevice(self.bus, XcdiDeviceOptions(SHARED, first_counter=n, first_tick=n))
+            for n in (0, 31_000)
+        ]
+        bodies = (StagedBody("Thigh", MARKERS[:3], 1), StagedBody("Shank", MARKERS[3:], 2))
+        self.server = NatNetServer(NatNetServerOptions(bodies=bodies))
+        self.absent: XbusDevice | None = None
+
+    async def run(self) -> None:
+        async with asyncio.TaskGroup() as tasks:
+            for device in (self.good, self.modem, self.slow, self.bus, self.server):
+                tasks.create_task(device.run())
+            tasks.create_task(self._play())
+            await self._appearing(tasks)
+
+    async def _appearing(self, tasks: asyncio.TaskGroup) -> None:
+        while self.absent is None:
+            await asyncio.sleep(0.01)
+        tasks.create_task(self.absent.run())
+
+    async def _play(self) -> None:
+        number, began = 0, time.monotonic()
+        while True:
+            number += 1
+            await asyncio.sleep(max(0.0, began + number / RATE_HZ - time.monotonic()))
+            self._push(time.monotonic_ns(), 0.4 * math.sin(0.03 * number), number)
+
+    def _push(self, t_ns: int, half: float, number: int) -> None:
+        """All sensors of the thigh rest, those of the shank turn."""
+        rest, turned = (1.0, 0.0, 0.0, 0.0), (math.cos(half), 0.0, math.sin(half), 0.0)
+        for device in (self.good, self.slow, *self.twins):
+            device.push(t_ns, rest)
+        for device in (self.modem, self.absent):
+            if device is not None:
+                device.push(t_ns, turned)
+        if number % 20 == 0:
+            self.gps.write(NMEA)
+        self.server.push(t_ns, dict.fromkeys(MARKERS, (0.1, 0.2, 0.3)), {})
+
+    def close(self) -> None:
+        for device in (self.good, self.modem, self.slow, self.gps, self.taken, self.bus):
+            device.unplug()
+        if self.absent is not None:
+            self.absent.unplug()
+        self.server.unplug()
+
+
+@contextlib.asynccontextmanager
+async def plugged_in(folder: Path) -> AsyncIterator[Hardware]:
+    hardware = Hardware(folder)
+    running = asyncio.create_task(hardware.run(), name="hardware")
+    held = os.open(folder / "taken", os.O_RDWR | os.O_NOCTTY)
+    fcntl.flock(held, fcntl.LOCK_EX)  # as another program holds it
+    try:
+        yield hardware
+    finally:
+        running.cancel()
+        await asyncio.wait([running])
+        os.close(held)
+        hardware.close()
+
+
+def write_rig(folder: Path, mqtt: int, mocap: int) -> Path:
+    names = {"good": "thigh", "modem": "shank", "slow": "thigh", "gps": "shank"}
+    names |= {"taken": "thigh", "absent": "shank"}
+    imus = "".join(IMU.format(name=n, segment=s, folder=folder) for n, s in names.items())
+    text = RIG.format(imus=imus, folder=folder, mocap=mocap, mqtt=mqtt, base=BASE)
+    (folder / "rig.toml").write_text(text, encoding="utf-8")
+    return folder / "rig.toml"
+
+
+def calibrate(rig_file: Path, state: Path) -> None:
+    """Store a calibration of sensors that lie along their bones."""
+    rig = load_rig(rig_file)
+    t_ns = np.arange(400, dtype=np.int64) * (10**9 // RATE_HZ)
+    still = np.tile((1.0, 0.0, 0.0, 0.0), (len(t_ns), 1))
+    names = [name for group in rig.chain.sensors for name in group]
+    trial = CalibrationTrial({name: SensorTrack(t_ns, still) for name in names}, None)
+    pose = fit_static(trial, rig.calibration, rig.chain)
+    CalibrationStore(state / "calibrations", rig.calibration_store).save(
+        fit_static_only(pose, None, rig.chain)
+    )
+
+
+EXPECTED = {
+    "slow": ("921600 baud but nothing decodes", "set baud = 115200"),
+    "gps": ("not an Xbus device", "set `port` to the right one, or `driver`"),
+    "taken": ("is used by another program", "fuser", "ModemManager", "udev rule"),
+    "absent": ("is not there", "plug it in, or set `port`"),
+    "modem": ("bytes made no message",),
+    "twin": ("two sensors send with the same CAN identifiers", "set `ids`"),
+    "mute": ("silent for 1 s", "0x321", "check power, bit rate and `ids`"),
+    "mocap": ("marker 'Thigh3' (mocap.markers.thigh) is not in the stream", "The server has", "T3"),
+}
+
+
+@pytest.mark.timeout(60)
+async def test_each_fault_is_named_with_its_remedy_and_the_rest_runs(
+    tmp_path: Path, mosquitto: MosquittoBroker
+) -> None:
+    async with plugged_in(tmp_path) as hardware, listening(mosquitto.port) as listener:
+        rig = write_rig(tmp_path, mosquitto.port, hardware.server.command_port)
+        calibrate(rig, tmp_path / "state")
+        async with daemon(tmp_path, rig) as child:
+            await listener.until(
+                lambda: all(listener.said(name, *parts) for name, parts in EXPECTED.items()), 25
+            )
+            poses = await listener.more_poses(100)
+            assert all({"good", "modem"} == sensors_in(pose) for pose in poses), poses[-1]
+            angles = knee_angles(poses)
+            assert len(angles) == len(poses)
+            assert max(angles) - min(angles) > 5
+            await appears(hardware, listener)
+            devices = await listener.health(lambda d: d["modem"]["received"] > 3 * MODEM_EVERY)
+            assert devices["modem"]["corrupt"] >= 3
+            assert devices["modem"]["lost"] == 0
+            assert devices["twin"]["received"] < 20 < devices["twin"]["corrupt"]
+            assert {"good", "modem", "mocap"} <= listener.online
+            assert not {"slow", "gps", "taken", "mute"} & listener.online
+            child.check()
+
+
+async def appears(hardware: Hardware, listener: Listener) -> None:
+    """A port that was absent is used within two seconds of its coming."""
+    hardware.absent = XbusDevice(hardware.folder / "absent")
+    await listener.until(lambda: "absent" in listener.online, 2.0)
+    (pose,) = await listener.more_poses(1)
+    await listener.until(lambda: "absent" in sensors_in(listener.poses[-1]), 1.0)
+    assert {"good", "modem"} <= sensors_in(pose)
