@@ -96,7 +96,8 @@ class LimbFuser:
         Notes
         -----
         Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
-        (a sample was extrapolated in time) and per segment ``one_sensor:``, ``untrained:`` (outside
+        (a sample was extrapolated in time), ``origin_fixed`` (cameras run but do not see O1, so
+        that it is at the configured origin), per segment ``one_sensor:``, ``untrained:`` (outside
         the movements of the calibration), ``held:``, ``lost:``; ``gimbal`` last.
         """
         if self._calibration is None:
@@ -113,6 +114,8 @@ class LimbFuser:
         flags = [*self._standing]
         if extrapolated and not extrapolated.isdisjoint(inputs):
             flags.append("extrapolating")
+        if optical_origin is None and mode == "imu+mocap":
+            flags.append("origin_fixed")
         for one in fused:
             flags += one.flags
         joints = self._joints(fused, optical_origin, flags)

@@ -13,6 +13,7 @@ import orjson
 
 from jointfit_daemon import __version__
 from jointfit_daemon.model import LimbState
+from jointfit_daemon.outputs.figures import shown
 from jointfit_daemon.outputs.mqtt import PAYLOAD_VERSION
 from jointfit_daemon.outputs.payloads import UnixClock, encode, encode_joint, encode_pose
 from jointfit_daemon.outputs.publisher import OFFLINE, ONLINE
@@ -119,7 +120,7 @@ class Reporter:
 
     def _calibration(self, status: CalibrationStatus) -> None:
         said: dict[str, Any] = {"phase": status.phase, "text": status.text}
-        said |= {"version": status.version, "quality": status.quality}
+        said |= {"version": status.version, "quality": shown(status.quality)}
         self._outbox.retain(f"{self._base}/calibration", self._stamped(said, status.t_ns))
         event = Notice(status.t_ns, "calibration", status.phase, status.text)
         self.event(event)

@@ -71,7 +71,7 @@ class Bulletin:
 def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
     source, kind = key
     if kind == "gap":
-        text = f"{held.amount} samples lost on the way: {held.text}"
+        text = f"{held.amount} sample{'s' if held.amount > 1 else ''} lost on the way"
         data: dict[str, object] = {"gaps": held.count, "lost": held.amount}
     else:
         text = f"{held.amount} bytes made no message: {held.text}"

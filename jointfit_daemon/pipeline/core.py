@@ -148,9 +148,7 @@ class Core:
         self._session.version = event.calibration_version
         self._use_calibration()
         text = "stored calibration loaded" if event.calibration else "no calibration stored yet"
-        outputs.append(
-            CalibrationStatus(event.t_ns, self._session.phase, text, event.calibration_version)
-        )
+        outputs.append(self._in_force(event.t_ns, text))
         return outputs
 
     def _replace_aligner(self, rig: Rig) -> None:
@@ -305,8 +303,13 @@ class Core:
 
     def _stored(self, event: CalibrationStored) -> list[Output]:
         self._session.version = event.version
-        text = f"stored as version {event.version}"
-        return [CalibrationStatus(event.t_ns, self._session.phase, text, event.version)]
+        return [self._in_force(event.t_ns, f"stored as version {event.version}")]
+
+    def _in_force(self, t_ns: int, text: str) -> CalibrationStatus:
+        """Return a status that may stay retained: with the figures of what is in force."""
+        session = self._session
+        quality = {} if session.calibration is None else session.calibration.quality
+        return CalibrationStatus(t_ns, session.phase, text, session.version, quality)
 
 
 def _frame_layout(rig: Rig) -> tuple[object, ...]:

@@ -223,6 +223,10 @@ def test_flags_origin_sync_and_mode_are_handed_through(
     seen = fuser.fuse(t, t, 8, orientations, optical_origin=(1.0, 2.0, 3.0), mode="imu+mocap")
     assert seen.joints[0].position == (1.0, 2.0, 3.0)
     assert seen.mode == "imu+mocap"
+    assert "origin_fixed" not in seen.flags
+    unseen = fuser.fuse(t, t, 9, orientations, mode="imu+mocap")
+    assert unseen.joints[0].position == (0.0, 0.0, 0.9)
+    assert unseen.flags == ("headings_from_static", "origin_fixed")
     assert fuser.fuse(t, t, 9, {**orientations, "S9": (1.0, 0.0, 0.0, 0.0)}).flags == (
         "headings_from_static",
     )

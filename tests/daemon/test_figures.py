@@ -1,0 +1,43 @@
+"""Figures of a calibration on the wire: every one with its unit, in degrees and milliseconds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.outputs.figures import shown
+
+
+def test_radians_are_told_in_degrees_and_nanoseconds_in_milliseconds() -> None:
+    told = shown({"alignment": {"S1": {"error_rad": math.pi / 2, "lag_ns": -5_527_259}}})
+    assert told == {"alignment": {"S1": {"error_deg": 90.0, "lag_ms": -5.527}}}
+
+
+def test_a_unit_counts_for_the_whole_table_that_hangs_from_it() -> None:
+    told = shown({"static": {"spread_rad": {"S1": 0.01, "S2": None}, "still_s": 5.15021}})
+    assert told["static"]["spread_deg"] == {"S1": pytest.approx(0.573, abs=1e-3), "S2": None}
+    assert told["static"]["still_s"] == 5.15
+
+
+def test_the_tables_of_the_holdout_get_the_unit_they_lack() -> None:
+    holdout = {
+        "method": "anchored",
+        "frames": 697,
+        "share": 0.4,
+        "segments": {"thigh": {"anchored": math.radians(2.5), "single": {"S1": math.radians(5)}}},
+        "flexion": {"knee": {"mean": np.float64(math.radians(3))}},
+    }
+    assert shown({"holdout": holdout})["holdout"] == {
+        "method": "anchored",
+        "frames": 697,
+        "share": 0.4,
+        "segments_deg": {"thigh": {"anchored": 2.5, "single": {"S1": 5.0}}},
+        "flexion_deg": {"knee": {"mean": 3.0}},
+    }
+
+
+def test_words_flags_lists_and_what_is_unknown_pass_unchanged() -> None:
+    told = {"alignment": None, "body_parts": ["foot", "shank"], "joints": {"fit": True}}
+    assert shown(told) == told
