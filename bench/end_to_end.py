@@ -199,14 +199,17 @@ def _judged(running: Gateway, data: Path) -> Played:
         if at in truth and abs(at - t_ns) < MATCH_NS and everyone:
             rows.append([*said, *truth[at]])
     calibration = running.calibration()
-    thigh, shank, femur, tibia = np.array(rows).swapaxes(0, 1)
-    said = tuple(
-        rotation.multiply(q, rotation.conjugate(np.array(calibration.segment[name].q_static)))
-        for name, q in zip(SEGMENTS, (thigh, shank), strict=True)
+    columns = np.array(rows).swapaxes(0, 1)
+    femur, tibia = columns[2:]
+    # what turned the bones' frames into the calibration's is constant, and is undone here
+    frames = [np.array(calibration.segment[name].q_static) for name in SEGMENTS]
+    thigh, shank = (
+        rotation.multiply(q, rotation.conjugate(frame))
+        for q, frame in zip(columns[:2], frames, strict=True)
     )
     whole = load(data, "squats1")
     judge = Judge.of(whole.part(slice(0, training_frames(whole))))
-    errors = judge.errors((said[0], said[1]), KneeTrial((femur,) * 4, femur, tibia))
+    errors = judge.errors((thigh, shank), KneeTrial((femur,) * 4, femur, tibia))
     return Played(len(rows), errors, calibration, running.health)
 
 

@@ -95,8 +95,8 @@ def test_the_mean_weighs_sensors_alike_however_bad_one_is() -> None:
     limb = Limb()
     limb.sensors[1] = rot.multiply(limb.sensors[1], rot.exp(np.array([0.3, 0.0, 0.0])))
     said = limb.fit("mean").predict(limb.sensors)
-    apart = [rot.angle_between(said, q) for q in limb.sensors]
-    assert np.allclose(*apart, atol=1e-9)
+    first, second = (rot.angle_between(said, q) for q in limb.sensors)
+    assert np.allclose(first, second, atol=1e-9)
     learned = limb.error(limb.fit("mean"), slice(0, 360))
     assert limb.fit("mean").residual_sd * np.sqrt(3) == pytest.approx(learned)
 
