@@ -171,7 +171,7 @@ def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:
     """Return the mean of a few orientations that lie within 90° of each other, equal weights.
 
     Sum of the quaternions on the first one's side, normalised: for two it is the eigenvector mean
-    exactly (Markley et al. 2007, equal weights), for more it differs in the third order of their distances.
+    (Markley et al. 2007) exactly, for more it differs in the third order of their distances.
     """
     first = orientations[0]
     w, x, y, z = first

@@ -68,8 +68,8 @@ def read_angles(above: Fused, below: Fused, *, sign: float, left: bool) -> Angle
     r"""Return the angles of one joint, or None where a segment's orientation is unknown.
 
     With isotropic errors :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, whose
-    first entry is :math:`1 / \cos^2\theta` times the sum (first-order propagation through the Grood-Suntay rates matrix E): the deviation
-    of flexion. It is None where the axes lock.
+    first entry is :math:`1 / \cos^2\theta` times the sum: the deviation of flexion, to first order
+    (E: rates of Grood and Suntay's angles to angular velocity). It is None where the axes lock.
     """
     if above.q is None or below.q is None or above.sd is None or below.sd is None:
         return None
