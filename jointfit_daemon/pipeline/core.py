@@ -12,7 +12,6 @@ from jointfit_daemon.fusion import LimbFuser, OpticalOrigin
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline.bulletin import Bulletin
 from jointfit_daemon.pipeline.events import (
-    CalibrationStatus,
     CalibrationStored,
     ChunkArrived,
     Configured,
@@ -96,7 +95,7 @@ class Core:
             return self._request(event)
         if isinstance(event, JobFinished):
             return self._job_finished(event)
-        return self._stored(event) if isinstance(event, CalibrationStored) else []
+        return self._session.stored(event) if isinstance(event, CalibrationStored) else []
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -134,22 +133,17 @@ class Core:
         if all(source.kind != "mocap" for source in rig.sources):
             self._mocap_used = self._mocap_idle = 0
         outputs: list[Output] = []
+        session = _session(event)
         if before is not None:
             outputs += self._session.abort(event.t_ns, "the rig was reloaded")
             outputs.append(Notice(event.t_ns, "reload", rig.name, "configuration reloaded"))
+            session.take_over(self._session, same_rig=_worn(before) == _worn(rig))
         if before is None or _frame_layout(before) != _frame_layout(rig):
             self._replace_aligner(rig)
-        self._session = CalibrationSession(
-            rig.chain,
-            rig.calibration,
-            mocap=any(source.kind == "mocap" for source in rig.sources),
-            calibration=event.calibration,
-        )
-        self._session.version = event.calibration_version
+        self._session = session
         self._use_calibration()
         text = "stored calibration loaded" if event.calibration else "no calibration stored yet"
-        outputs.append(self._in_force(event.t_ns, text))
-        return outputs
+        return [*outputs, session.status(event.t_ns, text)]
 
     def _replace_aligner(self, rig: Rig) -> None:
         """Begin a new grid of frames; samples that waited get their verdict, counts go on."""
@@ -176,9 +170,12 @@ class Core:
         state = self._sources.get(event.source)
         if state is None:
             return []
-        if state.counts.opened:  # what the device did while away is unknown: trust nothing old
+        again = state.counts.opened > 0
+        if again:  # what the device did while away is unknown: trust nothing old
             state.clock.feed_restart()
         state.opened()
+        if again and state.source.kind == "imu":
+            return self._session.restarted(event.t_ns, event.source)
         return []
 
     def _closed(self, event: SourceClosed) -> list[Output]:
@@ -226,6 +223,8 @@ class Core:
             return [DeviceInfo(source, state.info)]
         if isinstance(item, DeviceEvent) and item.kind == "restart" and state.source.kind == "imu":
             self._aligner.reset(source)
+            said = self._session.restarted(self._now_ns, source)
+            return [*self._bulletin.add(self._now_ns, source, item), *said]
         return list(self._bulletin.add(self._now_ns, source, item))
 
     def _imu_sample(self, source: str, sample: ImuSample, stamp: Stamp) -> list[Output]:
@@ -301,15 +300,21 @@ class Core:
             self._use_calibration()
         return outputs
 
-    def _stored(self, event: CalibrationStored) -> list[Output]:
-        self._session.version = event.version
-        return [self._in_force(event.t_ns, f"stored as version {event.version}")]
 
-    def _in_force(self, t_ns: int, text: str) -> CalibrationStatus:
-        """Return a status that may stay retained: with the figures of what is in force."""
-        session = self._session
-        quality = {} if session.calibration is None else session.calibration.quality
-        return CalibrationStatus(t_ns, session.phase, text, session.version, quality)
+def _session(event: Configured) -> CalibrationSession:
+    rig = event.rig
+    return CalibrationSession(
+        rig.chain,
+        rig.calibration,
+        mocap=any(source.kind == "mocap" for source in rig.sources),
+        calibration=event.calibration,
+        version=event.calibration_version,
+    )
+
+
+def _worn(rig: Rig) -> tuple[object, ...]:
+    """Return all that a pose or an alignment taken before a reload depends on."""
+    return rig.chain, rig.calibration, rig.sources
 
 
 def _frame_layout(rig: Rig) -> tuple[object, ...]:

@@ -143,11 +143,13 @@ class CalibrationStatus:
 
     t_ns: int
     phase: str
-    """``uncalibrated``, ``align``, ``aligned``, ``static``, ``functional``, ``fitting``,
-    ``calibrated`` or ``aborted``."""
+    """``uncalibrated``, ``align``, ``aligned``, ``static``, ``posed``, ``functional``,
+    ``fitting``, ``calibrated`` or ``aborted``."""
     text: str
     version: int | None = None
+    """Of the calibration in force; None while there is none, or it is not stored (yet)."""
     quality: Mapping[str, object] = field(default_factory=dict)
+    """Figures of what just ended, else of the calibration in force."""
 
 
 @dataclass(frozen=True, slots=True)

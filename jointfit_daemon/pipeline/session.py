@@ -11,10 +11,9 @@ what it wants to be told; it never fits anything itself and never blocks acquisi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.calibration.progress import MovementProgress
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.pipeline.events import (
     CalibrationProgress,
@@ -25,31 +24,25 @@ from jointfit_daemon.pipeline.events import (
     Notice,
     Reply,
 )
-from jointfit_daemon.pipeline.recorder import LONGEST_S, TrialRecorder
-from jointfit_daemon.pipeline.stillness_gate import StillnessGate
+from jointfit_daemon.pipeline.phase import TEXTS, Phase
+from jointfit_daemon.pipeline.recorder import LONGEST_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
-    from jointfit_daemon.pipeline.events import JobFinished, Output, Request
+    from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
 
-_NS = 1_000_000_000
-PROGRESS_NS = 200_000_000  # five a second: what a progress bar can show
-STATIC_PATIENCE_S = 120.0
-"""A pose that is not still within this time is given up, with the reason."""
-
-COLLECTING = ("align", "static", "functional")
+COLLECTING = tuple(TEXTS)
 
 
-@dataclass(slots=True)
-class _Phase:
-    name: str
-    began_ns: int
-    wanted_s: float
-    recorder: TrialRecorder
-    told_ns: int = 0
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    job: int
+    kind: str
+    static: CalibrationTrial | None
+    """The pose to be remembered if the worker accepts it."""
 
 
 class CalibrationSession:
@@ -65,6 +58,8 @@ class CalibrationSession:
         Whether the rig has an optical system; without it only a static calibration is possible.
     calibration : Calibration or None
         What is in force already.
+    version : int or None
+        Under which number the store has it.
     """
 
     def __init__(
@@ -74,19 +69,24 @@ class CalibrationSession:
         *,
         mocap: bool,
         calibration: Calibration | None,
+        version: int | None = None,
     ) -> None:
         self._chain, self._settings, self._mocap = chain, settings, mocap
         self.calibration = calibration
-        self.version: int | None = None
-        self._phase: _Phase | None = None
+        self.version = version
+        """Of the calibration in force; None while it is not stored."""
+        self._phase: Phase | None = None
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
-        self._gate: StillnessGate | None = None
-        self._movement: MovementProgress | None = None
-        self._latest: dict[str, Quaternion] = {}
-        self._job = 0
-        self._running: tuple[int, str] | None = None
+        self._jobs = 0
+        self._fitting: _Fit | None = None
         self._force = False
+
+    def take_over(self, before: CalibrationSession, *, same_rig: bool) -> None:
+        """Go on from the session before a reload: its worlds and pose, if they are still true."""
+        self._jobs = before._jobs  # numbers are never used twice
+        if same_rig:
+            self._alignment, self._static = before._alignment, before._static
 
     @property
     def collecting(self) -> bool:
@@ -95,10 +95,10 @@ class CalibrationSession:
 
     @property
     def phase(self) -> str:
-        """Return the phase by the name that ``CalibrationStatus`` publishes."""
+        """Return what goes on; between phases, whether a calibration is in force."""
         if self._phase is not None:
             return self._phase.name
-        if self._running is not None:
+        if self._fitting is not None:
             return "fitting"
         return "calibrated" if self.calibration is not None else "uncalibrated"
 
@@ -106,53 +106,44 @@ class CalibrationSession:
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> list[Output]:
         """Take one orientation; call only while ``collecting``."""
-        phase = self._phase
-        if phase is None:
-            return []
-        phase.recorder.add_sample(sensor, t_ns, q_world_sensor)
-        self._latest[sensor] = q_world_sensor
-        if self._gate is not None and self._gate.feed(sensor, t_ns, q_world_sensor):
-            return [Notice(t_ns, "calibration", sensor, f"{sensor} moved: standing still again")]
+        if self._phase is not None and self._phase.add_sample(sensor, t_ns, q_world_sensor):
+            text = f"{sensor} moved: the time of standing still begins anew"
+            return [Notice(t_ns, "calibration", sensor, text)]
         return []
 
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
         """Take one camera frame; call only while ``collecting``."""
         if self._phase is not None:
-            self._phase.recorder.add_mocap(t_ns, frame)
+            self._phase.add_mocap(t_ns, frame)
 
     def advance(self, now_ns: int) -> list[Output]:
         """End the phase when it has what it wants; tell progress at most five times a second."""
         phase = self._phase
-        if phase is None or now_ns < phase.told_ns + PROGRESS_NS:
+        if phase is None or not phase.due(now_ns):
             return []
-        phase.told_ns = now_ns
-        done, text, data = self._progress(phase, now_ns)
+        done, text, data = phase.progress(now_ns)
         outputs: list[Output] = [
-            CalibrationProgress(now_ns, phase.name, round(min(done, 1.0), 3), text, data)
+            CalibrationProgress(now_ns, phase.name, round(done, 3), text, data)
         ]
         if done >= 1.0:
-            outputs += self._collected(phase, now_ns)
-        elif phase.name == "static" and now_ns - phase.began_ns > STATIC_PATIENCE_S * _NS:
-            outputs += self._abort(now_ns, f"no {phase.wanted_s:g} s of stillness: {text}")
+            return outputs + self._collected(phase, now_ns)
+        if phase.given_up(now_ns):
+            outputs += self.abort(now_ns, f"no {phase.wanted_s:g} s of stillness: {text}")
         return outputs
 
-    def _progress(self, phase: _Phase, now_ns: int) -> tuple[float, str, dict[str, object]]:
-        elapsed = (now_ns - phase.began_ns) / _NS
-        if phase.name == "static" and self._gate is not None:
-            still = self._gate.still_s(now_ns)
-            return still / phase.wanted_s, self._gate.text(now_ns), {"still_s": round(still, 2)}
-        if phase.name == "functional" and self._movement is not None:
-            self._movement.look(self._latest)
-            errors = self._movement.predicted_center_errors(elapsed)
-            data: dict[str, object] = {
-                "arc_deg": {
-                    joint: round(math.degrees(arc), 1)
-                    for joint, arc in self._movement.arcs().items()
-                },
-                "predicted_center_error_m": errors,
-            }
-            return elapsed / phase.wanted_s, "keep moving", data
-        return elapsed / phase.wanted_s, "keep turning the plate about several axes", {}
+    def restarted(self, t_ns: int, sensor: str) -> list[Output]:
+        """Take it that a sensor was off: the heading of its world may be another from here on."""
+        outputs: list[Output] = []
+        if self._phase is not None and self._phase.name != "static":  # stillness begins anew anyway
+            outputs += self.abort(t_ns, f"{sensor} restarted in the middle: repeat the phase")
+        posed, self._static = self._static is not None, None
+        if posed or self._alignment is not None or self.calibration is not None:
+            text = (
+                f"{sensor} restarted: unless it finds north by itself its heading is another now; "
+                "repeat the static pose, and the align phase before it if there was one"
+            )
+            outputs.append(Notice(t_ns, "calibration", sensor, text, "warning"))
+        return outputs
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -160,18 +151,21 @@ class CalibrationSession:
         """Begin or end a phase; the reply says ``accepted``, the rest is told as it happens."""
         wanted = str(request.arguments.get("phase", ""))
         if wanted == "abort":
-            return [*self._abort(request.t_ns, "asked to"), _reply(request, phase=self.phase)]
+            outputs = self.abort(request.t_ns, "asked to")
+            data = {"phase": self.phase}
+            return [*outputs, Reply(request.command, request.transaction, "ok", data)]
+        wanted_s = _seconds(request.arguments.get("seconds"))
         refusal = self._refusal(wanted)
+        if refusal is None and wanted_s is not None and not 0.0 < wanted_s <= LONGEST_S:
+            refusal = ("seconds", f"expected a number above 0 and up to {LONGEST_S}")
         if refusal is not None:
             key, message = refusal
             error = {"key": key, "message": message}
             return [Reply(request.command, request.transaction, "error", {}, error)]
-        self._force = bool(request.arguments.get("force", False))
-        seconds = request.arguments.get("seconds")
-        wanted_s = self._default_s(wanted) if seconds is None else float(str(seconds))
+        self._force = request.arguments.get("force") is True
         return [
             Reply(request.command, request.transaction, "accepted", {"phase": wanted}),
-            *self._begin(request.t_ns, wanted, wanted_s),
+            *self._begin(request.t_ns, wanted, wanted_s or self._default_s(wanted)),
         ]
 
     def _refusal(self, wanted: str) -> tuple[str, str] | None:
@@ -183,6 +177,8 @@ class CalibrationSession:
             return "phase", f"{wanted!r} needs an optical system: add [mocap] to rig.toml"
         if wanted == "functional" and self._static is None:
             return "phase", "a static pose comes first: send static, stand still, then functional"
+        if wanted == "functional" and self._static is not None and self._static.optical is None:
+            return "phase", "the cameras saw nothing of the static pose: repeat it in their view"
         return None
 
     def _default_s(self, wanted: str) -> float:
@@ -194,99 +190,116 @@ class CalibrationSession:
         }[wanted]
 
     def _begin(self, t_ns: int, name: str, wanted_s: float) -> list[Output]:
-        self._phase = _Phase(name, t_ns, min(wanted_s, LONGEST_S), TrialRecorder(), t_ns)
-        self._latest = {}
-        sensors = [sensor for group in self._chain.sensors for sensor in group]
-        self._gate = StillnessGate(sensors, t_ns) if name == "static" else None
-        self._movement = MovementProgress(self._chain) if name == "functional" else None
-        text = {
-            "align": "turn the plate with all sensors by hand, about several axes",
-            "static": "stand still and upright, facing one way, joints straight",
-            "functional": "move every joint through its range: walk, squat, circle",
-        }[name]
-        return [CalibrationStatus(t_ns, name, f"{text}, {wanted_s:g} s", self.version)]
+        self._phase = Phase(name, self._chain, t_ns, min(wanted_s, LONGEST_S))
+        return [self._tell(t_ns, name, f"{TEXTS[name]}, {self._phase.wanted_s:g} s")]
 
     # --- phases end --------------------------------------------------------------------------
 
-    def _collected(self, phase: _Phase, now_ns: int) -> list[Output]:
-        self._phase, gate, self._gate = None, self._gate, None
-        payload: dict[str, object] = {"chain": self._chain, "settings": self._settings}
+    def _collected(self, phase: Phase, now_ns: int) -> list[Output]:
+        self._phase = None
+        trial, settings = phase.trial(now_ns), self._settings
+        payload: dict[str, object] = {"chain": self._chain}
         if phase.name == "align":
-            payload["trial"] = phase.recorder.trial()
-            return self._fit(now_ns, "align", payload)
-        stored = None if self.calibration is None else self.calibration.to_dict()
-        payload |= {"alignment": self._alignment, "previous": stored}
-        if phase.name == "static":
-            start_ns = gate.still_since_ns if gate is not None else None
-            payload["static"] = phase.recorder.trial(start_ns, now_ns)
-            self._static = phase.recorder.trial(start_ns, now_ns)
-            return self._fit(now_ns, "static", payload)
-        payload |= {"static": self._static, "functional": phase.recorder.trial()}
-        return self._fit(now_ns, "functional", payload)
-
-    def _fit(self, now_ns: int, kind: str, payload: Mapping[str, object]) -> list[Output]:
-        self._job += 1
-        self._running = (self._job, kind)
+            payload["trial"] = trial
+        else:
+            stored = None if self.calibration is None else self.calibration.to_dict()
+            payload |= {"alignment": self._alignment, "previous": stored, phase.name: trial}
+        if phase.name == "static":  # a pose is as long as was asked for, not as rig.toml has it
+            settings = replace(settings, static_s=phase.wanted_s)
+        elif phase.name == "functional":
+            payload["static"] = self._static
+        payload["settings"] = settings
+        self._jobs += 1
+        self._fitting = _Fit(self._jobs, phase.name, trial if phase.name == "static" else None)
+        outputs: list[Output] = []
+        if phase.overflowed:
+            text = f"{phase.overflowed} measurements found no room: ask for a shorter phase"
+            outputs.append(Notice(now_ns, "calibration", phase.name, text, "warning"))
         return [
-            CalibrationStatus(now_ns, "fitting", f"fitting the {kind} trial", self.version),
-            FitJob(self._job, kind, payload),
+            *outputs,
+            self._tell(now_ns, "fitting", f"fitting the {phase.name} trial"),
+            FitJob(self._jobs, phase.name, payload),
         ]
 
     def job_finished(self, event: JobFinished) -> list[Output]:
         """Take what the worker made of the last phase. Results of cancelled jobs are ignored."""
-        if self._running is None or event.job != self._running[0]:
+        fit = self._fitting
+        if fit is None or event.job != fit.job:
             return []
-        kind, self._running = self._running[1], None
-        if event.error is not None or event.result is None:
-            return self._failed(event.t_ns, f"{kind}: {event.error or 'no result'}")
-        if (refused := event.result.get("refused")) is not None:
-            return self._failed(event.t_ns, f"{kind}: {refused}")
-        return self._finished(event.t_ns, kind, dict(event.result))
+        self._fitting = None
+        result = event.result or {}
+        failure = event.error or result.get("refused") or (None if result else "no result")
+        if fit.kind == "static":
+            self._static = fit.static if failure is None else None
+        if failure is not None:
+            text = f"{fit.kind}: {failure}"
+            return [
+                Notice(event.t_ns, "calibration", "fit", text, "warning"),
+                self._tell(event.t_ns, "aborted", text),
+            ]
+        return self._finished(event.t_ns, fit.kind, dict(result))
 
     def _finished(self, t_ns: int, kind: str, result: dict[str, Any]) -> list[Output]:
         quality = result.get("quality", {})
         if kind == "align":
             self._alignment = result["alignment"]
-            return [CalibrationStatus(t_ns, "aligned", "worlds aligned", self.version, quality)]
+            said = self._tell(t_ns, "aligned", "worlds aligned", quality)
+            return [*_notes(t_ns, kind, result["alignment"].get("notes", ())), said]
         if "calibration" not in result:
-            return [CalibrationStatus(t_ns, "posed", "static pose taken", self.version, quality)]
+            return [self._tell(t_ns, "posed", "static pose taken", quality)]
         keep = result.get("worse")
         if keep is not None and not self._force:
             text = f"the stored calibration stays, the new one is worse: {keep}; force overrides"
+            data = {"quality": quality}
             return [
-                Notice(t_ns, "calibration", kind, text, "warning", {"quality": quality}),
-                CalibrationStatus(t_ns, self.phase, text, self.version, quality),
+                Notice(t_ns, "calibration", kind, text, "warning", data),
+                self._tell(t_ns, self.phase, text),
             ]
-        self.calibration = Calibration.from_dict(result["calibration"])
+        self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
         phase = "posed" if kind == "static" else "calibrated"
         text = "static pose taken: sensors re-seated" if kind == "static" else "calibrated"
         return [
+            *(_notes(t_ns, kind, self.calibration.notes) if kind == "functional" else ()),
             CalibrationReady(self.calibration),
-            CalibrationStatus(t_ns, phase, text, self.version, quality),
+            self._tell(t_ns, phase, text, quality),
         ]
 
-    def _failed(self, t_ns: int, text: str) -> list[Output]:
-        if text.startswith("static"):
-            self._static = None
-        return [
-            Notice(t_ns, "calibration", "fit", text, "warning"),
-            CalibrationStatus(t_ns, "aborted", text, self.version),
-        ]
+    def stored(self, event: CalibrationStored) -> list[Output]:
+        """Take the number of the calibration in force; what goes on meanwhile goes on."""
+        self.version = event.version
+        return [self.status(event.t_ns, f"stored as version {event.version}")]
 
-    def _abort(self, t_ns: int, why: str) -> list[Output]:
-        outputs: list[Output] = []
-        if self._running is not None:
-            outputs.append(CancelJob(self._running[0]))
-        ended = self._phase is not None or self._running is not None
-        self._phase = self._running = self._gate = self._movement = None
-        if ended:
-            outputs.append(CalibrationStatus(t_ns, "aborted", why, self.version))
-        return outputs
+    def status(self, t_ns: int, text: str) -> CalibrationStatus:
+        """Return what is to be told of the session as it stands."""
+        return self._tell(t_ns, self.phase, text)
 
     def abort(self, t_ns: int, why: str) -> list[Output]:
-        """End whatever runs: a reload changed the rig under it."""
-        return self._abort(t_ns, why)
+        """End whatever runs."""
+        if self._phase is None and self._fitting is None:
+            return []
+        outputs: list[Output] = []
+        if self._fitting is not None:
+            outputs.append(CancelJob(self._fitting.job))
+        self._phase = self._fitting = None
+        return [*outputs, self._tell(t_ns, "aborted", why)]
+
+    def _tell(
+        self, t_ns: int, phase: str, text: str, quality: Mapping[str, object] | None = None
+    ) -> CalibrationStatus:
+        """Return a status with the given figures, else with those of the calibration in force."""
+        if quality is None:
+            quality = {} if self.calibration is None else self.calibration.quality
+        return CalibrationStatus(t_ns, phase, text, self.version, quality)
 
 
-def _reply(request: Request, **data: object) -> Reply:
-    return Reply(request.command, request.transaction, "ok", data)
+def _seconds(value: object) -> float | None:
+    """Return a number of seconds as it was asked for; NaN for what is none."""
+    if value is None:
+        return None
+    usable = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(str(value)) if usable else math.nan
+
+
+def _notes(t_ns: int, kind: str, notes: tuple[str, ...] | list[str]) -> list[Output]:
+    """Return what the wearer should know besides the figures."""
+    return [Notice(t_ns, "calibration", kind, note, "warning") for note in notes]

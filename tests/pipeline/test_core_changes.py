@@ -17,6 +17,7 @@ from jointfit_daemon.pipeline.events import (
     DeviceStatus,
     FitJob,
     JobFinished,
+    Notice,
     Request,
     SourceClosed,
     SourceOpened,
@@ -163,6 +164,19 @@ def test_limbs_of_any_shape_are_calibrated_by_standing_still(worn: dict[str, str
     ]
     assert len(state.joints) == len(state.segments) + 1
     accounted(bench)
+
+
+def test_a_sensor_that_comes_back_is_said_to_need_a_new_pose() -> None:
+    bench, _ = calibrated_by_standing(shaped({"S1": "thigh", "S3": "shank"}))
+    told = len(bench.out)
+    bench.feed([SourceClosed(at(721), "S3", "lost", "unplugged"), SourceOpened(at(722), "S3")])
+    (notice,) = [
+        output
+        for output in bench.out[told:]
+        if isinstance(output, Notice) and output.kind == "calibration"
+    ]
+    assert notice.id == "S3"
+    assert "static" in notice.text
 
 
 @pytest.mark.parametrize(("params", "mode"), [(0, "imu+mocap"), (4, "imu")])
