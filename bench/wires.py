@@ -58,6 +58,7 @@ def xcdi_frames(
                 (ids.group_counter, xcdi.DataId.GROUP_COUNTER, (k & 0xFFFF,)),
                 (ids.quaternion, xcdi.DataId.QUATERNION, xcdi.quaternion_counts(q)),
             )
+            if can_id is not None
         ]
         for k, q in enumerate(orientations)
     ]
