@@ -17,6 +17,7 @@ this file moves them.
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import math
 import signal
@@ -33,7 +34,6 @@ from jointfit_daemon.outputs.reporter import Reporter
 from jointfit_daemon.pipeline.core import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
-    CalibrationStored,
     CancelJob,
     Configured,
     DeviceStatus,
@@ -48,6 +48,7 @@ from jointfit_daemon.supervisor.last_resort import leave_within
 from jointfit_daemon.supervisor.process import ProcessWatch
 from jointfit_daemon.supervisor.requests import reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
+from jointfit_daemon.supervisor.storing import StoreRunner
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
 from jointfit_daemon.supervisor.watchdog import Progress
 
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.pipeline.events import Output
@@ -100,6 +100,7 @@ class Daemon:
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._fits: FitRunner
+        self._stores: StoreRunner
         self._mqtt: asyncio.Task[None]
         self._use_broker(rig)
 
@@ -144,6 +145,9 @@ class Daemon:
     async def _start(self, tasks: asyncio.TaskGroup) -> None:
         self._sources = SourceTasks(tasks, self._heart.feed)
         self._fits = FitRunner(tasks, self._heart.feed)
+        self._stores = StoreRunner(
+            tasks, self._heart.feed, lambda text: self._tell("calibration", text, "error")
+        )
         self._open_log(tasks)
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
         self._configure(self._rig)
@@ -151,6 +155,7 @@ class Daemon:
         tasks.create_task(self._look_after(), name="health")
         tasks.create_task(self._reload_when_asked(), name="reload")
         await self._sources.apply(self._rig.sources)
+        gc.freeze()  # what a start made stays: going through it all again takes milliseconds
         self._systemd.ready()
         log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
 
@@ -185,7 +190,7 @@ class Daemon:
             case CancelJob():
                 self._fits.cancel()
             case CalibrationReady(calibration):
-                self._tasks.create_task(self._store(calibration), name="store")
+                self._stores.start(self._rig, calibration)
             case Reply():
                 self._answer(output)
             case Notice():
@@ -197,14 +202,6 @@ class Daemon:
     def _came_or_went(self, status: DeviceStatus) -> None:
         (self._online.add if status.online else self._online.discard)(status.id)
         self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
-
-    async def _store(self, calibration: Calibration) -> None:
-        try:
-            version = await asyncio.to_thread(calibrations.save, self._rig, calibration)
-        except OSError as fault:
-            self._tell("calibration", f"in force but not stored: {fault}", "error")
-            return
-        self._heart.feed(CalibrationStored(time.monotonic_ns(), version))
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -266,7 +263,7 @@ class Daemon:
     # --- configuration -----------------------------------------------------------------------
 
     def _configure(self, rig: Rig) -> None:
-        found = calibrations.stored(rig)
+        found = self._stores.found(rig)
         for complaint in found.complaints:
             self._tell("calibration", complaint, "warning")
         now_ns = time.monotonic_ns()
@@ -295,6 +292,7 @@ class Daemon:
         if before.mqtt != rig.mqtt:
             await self._move_to_broker(before, rig)
         self._online &= {source.id for source in rig.sources}
+        await self._stores.settle()  # else the store would not have what is in force
         self._configure(rig)
         await self._sources.apply(rig.sources)
         log.info("%s: reloaded, %d sources", rig.name, len(rig.sources))

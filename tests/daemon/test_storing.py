@@ -1,0 +1,132 @@
+"""Writing calibrations: in turn, off the loop, and never at odds with what a reload finds."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.pipeline.events import CalibrationReady, CalibrationStored, Configured, Request
+from jointfit_daemon.supervisor import calibrations
+from jointfit_daemon.supervisor.daemon import Daemon
+from jointfit_daemon.supervisor.storing import StoreRunner
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Event, Output
+
+
+@pytest.fixture
+def rig(table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    return parse_rig(table)
+
+
+def calibration_of(rig: Rig, note: str = "") -> Calibration:
+    chain = rig.chain
+    return Calibration(
+        "mean", chain.joints, chain.segments, chain.sensors, {}, {}, {}, notes=(note,)
+    )
+
+
+class SlowDisk:
+    """Writes when it is told to go on; counts who writes at the same time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go = threading.Event()
+        self.writing = self.most = 0
+        self._save = calibrations.save
+        monkeypatch.setattr(calibrations, "save", self.save)
+
+    def save(self, rig: Rig, calibration: Calibration) -> int:
+        self.writing += 1
+        self.most = max(self.most, self.writing)
+        self.go.wait(5)
+        version = self._save(rig, calibration)
+        self.writing -= 1
+        return version
+
+
+async def test_two_calibrations_are_written_one_after_the_other(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = SlowDisk(monkeypatch)
+    events: list[Event] = []
+    complaints: list[str] = []
+    async with asyncio.TaskGroup() as tasks:
+        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner.start(rig, calibration_of(rig, "first"))
+        runner.start(rig, calibration_of(rig, "second"))
+        await asyncio.sleep(0.05)
+        disk.go.set()
+        await runner.settle()
+    assert disk.most == 1
+    assert complaints == []
+    assert [event.version for event in events if isinstance(event, CalibrationStored)] == [1, 2]
+    found = runner.found(rig).calibration
+    assert found is not None
+    assert found.notes == ("second",)
+
+
+async def test_what_could_not_be_written_stays_in_force_over_a_reload(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> int:
+        raise OSError("no space left")
+
+    calibrations.save(rig, calibration_of(rig, "old"))
+    monkeypatch.setattr(calibrations, "save", full)
+    complaints: list[str] = []
+    events: list[Event] = []
+    async with asyncio.TaskGroup() as tasks:
+        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner.start(rig, calibration_of(rig, "new"))
+    assert "no space left" in complaints[0]
+    assert events == []
+    found = runner.found(rig)
+    assert found.calibration == calibration_of(rig, "new")
+    assert found.version is None
+    assert "not stored" in found.complaints[0]
+
+
+class ReadyCore:
+    """Hands out a calibration when asked, and keeps what it is configured with."""
+
+    next_deadline_ns = None
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.events: list[Event] = []
+
+    def feed(self, event: Event) -> list[Output]:
+        self.events.append(event)
+        return [CalibrationReady(self.calibration)] if isinstance(event, Request) else []
+
+    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
+        return {"devices": {}, "frames": {}}
+
+
+async def test_a_reload_while_a_calibration_is_written_finds_it(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    disk, core = SlowDisk(monkeypatch), ReadyCore(calibration_of(rig, "new"))
+    daemon = Daemon(tmp_path / "rig.toml", rig, core)
+    running = asyncio.create_task(daemon.run())
+    async with asyncio.timeout(8):
+        while not core.events:
+            await asyncio.sleep(0.01)
+        daemon._heart.feed(Request(1, "calibrate", "t", {}))
+        reload = asyncio.create_task(daemon._change_to(rig))
+        await asyncio.sleep(0.2)
+        disk.go.set()
+        await reload
+    running.cancel()
+    await asyncio.wait([running])
+    configured = [event for event in core.events if isinstance(event, Configured)]
+    assert configured[-1].calibration is not None
+    assert configured[-1].calibration_version == 1
