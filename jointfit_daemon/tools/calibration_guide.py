@@ -6,18 +6,15 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-ENDS = {
-    "align": {"aligned"},
-    "static": {"posed"},
-    "functional": {"calibrated"},
-}
-"""Status that ends each phase well; ``aborted`` ends any of them otherwise."""
+STORING_S = 1.5
+"""A result is written to the store within this time, or it never will be."""
 
 
 class PhaseAborted(Exception):  # noqa: N818 - named for what happened
@@ -37,6 +34,7 @@ class CalibrationWatch:
     status: Mapping[str, Any] = field(default_factory=dict)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
     _seen: list[Mapping[str, Any]] = field(default_factory=list)
+    _lost: Exception | None = None
 
     def on_status(self, payload: Mapping[str, Any]) -> None:
         """Take a message of topic ``calibration``."""
@@ -49,25 +47,52 @@ class CalibrationWatch:
         done = payload.get("progress") or 0.0
         self.show(str(payload.get("phase", "")), float(done), str(payload.get("text", "")))
 
+    def lose(self, why: Exception) -> None:
+        """Take that nothing more will come; who waits gets `why`."""
+        self._lost = why
+        self._changed.set()
+
     def begin(self) -> None:
-        """Forget what was said before: a retained status is not an answer."""
+        """Forget what was said before."""
         self._seen.clear()
         self._changed.clear()
 
     async def ended(self, phase: str) -> Mapping[str, Any]:
-        """Wait until `phase` ends; return the status that ended it.
+        """Wait until `phase` began and ended; return the status that ended it.
+
+        A retained status of earlier may come late: nothing counts before `phase` itself was told.
 
         Raises
         ------
         PhaseAborted
             The daemon gave up; the reason is its text.
         """
+        began = False
         while True:
             for status in self._seen:
-                if status.get("phase") in ENDS[phase]:
-                    return status
-                if status.get("phase") == "aborted":
+                told = status.get("phase")
+                if told == phase:
+                    began = True
+                elif began and told == "aborted":
                     raise PhaseAborted(str(status.get("text", "no reason given")))
+                elif began and told != "fitting":
+                    return status
             self._seen.clear()
-            self._changed.clear()
-            await self._changed.wait()
+            await self._news()
+
+    async def stored(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the status that names the version in the store; `ended` if none was written."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(STORING_S):
+                while self.status.get("version") == ended.get("version"):
+                    await self._news()
+                return self.status
+        return ended
+
+    async def _news(self) -> None:
+        if self._lost is not None:
+            raise self._lost
+        self._changed.clear()
+        await self._changed.wait()
+        if self._lost is not None:
+            raise self._lost

@@ -1,0 +1,88 @@
+"""Leading a calibration: what counts as an answer, what does not, and what is told at the end."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from jointfit_daemon.tools import calibration_guide
+from jointfit_daemon.tools.calibration_guide import CalibrationWatch, PhaseAborted
+from jointfit_daemon.tools.calibration_report import report
+
+
+def watch(*phases: str) -> CalibrationWatch:
+    one = CalibrationWatch(lambda *_: None)
+    one.begin()
+    for phase in phases:
+        one.on_status({"phase": phase, "text": f"it is {phase}", "version": 1})
+    return one
+
+
+async def test_a_retained_status_of_earlier_is_not_the_answer() -> None:
+    one = watch("calibrated")
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.05):
+            await one.ended("functional")
+
+
+@pytest.mark.parametrize(
+    ("phase", "end"),
+    [("align", "aligned"), ("static", "posed"), ("static", "calibrated"),
+     ("functional", "calibrated"), ("functional", "uncalibrated")],
+)  # fmt: skip
+async def test_whatever_follows_the_phase_and_its_fit_ends_it(phase: str, end: str) -> None:
+    ended = await watch("aborted", phase, "fitting", end).ended(phase)
+    assert ended["phase"] == end
+
+
+async def test_an_aborted_phase_is_told_with_its_reason() -> None:
+    with pytest.raises(PhaseAborted, match="it is aborted"):
+        await watch("static", "aborted").ended("static")
+
+
+async def test_who_waits_is_told_that_the_daemon_is_gone() -> None:
+    one = watch("static")
+    asyncio.get_running_loop().call_later(0.01, one.lose, PhaseAborted("gone"))
+    with pytest.raises(PhaseAborted, match="gone"):
+        await one.ended("static")
+
+
+async def test_the_version_of_the_store_is_waited_for_but_not_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(calibration_guide, "STORING_S", 0.05)
+    one = watch("functional", "fitting", "calibrated")
+    ended = await one.ended("functional")
+    assert await one.stored(ended) is ended
+    stored = {"phase": "calibrated", "text": "stored as version 2", "version": 2}
+    asyncio.get_running_loop().call_later(0.01, one.on_status, stored)
+    assert (await one.stored(ended))["version"] == 2
+
+
+def test_the_report_names_errors_centers_and_a_missing_align_phase() -> None:
+    lines = report(
+        {
+            "alignment": None,
+            "holdout": {
+                "method": "anchored",
+                "segments_deg": {"thigh": {"anchored": 2.11, "mean": 4.06}},
+                "flexion_deg": {"knee": {"anchored": None}},
+            },
+            "anatomy": {
+                "joints": {"knee": {"source": "fit", "sd_m": 0.024}},
+                "lengths_m": {"thigh": 0.41, "shank": None},
+            },
+        }
+    )
+    assert lines == [
+        "thigh: orientation error 2.1°; the mean of the sensors has 4.1°",
+        "knee: flexion error unknown",
+        "knee: center by fit, sd 24 mm",
+        "thigh: 0.410 m long",
+        "no align phase: headings come from the static pose",
+    ]
+
+
+def test_nothing_known_is_nothing_told() -> None:
+    assert report({}) == []
