@@ -86,6 +86,8 @@ class FrameAligner:
         self._active = active
         self._next: int | None = None  # number of the next frame; None until a stream begins
         self._completed_ns = 0
+        self._deadline_ns: int | None = None
+        self._changed = True  # since `_deadline_ns` was worked out
         self.emitted_frames = 0
         self.skipped_frames = 0
         """Frames never emitted because no stream had anything near them."""
@@ -122,6 +124,7 @@ class FrameAligner:
         stream = self._streams[name]
         if not self._active:
             return stream.idle()
+        self._changed = True
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
         return stream.push(t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns)
 
@@ -134,20 +137,17 @@ class FrameAligner:
     @property
     def next_deadline_ns(self) -> int | None:
         """Return when ``advance`` will emit a frame if no sample comes; None: only samples can."""
-        if not self._active or not self._begin():
-            return None
-        return self._due()
+        if self._changed:
+            self._deadline_ns = self._due() if self._active and self._begin() else None
+            self._changed = False
+        return self._deadline_ns
 
     def advance(self, now_ns: int) -> list[AlignedFrame]:
         """Return the frames due at `now_ns`, in order."""
         frames: list[AlignedFrame] = []
-        if not self._active:
-            return frames
-        while self._begin():
-            due_ns = self._due()
-            if due_ns > now_ns:
-                break
+        while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
             frame = self._emit(due_ns)
+            self._changed = True
             if frame is not None:
                 frames.append(frame)
         return frames
@@ -230,17 +230,20 @@ class FrameAligner:
     def active(self, wanted: bool) -> None:
         if self._active and not wanted:
             self.close()
-        self._active = wanted
+        self._active, self._changed = wanted, True
 
     def lose(self, name: str) -> None:
         """Take it that the stream has ended: do not wait for it until it returns."""
         self._streams[name].lose()
+        self._changed = True
 
     def reset(self, name: str) -> None:
         """Forget the samples of a stream whose clock began anew."""
         self._streams[name].reset()
+        self._changed = True
 
     def close(self) -> None:
         """Give every pending sample its verdict; the next sample begins anew."""
         for _, stream in self._items:
             stream.reset()
+        self._changed = True
