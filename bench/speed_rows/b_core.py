@@ -54,13 +54,14 @@ def clock_rows(quick: bool) -> list[Row]:
 
 
 def align_rows(quick: bool) -> list[Row]:
-    """Four streams at 400 Hz to frames at 100 Hz, every sample pushed and asked after."""
+    """Four streams at 400 Hz to frames at 100 Hz, time looked at after each, as in the core."""
     period_ns, seconds = 2_500_000, 2
     n = seconds * NS // period_ns
     orientations = walking("S1", NS / period_ns, seconds)
 
     def work() -> Callable[[], object]:
         aligner = FrameAligner({s: StreamSpec(period_ns) for s in SENSORS}, 10_000_000)
+        deadlines: list[int | None] = []
 
         def run() -> None:
             for k, q in enumerate(orientations):
@@ -68,6 +69,7 @@ def align_rows(quick: bool) -> list[Row]:
                     t_ns = START_NS + k * period_ns + number * 300_000
                     aligner.push(sensor, t_ns, t_ns + 2_000_000, q)
                     aligner.advance(t_ns + 2_000_000)
+                    deadlines.append(aligner.next_deadline_ns)
 
         return run
 
