@@ -103,7 +103,7 @@ def describe(rig: Rig) -> str:
 
 
 def _run(config: Path, rig: Rig) -> int:
-    from jointfit_daemon.supervisor import run_daemon
+    from jointfit_daemon.supervisor.daemon import run_daemon
     from jointfit_daemon.supervisor.last_resort import leave_within
 
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon takes it: no reload yet

@@ -1,5 +1,4 @@
-"""The async shell: start, retry, stop, reload, tell systemd. Law: moves events, decides nothing."""
+"""The async shell: start, retry, stop, reload, tell systemd. Law: moves events, decides nothing.
 
-from jointfit_daemon.supervisor.daemon import run_daemon
-
-__all__ = ["run_daemon"]
+Nothing is imported here: the worker process lives in this package and needs none of the shell.
+"""
