@@ -91,8 +91,9 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
     means = {s: robust_mean(trial.sensors[s].q_world_sensor) for s in heard}
     spans = [_span_s(trial.sensors[s].t_ns) for s in heard]
     still_s = min(spans, default=0.0)
-    # a rig may ask for a shorter pose than the usual three seconds, never get less than it asked
-    limits = StaticLimits(still_s=min(StaticLimits().still_s, 0.9 * settings.static_s))
+    # A rig may ask for a shorter pose than the usual three seconds. A tenth less is enough: the
+    # samples of a pose span less than the pose, by their period and the way they come.
+    limits = StaticLimits(still_s=0.9 * min(StaticLimits().still_s, settings.static_s))
     if heard:
         reasons += static_problems(means, still_s, limits)
     clusters: dict[str, Cluster] = {}
@@ -182,16 +183,23 @@ def _plain_means(sensors: tuple[str, ...]) -> dict[str, SegmentModel]:
     }
 
 
-def with_new_static(calibration: Calibration, pose: StaticPose) -> Calibration:
+def with_new_static(
+    calibration: Calibration, pose: StaticPose, alignment: Alignment | None = None
+) -> Calibration:
     """Return the calibration after sensors were put on anew: only the biases change.
 
     Where cameras see a segment's markers in their old places on the body, they say how it stands
     now; else it is taken to stand as in the old pose, facing the same way (`same_pose_assumed`).
 
+    Parameters
+    ----------
+    alignment : Alignment, optional
+        Newer than the calibration: gives the worlds, and the lags it has found.
+
     Raises
     ------
     CalibrationRefused
-        The pose lacks a calibrated sensor, or markers were moved.
+        The pose or the alignment lacks a calibrated sensor, or markers were moved.
     """
     if missing := [name for name in calibration.sensor if name not in pose.sensors]:
         raise CalibrationRefused(
@@ -209,15 +217,18 @@ def with_new_static(calibration: Calibration, pose: StaticPose) -> Calibration:
         for n, g in zip(calibration.segments, calibration.chain_sensors, strict=True)
         for s in g
     }
-    sensors = {
-        name: sensor_calibration(
-            pose.sensors[name], old.q_optical_world, q_now[owner[name]], old.lag_ns
-        )
-        for name, old in calibration.sensor.items()
-    }
+    sensors = {}
+    for name, old in calibration.sensor.items():
+        world, lag_ns = old.q_optical_world, old.lag_ns
+        if alignment is not None:
+            world, found_ns = alignment.world(name), alignment.sensors[name].lag_ns
+            lag_ns = lag_ns if found_ns is None else found_ns
+        sensors[name] = sensor_calibration(pose.sensors[name], world, q_now[owner[name]], lag_ns)
     flags = [flag for flag in calibration.flags if flag != "same_pose_assumed"]
     flags += ["same_pose_assumed"] if assumed else []
     quality = {**calibration.quality, "static": pose.quality}
+    if alignment is not None:
+        quality["alignment"] = alignment.quality
     return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.static import (
     RobustMean,
     StaticLimits,
@@ -13,7 +14,10 @@ from jointfit_daemon.calibration.static import (
     static_bias,
     static_problems,
 )
+from jointfit_daemon.calibration.static_pose import fit_static
+from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial, SensorTrack
 from jointfit_daemon.kinematics import rotation as rot
+from jointfit_daemon.model import Chain
 
 DEG = np.deg2rad(1.0)
 
@@ -81,3 +85,14 @@ def test_a_sensor_that_slipped_is_told_from_a_pose_that_changed() -> None:
     slipped = {**posture, "S2": rot.multiply(posture["S2"], rot.exp([0.0, 0.0, 4 * DEG]))}
     (problem,) = redonning_problems(before, slipped, segments)
     assert "S1 and S2 differ by 4.0 deg" in problem
+
+
+def test_a_pose_held_for_three_seconds_is_three_seconds_though_its_samples_span_less() -> None:
+    t_ns = np.arange(299, dtype=np.int64) * 10_000_000
+    track = SensorTrack(t_ns, np.tile(rot.IDENTITY, (len(t_ns), 1)))
+    chain = Chain(("hip", "knee"), ("thigh",), (("S1",),))
+    settings = CalibrationSettings(static_s=5.0)
+    assert fit_static(CalibrationTrial({"S1": track}, None), settings, chain).still_s < 3.0
+    half = SensorTrack(t_ns[:150], track.q_world_sensor[:150])
+    with pytest.raises(CalibrationRefused, match="stand still for longer"):
+        fit_static(CalibrationTrial({"S1": half}, None), settings, chain)
