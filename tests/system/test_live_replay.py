@@ -66,6 +66,7 @@ async def test_a_run_with_calibration_reconnect_and_reload_replays_byte_for_byte
         assert listener.latest["bridge/health"]["recording"]["failure"] is None
         code, _ = await stopped(daemon)
         assert code == 0, station.log
+    assert "the worker said" not in station.log  # fits print nothing
     (log,) = (tmp_path / "state" / "recordings").iterdir()
     events = list(read_events(log))
     assert len([e for e in events if isinstance(e, Configured)]) == 2
