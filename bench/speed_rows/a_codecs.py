@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import statistics
+import struct
+import termios
 import time
 import tty
 from typing import TYPE_CHECKING, Any
@@ -133,8 +136,16 @@ class Line:
         self._bytes = b"".join(wires.slcan_lines(groups))
 
     def send(self) -> None:
-        """Put `BATCH` frames on the line."""
+        """Put `BATCH` frames on the line and wait until all of them can be read."""
         assert os.write(self._far, self._bytes) == len(self._bytes)
+        until = time.monotonic() + 5.0
+        while self._waiting() < len(self._bytes):
+            assert time.monotonic() < until
+            time.sleep(0.001)
+
+    def _waiting(self) -> int:
+        (count,) = struct.unpack("i", fcntl.ioctl(self.near, termios.FIONREAD, bytes(4)))
+        return int(count)
 
     def close(self) -> None:
         os.close(self._far)
