@@ -65,7 +65,20 @@ def _previous(payload: Mapping[str, Any]) -> Any:
     return calibration if calibration.fits(payload["chain"]) else None
 
 
+def _newer_worlds(payload: Mapping[str, Any], previous: Calibration) -> Alignment | None:
+    """Return the alignment of this session, if the models of `previous` live in such worlds."""
+    if payload.get("alignment") is None or "headings_from_static" in previous.flags:
+        return None
+    return Alignment.from_dict(payload["alignment"])
+
+
 def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
+    heard = payload["trial"].sensors
+    missing = [s for group in payload["chain"].sensors for s in group if s not in heard]
+    if missing:  # later phases would have to refuse what this one let pass
+        raise CalibrationRefused(
+            *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
+        )
     found = fit_alignment(payload["trial"], payload["settings"])
     return {"alignment": found.to_dict(), "quality": found.quality}
 
@@ -76,7 +89,7 @@ def _static(payload: Mapping[str, Any]) -> dict[str, Any]:
     result: dict[str, Any] = {"quality": pose.quality}
     previous, markers = _previous(payload), bool(settings.markers or settings.rigid_bodies)
     if previous is not None:
-        calibration = with_new_static(previous, pose)
+        calibration = with_new_static(previous, pose, _newer_worlds(payload, previous))
     elif not markers:  # no cameras: a static pose is all there will ever be
         calibration = fit_static_only(pose, _alignment(payload), chain, software=__version__)
     else:
