@@ -42,6 +42,8 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from jointfit_daemon.driver import driver_names
+
     table = Table(title=f"{config}: rig {rig.name!r} is right", title_justify="left")
     for column in ("source", "driver", "on", "rate"):
         table.add_column(column)
@@ -54,3 +56,4 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
             f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
             f"{rig.calibration_store!r} by {rig.calibration.method}"
         )
+        console.print(f"drivers installed: {', '.join(driver_names())}")

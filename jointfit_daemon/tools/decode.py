@@ -12,7 +12,7 @@ import typer
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from jointfit_daemon.driver import Decoder, Driver
     from jointfit_daemon.model import Decoded
@@ -57,7 +57,7 @@ class Summary:
 
 
 def decode(
-    protocol: Annotated[str, typer.Argument(help="Driver name, as `jointfit check` lists them.")],
+    protocol: Annotated[str, typer.Argument(help="Driver name: xbus, xcdi, natnet, or yours.")],
     file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or a `candump -L` log.")],
     *,
     jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object a decoded item.")] = False,
@@ -77,7 +77,8 @@ def decode(
         decoder = driver(_settings(driver, protocol, setting or [])).decoder()
         chunks = read_capture(file, driver.wire)
     except (UnknownDriver, OSError, ValueError) as fault:
-        typer.echo(f"jointfit decode: {fault}", err=True)
+        why = f"{file}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
+        typer.echo(f"jointfit decode: {why}", err=True)
         raise typer.Exit(MISUSE) from None
     counts = Summary()
     for item in _items(decoder, chunks):
@@ -91,10 +92,31 @@ def decode(
     if summary:
         typer.echo(orjson.dumps(found))
     else:
-        for key, value in found.items():
-            typer.echo(f"{key:18} {value}")
-        for text in dict.fromkeys(counts.warnings):
-            typer.echo(f"warning: {text}", err=True)
+        _print_table(found, counts.warnings)
+
+
+def _print_table(found: Mapping[str, object], warnings: list[str]) -> None:
+    for key, value in found.items():
+        typer.echo(f"{key:18} {_cell(value)}")
+    if remark := _remark(found):
+        typer.echo(remark, err=True)
+    for text in dict.fromkeys(warnings):
+        typer.echo(f"warning: {text}", err=True)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, tuple):
+        return "  ".join(f"{part:.6f}" for part in value)
+    return "-" if value is None else str(value)
+
+
+def _remark(found: Mapping[str, object]) -> str | None:
+    """Return what a table of zeros means."""
+    if not found["messages"]:
+        return "nothing in the file is of this protocol, or the file is empty"
+    if not found["quaternions"]:
+        return "no message holds an orientation: the device was not set to send quaternions"
+    return None
 
 
 def _items(decoder: Decoder, chunks: Any) -> Iterator[Decoded]:
@@ -121,6 +143,10 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
     """Return settings for a decoder alone: what only opening needs gets a placeholder."""
     import tomllib
 
+    from pydantic import ValidationError
+
+    from jointfit_daemon.config.faults import faults_of
+
     given: dict[str, Any] = {"driver": name}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -134,7 +160,11 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
     for key, info in driver.Settings.model_fields.items():
         if info.is_required() and key not in given:
             given[key] = _placeholder(info.annotation)
-    return driver.Settings.model_validate(given)
+    try:
+        return driver.Settings.model_validate(given)
+    except ValidationError as error:
+        faults = faults_of(error, driver.Settings, name)
+        raise ValueError("; ".join(fault.text() for fault in faults)) from None
 
 
 def _placeholder(annotation: Any) -> Any:

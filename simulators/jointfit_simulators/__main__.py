@@ -39,6 +39,15 @@ if TYPE_CHECKING:
 USAGE = 2
 ORIGIN_NS = 100_000_000
 _COMMAND_BYTES = 4096
+COMMANDS = """commands, one a line on standard input:
+  play NAME                   change to another motion
+  unplug ID, plug ID          a sensor, or can0 for the bus adapter
+  reboot ID                   a sensor restarts, and its clock with it
+  occlude on, occlude off     somebody stands before the cameras
+  mocap stop, mocap start     the motion-capture server is silent
+  pause on, pause off         the wearer freezes
+  status                      what was sent, as JSON
+  quit                        stop, and print the counts"""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -48,7 +57,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("knobs", help="list every knob with its default")
     commands.add_parser("motions", help="list every motion")
-    play = commands.add_parser("play", help="play a scene until told to quit")
+    play = commands.add_parser(
+        "play", help="play a scene until told to quit", epilog=COMMANDS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     play.add_argument("--directory", type=Path, required=True, help="for ports, rig.toml, truth")
     play.add_argument("--programme", help="NAME:SECONDS,…; the last one goes on (default stand)")
     play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
