@@ -24,7 +24,6 @@ from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.tools.calibration_guide import CalibrationWatch
 from jointfit_daemon.tools.demo_processes import daemon, simulator
 from tests.broker_fixture import MosquittoBroker
 
@@ -47,7 +46,9 @@ SQUATS_HZ, WALKING_HZ = 50.0, 100.0
 SEGMENTS = ("thigh", "shank")
 TRUTH_NS, MATCH_NS = 10_000_000, 1_000_000
 """Truth and poses are true for whole hundredths of a second of one clock; the rest is rounding."""
-CONNECT_S = 40.0
+CONNECT_S = PATIENCE_S = 40.0
+ENDS = {"static": "posed", "functional": "calibrated"}
+"""Phases, and the state that ends each well."""
 
 
 @dataclass(slots=True)
@@ -57,17 +58,17 @@ class Gateway:
     folder: Path
     sim: Simulator
     client: MqttClient
-    watch: CalibrationWatch
     poses: list[dict[str, Any]] = field(default_factory=list)
     online: set[str] = field(default_factory=set)
     health: dict[str, Any] = field(default_factory=dict)
+    _phases: asyncio.Queue[dict[str, Any]] = field(default_factory=asyncio.Queue)
 
     async def listen(self) -> None:
         async for topic, payload in self.client.messages():
             if topic == "pose":
                 self.poses.append(payload)
             elif topic == "calibration":
-                self.watch.on_status(payload)
+                self._phases.put_nowait(payload)
             elif topic == "bridge/health":
                 self.health = payload
             elif topic.endswith("/availability"):
@@ -82,12 +83,15 @@ class Gateway:
 
     async def phase(self, name: str, seconds: float) -> None:
         """Run one phase of a calibration to its end."""
-        self.watch.begin()
+        while not self._phases.empty():  # what was said before is no answer
+            self._phases.get_nowait()
         answer = await self.client.request("calibrate", {"phase": name, "seconds": seconds})
         if answer["status"] != "accepted":
             raise RuntimeError(f"{name}: {answer}")
-        async with asyncio.timeout(seconds + 40):
-            await self.watch.ended(name)
+        async with asyncio.timeout(seconds + PATIENCE_S):
+            while (status := await self._phases.get())["phase"] != ENDS[name]:
+                if status["phase"] == "aborted":
+                    raise RuntimeError(f"{name}: {status['text']}")
 
     async def live(self, motion: str, seconds: float) -> None:
         """Play a motion of so many seconds and keep what is said meanwhile."""
@@ -114,7 +118,7 @@ async def gateway(folder: Path, port: int, options: Sequence[str]) -> AsyncItera
     ):
         ready = await sim.ready()
         await client.subscribe("pose", "calibration", "bridge/health", "device/+/availability")
-        found = Gateway(folder, sim, client, CalibrationWatch(lambda *_: None))
+        found = Gateway(folder, sim, client)
         listening = asyncio.create_task(found.listen(), name="listener")
         try:
             async with daemon(folder, Path(ready["rig"])):

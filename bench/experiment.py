@@ -41,6 +41,8 @@ class Figure:
 
     @property
     def goal_text(self) -> str:
+        if -self.least == self.goal == float("inf"):
+            return "–"
         if self.least == -float("inf"):
             return f"≤ {self.goal:g}"
         return (
@@ -63,7 +65,9 @@ class Experiment:
     packages: tuple[str, ...] = ()
     """What must be installed beside the project."""
     programs: tuple[str, ...] = ()
-    """What it runs as a process: such a row is measured by ``tests/system``, not as a unit test."""
+    """What it runs as a process."""
+    long: bool = False
+    """Takes longer than a test may: a shorter one stands for it among the tests."""
 
     def missing(self, data: Path = DATA) -> str | None:
         """Say what keeps this experiment from running; None if nothing does."""

