@@ -25,6 +25,22 @@ CORRELATION_S = 0.5
 """Skin motion keeps its value about this long, so a second is worth two samples."""
 
 
+class _Reach:
+    """How far one orientation went about its first value."""
+
+    def __init__(self, first: np.ndarray) -> None:
+        self._first = first
+        self._low = self._high = np.zeros(3)
+
+    def take(self, q: np.ndarray) -> None:
+        turned = rotation.log(rotation.multiply(rotation.conjugate(self._first), q))
+        self._low, self._high = np.minimum(self._low, turned), np.maximum(self._high, turned)
+
+    @property
+    def arc(self) -> float:
+        return float(np.linalg.norm(self._high - self._low))
+
+
 @dataclass(slots=True)
 class MovementProgress:
     """Arc covered by each inner joint and the joint-centre error to be expected from it.
@@ -35,43 +51,32 @@ class MovementProgress:
     """
 
     chain: Chain
-    _reference: dict[str, np.ndarray] = field(default_factory=dict)
-    _low: dict[str, np.ndarray] = field(default_factory=dict)
-    _high: dict[str, np.ndarray] = field(default_factory=dict)
+    _seen: dict[tuple[str, str, str], _Reach] = field(default_factory=dict)
+    """By joint and the two sensors looked at: each pair has a mount, so a zero, of its own."""
 
     def look(self, latest: Mapping[str, Quaternion]) -> None:
-        """Take the newest orientation of each sensor."""
-        for joint, proximal, distal in self._pairs(latest):
-            q = rotation.multiply(rotation.conjugate(proximal), distal)
-            reference = self._reference.setdefault(joint, q)
-            turned = rotation.log(rotation.multiply(rotation.conjugate(reference), q))
-            self._low[joint] = np.minimum(self._low.get(joint, turned), turned)
-            self._high[joint] = np.maximum(self._high.get(joint, turned), turned)
+        """Take the newest orientation of each sensor that is alive."""
+        for joint, above, below in zip(
+            self.chain.joints[1:-1], self.chain.sensors, self.chain.sensors[1:], strict=False
+        ):
+            a = next((sensor for sensor in above if sensor in latest), None)
+            b = next((sensor for sensor in below if sensor in latest), None)
+            if a is not None and b is not None:
+                proximal, distal = np.asarray(latest[a]), np.asarray(latest[b])
+                q = rotation.multiply(rotation.conjugate(proximal), distal)
+                self._seen.setdefault((joint, a, b), _Reach(q)).take(q)
 
     def arcs(self) -> dict[str, float]:
         """Return the largest arc each inner joint went through so far, rad."""
-        return {
-            joint: float(np.linalg.norm(self._high[joint] - self._low[joint]))
-            for joint in self._reference
-        }
+        arcs: dict[str, float] = {}
+        for (joint, _, _), reach in self._seen.items():
+            arcs[joint] = max(arcs.get(joint, 0.0), reach.arc)
+        return arcs
 
     def predicted_center_errors(self, elapsed_s: float) -> dict[str, float | None]:
         """Return the expected RMS error of each inner joint centre, m; None while it is useless."""
         looks = max(1.0, elapsed_s / CORRELATION_S)
         return {joint: _predicted(arc, looks) for joint, arc in self.arcs().items()}
-
-    def _pairs(
-        self, latest: Mapping[str, Quaternion]
-    ) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        pairs = []
-        for joint, above, below in zip(
-            self.chain.joints[1:-1], self.chain.sensors, self.chain.sensors[1:], strict=False
-        ):
-            a = next((latest[s] for s in above if s in latest), None)
-            b = next((latest[s] for s in below if s in latest), None)
-            if a is not None and b is not None:
-                pairs.append((joint, np.asarray(a), np.asarray(b)))
-        return pairs
 
 
 def _predicted(arc: float, looks: float) -> float | None:
