@@ -59,7 +59,7 @@ class _Life:
 
 
 async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None:
-    """Run one source for ever, or until its settings prove wrong."""
+    """Run one source for ever, or until its settings prove wrong: only a reload tries again."""
     life, loop = _Life(source.id, deliver), asyncio.get_running_loop()
     delay = FIRST_RETRY_S
     while True:
@@ -73,7 +73,7 @@ async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None
             life.closed("lost", str(lost))  # the core tells it, on the log too
         except DeviceMisconfigured as wrong:
             life.closed("misconfigured", str(wrong))
-            log.error("%s: stopped until its settings change: %s", source.id, wrong)  # noqa: TRY400 - it says enough
+            log.error("%s: stopped until the next reload: %s", source.id, wrong)  # noqa: TRY400 - it says enough
             return
         except asyncio.CancelledError:
             life.removed()
@@ -98,12 +98,15 @@ class SourceTasks:
         self._running: dict[str, tuple[Source, asyncio.Task[None]]] = {}
 
     async def retire(self, sources: Iterable[Source]) -> None:
-        """Stop those that are not among these; one whose settings are the same keeps its port."""
+        """Stop those that are not among these; one whose settings are the same keeps its port.
+
+        One that stopped by itself is forgotten: what was wrong may be right now, outside rig.toml.
+        """
         wanted = {source.id: source for source in sources}
         gone = [
             self._running.pop(name)[1]
-            for name, (source, _) in list(self._running.items())
-            if wanted.get(name) != source
+            for name, (source, task) in list(self._running.items())
+            if wanted.get(name) != source or task.done()
         ]
         await stop(gone)
 
