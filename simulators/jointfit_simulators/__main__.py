@@ -45,7 +45,7 @@ COMMANDS = """commands, one a line on standard input:
   reboot ID                   a sensor restarts, and its clock with it
   occlude on, occlude off     somebody stands before the cameras
   mocap stop, mocap start     the motion-capture server is silent
-  pause on, pause off         the wearer freezes
+  pause on, pause off         all wires are silent; time goes on
   status                      what was sent, as JSON
   quit                        stop, and print the counts"""
 
