@@ -90,6 +90,8 @@ class Figures:
     """CPU time of the daemon in these seconds."""
     loop_s: float
     """CPU time of the fixed loop, measured meanwhile."""
+    waited_s: float
+    """How long the daemon was ready to run meanwhile and had no core: the machine's doing."""
     rss_mb: float
     unaccounted: int
     """Samples sent and not received, or without a verdict, or dropped."""
@@ -150,17 +152,17 @@ async def _subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
 
 async def _measure(
     pid: int, heard: Heard, seconds: float
-) -> tuple[list[float], float, float, float, float]:
+) -> tuple[list[float], float, float, float, float, float]:
     gc.collect()
     gc.freeze()  # pauses of this process would look like the daemon's
     heard.latencies_ms.clear()
-    began_s, began_cpu = time.monotonic(), cpu_s(pid)
+    began_s, began_cpu, began_wait = time.monotonic(), cpu_s(pid), waited_s(pid)
     await asyncio.sleep(seconds)
     latencies, took_s = heard.latencies_ms[:], time.monotonic() - began_s
-    spent = cpu_s(pid) - began_cpu
+    spent, waited = cpu_s(pid) - began_cpu, waited_s(pid) - began_wait
     assert heard.pose["mode"] == "imu+mocap", heard.pose
     assert heard.pose["sync"] == "locked", heard.pose
-    return latencies, took_s, spent, loop_s(), rss_mb(pid)
+    return latencies, took_s, spent, loop_s(), waited, rss_mb(pid)
 
 
 async def _last_health(heard: Heard) -> dict[str, Any]:
@@ -187,6 +189,14 @@ def cpu_s(pid: int) -> float:
     text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
     fields = text.rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+
+
+def waited_s(pid: int) -> float:
+    """Return how long the main thread of a process was ready and had no core so far, s."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="utf-8").split()[1]) / 1e9
+    except OSError:  # a kernel without it
+        return float("nan")
 
 
 def rss_mb(pid: int) -> float:

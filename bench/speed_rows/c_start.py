@@ -13,7 +13,9 @@ from bench.worn import bench_rig, phases
 from jointfit_daemon.calibration.alignment_phase import fit_alignment
 from jointfit_daemon.calibration.jobs import run_job
 
-DAEMON = "import jointfit_daemon.__main__, jointfit_daemon.config, jointfit_daemon.supervisor"
+DAEMON = (
+    "import jointfit_daemon.__main__, jointfit_daemon.config, jointfit_daemon.supervisor.daemon"
+)
 CHECKING = "import jointfit_daemon.__main__, jointfit_daemon.config"
 
 

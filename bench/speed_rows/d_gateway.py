@@ -72,7 +72,8 @@ def _cost(name: str, found: Figures, goal_percent: float | None) -> list[Row]:
     share = 100 * found.cpu_s / found.seconds
     frame_s = found.cpu_s / max(1, len(found.latencies_ms))
     floor = None if goal_percent is None else 5 * goal_percent
-    note = f"{1e6 * frame_s:.0f} µs a frame"
+    waited = 100 * found.waited_s / found.seconds
+    note = f"{1e6 * frame_s:.0f} µs a frame; ready and without a core {waited:.1f} % of the time"
     return [
         Row(
             f"{name}: CPU of the daemon",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def test_a_running_daemon_does_without_scipy() -> None:
-    code = "import sys, jointfit_daemon.supervisor; print('scipy' in sys.modules)"
+    code = "import sys, jointfit_daemon.supervisor.daemon; print('scipy' in sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "False"
 
