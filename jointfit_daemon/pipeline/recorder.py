@@ -82,18 +82,16 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
     positions = np.full((n, len(markers), 3), np.nan)
     body_positions = np.full((n, len(bodies), 3), np.nan)
     body_orientations = np.full((n, len(bodies), 4), np.nan)
-    columns = {
-        layout: (
-            [markers.index(name) for name in layout.markers],
-            [bodies.index(name) for name in layout.bodies],
+    for layout in layouts:  # all frames of a layout at once: a row at a time would hold up the core
+        rows = np.array([row for row, (_, frame) in enumerate(frames) if frame.layout == layout])
+        seen = [frame for _, frame in frames if frame.layout == layout]
+        to_marker = np.array([markers.index(name) for name in layout.markers], dtype=np.intp)
+        to_body = np.array([bodies.index(name) for name in layout.bodies], dtype=np.intp)
+        positions[np.ix_(rows, to_marker)] = np.stack([frame.markers for frame in seen])
+        body_positions[np.ix_(rows, to_body)] = np.stack([frame.body_positions for frame in seen])
+        body_orientations[np.ix_(rows, to_body)] = np.stack(
+            [frame.body_orientations for frame in seen]
         )
-        for layout in layouts
-    }
-    for row, (_, frame) in enumerate(frames):
-        marker_columns, body_columns = columns[frame.layout]
-        positions[row, marker_columns] = frame.markers
-        body_positions[row, body_columns] = frame.body_positions
-        body_orientations[row, body_columns] = frame.body_orientations
     t_ns = np.array([t for t, _ in frames], dtype=np.int64)
     keep = _increasing(t_ns)
     return OpticalTrack(

@@ -65,3 +65,18 @@ def test_without_a_camera_there_is_no_optical_track() -> None:
     recorder = TrialRecorder()
     recorder.add_sample("S1", 1, IDENTITY)
     assert recorder.trial().optical is None
+
+
+def test_layouts_that_alternate_keep_every_value_in_its_place() -> None:
+    one, other = MocapLayout(("a", "b"), ("T",)), MocapLayout(("c", "a"), ())
+    recorder = TrialRecorder()
+    for k in range(6):
+        recorder.add_mocap(k, frame(one if k % 2 else other, float(k)))
+    optical = recorder.trial().optical
+    assert optical is not None
+    assert optical.markers == ("c", "a", "b")
+    for k in range(6):
+        c, a, b = optical.positions[k, :, 0]
+        assert a == k
+        assert (np.isnan(c), b) == (True, k) if k % 2 else (c, np.isnan(b)) == (k, True)
+        assert np.isnan(optical.body_positions[k]).all() == (k % 2 == 0)
