@@ -42,7 +42,7 @@ def test_squats_as_bytes_give_the_offline_figures(
 ) -> None:
     for method in METHODS:
         live = played["squats", method]
-        assert 0.98 * len(knee.held) <= live.frames <= len(knee.held) == 270
+        assert 0.9 * len(knee.held) <= live.frames <= len(knee.held) == 270
         models = KneeModels(method, [knee.training])
         offline = knee.judge.errors(models.predict(knee.held), knee.held)
         assert live.errors == pytest.approx(offline, abs=0.1), method
