@@ -50,7 +50,7 @@ class Bulletin:
         return [Notice(now_ns, kind, source, item.text, level, dict(item.data))]
 
     def due(self, now_ns: int) -> list[Notice]:
-        """Return the held-back notices whose second is over."""
+        """Return the held-back notices whose quiet time is over."""
         if not self._held:
             return []
         return [

@@ -12,7 +12,7 @@ from jointfit_daemon.pipeline.bulletin import QUIET_NS, Bulletin
 
 
 @given(st.lists(st.tuples(st.integers(0, 400_000_000), st.integers(1, 50)), min_size=1))
-def test_every_discarded_byte_is_told_and_at_most_once_a_second(
+def test_every_discarded_byte_is_told_and_at_most_once_in_ten_seconds(
     steps: list[tuple[int, int]],
 ) -> None:
     bulletin, now, told = Bulletin(), 0, []
