@@ -310,5 +310,8 @@ def _remedy(path: str, number: int) -> str:
         )
     if number == errno.ENOENT:
         there = ", ".join(sorted(map(str, Path("/dev/serial/by-id").glob("*"))))
-        return f": plug it in, or set `port` to one that is there: {there or 'none is'}"
+        return (
+            ": plug it in, or set `port` (of an SLCAN adapter: `channel`) to one that is there: "
+            f"{there or '/dev/serial/by-id is empty'}"
+        )
     return ": check the cable"

@@ -76,14 +76,20 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
             "sync": state.sync,
             "flags": state.flags,
             "segments": {segment.name: _segment(segment) for segment in state.segments},
-            "joints": {joint.name: _joint(joint) for joint in state.joints},
+            "joints": {
+                joint.name: _joint(joint, inner=0 < i < len(state.joints) - 1)
+                for i, joint in enumerate(state.joints)
+            },
         }
     )
 
 
-def encode_joint(joint: JointState, t_us: int) -> bytes:
-    """Return the payload of ``joint/NAME``: scalars only, for plain dashboards."""
-    scalars: dict[str, Any] = {"v": PAYLOAD_VERSION, "t_us": t_us, **_joint(joint)}
+def encode_joint(joint: JointState, t_us: int, *, inner: bool = False) -> bytes:
+    """Return the payload of ``joint/NAME``: scalars only, for plain dashboards.
+
+    A joint between two segments (`inner`) has angles even while they are unknown.
+    """
+    scalars: dict[str, Any] = {"v": PAYLOAD_VERSION, "t_us": t_us, **_joint(joint, inner=inner)}
     position = scalars.pop("p_m") or (None, None, None)
     return encode(scalars | dict(zip(("x_m", "y_m", "z_m"), position, strict=True)))
 
@@ -96,12 +102,12 @@ def _segment(segment: SegmentState) -> dict[str, Any]:
     }
 
 
-def _joint(joint: JointState) -> dict[str, Any]:
+def _joint(joint: JointState, *, inner: bool) -> dict[str, Any]:
     shown: dict[str, Any] = {
         "p_m": _rounded(joint.position, 4),
         "sd_m": None if joint.position_sd is None else round(joint.position_sd, 4),
     }
-    if joint.angles is None and joint.inner is None:
+    if not inner and joint.angles is None and joint.inner is None:
         return shown  # an end of the chain has no angles
     flexion, adduction, rotation = joint.angles or (None, None, None)
     return shown | {

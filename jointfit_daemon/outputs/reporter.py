@@ -108,8 +108,10 @@ class Reporter:
             self._outbox.stream(f"{self._pose_topic}/ui", pose)
         if self._joints.due(state.t_ns):
             t_us = (state.t_ns + offset_ns) // 1000
-            for joint in state.joints:
-                self._outbox.stream(f"{self._base}/joint/{joint.name}", encode_joint(joint, t_us))
+            for i, joint in enumerate(state.joints):
+                inner = 0 < i < len(state.joints) - 1
+                payload = encode_joint(joint, t_us, inner=inner)
+                self._outbox.stream(f"{self._base}/joint/{joint.name}", payload)
 
     def event(self, notice: Notice, level: str | None = None) -> None:
         """Publish one change of state on ``bridge/event``, at its own level or at `level`."""

@@ -1,13 +1,16 @@
-"""Figures of a calibration on the wire: every one with its unit, in degrees and milliseconds."""
+"""Figures on the wire: every one with its unit, in degrees and milliseconds, or null."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import orjson
 import pytest
 
+from jointfit_daemon.model import JointState, LimbState
 from jointfit_daemon.outputs.figures import shown
+from jointfit_daemon.outputs.payloads import encode_pose
 
 
 def test_radians_are_told_in_degrees_and_nanoseconds_in_milliseconds() -> None:
@@ -41,3 +44,14 @@ def test_the_tables_of_the_holdout_get_the_unit_they_lack() -> None:
 def test_words_flags_lists_and_what_is_unknown_pass_unchanged() -> None:
     told = {"alignment": None, "body_parts": ["foot", "shank"], "joints": {"fit": True}}
     assert shown(told) == told
+
+
+def test_a_knee_that_is_unknown_keeps_its_keys_and_a_hip_has_none() -> None:
+    lost = [JointState(name, None, None) for name in ("hip", "knee", "ankle")]
+    state = LimbState(1, 1, 1, "uncalibrated", "settling", (), (), tuple(lost))
+    joints = orjson.loads(encode_pose(state, 0, 1))["joints"]
+    nothing = {"p_m": None, "sd_m": None}
+    angles = dict.fromkeys(
+        ("flexion_deg", "adduction_deg", "rotation_deg", "inner_deg", "sd_deg"), None
+    )
+    assert joints == {"hip": nothing, "knee": nothing | angles, "ankle": nothing}
