@@ -56,11 +56,14 @@ def demo(
         raise typer.Exit(1)
 
 
+HINTS = {"latency_p99_ms": ": did other programs keep this machine busy?"}
+
+
 def missed_bounds(figures: dict[str, Any]) -> list[str]:
     """Return the promises that these figures break, in words."""
     values = {**figures, "latency_p99_ms": figures["latency_ms"]["p99"]}
     return [
-        f"{name} is {values[name]}, promised at most {bound:g}"
+        f"{name} is {values[name]}, promised at most {bound:g}{HINTS.get(name, '')}"
         for name, bound in BOUNDS.items()
         if values.get(name) is None or not values[name] <= bound
     ]
