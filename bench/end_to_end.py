@@ -30,9 +30,13 @@ from tests.broker_fixture import MosquittoBroker
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
+    from numpy.typing import NDArray
+
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.tools.demo_processes import Simulator
+
+    Array = NDArray[np.float64]
 
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
 SETTLE_S, STATIC_S = 3.0, 3.5
@@ -191,11 +195,26 @@ class Played:
 
     frames: int
     """Poses judged."""
+    truth: tuple[Array, Array]
+    """Recorded thigh and shank at their instants, q_world_bone, shape (frames, 4)."""
     errors: tuple[float, float, float]
     """RMS degrees of thigh, shank and knee flexion."""
     calibration: Calibration
     health: dict[str, Any]
     """The daemon's last account of its devices."""
+
+    def of(self, recorded: KneeTrial) -> KneeTrial:
+        """Return the frames of the recording that were judged: those nearest in posture."""
+        femur, tibia = (q[:, None] for q in self.truth)
+        apart = rotation.angle_between(femur, recorded.thigh)
+        apart = apart + rotation.angle_between(tibia, recorded.shank)
+        nearest = np.argmin(apart, axis=1)
+        thigh_a, thigh_b, shank_a, shank_b = (q[nearest] for q in recorded.sensors)
+        return KneeTrial(
+            (thigh_a, thigh_b, shank_a, shank_b),
+            recorded.thigh[nearest],
+            recorded.shank[nearest],
+        )
 
 
 def _judged(running: Gateway, data: Path) -> Played:
@@ -223,7 +242,7 @@ def _judged(running: Gateway, data: Path) -> Played:
     whole = load(data, "squats1")
     judge = Judge.of(whole.part(slice(0, training_frames(whole))))
     errors = judge.errors((thigh, shank), KneeTrial((femur,) * 4, femur, tibia))
-    return Played(len(rows), errors, calibration, running.health)
+    return Played(len(rows), (femur, tibia), errors, calibration, running.health)
 
 
 def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:

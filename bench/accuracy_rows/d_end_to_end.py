@@ -38,13 +38,15 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Fi
         held = knee.held if trial == "squats" else load(data, "walking1")
         figures = []
         for method in methods:
-            offline = knee.judge.errors(KneeModels(method, [knee.training]).predict(held), held)
             live = _played(data)[trial, method]
+            # frames for which this machine was too busy to deliver in time are judged by neither
+            same = live.of(held)
+            models = KneeModels(method, [knee.training])
+            offline = knee.judge.errors(models.predict(same), same)
             figures += [
                 near(f"{method}: {name} (offline {expected:.3f})", said, expected, ALLOWED_DEG)
                 for name, said, expected in zip(NAMES, live.errors, offline, strict=True)
             ]
-            # frames for which this machine was too busy to deliver in time are not judged
             share = live.frames / len(held)
             figures.append(Figure(f"{method}: share judged", share, 1.0, least=0.9, unit=""))
         return figures
