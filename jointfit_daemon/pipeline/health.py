@@ -73,7 +73,7 @@ def _clock(state: SourceState) -> dict[str, object]:
     return {
         "clock": clock.state,
         "epoch": clock.epoch,
-        "skew_ppm": clock.skew_ppm,
+        "skew_ppm": None if clock.skew_ppm is None else round(clock.skew_ppm, 2),
         "sigma_us": _us(clock.sigma_ns),
         "jitter_us": _us(clock.jitter_ns),
     }

@@ -113,9 +113,11 @@ class SourceState:
         decoder: Decoder,
     ) -> list[Stamped | Corrupt | DeviceEvent]:
         taken: list[Stamped | Corrupt | DeviceEvent] = []
-        counts, clock = self.counts, self.clock
+        counts, clock, now_ns = self.counts, self.clock, self.last_arrival_ns or 0
         for item in decoded:
             if isinstance(item, ImuSample):
+                if item.arrival_ns > now_ns:  # a stamp of kernel or adapter that is simply wrong
+                    item = item._replace(arrival_ns=now_ns)  # noqa: PLW2901 - the sample, mended
                 counts.received += 1
                 stamp = clock.feed_sample(
                     item.ticks, item.counter, item.arrival_ns, decoder.tick_clock
