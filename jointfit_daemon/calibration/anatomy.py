@@ -45,7 +45,7 @@ MAX_AXIS_TILT = 0.7
 CONFIGURED_SD_M = 0.01
 """Standard deviation given to a configured length."""
 SKIN_SD_M = 0.005
-"""Systematic part of any center found through skin; no residual shows it (algorithms C12)."""
+"""Systematic part of any center found through skin; no residual shows it."""
 SKIN_RADIAL_M = 0.003
 """Part of a marker's 5 mm of skin motion that lies along its radius and repeats with posture; over
 a short arc it moves the center by the inverse of that arc."""
