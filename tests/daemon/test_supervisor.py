@@ -460,7 +460,8 @@ async def test_systemd_hears_ready_watchdog_status_and_stopping(
     assert any(word.startswith("STATUS=0 of 2 IMUs, missing S1, S2") for word in words)
     assert any(word.startswith("RELOADING=1\nMONOTONIC_USEC=") for word in words)
     assert words.count("READY=1") == 2
-    assert words[-1] == "STOPPING=1"
+    after = words[words.index("STOPPING=1") + 1 :]
+    assert set(after) <= {"WATCHDOG=1"}  # a stop that takes its time is still alive
 
 
 async def test_a_systemd_that_does_not_listen_does_not_stop_the_loop(
