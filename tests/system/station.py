@@ -108,10 +108,10 @@ class Listener:
         await self.until(lambda: devices <= self.online, within_s)
 
     async def more_poses(self, count: int = 20, within_s: float = 10.0) -> list[dict[str, Any]]:
-        """Wait for `count` poses from now on and return them."""
+        """Wait for `count` poses from now on and return just these; more may have come at once."""
         before = len(self.poses)
         await self.until(lambda: len(self.poses) >= before + count, within_s)
-        return self.poses[before:]
+        return self.poses[before : before + count]
 
     async def health(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Wait for a health message from now on that meets `condition`."""
