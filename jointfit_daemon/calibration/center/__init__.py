@@ -1,0 +1,1 @@
+"""Centers of rotation: planar and spatial, batch and one frame at a time, with their errors."""
