@@ -1,6 +1,6 @@
-"""What a row of the accuracy table is made of.
+"""What a row of an accuracy table is made of.
 
-A module of ``bench/accuracy_rows`` has a tuple ``EXPERIMENTS``; nothing else is asked of it. Every
+A module of a folder ``bench/*_rows`` has a tuple ``EXPERIMENTS``; nothing else is asked of it. Every
 experiment is deterministic: it draws from seeded generators and reads recordings, which lie beside
 the project and not in it. Where they are not, or a package only this bench needs is not installed,
 the row says so and is left out.
@@ -85,10 +85,10 @@ def near(name: str, value: float, expected: float, tolerance: float, unit: str =
     return Figure(name, value, round(expected + tolerance, 9), round(expected - tolerance, 9), unit)
 
 
-def find_experiments() -> list[Experiment]:
-    """Return all rows of ``bench/accuracy_rows``, in order of module and place."""
-    folder = Path(__file__).parent / "accuracy_rows"
+def find_experiments(folder: str = "accuracy_rows") -> list[Experiment]:
+    """Return all rows of ``bench/<folder>``, in order of module and place."""
+    path = Path(__file__).parent / folder
     found: list[Experiment] = []
-    for module in sorted(iter_modules([str(folder)]), key=lambda info: info.name):
-        found += import_module(f"bench.accuracy_rows.{module.name}").EXPERIMENTS
+    for module in sorted(iter_modules([str(path)]), key=lambda info: info.name):
+        found += import_module(f"bench.{folder}.{module.name}").EXPERIMENTS
     return found
