@@ -1,6 +1,6 @@
 """What a row of an accuracy table is made of.
 
-A module of a folder ``bench/*_rows`` has a tuple ``EXPERIMENTS``; nothing else is asked of it. Every
+A module of a folder ``bench/*_rows`` has a tuple ``EXPERIMENTS``; nothing else is asked of it. Each
 experiment is deterministic: it draws from seeded generators and reads recordings, which lie beside
 the project and not in it. Where they are not, or a package only this bench needs is not installed,
 the row says so and is left out.
