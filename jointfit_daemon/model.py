@@ -103,6 +103,24 @@ class ClockEcho:
     ticks: int
 
 
+class SyncPulse(NamedTuple):
+    """One edge on a hardware sync line, as the device that saw (or made) it stamped it.
+
+    Lines are electrical: one edge is the same instant on every device wired to the line, to well
+    below a microsecond, whatever each calls it. That instant is its rising (configured) edge. A
+    decoder yields pulses in wire order among its samples and never invents one that was not seen.
+    """
+
+    arrival_ns: int
+    """Host time of the first byte of the message that tells of it; ms late does not matter."""
+    ticks: int
+    """Device time of the edge itself, in ticks of the decoder's ``tick_clock``."""
+    line: int = 0
+    """Which wire of the rig, as configured; devices on the same wire say the same number."""
+    number: int | None = None
+    """The device's own count of edges on that line; None if it does not count."""
+
+
 @dataclass(frozen=True, slots=True)
 class Corrupt:
     """Bytes that made no message. An event, never an exception."""
@@ -124,7 +142,7 @@ class DeviceEvent:
     data: Mapping[str, object] = field(default_factory=dict)
 
 
-Decoded = ImuSample | MocapFrame | ClockEcho | Corrupt | DeviceEvent
+Decoded = ImuSample | MocapFrame | ClockEcho | SyncPulse | Corrupt | DeviceEvent
 """What a driver's decoder yields."""
 
 

@@ -9,7 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame
+from jointfit_daemon.model import (
+    ClockEcho,
+    Corrupt,
+    DeviceEvent,
+    ImuSample,
+    MocapFrame,
+    SyncPulse,
+)
 from jointfit_daemon.timing.clock import DeviceClock
 
 if TYPE_CHECKING:
@@ -17,7 +24,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Source
     from jointfit_daemon.driver import Decoder
-    from jointfit_daemon.model import Chunk
+    from jointfit_daemon.model import Chunk, Decoded
     from jointfit_daemon.timing.clock import Stamp
 
 _NS = 1_000_000_000
@@ -109,7 +116,7 @@ class SourceState:
 
     def _take(
         self,
-        decoded: list[ImuSample | MocapFrame | ClockEcho | Corrupt | DeviceEvent],
+        decoded: list[Decoded],
         decoder: Decoder,
     ) -> list[Stamped | Corrupt | DeviceEvent]:
         taken: list[Stamped | Corrupt | DeviceEvent] = []
@@ -131,7 +138,7 @@ class SourceState:
                 taken.append(Stamped(item, stamp))
             elif isinstance(item, ClockEcho):
                 clock.feed_echo(item, decoder.tick_clock)
-            else:
+            elif not isinstance(item, SyncPulse):
                 self._count(item)
                 taken.append(item)
         return taken

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame
+from jointfit_daemon.model import (
+    ClockEcho,
+    Corrupt,
+    DeviceEvent,
+    ImuSample,
+    MocapFrame,
+    SyncPulse,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -198,4 +205,6 @@ def _row(item: Decoded) -> dict[str, object]:
         return {"type": "corrupt", "discarded": item.discarded, "reason": item.reason}
     if isinstance(item, ClockEcho):
         return {"type": "echo", "sent_ns": item.sent_ns, "ticks": item.ticks}
+    if isinstance(item, SyncPulse):
+        return {"type": "pulse", **item._asdict()}
     return {"type": item.kind, "text": item.text, "data": dict(item.data)}
