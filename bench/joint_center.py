@@ -1,4 +1,4 @@
-"""Centers of rotation: `python bench/joint_center.py [--json FILE] [--markdown] [--plot DIR] [ID ...]`.
+"""Centers of rotation: `bench/joint_center.py [--json FILE] [--markdown] [--plot DIR] [ID ...]`.
 
 Measures every row of ``bench/joint_center_rows``; see ``bench/table.py``. With ``--plot DIR`` it
 also draws the real trials, one PNG each: the estimated centers beside those of the models.
@@ -26,7 +26,7 @@ def main() -> int:
     """Measure the rows, then draw if asked; return the exit code."""
     code, options = table.main(__doc__ or "", "joint_center_rows", _options)
     if options.plot is not None:
-        from bench.joint_center_plot import draw
+        from bench.joint_center_plot import draw  # noqa: PLC0415 - matplotlib is optional
 
         for path in draw(options.plot):
             print(path, file=sys.stderr)
