@@ -1,0 +1,54 @@
+"""What the estimators of a center look at.
+
+Law: positions in meters; NaN is "not seen"; both body parts of a pair in one world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.kinematics import rotation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPoses:
+    """Where one body part was over time: a point x of its own is at R(q) x + t in the world."""
+
+    q: Array
+    """q_world_body, scalar first, shape (n, 4); NaN where not known."""
+    t: Array
+    """Where its origin was, m, shape (n, 3)."""
+
+    def to_world(self, x: Array) -> Array:
+        """Take one point of the body, m, shape (3,), to the world, shape (n, 3)."""
+        return rotation.rotate(self.q, x) + self.t
+
+    def to_body(self, points: Array) -> Array:
+        """Take points seen in the world, m, shape (n, k, 3), to the body's coordinates."""
+        return rotation.rotate(rotation.conjugate(self.q)[:, None], points - self.t[:, None])
+
+
+@dataclass(frozen=True, slots=True)
+class Movement:
+    """Everything that is known of a movement; a method says which of it it needs."""
+
+    points: Array | None = None
+    """Markers of the child in the parent's coordinates, m, shape (n, k, 3), or (n, k, 2) in a
+    plane."""
+    parent: BodyPoses | None = None
+    child: BodyPoses | None = None
+    angles: Array | None = None
+    """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
+    inertial sensors: for ``oriented``."""
+    axis: Array | None = None
+    """Normal of the plane for planar methods on points in space, shape (3,); found if None."""
+    near: Array | None = None
+    """Where to begin and to stay along unseen directions, m, shape (d,); the markers' mean if
+    None."""
+    interval: float = 0.01
+    """From frame to frame, s."""
