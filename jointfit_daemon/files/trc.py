@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEADER_ROWS = 5
-_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+"""Units of length that marker files use."""
 _KEYS = (
     "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
 )
@@ -74,13 +75,13 @@ def read_trc(path: Path) -> MarkerTrajectories:
     body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)
     rows = rows_of_numbers(path, body, separator, 2 + 3 * len(names))
     unit = header.get("Units", "mm").lower()
-    if unit not in _METRES:
-        raise Malformed(f"{path}: Units is {unit!r}, expected one of {', '.join(_METRES)}")
+    if unit not in METRES:
+        raise Malformed(f"{path}: Units is {unit!r}, expected one of {', '.join(METRES)}")
     return MarkerTrajectories(
         names,
         rows[:, 1],
         rows[:, 0].astype(np.int64),
-        rows[:, 2:].reshape(-1, len(names), 3) * _METRES[unit],
+        rows[:, 2:].reshape(-1, len(names), 3) * METRES[unit],
         float(header["DataRate"]),
         _doubts(header, rows=len(rows), markers=len(names)),
     )
