@@ -4,9 +4,10 @@ Law: nothing but JSON lines on stdout. One when all is ready, one for every ``st
 …}`` for a command that was not understood, and one with the counts of all that was sent at the end.
 
 ``jointfit-sim play --directory DIR`` reads commands from stdin, one a line: ``play NAME``,
-``unplug ID``, ``plug ID``, ``reboot ID``, ``occlude on|off``, ``mocap stop|start``, ``pause
-on|off``, ``status``, ``quit``. ID is a sensor, or ``can0`` for the bus adapter. The end of stdin
-changes nothing; SIGTERM and SIGINT quit.
+``unplug ID``, ``plug ID``, ``reboot ID``, ``occlude on|off``, ``mocap stop|start|restart``, ``pause
+on|off``, ``status``, ``quit``. ID is a sensor, ``can0`` for the bus adapter, or (to reboot)
+``mocap``. ``--at SECONDS=COMMAND`` gives a command its time beforehand. The end of stdin changes
+nothing; SIGTERM and SIGINT quit.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import orjson
 
+from jointfit_simulators.clocks import ClockFault
 from jointfit_simulators.motion import MOTIONS
 from jointfit_simulators.programme import UnknownMotion, parse_programme
 from jointfit_simulators.replayed import Replayed
@@ -42,9 +44,10 @@ _COMMAND_BYTES = 4096
 COMMANDS = """commands, one a line on standard input:
   play NAME                   change to another motion
   unplug ID, plug ID          a sensor, or can0 for the bus adapter
-  reboot ID                   a sensor restarts, and its clock with it
+  reboot ID                   a sensor, or mocap, restarts, and its clock with it
   occlude on, occlude off     somebody stands before the cameras
   mocap stop, mocap start     the motion-capture server is silent
+  mocap restart               it is closed and opened again; its clock goes on
   pause on, pause off         all wires are silent; time goes on
   status                      what was sent, as JSON
   quit                        stop, and print the counts"""
@@ -72,6 +75,12 @@ def _parser() -> argparse.ArgumentParser:
     play.add_argument("--can", default="slcan", help="slcan, or INTERFACE:CHANNEL of python-can")
     play.add_argument("--motion", action="append", default=[], metavar="NAME=FILE",
                       help="a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
+    play.add_argument("--clock", action="append", default=[], metavar="ID=PPM[,UP_S]",
+                      help="skew of a sensor's or mocap's clock; seconds it is up")  # fmt: skip
+    play.add_argument("--at", action="append", default=[], metavar="SECONDS=COMMAND",
+                      help="a command and its time, from the beginning of the run")  # fmt: skip
+    play.add_argument("--sample-log", action="store_true",
+                      help="write samples.jsonl: when each sample was truly taken")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
                       help="a recorded trial: .npz or .sto, with .trc and .json")  # fmt: skip
     for field in dataclasses.fields(RigOptions):
@@ -98,8 +107,13 @@ def _subject(options: argparse.Namespace, knobs: Knobs) -> Subject:
     if options.trial:
         recording = read_recording(options.trial)
         return Replayed(recording, SENSORS, steps, transition_s=knobs.transition_s)
-    files = dict(motion.split("=", 1) for motion in options.motion)
+    files = dict(_pairs(options.motion))
     return Wearer(knobs, steps, motion_files={name: Path(path) for name, path in files.items()})
+
+
+def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
+    """Split ``A=B`` words; ValueError for one that is none."""
+    return [(a, b) for a, b in (word.split("=", 1) for word in words)]
 
 
 def _say(line: dict[str, object]) -> None:
@@ -140,7 +154,13 @@ async def _play(options: argparse.Namespace) -> None:
         **{field.name: getattr(options, field.name) for field in dataclasses.fields(RigOptions)}
     )
     hardware = SceneOptions(
-        options.directory.absolute(), mocap=not options.no_mocap, can=options.can, rig=rig
+        options.directory.absolute(),
+        mocap=not options.no_mocap,
+        can=options.can,
+        rig=rig,
+        clocks={name: ClockFault.parse(text) for name, text in _pairs(options.clock)},
+        script=tuple((float(at_s), command) for at_s, command in _pairs(options.at)),
+        sample_log=options.sample_log,
     )
     subject = _subject(options, knobs)
     # a whole tenth: samples of perfect clocks and lines of the truth then share their instants

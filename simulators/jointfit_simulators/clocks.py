@@ -7,7 +7,7 @@ clock is an offset, a skew, jitter and a delay. True time is host CLOCK_MONOTONI
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,21 @@ class DeviceClock:
         """Return the host instants at which the clock shows `device_ns`."""
         since = np.rint(device_ns / (1 + self.skew)).astype(np.int64)
         return self.boot_ns + since
+
+
+class ClockFault(NamedTuple):
+    """What is asked of one device's clock, instead of what the dice would give it."""
+
+    skew_ppm: float
+    """By how much it runs fast."""
+    up_s: float | None = None
+    """How long it has been up when the run begins; None: as the dice fall."""
+
+    @classmethod
+    def parse(cls, text: str) -> ClockFault:
+        """Return what ``SKEW_PPM`` or ``SKEW_PPM,UP_S`` asks for; ValueError if nothing."""
+        skew_ppm, _, up_s = text.partition(",")
+        return cls(float(skew_ppm), float(up_s) if up_s else None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +98,15 @@ class Ticker:
         self._late_ns = knobs.latency_jitter_ms * 1e6
         self._dropout = knobs.dropout
         self._last_due_ns = 0
+
+    def ask(self, fault: ClockFault, now_ns: int) -> None:
+        """Run as `fault` says, from `now_ns` (the beginning of the run) on."""
+        up_ns = now_ns - self.clock.boot_ns if fault.up_s is None else round(fault.up_s * NS)
+        self.clock = DeviceClock(now_ns - up_ns, fault.skew_ppm * 1e-6)
+
+    def device_ns(self, host_ns: int) -> int:
+        """Return what the clock shows at a host instant, whatever became of it since the start."""
+        return self.clock.device_ns(host_ns)
 
     def reboot(self, host_ns: int) -> None:
         """Count from 0 again, from `host_ns` on."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from jointfit_simulators.clocks import DeviceClock
+    from jointfit_simulators.clocks import Ticker
     from jointfit_simulators.settings import Knobs
 
 WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
@@ -151,7 +151,7 @@ def _imu_table(knobs: Knobs, name: str, segment: str, driver: str, where: list[s
 
 
 def optical_server(
-    knobs: Knobs, clusters: Mapping[str, tuple[str, ...]], bodies: Sequence[str], clock: DeviceClock
+    knobs: Knobs, clusters: Mapping[str, tuple[str, ...]], bodies: Sequence[str], ticker: Ticker
 ) -> NatNetServer:
     """Return a NatNet server whose project has a body for every cluster of markers.
 
@@ -163,8 +163,8 @@ def optical_server(
         Markers of each body part.
     bodies
         Rigid bodies that are tracked; those without markers come last.
-    clock
-        The server's.
+    ticker
+        Whose clock is the server's.
     """
     owned = {part.capitalize(): names for part, names in clusters.items()}
     owned |= {body: () for body in bodies if body not in owned}
@@ -172,7 +172,7 @@ def optical_server(
         StagedBody(body, names, number) for number, (body, names) in enumerate(owned.items(), 1)
     )
     options = NatNetServerOptions(
-        bodies=staged, rate_hz=knobs.mocap_hz, device_ns=clock.device_ns, seed=knobs.seed
+        bodies=staged, rate_hz=knobs.mocap_hz, device_ns=ticker.device_ns, seed=knobs.seed
     )
     return NatNetServer(options)
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.clocks import Ticker
     from jointfit_simulators.observation import Observation
     from jointfit_simulators.settings import Knobs
+    from jointfit_simulators.streams import SampleTold
 
 Vector = tuple[float, float, float]
 Pose = tuple[Vector, tuple[float, float, float, float]]
@@ -30,6 +31,9 @@ Pose = tuple[Vector, tuple[float, float, float, float]]
 
 class OpticalServer(Protocol):
     """What sends camera frames."""
+
+    number: int
+    """Of the next frame."""
 
     @property
     def sent(self) -> int:
@@ -57,12 +61,20 @@ class OpticalStream:
         When they expose, by the server's clock.
     server
         Where frames go; None: no optical system.
+    told
+        Told of every frame sent, as `mocap`.
     """
 
     def __init__(
-        self, knobs: Knobs, cameras: Cameras, ticker: Ticker, server: OpticalServer | None
+        self,
+        knobs: Knobs,
+        cameras: Cameras,
+        ticker: Ticker,
+        server: OpticalServer | None,
+        told: SampleTold | None = None,
     ) -> None:
         self.cameras = cameras
+        self._told = told
         self._server = server
         self._ticker = ticker
         self._period_ns = NS / knobs.mocap_hz
@@ -108,7 +120,10 @@ class OpticalStream:
         """Send the next frame, or drop it where nobody is to hear it."""
         frame = self._waiting.popleft()
         if heard and self.running and self._server is not None:
+            before, number = self._server.sent, self._server.number
             self._server.push(*frame)
+            if self._told is not None and self._server.sent > before:
+                self._told("mocap", number, frame[0])
 
     def forget(self) -> None:
         """Drop what is planned and not sent."""

@@ -12,19 +12,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.cameras import Cameras
-from jointfit_simulators.clocks import Ticker
+from jointfit_simulators.clocks import NS, Ticker
 from jointfit_simulators.hardware import WIRES, mocap_table, optical_server, wire_up
 from jointfit_simulators.optical_stream import OpticalStream
 from jointfit_simulators.orientation import to_wxyz
 from jointfit_simulators.player import Player
 from jointfit_simulators.programme import UnknownMotion
 from jointfit_simulators.rig_file import RigOptions, rig_toml
+from jointfit_simulators.sample_log import SampleLog
 from jointfit_simulators.truth_log import TruthLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from jointfit_simulators.clocks import ClockFault
     from jointfit_simulators.natnet_server import NatNetServer
     from jointfit_simulators.observation import Subject
     from jointfit_simulators.settings import Knobs
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
 
 RIG_FILE = "rig.toml"
 TRUTH_FILE = "truth.jsonl"
+SAMPLES_FILE = "samples.jsonl"
+OPTICAL = "mocap"
+DOWN_S = 1.0
+"""How long the motion-capture server is away when it restarts."""
 LINGER_S = 0.3
 """Ports stay open this long after the last byte, so that it can be read."""
 
@@ -45,6 +51,12 @@ class SceneOptions:
     can: str = "slcan"
     wires: Mapping[str, str] = dataclasses.field(default_factory=lambda: WIRES)
     rig: RigOptions = dataclasses.field(default_factory=RigOptions)
+    clocks: Mapping[str, ClockFault] = dataclasses.field(default_factory=dict)
+    """Clocks that are asked for, by sensor or ``mocap``; the dice give the others."""
+    script: tuple[tuple[float, str], ...] = ()
+    """Commands and when to obey them, s from the beginning of the run."""
+    sample_log: bool = False
+    """Tell the true instant of every sample sent."""
 
 
 class BadCommand(ValueError):  # noqa: N818 - named for what happened
@@ -80,11 +92,20 @@ class Scene:
             now_ns=now_ns,
         )
         cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
-        ticker = Ticker(knobs, "mocap", latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
+        samples = options.directory / SAMPLES_FILE
+        self._samples = SampleLog(samples) if options.sample_log else None
+        told = None if self._samples is None else self._samples.add
+        ticker = Ticker(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
+        self._tickers = {n: s.ticker for n, s in self._hardware.streams.items()} | {OPTICAL: ticker}
+        for name, fault in options.clocks.items():
+            self._ticker(name).ask(fault, now_ns)
+        for stream in self._hardware.streams.values():
+            stream.told = told
         self._server: NatNetServer | None = None
         if options.mocap:
-            self._server = optical_server(knobs, subject.clusters, cameras.bodies, ticker.clock)
-        self._optical = OpticalStream(knobs, cameras, ticker, self._server)
+            self._server = optical_server(knobs, subject.clusters, cameras.bodies, ticker)
+        self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
+        self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
         self._player = Player(
             subject, self._hardware.streams, self._optical, self._truth, origin_ns=now_ns
@@ -94,9 +115,9 @@ class Scene:
             "play": self._play,
             "unplug": lambda name: self._plugs(name)[0](),
             "plug": lambda name: self._plugs(name)[1](),
-            "reboot": lambda name: self._stream(name).device.power_cycle(),
+            "reboot": self._reboot,
             "occlude": lambda word: setattr(cameras, "covered", _on(word)),
-            "mocap": lambda word: setattr(self._optical, "running", _on(word)),
+            "mocap": self._mocap,
             "pause": lambda word: setattr(self._player, "paused", _on(word or "on")),
             "quit": lambda _: self._quit.set(),
         }
@@ -113,8 +134,8 @@ class Scene:
                 n: to_wxyz(cameras.world * s.sensor.world.inv()) for n, s in streams.items()
             },
             "clocks": {
-                n: {"boot_ns": s.ticker.clock.boot_ns, "skew": s.ticker.clock.skew}
-                for n, s in streams.items()
+                n: {"boot_ns": ticker.clock.boot_ns, "skew": ticker.clock.skew}
+                for n, ticker in self._tickers.items()
             },
             **self._subject.facts,
         }
@@ -137,17 +158,29 @@ class Scene:
                 await self._server.ready.wait()
             rig = self._write_rig()
             playing = tasks.create_task(self._player.run(), name="player")
+            following = tasks.create_task(self._follow_script(say), name="script")
             truth = self._options.directory / TRUTH_FILE
             ports = self._hardware.ports
             say({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
             await self._quit.wait()
             playing.cancel()
+            following.cancel()
             self._player.finish()
             say(self.account())
             await asyncio.sleep(LINGER_S)
             for task in serving:
                 task.cancel()
         self.close()
+
+    async def _follow_script(self, say: Callable[[dict[str, object]], None]) -> None:
+        """Obey every command of the script in its time."""
+        for at_s, line in sorted(self._options.script):
+            due_ns = self._origin_ns + round(at_s * NS)
+            await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / NS))
+            try:
+                self.command(line)
+            except BadCommand as error:
+                say({"error": str(error)})
 
     def stop(self) -> None:
         """End `run`."""
@@ -156,6 +189,8 @@ class Scene:
     def close(self) -> None:
         """Close the truth and unplug everything."""
         self._truth.close()
+        if self._samples is not None:
+            self._samples.close()
         for stream in self._hardware.streams.values():
             stream.device.unplug()
         if self._server is not None:
@@ -195,6 +230,33 @@ class Scene:
 
     def _play(self, name: str) -> None:
         self._player.play(name)
+
+    def _ticker(self, name: str) -> Ticker:
+        if name not in self._tickers:
+            raise BadCommand(f"no clock {name!r}; there are: {', '.join(self._tickers)}")
+        return self._tickers[name]
+
+    def _reboot(self, name: str) -> None:
+        if name == OPTICAL:
+            self._restart_server(clock_anew=True)
+        else:
+            self._stream(name).device.power_cycle()
+
+    def _mocap(self, word: str) -> None:
+        if word == "restart":
+            self._restart_server(clock_anew=False)
+        else:
+            self._optical.running = _on(word)
+
+    def _restart_server(self, *, clock_anew: bool) -> None:
+        """Close the server and open it a second later; only a reboot begins its clock anew."""
+        server = self._server
+        if server is None:
+            raise BadCommand("there is no motion-capture server")
+        server.unplug()
+        if clock_anew:
+            self._tickers[OPTICAL].reboot(time.monotonic_ns())
+        asyncio.get_running_loop().call_later(DOWN_S, server.restart)
 
     def _stream(self, name: str) -> ImuStream:
         try:

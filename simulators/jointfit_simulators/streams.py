@@ -8,6 +8,7 @@ counted as such.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
@@ -23,8 +24,20 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 
+SampleTold = Callable[[str, int, int], None]
+"""Told of every sample sent: device, its number as sent, true instant on the host's clock, ns."""
+
+
 class WornDevice(ImuDevice, Protocol):
     """A virtual IMU with the faults this scene plays."""
+
+    @property
+    def counter(self) -> int:
+        """Number that its next sample will carry."""
+
+    @property
+    def line_ns(self) -> int:
+        """How long a sample takes on the line, first byte to last, ns; 0 where it takes none."""
 
     def lose(self, count: int) -> None:
         """Lose the next `count` samples: they take a counter value and are not sent."""
@@ -56,6 +69,8 @@ class ImuStream:
         Others use its wire: unplugging it means that it falls silent.
     now_ns
         Host time at which the run begins.
+    told
+        Told of every sample sent.
     """
 
     def __init__(
@@ -67,13 +82,14 @@ class ImuStream:
         latency_ms: float,
         shared_wire: bool,
         now_ns: int,
+        told: SampleTold | None = None,
     ) -> None:
-        self.name, self.device = name, device
+        self.name, self.device, self.told = name, device, told
         self.sensor = OrientationSensor(knobs, name)
         self.ticker = Ticker(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
         self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
         self._unplugged = False
-        self._waiting: deque[tuple[int, Quaternion | None]] = deque()
+        self._waiting: deque[tuple[int, int, Quaternion | None]] = deque()
         self.dropped_out = 0
         """Samples taken while measuring and never sent, as the knob wants it."""
         self.unheard = 0
@@ -91,15 +107,17 @@ class ImuStream:
         """Give the planned samples their orientations; return when each is due on the wire."""
         said = self.sensor.report(t_s, q_base_sensor)
         lost = self._taken.dropped | ~np.isfinite(said[:, 0])
-        for stamp, q, never in zip(
-            self._taken.device_ns.tolist(), said.tolist(), lost.tolist(), strict=True
-        ):
-            self._waiting.append((stamp, None if never else cast("Quaternion", tuple(q))))
-        return cast("list[int]", self._taken.due_ns.tolist())
+        for true_ns, stamp, q, never in zip(
+            self._taken.host_ns.tolist(), self._taken.device_ns.tolist(), said.tolist(),
+            lost.tolist(), strict=True,
+        ):  # fmt: skip
+            self._waiting.append((true_ns, stamp, None if never else cast("Quaternion", tuple(q))))
+        # the host has a sample when its last byte is there
+        return cast("list[int]", (self._taken.due_ns + self.device.line_ns).tolist())
 
     def emit(self, *, heard: bool = True) -> None:
         """Put the next sample on the wire, or drop it where nobody is to hear it."""
-        stamp, q = self._waiting.popleft()
+        true_ns, stamp, q = self._waiting.popleft()
         if self._unplugged or not heard or not self.device.streaming:
             self.unheard += 1
             return
@@ -108,9 +126,12 @@ class ImuStream:
             self.device.lose(1)
             self.device.push(stamp, (1.0, 0.0, 0.0, 0.0))
             return
-        before = self.device.sent
+        before, number = self.device.sent, self.device.counter
         self.device.push(stamp, q)
-        self.refused += self.device.sent == before
+        if self.device.sent == before:
+            self.refused += 1
+        elif self.told is not None:
+            self.told(self.name, number, true_ns)
 
     def forget(self) -> None:
         """Drop what is planned and not sent."""

@@ -36,6 +36,7 @@ FILTER_RATE_HZ = 400
 _MOST_OUTPUTS = 32
 _COUNTS = 1 << 16
 _FOREIGN_EVERY = 12  # messages: a GNSS receiver at 4 Hz beside orientations at 50 Hz
+_BITS = 10  # of one byte on the line, 8N1
 _PARAMETER = b"\x21"
 _INVALID = b"\x04"
 
@@ -104,7 +105,7 @@ class XbusDevice:
         self._measuring = options.measures_at_once or options.stuck
         self._stuck, self._waking = options.stuck, False
         self._counter = options.first_counter
-        self._epoch_ns = self._last_ns = self._messages = self._to_lose = 0
+        self._epoch_ns = self._last_ns = self._messages = self._to_lose = self._sample_bytes = 0
         self._random = random.Random(3)  # noqa: S311 - the same foreign times every run
         self._timer: asyncio.TimerHandle | None = None
         self.sent = 0
@@ -126,6 +127,17 @@ class XbusDevice:
             if data_id & 0xFFF0 == Item.QUATERNION:
                 return float(FILTER_RATE_HZ if rate in {0, setup.MAX_RATE} else rate)
         return 0.0
+
+    @property
+    def counter(self) -> int:
+        """Number of the next message."""
+        return self._counter
+
+    @property
+    def line_ns(self) -> int:
+        """How long the last sample took on a real line of the host's speed, ns."""
+        baud = self._line.host_baud
+        return self._sample_bytes * _BITS * 1_000_000_000 // baud if baud else 0
 
     @property
     def outputs(self) -> tuple[setup.Output, ...]:
@@ -295,7 +307,9 @@ class XbusDevice:
             for data_id, _ in self._outputs
             if (value := _value(data_id, counter, ticks % self._modulus, q)) is not None
         ]
-        return self._send(MessageId.MT_DATA2, mtdata2.encode_items(items))
+        data = mtdata2.encode_items(items)
+        self._sample_bytes = len(data) + 5
+        return self._send(MessageId.MT_DATA2, data)
 
 
 def _value(data_id: int, counter: int, ticks: int, q: Quaternion | None) -> Value | None:

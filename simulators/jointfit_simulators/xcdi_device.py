@@ -77,6 +77,16 @@ class XcdiDevice:
         """Groups a second, as configured."""
         return self._options.rate_hz
 
+    @property
+    def counter(self) -> int:
+        """Number of the next group."""
+        return self._counter
+
+    @property
+    def line_ns(self) -> int:
+        """No time: a bus adapter hands frames on at once."""
+        return 0
+
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one group now; ``ImuDevice.push`` says the rest."""
         frames = self.group(device_ns, q_world_sensor)

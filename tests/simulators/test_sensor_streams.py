@@ -19,6 +19,7 @@ class Listed:
     """A device that keeps what it sends, and whose line is full when asked to be."""
 
     rate_hz = 100.0
+    counter = line_ns = 0
 
     def __init__(self) -> None:
         self.streaming, self.full = True, False
