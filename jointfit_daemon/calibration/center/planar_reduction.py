@@ -1,0 +1,135 @@
+r"""From markers of two segments to one point moving about a fixed center in a plane.
+
+Law: what the parent does is taken out first; its markers' noise comes in by that, and is told.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Array = NDArray[np.float64]
+
+TOO_CLOSE_M = 1e-6
+
+
+def in_segment_plane(first: ArrayLike, second: ArrayLike, marker: ArrayLike) -> Array:
+    r"""Take a marker to the coordinates of a segment that two markers fix in the plane.
+
+    .. math:: x = R(-\varphi)\,(m - (p_1 + p_2)/2),
+              \qquad \varphi = \mathrm{atan2}(p_2 - p_1)
+
+    Parameters
+    ----------
+    first, second : array_like, shape (..., 2)
+        Markers of the parent, m: the origin is midway, x points from the first to the second.
+    marker : array_like, shape (..., 2)
+        Marker of the child, m.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        m; NaN where a marker is not seen or the parent's two are at one place.
+    """
+    p, q = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    d = np.asarray(marker, dtype=np.float64) - (p + q) / 2
+    along = q - p
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    length = np.where(length > TOO_CLOSE_M, length, np.nan)
+    e = along / length
+    x = (e * d).sum(axis=-1)
+    y = e[..., 0] * d[..., 1] - e[..., 1] * d[..., 0]
+    return np.stack((x, y), axis=-1)
+
+
+def project(points: ArrayLike, axis: ArrayLike) -> Array:
+    """Project points in the parent's coordinates on the plane across a joint's axis.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        m.
+    axis : array_like, shape (3,)
+        The joint's axis; x gives the plane (y, z).
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        m, along the two columns of ``plane_of(axis)``.
+    """
+    return np.asarray(np.asarray(points, dtype=np.float64) @ plane_of(axis))
+
+
+def plane_of(axis: ArrayLike) -> Array:
+    """Return two unit directions across an axis, right-handed with it, shape (3, 2).
+
+    For x they are exactly y and z. A center (a, b) found in the plane is ``plane @ (a, b)`` in
+    space, plus anything along the axis.
+
+    Raises
+    ------
+    ValueError
+        The axis has no length.
+    """
+    n = np.asarray(axis, dtype=np.float64)
+    length = float(np.linalg.norm(n))
+    if not length > 0.0:
+        raise ValueError("an axis needs a length: (0, 0, 0) has no plane across it")
+    n = n / length
+    # y is farthest from the axis a hinge of ours has; z stands in where the axis is y
+    guide = np.eye(3)[1 if abs(n[1]) < 0.9 else 2]
+    first = guide - n * (n @ guide)
+    first /= np.linalg.norm(first)
+    return np.column_stack((first, np.cross(n, first)))
+
+
+def parent_noise(lever: ArrayLike, apart: float, noise: float) -> Array:
+    r"""Return the covariance of a marker in coordinates that two noisy markers fix.
+
+    .. math:: \Sigma_x = \sigma^2 \left[ \tfrac32 I + \tfrac{2}{b^2}
+              \lambda_\perp \lambda_\perp^T \right], \qquad \lambda_\perp = (-\lambda_y, \lambda_x)
+
+    Two close parent markers are useless: their noise is turned by the lever arm.
+
+    Parameters
+    ----------
+    lever : array_like, shape (..., 2)
+        The marker from the middle of the parent's two, m.
+    apart : float
+        Distance of the parent's markers, b, m.
+    noise : float
+        Standard deviation of every coordinate of every marker, m.
+
+    Returns
+    -------
+    ndarray, shape (..., 2, 2)
+        m²; its component along the radius is the noise that a circle fit will find.
+    """
+    v = np.asarray(lever, dtype=np.float64)
+    across = np.stack((-v[..., 1], v[..., 0]), axis=-1)
+    outer = across[..., :, None] * across[..., None, :]
+    return np.asarray(noise**2 * (1.5 * np.eye(2) + 2.0 / apart**2 * outer))
+
+
+def radial_noise(points: ArrayLike, center: ArrayLike, apart: float, noise: float) -> float:
+    """Return the noise along the radius that a circle sees, parent's noise included, m.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2)
+        Marker in the parent's coordinates, m.
+    center : array_like, shape (2,)
+        m.
+    apart, noise : float
+        As in `parent_noise`, m.
+    """
+    x = np.asarray(points, dtype=np.float64)
+    spoke = x - np.asarray(center, dtype=np.float64)
+    spoke = spoke / np.linalg.norm(spoke, axis=-1, keepdims=True)
+    S = parent_noise(x, apart, noise)
+    return float(np.sqrt(np.einsum("ni,nij,nj->n", spoke, S, spoke).mean()))
