@@ -65,6 +65,9 @@ class ImuSample(NamedTuple):
     """Sequence number as sent; None if the device has none."""
     status: int | None = None
     """The device's own status word, if it sent one."""
+    rate: Vector | None = None
+    """Angular rate at the instant of the orientation, in the same sensor frame, rad/s; None where
+    none came. A mean since the sample before is no such rate: leave it out."""
 
 
 @dataclass(frozen=True, slots=True)

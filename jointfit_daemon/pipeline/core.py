@@ -236,6 +236,7 @@ class Core:
             sample.q_world_sensor,
             synced=stamp.synced,
             epoch=stamp.epoch,
+            rate=sample.rate,
         )
         if self._session.collecting:
             return self._session.add_sample(source, t_ns, sample.q_world_sensor)

@@ -6,8 +6,11 @@ order, each once, whatever comes in. Every pushed sample gets exactly one verdic
 Frame k is true for ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on when
 anything started. It goes out as soon as every living stream has a sample at or after t_k, or at
 its deadline: each stream's next sample is expected at its usual delay, and is waited for 1.5 of
-its periods at most. What is lacking then is continued at constant angular rate for up to 2.5
-periods after the last sample, and is missing after that.
+its periods at most. What is lacking then is continued from the last samples for up to 2.5 periods,
+and is missing after that.
+
+In mode ``fast`` a stream is content with a sample one of its own periods before t_k, and what lies
+between is extrapolated: frames leave one period earlier, never before t_k itself.
 """
 
 from __future__ import annotations
@@ -20,15 +23,12 @@ from jointfit_daemon.timing.stream import Stream, StreamSpec, Verdict
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.model import Quaternion
+    from jointfit_daemon.model import Quaternion, Vector
 
 __all__ = ["AlignedFrame", "FrameAligner", "Mode", "StreamSpec", "Verdict"]
 
 Mode = Literal["smooth", "fast"]
-"""``smooth`` waits for samples and interpolates; ``fast`` does not wait and extrapolates."""
-
-FAST_WAIT_NS = 1_000_000
-"""What ``fast`` grants the streams after t_k."""
+"""``smooth`` waits for samples and interpolates; ``fast`` extrapolates by a period at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,7 @@ class FrameAligner:
         *,
         synced: bool = True,
         epoch: int = 0,
+        rate: Vector | None = None,
     ) -> Verdict | None:
         """Take one sample; return its verdict if that is certain already.
 
@@ -120,13 +121,17 @@ class FrameAligner:
             Whether its clock has settled.
         epoch : int
             Epoch of its clock: samples of different epochs are never joined.
+        rate : Vector, optional
+            Angular rate at `t_ns` in the sensor's own frame, rad/s, where it was measured.
         """
         stream = self._streams[name]
         if not self._active:
             return stream.idle()
         self._changed = True
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
-        return stream.push(t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns)
+        return stream.push(
+            t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns, rate=rate
+        )
 
     def counts(self, name: str) -> dict[str, int]:
         """Return ``received`` and what became of it: the verdicts and ``pending`` add up to it."""
@@ -178,13 +183,10 @@ class FrameAligner:
     def _due(self) -> int:
         """Return when the next frame is or was complete, or its deadline if it is not, ns."""
         t_k = (self._next or 0) * self._period_ns
-        due = 0
-        for _, stream in self._items:
-            at = stream.due(t_k)
-            if self._fast and stream.newest_ns < t_k:
-                at = min(at, t_k + FAST_WAIT_NS)
-            due = max(due, at)
-        return due
+        if self._fast:
+            ahead = (stream.due(t_k - stream.period_ns) for _, stream in self._items)
+            return max(t_k, *ahead)
+        return max(stream.due(t_k) for _, stream in self._items)
 
     def _emit(self, due_ns: int) -> AlignedFrame | None:
         number = self._next or 0

@@ -1,8 +1,8 @@
 """One stream on its way into frames: its waiting samples, its habits, its verdicts.
 
 Law: pure, bounded; knows nothing of the other streams. A sample stays while a frame may still need
-it, at most two at or before the last frame (the rate of an extrapolation needs both), and gets its
-verdict when it leaves.
+it, at most three at or before the last frame (what an extrapolation needs), and gets its verdict
+when it leaves.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections import deque
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.kinematics.rotation_scalar import interpolate_one
+from jointfit_daemon.timing import interpolate
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Quaternion
+    from jointfit_daemon.model import Quaternion, Vector
 
 CAPACITY = 512
 """Samples that may wait in one stream."""
@@ -24,6 +24,8 @@ REACH = 2.5
 """Periods after the last sample that may be extrapolated over."""
 GAP = 4.0
 """Periods between two samples that may be interpolated over."""
+CROWDED = 0.5
+"""Periods between two samples that tell no rate: while a clock settles, stamps may crowd."""
 LOST_PERIODS = 3
 LOST_LEAST_NS = 50_000_000
 FUTURE_NS = 100_000_000
@@ -36,6 +38,7 @@ DELAY_MOST_NS = 250_000_000
 _EARLY = 20  # a twentieth of a period: a sample due just before t_k may as well come just after
 _DELAY_STEP = 128
 _DELAY_UP = 3  # three steps up for one down: settles where a quarter of the samples is later
+_BEHIND = 3  # samples at or before a frame that an extrapolation needs
 
 
 class StreamSpec(NamedTuple):
@@ -63,27 +66,31 @@ class Verdict(StrEnum):
 
 
 class _Sample:
-    __slots__ = ("arrival_ns", "late", "q", "synced", "t_ns", "used")
+    __slots__ = ("arrival_ns", "late", "q", "rate", "synced", "t_ns", "used")
 
-    def __init__(self, t_ns: int, arrival_ns: int, q: Quaternion, synced: bool, late: bool) -> None:
-        self.t_ns, self.arrival_ns, self.q, self.synced = t_ns, arrival_ns, q, synced
-        self.late, self.used = late, False
+    def __init__(
+        self, t_ns: int, arrival_ns: int, q: Quaternion, rate: Vector | None, synced: bool
+    ) -> None:
+        self.t_ns, self.arrival_ns, self.q, self.rate = t_ns, arrival_ns, q, rate
+        self.synced = synced
+        self.late = self.used = False
 
 
 class Stream:
     """Samples of one stream between their arrival and their verdict."""
 
     __slots__ = (
-        "_counts", "_delay_ns", "_delay_step", "_epoch", "_gap_ns", "_lost_after_ns",
-        "_patience_ns", "_period_ns", "_reach_ns", "_received", "_samples", "_waited_for",
-        "extrapolated", "newest_arrival_ns", "newest_ns", "synced",
+        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_epoch", "_gap_ns", "_lost_after_ns",
+        "_patience_ns", "_reach_ns", "_received", "_samples", "_waited_for",
+        "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced",
     )  # fmt: skip
 
     def __init__(self, spec: StreamSpec) -> None:
-        period = self._period_ns = spec.period_ns
+        period = self.period_ns = spec.period_ns
         self._patience_ns = round(PATIENCE * period)
         self._reach_ns = round(REACH * period)
         self._gap_ns = round(GAP * period)
+        self._crowded_ns = round(CROWDED * period)
         self._lost_after_ns = max(LOST_PERIODS * period, LOST_LEAST_NS)
         self._delay_step = max(1, period // _DELAY_STEP)
         self._delay_ns: int | None = None  # usual arrival minus stamp
@@ -112,6 +119,7 @@ class Stream:
         synced: bool,
         epoch: int,
         passed_ns: int | None,
+        rate: Vector | None = None,
     ) -> Verdict | None:
         """Take a sample; `passed_ns` is the last frame that is out. Return an early verdict."""
         self._received += 1
@@ -123,7 +131,8 @@ class Stream:
             self.reset()
             self._epoch = epoch
         samples = self._samples
-        sample = _Sample(t_ns, arrival_ns, q, synced, passed_ns is not None and t_ns <= passed_ns)
+        sample = _Sample(t_ns, arrival_ns, q, rate, synced)
+        sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
             return self._insert(sample)
         self._learn_delay(arrival_ns - t_ns)
@@ -182,7 +191,7 @@ class Stream:
             return 0
         newest = self.newest_ns
         if newest < t_ns:
-            period = self._period_ns
+            period = self.period_ns
             expected = newest - (newest + period // _EARLY - t_ns) // period * period
             deadline = expected + min(self._delay_ns or 0, DELAY_MOST_NS) + self._patience_ns
             return min(deadline, self.newest_arrival_ns + self._lost_after_ns)
@@ -195,28 +204,54 @@ class Stream:
         """Return the orientation at `t_ns`, which grows from call to call; None: missing."""
         self.extrapolated = False
         samples = self._samples
-        while len(samples) > 2 and samples[2].t_ns <= t_ns:  # noqa: PLR2004 - two may lie before
+        while len(samples) > _BEHIND and samples[_BEHIND].t_ns <= t_ns:
             self._leave(samples.popleft(), Verdict.DECIMATED)
         if not samples or samples[0].t_ns > t_ns:
             return None
-        left = 1 if len(samples) > 1 and samples[1].t_ns <= t_ns else 0
-        a = samples[left]
+        last = 0
+        while last + 1 < len(samples) and samples[last + 1].t_ns <= t_ns:
+            last += 1
+        a = samples[last]
         if a.t_ns == t_ns:
             a.used, self.synced = True, a.synced
             return a.q
-        if len(samples) > left + 1:
-            b = samples[left + 1]
+        if last + 1 < len(samples):
+            b = samples[last + 1]
             if b.t_ns - a.t_ns <= self._gap_ns:
-                return self._between(a, b, t_ns)
-        if left and t_ns - a.t_ns <= self._reach_ns and a.t_ns - samples[0].t_ns <= self._gap_ns:
-            self.extrapolated = True
-            return self._between(samples[0], a, t_ns)
-        return None
+                return self._between(self._before(last), a, b, t_ns)
+        if t_ns - a.t_ns > self._reach_ns:
+            return None
+        return self._beyond(last, t_ns)
 
-    def _between(self, a: _Sample, b: _Sample, t_ns: int) -> Quaternion:
+    def _before(self, at: int) -> _Sample | None:
+        """Return the sample before the one at that place, if the two tell a rate."""
+        if not at:
+            return None
+        before = self._samples[at - 1]
+        apart_ns = self._samples[at].t_ns - before.t_ns
+        return before if self._crowded_ns <= apart_ns <= self._gap_ns else None
+
+    def _between(self, before: _Sample | None, a: _Sample, b: _Sample, t_ns: int) -> Quaternion:
         a.used = b.used = True
         self.synced = a.synced and b.synced
-        return interpolate_one(a.q, b.q, (t_ns - a.t_ns) / (b.t_ns - a.t_ns))
+        if before is not None and before.synced is a.synced:
+            before.used = True
+        else:
+            before = None
+        return interpolate.between(before, a, b, t_ns)
+
+    def _beyond(self, last: int, t_ns: int) -> Quaternion | None:
+        before = self._before(last)
+        if before is None:
+            return None
+        a, earlier = self._samples[last], self._before(last - 1)
+        a.used = before.used = self.extrapolated = True
+        self.synced = a.synced and before.synced
+        if earlier is not None and earlier.synced is before.synced:
+            earlier.used = True
+        else:
+            earlier = None
+        return interpolate.beyond(earlier, before, a, t_ns)
 
     # --- end ---------------------------------------------------------------------------------
 
