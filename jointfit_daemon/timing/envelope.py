@@ -3,30 +3,27 @@
 Law: pure, integers in, constant memory, constant time a sample (a refit a second).
 
 With device time u and arrival A the difference ``y = A - u = c + s u + D`` has a delay
-``D >= D_min`` of unknown shape. The line that minimises ``sum(y - c - s u)`` without passing above
-any point is the edge of the lower convex hull that straddles the mean of u (Moon, Skelly, Towsley,
-INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002). It rests on the fastest samples, so jitter of any
-shape leaves it unbiased but for D_min, which nobody can see from one side.
+``D >= D_min`` of unknown shape. The line wanted passes below every point and as close as it can:
+``feasible`` tells its mean and covariance. It rests on the fastest samples, so jitter of any shape
+leaves it unbiased but for D_min, which nobody can see from one side.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from itertools import pairwise
-from math import hypot, inf
+from math import hypot, inf, sqrt
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+from jointfit_daemon.timing.feasible import mean_feasible_line
 
-Point = tuple[int, int]
-"""Device time and difference, ns."""
+if TYPE_CHECKING:
+    from jointfit_daemon.timing.feasible import Point
 
 BUCKET_NS = 250_000_000
 """Of each bucket only the fastest sample is kept."""
 BUCKETS = 240
 """One minute: long against jitter, short against the temperature of a crystal."""
-YOUNG_NS = 5_000_000_000
+YOUNG_NS = 10_000_000_000
 """Until this span every bucket is worth a refit; later one a second is."""
 SETTLED_NS = 2_000_000_000
 SETTLED_POINTS = 10
@@ -41,34 +38,11 @@ _OLD_REFIT_BUCKETS = 4
 _LINE_POINTS = 3  # two make a line, the third a doubt
 
 
-def lower_hull(points: Iterable[Point]) -> list[Point]:
-    """Return the lower convex hull from left to right (Andrew's monotone chain, exact)."""
-    hull: list[Point] = []
-    for u, y in sorted(points):
-        while len(hull) > 1:
-            (u0, y0), (u1, y1) = hull[-2], hull[-1]
-            if (u1 - u0) * (y - y0) > (y1 - y0) * (u - u0):
-                break
-            hull.pop()
-        if hull and hull[-1][0] == u:  # same instant, and not lower: sorted() put the lower first
-            continue
-        hull.append((u, y))
-    return hull
-
-
-def straddling_edge(hull: Sequence[Point], mean_u: float) -> tuple[Point, Point]:
-    """Return the edge of `hull` (two points or more) that spans `mean_u`."""
-    for left, right in pairwise(hull):
-        if mean_u <= right[0]:
-            return left, right
-    return hull[-2], hull[-1]
-
-
 class Envelope:
     """Streaming lower envelope of (u, y).
 
-    The slope is the hull's, drawn towards its prior as far as the hull cannot tell: with a short
-    span or a few scattered points it stays near 0, later the prior no longer matters.
+    The slope stays near its prior as long as the points cannot tell: with a short span or a few
+    scattered ones it is near 0, later the prior no longer matters.
 
     Parameters
     ----------
@@ -78,7 +52,7 @@ class Envelope:
 
     __slots__ = (
         "_best", "_best_key", "_bucket_end", "_c", "_points", "_prior", "_prior_sd", "_ref",
-        "_sealed", "_sigma_c", "_sigma_s", "_span", "_y0", "skew",
+        "_sealed", "_span", "_variance", "_y0", "skew",
     )  # fmt: skip
 
     def __init__(self, skew_sd: float = CRYSTAL) -> None:
@@ -90,7 +64,7 @@ class Envelope:
         self._best_key = inf
         self._bucket_end = self._ref = self._y0 = self._sealed = self._span = 0
         self._c = 0.0
-        self._sigma_c, self._sigma_s = inf, skew_sd
+        self._variance = (inf, 0.0, skew_sd**2)
 
     @property
     def settled(self) -> bool:
@@ -109,7 +83,9 @@ class Envelope:
 
     def sigma_ns(self, u: int) -> float:
         """Return the standard deviation of the line at `u`, ns; inf before the third bucket."""
-        return self._sigma_c + self._sigma_s * abs(u - self._ref + self._span // 2)
+        height, both, slope = self._variance
+        ahead = u - self._ref
+        return hypot(FLOOR_NS, sqrt(max(0.0, height + ahead * (2.0 * both + ahead * slope))))
 
     def feed(self, u: int, y: int) -> float:
         """Take a point with increasing `u`; return how far above the line it was, ns.
@@ -142,7 +118,8 @@ class Envelope:
         self._sealed += 1
         if not points:  # a silence of a whole window: the slope is still a good guess
             self._prior, self._prior_sd = self.skew, CRYSTAL / 10
-            self._c, self._ref, self._sigma_c = y - 0.0, u, inf
+            self._c, self._ref = float(y), u
+            self._variance = (inf, 0.0, self._prior_sd**2)
         elif self._span < YOUNG_NS or self._sealed % _OLD_REFIT_BUCKETS == 0:
             self._refit(u)
         self._best, self._best_key = (u, y), y - self.skew * (u - self._ref)
@@ -153,18 +130,6 @@ class Envelope:
         if len(points) < _LINE_POINTS:
             self._c, self._ref = self._c + self.skew * (u - self._ref), u
             return
-        hull = lower_hull(points)
-        (ua, ya), (ub, yb) = straddling_edge(hull, sum(p[0] for p in points) / len(points))
-        slope = (yb - ya) / (ub - ua)
-        rests = sorted(y - ya - slope * (at - ua) for at, y in points)
-        # Two rest on the line and the third may be near it by luck; the median never is, and the
-        # line is the better the more points there are (1/n, as for any minimum).
-        typical = rests[len(rests) // 2] * min(1.0, SETTLED_POINTS / len(rests))
-        self._sigma_c = max(FLOOR_NS, rests[2], typical)
-        reach = max(ub - ua, self._span / 2)
-        hull_var, prior_var = 2.0 * (self._sigma_c / reach) ** 2, self._prior_sd**2
-        trust = prior_var / (prior_var + hull_var)
-        self.skew = self._prior + trust * (slope - self._prior)
-        self._sigma_s = hypot(self._prior_sd * (1.0 - trust), trust * hull_var**0.5)
-        self._ref = u
-        self._c = min(y - self.skew * (at - u) for at, y in hull)
+        line = mean_feasible_line(points, u, self._prior, self._prior_sd)
+        self._ref, self._c, self.skew = u, line.height, line.slope
+        self._variance = (line.height_var, line.both, line.slope_var)

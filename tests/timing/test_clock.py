@@ -119,9 +119,11 @@ def test_devices_without_time_are_stamped_evenly(delay: Delay, use: str, state: 
 
 @pytest.mark.parametrize("seconds", [3, 5])
 def test_a_young_clock_does_not_trust_its_slope(seconds: int) -> None:
+    worst = []
     for seed in range(12):
         errors, _ = errors_of(DeviceClock(PERIOD), Device(seed).samples(6.5, latency_timer))
-        assert after(errors, seconds) < 0.45
+        worst.append(after(errors, seconds))
+    assert float(np.sqrt(np.mean(np.square(worst)))) < 0.25
 
 
 def test_a_better_estimate_is_approached_slowly_and_sigma_says_how_far_it_is() -> None:

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.timing.envelope import Envelope, lower_hull, straddling_edge
+from jointfit_daemon.timing.envelope import Envelope
+from jointfit_daemon.timing.feasible import lower_hull, straddling_edge
 from jointfit_daemon.timing.wrap import unwrap
 
 MS = 1_000_000

@@ -1,0 +1,139 @@
+"""Lines that pass below all points of a cloud: where they are on average, and how far apart.
+
+Law: pure functions of points with integer coordinates.
+
+Of points ``y = c + s u + D`` with delays D >= 0 a line (c, s) is *feasible* if it lies above no
+point. The smallest delays come at a constant rate of G points a nanosecond of height, whatever the
+shape of the others, so the likelihood of a feasible line is ``exp(G sum_mean)``, where
+``sum_mean = c + s mean(u)``. Its maximum is the edge of the lower convex hull that straddles the
+mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002). Its mean, under a
+normal prior of s, errs less and has a covariance to tell of. Given s, c is at most ``h(s) =
+min(y - s u)`` and exponentially distributed below that, with mean ``h(s) - 1/G``; what is left is
+an integral over s alone.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import exp, log
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+Point = tuple[int, int]
+"""Device time and difference, ns."""
+
+_SUPPORTS = 2  # points that every edge rests on
+_FINEST_NS = 1_000.0  # no cloud of points is taken to define its lower edge better
+_TAIL = 14.0  # of the logarithm of the likelihood
+_PRIOR_TAIL = 6.0
+_STEPS = 20
+_PASSES = 3
+
+
+class Line(NamedTuple):
+    """Mean and covariance of the feasible lines."""
+
+    height: float
+    """At the reference, ns."""
+    slope: float
+    height_var: float
+    both: float
+    """Covariance of height and slope."""
+    slope_var: float
+
+
+def lower_hull(points: Iterable[Point]) -> list[Point]:
+    """Return the lower convex hull from left to right (Andrew's monotone chain, exact)."""
+    hull: list[Point] = []
+    for u, y in sorted(points):
+        while len(hull) > 1:
+            (u0, y0), (u1, y1) = hull[-2], hull[-1]
+            if (u1 - u0) * (y - y0) > (y1 - y0) * (u - u0):
+                break
+            hull.pop()
+        if hull and hull[-1][0] == u:  # same instant, and not lower: sorted() put the lower first
+            continue
+        hull.append((u, y))
+    return hull
+
+
+def straddling_edge(hull: Sequence[Point], mean_u: float) -> tuple[Point, Point]:
+    """Return the edge of `hull` (two points or more) that spans `mean_u`."""
+    for left, right in pairwise(hull):
+        if mean_u <= right[0]:
+            return left, right
+    return hull[-2], hull[-1]
+
+
+def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd: float) -> Line:
+    """Return the mean of the lines below `points`, weighted by their likelihood.
+
+    Parameters
+    ----------
+    points : sequence of (int, int)
+        (u, y) in ns, three or more, at different u.
+    ref : int
+        The u at which the height is asked for, ns.
+    prior, prior_sd : float
+        What is known of the slope beforehand.
+    """
+    hull = lower_hull(points)
+    mean_u = sum(at for at, _ in points) / len(points)
+    (ua, ya), (ub, yb) = straddling_edge(hull, mean_u)
+    edge = (yb - ya) / (ub - ua)
+    scale = _edge_scale([y - ya - edge * (at - ua) for at, y in points])
+    rows = [(float(at - ref), float(y - ya)) for at, y in hull]
+    middle, least = mean_u - ref, (hull[-1][0] - hull[0][0]) / 100
+    low = edge - _TAIL * scale / max(mean_u - ua, least)
+    high = edge + _TAIL * scale / max(ub - mean_u, least)
+    near, far = prior - _PRIOR_TAIL * prior_sd, prior + _PRIOR_TAIL * prior_sd
+    if low < far and near < high:
+        low, high = max(low, near), min(high, far)
+    grid = _weighed(rows, middle, scale, (low, high), (prior, prior_sd))
+    return _moments(grid, scale, float(ya))
+
+
+def _edge_scale(rests: list[float]) -> float:
+    """Return 1/G, ns, from the heights of all points above the edge."""
+    rests.sort()
+    # Half of the points lie within log(2) mean heights. The two that the edge rests on say nothing,
+    # and a third is the price of not knowing the mean height beforehand.
+    median = rests[(len(rests) + _SUPPORTS) // 2]
+    return max(median / log(2.0), _FINEST_NS) / max(1, len(rests) - _SUPPORTS - 1)
+
+
+def _weighed(
+    rows: list[tuple[float, float]],
+    middle: float,
+    scale: float,
+    limits: tuple[float, float],
+    prior: tuple[float, float],
+) -> list[tuple[float, float, float]]:
+    """Return slope, highest feasible height and weight over the slopes that matter."""
+    low, high = limits
+    mean, sd = prior
+    grid: list[tuple[float, float, float]] = []
+    top = 0.0
+    for _ in range(_PASSES):
+        step = (high - low) / _STEPS
+        grid = []
+        for k in range(_STEPS + 1):
+            s = low + k * step
+            height = min([y - s * u for u, y in rows])
+            grid.append((s, height, (height + s * middle) / scale - 0.5 * ((s - mean) / sd) ** 2))
+        top = max([row[2] for row in grid])
+        kept = [k for k, row in enumerate(grid) if row[2] > top - _TAIL]
+        low, high = grid[max(0, kept[0] - 1)][0], grid[min(_STEPS, kept[-1] + 1)][0]
+    return [(s, height, exp(weight - top)) for s, height, weight in grid]
+
+
+def _moments(grid: list[tuple[float, float, float]], scale: float, base: float) -> Line:
+    total = sum([w for _, _, w in grid])
+    slope = sum([w * s for s, _, w in grid]) / total
+    height = sum([w * h for _, h, w in grid]) / total
+    slope_var = sum([w * (s - slope) ** 2 for s, _, w in grid]) / total
+    both = sum([w * (s - slope) * (h - height) for s, h, w in grid]) / total
+    height_var = sum([w * (h - height) ** 2 for _, h, w in grid]) / total
+    return Line(base + height - scale, slope, height_var + scale**2, both, slope_var)
