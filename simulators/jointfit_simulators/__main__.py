@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import selectors
 import signal
 import sys
 import time
@@ -174,6 +175,11 @@ async def _play(options: argparse.Namespace) -> None:
         obeying.cancel()
 
 
+def _punctual_loop() -> asyncio.AbstractEventLoop:
+    """Return a loop that wakes to the microsecond: epoll rounds up to the next millisecond."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jointfit-sim``; return its exit code."""
     options = _parser().parse_args(arguments)
@@ -183,7 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say({"motions": list(MOTIONS)})
     else:
         try:
-            asyncio.run(_play(options))
+            with asyncio.Runner(loop_factory=_punctual_loop) as runner:
+                runner.run(_play(options))
         except (ValueError, UnknownMotion, OSError) as error:
             print(f"jointfit-sim: {error}", file=sys.stderr)
             return USAGE

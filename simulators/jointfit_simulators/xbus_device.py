@@ -105,7 +105,7 @@ class XbusDevice:
         self._measuring = options.measures_at_once or options.stuck
         self._stuck, self._waking = options.stuck, False
         self._counter = options.first_counter
-        self._epoch_ns = self._last_ns = self._messages = self._to_lose = self._sample_bytes = 0
+        self._epoch_ns = self._last_ns = self._messages = self._to_lose = 0
         self._random = random.Random(3)  # noqa: S311 - the same foreign times every run
         self._timer: asyncio.TimerHandle | None = None
         self.sent = 0
@@ -135,9 +135,10 @@ class XbusDevice:
 
     @property
     def line_ns(self) -> int:
-        """How long the last sample took on a real line of the host's speed, ns."""
+        """How long a sample takes on a real line of the host's speed, ns."""
         baud = self._line.host_baud
-        return self._sample_bytes * _BITS * 1_000_000_000 // baud if baud else 0
+        size = len(encode(MessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0))))
+        return size * _BITS * 1_000_000_000 // baud if baud else 0
 
     @property
     def outputs(self) -> tuple[setup.Output, ...]:
@@ -302,14 +303,15 @@ class XbusDevice:
         if self._to_lose:
             self._to_lose -= 1
             return False
-        items = [
+        return self._send(MessageId.MT_DATA2, self._content(counter, ticks % self._modulus, q))
+
+    def _content(self, counter: int, ticks: int, q: Quaternion | None) -> bytes:
+        """Return the data of one MTData2."""
+        return mtdata2.encode_items(
             (data_id, value)
             for data_id, _ in self._outputs
-            if (value := _value(data_id, counter, ticks % self._modulus, q)) is not None
-        ]
-        data = mtdata2.encode_items(items)
-        self._sample_bytes = len(data) + 5
-        return self._send(MessageId.MT_DATA2, data)
+            if (value := _value(data_id, counter, ticks, q)) is not None
+        )
 
 
 def _value(data_id: int, counter: int, ticks: int, q: Quaternion | None) -> Value | None:
