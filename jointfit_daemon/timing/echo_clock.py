@@ -15,6 +15,8 @@ from collections import deque
 from math import inf, sqrt
 from typing import NamedTuple
 
+from jointfit_daemon.timing.line_fit import FittedLine, fit_line
+
 MEMORY_NS = 120_000_000_000
 CAPACITY = 256
 BURST = 10
@@ -25,9 +27,6 @@ SKEW_SD = 50e-6
 STALE_NS = 20_000_000_000
 JUMP_NS = 5_000_000
 """A server clock that disagrees by more than this, beyond the echo's own bound, began anew."""
-
-_HUBER = 1.345
-_PASSES = 4
 
 
 class _Echo(NamedTuple):
@@ -40,14 +39,13 @@ class EchoFit:
     """Line through the echoes of the last two minutes."""
 
     __slots__ = (
-        "_covariance", "_echoes", "_ref", "_theta", "_theta_ref", "bound_ns", "echoes", "slope",
+        "_echoes", "_line", "_ref", "_theta_ref", "bound_ns", "echoes", "slope",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self._echoes: deque[_Echo] = deque(maxlen=CAPACITY)
         self._ref = self._theta_ref = 0
-        self._theta = 0.0
-        self._covariance = (inf, 0.0, SKEW_SD**2)
+        self._line = FittedLine(0.0, 0.0, inf, 0.0, SKEW_SD**2)
         self.slope = 0.0
         """d theta / d host time: positive when the server clock runs fast."""
         self.bound_ns = inf
@@ -65,12 +63,19 @@ class EchoFit:
         """Host time of the last echo; None before the first."""
         return self._echoes[-1].middle_ns if self._echoes else None
 
+    @property
+    def skew_sigma(self) -> float:
+        """Standard deviation of ``slope``."""
+        return sqrt(self._line.slope_var)
+
     def contradicts(self, u: int, sent_ns: int, received_ns: int) -> bool:
         """Tell whether an answer cannot come from the clock that was fitted."""
         if not self.settled:
             return False
         middle = (sent_ns + received_ns) // 2
-        excess = abs(u - middle - self._theta_ref - self._theta - self.slope * (middle - self._ref))
+        excess = abs(
+            u - middle - self._theta_ref - self._line.height - self.slope * (middle - self._ref)
+        )
         return excess > (received_ns - sent_ns) / 2 + JUMP_NS
 
     def feed(self, u: int, sent_ns: int, received_ns: int) -> None:
@@ -100,29 +105,18 @@ class EchoFit:
             )
             for echo in kept
         ]
-        theta, slope = rows[0][1], 0.0
-        covariance = self._covariance
-        for number in range(_PASSES):
-            a = b = d = p = q = 0.0
-            for m, y, weight in rows:
-                residual = abs(y - theta - slope * m) * sqrt(weight)
-                w = weight if number == 0 or residual <= _HUBER else weight * _HUBER / residual
-                a, b, d = a + w, b + w * m, d + w * m * m
-                p, q = p + w * y, q + w * m * y
-            d += 1.0 / SKEW_SD**2
-            det = a * d - b * b
-            theta, slope = (d * p - b * q) / det, (a * q - b * p) / det
-            covariance = (d / det, -b / det, a / det)
         self._ref, self._theta_ref = ref, theta_ref
-        self._theta, self.slope, self._covariance = theta, slope, covariance
+        self._line = fit_line(rows, SKEW_SD)
+        self.slope = self._line.slope
 
     def host_ns(self, u: int) -> int:
         """Return the host time of server time `u`, ns: solves ``u = m + theta(m)``."""
         ahead = u - self._ref - self._theta_ref
-        return self._ref + ahead - round((self._theta + self.slope * ahead) / (1.0 + self.slope))
+        return (
+            self._ref + ahead - round((self._line.height + self.slope * ahead) / (1.0 + self.slope))
+        )
 
     def sigma_ns(self, host_ns: int) -> float:
         """Return the standard deviation at `host_ns`, ns; inf before any echo."""
         m = host_ns - self._ref
-        theta_var, both, slope_var = self._covariance
-        return sqrt(max(0.0, theta_var + m * (2.0 * both + m * slope_var)))
+        return sqrt(self._line.variance_at(m))

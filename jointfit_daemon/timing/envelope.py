@@ -71,6 +71,11 @@ class Envelope:
         """Whether the line rests on enough."""
         return len(self._points) >= SETTLED_POINTS and self._span >= SETTLED_NS
 
+    @property
+    def skew_sigma(self) -> float:
+        """Standard deviation of ``skew``."""
+        return sqrt(self._variance[2])
+
     def residual(self, u: int, y: int) -> float:
         """Return how far (u, y) lies above the line, ns; 0 before the first point."""
         if self._best is None:

@@ -1,0 +1,49 @@
+"""A straight line through points of unequal worth, some of them wrong. Law: pure; no state.
+
+Weighted least squares with Huber weights and a normal prior of the slope (mean 0), so that a short
+span gives no wild slope.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_HUBER = 1.345
+_PASSES = 4
+
+
+class FittedLine(NamedTuple):
+    """``y = height + slope x`` with its covariance."""
+
+    height: float
+    slope: float
+    height_var: float
+    both: float
+    """Covariance of height and slope."""
+    slope_var: float
+
+    def variance_at(self, x: float) -> float:
+        """Return the variance of the line at `x`."""
+        return max(0.0, self.height_var + x * (2.0 * self.both + x * self.slope_var))
+
+
+def fit_line(rows: Sequence[tuple[float, float, float]], slope_sd: float) -> FittedLine:
+    """Return the line through `rows`, each (x, y, 1/variance of y); at least one."""
+    height, slope = rows[0][1], 0.0
+    height_var = both = slope_var = 0.0
+    for number in range(_PASSES):
+        a = b = d = p = q = 0.0
+        for x, y, weight in rows:
+            residual = abs(y - height - slope * x) * sqrt(weight)
+            w = weight if number == 0 or residual <= _HUBER else weight * _HUBER / residual
+            a, b, d = a + w, b + w * x, d + w * x * x
+            p, q = p + w * y, q + w * x * y
+        d += 1.0 / slope_sd**2
+        det = a * d - b * b
+        height, slope = (d * p - b * q) / det, (a * q - b * p) / det
+        height_var, both, slope_var = d / det, -b / det, a / det
+    return FittedLine(height, slope, height_var, both, slope_var)
