@@ -49,6 +49,9 @@ class CenterEstimate:
     """Unit axis of a hinge in the parent's coordinates, shape (3,), where one was found."""
     flags: tuple[str, ...] = ()
     """What the user should know and what was done about it, e.g. ``orientation_inconsistent``."""
+    within95: float | None = None
+    """Squared Mahalanobis distance eᵀC⁻¹e that 95 % of the centers published by this method stay
+    within: the published ellipse. None: the quantile of chi-square is the best that is known."""
     refused: str | None = None
     """Why the center must not be used and what to do; None if it may be used."""
 

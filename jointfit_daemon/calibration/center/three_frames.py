@@ -86,7 +86,7 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
     radius = float(np.hypot(*spokes[0]))
     u = spokes / radius
     design = np.column_stack((u, np.ones(3)))
-    covariance: Array = noise**2 * np.linalg.inv(design.T @ design)[:2, :2]
+    covariance = np.asarray(noise**2 * np.linalg.inv(design.T @ design)[:2, :2])
     error = float(triangle_error(p, noise))
     # beyond it the smallest turn of the center is lost in noise and the error has no mean square
     lost = f"noise of {1000 * noise:.1f} mm hides the arc: choose frames further apart"

@@ -1,0 +1,259 @@
+r"""From a circle's moments to a published center: the error told, or why there is none.
+
+Law: one verdict for all planar estimators. A refusal names its cause and the remedy; nothing that
+is not known is given as a number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import degrees, inf, isfinite, pi, radians, sin, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration.center.circle import (
+    Method,
+    circle_from_root,
+    smallest_root,
+    temper,
+)
+from jointfit_daemon.calibration.center.moments import (
+    GATE,
+    ROUNDING,
+    CircleMoments,
+    Judged,
+    ellipse_scale,
+    judge,
+    moments_of,
+)
+from jointfit_daemon.calibration.center.result import CenterEstimate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike
+
+Array = NDArray[np.float64]
+
+STILL_M = 0.001
+"""RMS distance from their mean below which points are one place seen again and again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a planar center must keep to be published."""
+
+    gate: float = GATE
+    """Least T."""
+    reach: tuple[float, float] = (0.02, 1.0)
+    """Distance of a marker from the center, m."""
+    arc: float = radians(10.0)
+    """Least angle gone through, rad."""
+    sd: float = 0.02
+    """Largest predicted RMS error, m."""
+
+
+def circle_estimate(
+    points: ArrayLike,
+    weights: ArrayLike | None = None,
+    *,
+    method: Method = "hyper",
+    limits: Limits | None = None,
+) -> CenterEstimate:
+    """Estimate the center one marker turns about from all its frames at once.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2)
+        In the parent's coordinates, in order of time, m; NaN where not seen.
+    weights : array_like, shape (n,), optional
+        Not negative.
+    method : str
+        ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
+    limits : Limits, optional
+        When to refuse.
+
+    Returns
+    -------
+    CenterEstimate
+        The same, to rounding, as a `RunningCircle` fed with these points gives.
+    """
+    p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    seen = np.asarray(np.isfinite(p).all(axis=-1))
+    w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
+    m = CircleMoments(*(float(v) for v in moments_of(p, w)))
+
+    def lagged(a: float, b: float, square: float) -> float:
+        d = np.where(seen[:, None], p, 0.0) - (m.x + a, m.y + b)
+        e = ((d**2).sum(axis=-1) - square) / (2.0 * sqrt(square))
+        pair = w[1:] * w[:-1]
+        return float((pair * e[1:] * e[:-1]).sum() / max(float(pair.sum()), 1e-300))
+
+    return publish(m, lagged, method=method, frames=int(seen.sum()), limits=limits or Limits())
+
+
+def publish(
+    m: CircleMoments[float],
+    lagged: Callable[[float, float, float], float],
+    *,
+    method: Method,
+    frames: int,
+    limits: Limits,
+) -> CenterEstimate:
+    """Fit, judge and tell.
+
+    Parameters
+    ----------
+    m : CircleMoments
+        Of the points.
+    lagged : callable
+        Mean product of the radial residuals of neighbours in time, m², about the center (a, b) from
+        the centroid and for R²: what correlation is read from.
+    method : str
+        Of the circle.
+    frames : int
+        Points seen.
+    limits : Limits
+        When to refuse.
+    """
+    reason = _no_circle(m, frames)
+    if reason is not None:
+        return nothing(method, (m.x, m.y), frames, reason)
+    a, b, square = circle_from_root(m, smallest_root(m, method), method)
+    judged = judge(m, a, b, square) if square > 0.0 else None
+    if judged is None or not (judged.largest > 0.0 or judged.noise == 0.0):
+        reason = "noise hides the arc: move the joint further, or bring the cameras closer"
+        return nothing(method, (m.x, m.y), frames, reason)
+    wider = _persistence(lagged(a, b, square), judged.residual)
+    return _told(m, (a, b, square), judged, wider, method=method, frames=frames, limits=limits)
+
+
+def _told(
+    m: CircleMoments[float],
+    circle: tuple[float, float, float],
+    judged: Judged[float],
+    wider: float,
+    *,
+    method: Method,
+    frames: int,
+    limits: Limits,
+) -> CenterEstimate:
+    a, b, square = circle
+    cov = (wider * judged.xx, wider * judged.xy, wider * judged.yy)
+    largest = wider * judged.largest
+    T = sqrt(square / largest) if largest > 0.0 else inf
+    a, b, cov = temper(a, b, square, cov)
+    radius, arc = sqrt(square), arc_of_spread((m.xx + m.yy - 2.0 * judged.noise) / square)
+    effective = m.effective / wider
+    sd = sqrt(max(cov[0] + cov[2], 0.0))
+    return CenterEstimate(
+        method=method,
+        center=np.array([m.x + a, m.y + b]),
+        covariance=np.array([[cov[0], cov[1]], [cov[1], cov[2]]]),
+        noise=sqrt(judged.noise),
+        residual=sqrt(judged.residual),
+        radii=np.array([radius]),
+        arc=arc,
+        bound=sqrt(judged.bound),
+        conditioning=T,
+        frames=frames,
+        effective_frames=effective,
+        within95=ellipse_scale(m.effective, T),
+        refused=objection(radius, arc, T, sd, limits),
+    )
+
+
+def objection(radius: float, arc: float, T: float, sd: float, limits: Limits) -> str | None:
+    """Return why a circle that was found must not be used, with the remedy; None if it may."""
+    if not limits.reach[0] <= radius <= limits.reach[1]:
+        return (
+            f"the marker would be {radius:.2f} m from the center, not {limits.reach[0]:g} to "
+            f"{limits.reach[1]:g} m: check marker names, or move the joint further"
+        )
+    if arc < limits.arc:
+        return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
+    if limits.gate > T:
+        return (
+            f"ill-conditioned: the arc's curvature is {T:.1f} times its standard error, at least "
+            f"{limits.gate:g} are needed: move the joint further"
+        )
+    if sd > limits.sd:
+        return (
+            f"uncertain to {1000 * sd:.0f} mm, more than the {1000 * limits.sd:.0f} mm allowed: "
+            "move the joint further or for longer"
+        )
+    return None
+
+
+def nothing(
+    method: str, at: tuple[float, float], frames: int, reason: str, flags: tuple[str, ...] = ()
+) -> CenterEstimate:
+    """Return the estimate that says that there is none: every direction unseen."""
+    middle = np.array(at if isfinite(at[0]) and isfinite(at[1]) else (0.0, 0.0))
+    return CenterEstimate(
+        method=method,
+        center=middle,
+        covariance=np.zeros((2, 2)),
+        noise=0.0,
+        residual=0.0,
+        radii=np.zeros(0),
+        arc=0.0,
+        bound=inf,
+        conditioning=0.0,
+        frames=frames,
+        effective_frames=float(frames),
+        unseen=np.eye(2),
+        flags=flags,
+        refused=reason,
+    )
+
+
+def _no_circle(m: CircleMoments[float], frames: int) -> str | None:
+    spread = m.xx + m.yy
+    if frames == 0:
+        return "the marker was never seen: check its name, the cameras and what covers it"
+    if not isfinite(m.zz):
+        return "a coordinate is absurdly large: check the units and the marker's name"
+    if frames < 4 or m.effective <= 3.0:
+        return f"{frames} usable frames, at least 4 are needed: record for longer"
+    if spread < STILL_M**2:
+        return f"no motion: the marker moved {1000 * sqrt(spread):.1f} mm RMS: move the joint"
+    if m.xx * m.yy - m.xy**2 <= ROUNDING * spread**2:
+        return "the points are on a line, a straight path has no center: turn the joint"
+    return None
+
+
+def _persistence(product: float, residual: float) -> float:
+    rho = product / residual if residual > 0.0 else 0.0
+    rho = min(max(rho, 0.0), 0.99) if isfinite(rho) else 0.0
+    return (1.0 + rho) / (1.0 - rho)
+
+
+def arc_of_spread(spread: float) -> float:
+    r"""Return the evenly covered arc, rad, whose points have this variance over R².
+
+    .. math:: 1 - \left( \frac{\sin(\varphi/2)}{\varphi/2} \right)^2 = \text{spread}
+    """
+    if spread <= 0.0:
+        return 0.0
+    if spread >= 1.0:
+        return 2.0 * pi
+    low, high = 0.0, pi
+    for _ in range(30):
+        half = (low + high) / 2
+        low, high = (half, high) if 1.0 - (sin(half) / half) ** 2 < spread else (low, half)
+    return low + high
+
+
+def arc_about(points: Array, center: Array) -> float:
+    """Return the angle between the outermost of the points about a center, rad, at most 2π."""
+    seen = points[np.isfinite(points).all(axis=-1)] - center
+    if len(seen) < 2 or not np.isfinite(center).all():
+        return 0.0
+    turn = np.sort(np.arctan2(seen[:, 1], seen[:, 0]))
+    gaps = np.diff(turn, append=turn[0] + 2.0 * pi)
+    widest = float(gaps.max())
+    # a full circle leaves gaps no wider than its frames are apart
+    return 2.0 * pi - widest if widest > 4.0 * pi / len(seen) else 2.0 * pi
