@@ -1,0 +1,107 @@
+r"""What a fit of spheres needs to know of any number of frames: sums of fixed size.
+
+Law: for every marker φ = (|p|², p, 1), p its place from a fixed point near it. All estimates of
+spheres about one center are functions of
+
+.. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
+          L_j = \sum_t \sqrt{w_{tj} w_{t-1,j}}\, φ_{tj} φ_{t-1,j}^T
+
+M holds the residuals' variances and what markers have in common (noise of the parent's frame), L
+how long they persist. Forgetting multiplies both. A marker that is not seen adds nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SphereSums:
+    """Sums over frames of k markers in d dimensions, e = d + 2."""
+
+    origin: Array
+    """The fixed point of each marker, m, shape (k, d)."""
+    M: Array
+    """Shape (k, e, k, e)."""
+    L: Array
+    """Shape (k, e, e)."""
+    squares: Array
+    """Σ w², shape (k,)."""
+    frames: int
+    """Frames that showed any marker."""
+
+    @property
+    def weights(self) -> Array:
+        """Return Σ w per marker, shape (k,)."""
+        last = self.M.shape[1] - 1
+        return np.asarray(np.einsum("jj->j", self.M[:, last, :, last]).copy())
+
+    @property
+    def counts(self) -> Array:
+        """Return how many frames the weights are worth, (Σw)²/Σw² per marker, shape (k,)."""
+        return np.asarray(self.weights**2 / np.maximum(self.squares, 1e-300))
+
+    def only(self, markers: Array) -> SphereSums:
+        """Return the sums of some markers, given as a mask or as indices."""
+        pick = np.arange(len(self.origin))[markers]
+        M = self.M[pick][:, :, pick]
+        return SphereSums(self.origin[pick], M, self.L[pick], self.squares[pick], self.frames)
+
+
+def raised(points: Array, origin: Array) -> Array:
+    """Return φ of points, shape (..., k, d), about `origin`, (k, d): shape (..., k, d + 2)."""
+    p = points - origin
+    square = (p * p).sum(axis=-1, keepdims=True)
+    return np.concatenate((square, p, np.ones_like(square)), axis=-1)
+
+
+def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
+    """Sum over all frames at once.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, d)
+        Markers, m; NaN where not seen.
+    weights : ndarray, shape (n, k), optional
+        Non-negative; one if None.
+    """
+    seen = np.isfinite(points).all(axis=-1)
+    w = np.where(seen, 1.0 if weights is None else weights, 0.0)
+    known = np.where(seen[..., None], points, 0.0)
+    origin = known.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
+    phi = np.sqrt(w)[..., None] * raised(np.where(seen[..., None], points, origin), origin)
+    n, k, e = phi.shape
+    flat = phi.reshape(n, k * e)
+    M = (flat.T @ flat).reshape(k, e, k, e)
+    L = np.einsum("tja,tjb->jab", phi[1:], phi[:-1])
+    return SphereSums(origin, M, L, (w * w).sum(axis=0), int(np.count_nonzero(seen.any(axis=1))))
+
+
+def shift(by: Array) -> Array:
+    """Return T, shape (k, e, e): φ about a point moved by `by`, shape (k, d), is T φ."""
+    k, d = by.shape
+    T = np.tile(np.eye(d + 2), (k, 1, 1))
+    T[:, 0, 1:-1] = -2.0 * by
+    T[:, 0, -1] = (by * by).sum(axis=-1)
+    T[:, 1:-1, -1] = -by
+    return T
+
+
+def about(sums: SphereSums, by: Array) -> SphereSums:
+    """Return the same sums about fixed points moved by `by`, m, shape (k, d)."""
+    T = shift(by)
+    M = np.einsum("jab,jblc,ldc->jald", T, sums.M, T)
+    L = np.einsum("jab,jbc,jdc->jad", T, sums.L, T)
+    return SphereSums(sums.origin + by, M, L, sums.squares, sums.frames)
+
+
+def centered(sums: SphereSums) -> SphereSums:
+    """Return the sums about each marker's mean; markers never seen stay where they are."""
+    e = sums.M.shape[1]
+    first = np.einsum("jaj->ja", sums.M[:, 1 : e - 1, :, e - 1])
+    return about(sums, first / np.maximum(sums.weights, 1e-300)[:, None])

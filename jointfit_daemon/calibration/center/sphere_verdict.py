@@ -1,0 +1,210 @@
+"""The answer that sums of spheres give: center, covariance, refusal with its remedy.
+
+Law: a hinge shows two directions and its axis, and that is a good answer; a line or a rest shows
+nothing, and that is said. Where to stay along an unseen direction is the caller's knowledge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import degrees, inf, pi, sin
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration.center.result import CenterEstimate
+from jointfit_daemon.calibration.center.sphere_algebra import paths_of
+from jointfit_daemon.calibration.center.sphere_directions import (
+    MIN_CONDITIONING,
+    Limits,
+    moved,
+    observe,
+)
+from jointfit_daemon.calibration.center.sphere_sums import centered
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.center.sphere_algebra import Paths, Spheres
+    from jointfit_daemon.calibration.center.sphere_directions import Seen
+    from jointfit_daemon.calibration.center.sphere_sums import SphereSums
+
+Array = NDArray[np.float64]
+
+MIN_FRAMES = 15
+"""Effective frames a marker must be seen in."""
+LOUD = 9.0
+"""Variance of a marker over that of the others from which it is named."""
+PERSISTENT = 0.5
+"""Correlation of residuals from frame to frame from which it is flagged."""
+STILL = "the markers stood still in the parent: move the joint, at least 30° each way"
+
+
+def center_of(
+    sums: SphereSums,
+    *,
+    method: str = "running_sphere",
+    near: Array | None = None,
+    shape: Array | None = None,
+    limits: Limits | None = None,
+) -> CenterEstimate:
+    """Judge the center that sums over frames show.
+
+    Parameters
+    ----------
+    sums : SphereSums
+        Of any number of frames, about any fixed points.
+    method : str
+        Name to sign with.
+    near : ndarray, shape (d,), optional
+        Where to stay along unseen directions, m; None: beside the markers' mean.
+    shape : ndarray, shape (k, d, d), optional
+        Covariance of each marker's noise relative to the common variance, as
+        ``parent_noise.relative`` gives it for a moving parent; None: isotropic.
+    limits : Limits, optional
+        When to refuse.
+
+    Returns
+    -------
+    CenterEstimate
+        NaN only in the center of a refusal that has none, and in the radii of markers that were
+        not seen often enough to be used.
+    """
+    return center_and_spheres(sums, method=method, near=near, shape=shape, limits=limits)[0]
+
+
+def center_and_spheres(
+    sums: SphereSums,
+    *,
+    method: str = "running_sphere",
+    near: Array | None = None,
+    shape: Array | None = None,
+    limits: Limits | None = None,
+) -> tuple[CenterEstimate, Spheres | None]:
+    """Return `center_of` and the spheres of the markers used, None where there are none."""
+    limits = limits or Limits()
+    d = sums.origin.shape[1]
+    usable = sums.counts >= MIN_FRAMES
+    if not usable.any():
+        reason = f"{sums.frames} usable frames, at least {MIN_FRAMES} are needed"
+        return refusal(method, d, sums.frames, f"{reason}: keep the markers in view"), None
+    sums = centered(sums.only(usable))
+    paths = paths_of(sums, None if shape is None else shape[usable])
+    basis = moved(paths)
+    if basis.shape[1] == 0:
+        return refusal(method, d, sums.frames, STILL), None
+    seen = observe(sums, paths, basis, limits)
+    if seen is None:
+        return refusal(method, d, sums.frames, _too_little(paths)), None
+    found = _answer(sums, paths, seen, near, limits)
+    radii = np.full(len(usable), np.nan)
+    radii[usable] = found.radii
+    return replace(found, method=method, radii=radii), seen.found
+
+
+def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
+    """Return an estimate that knows nothing, in any direction, and says why."""
+    return CenterEstimate(
+        method=method,
+        center=np.full(d, np.nan),
+        covariance=np.zeros((d, d)),
+        noise=inf,
+        residual=inf,
+        radii=np.zeros(0),
+        arc=0.0,
+        bound=inf,
+        conditioning=0.0,
+        frames=frames,
+        effective_frames=0.0,
+        unseen=np.eye(d),
+        refused=reason,
+    )
+
+
+def _too_little(paths: Paths) -> str:
+    way = 1000.0 * float(np.sqrt(12.0 * np.trace(paths.C, axis1=1, axis2=2).max()))
+    return (
+        f"the markers moved {way:.0f} mm on what may be a straight line: bend the joint further, "
+        "at least 30° each way"
+    )
+
+
+def _answer(
+    sums: SphereSums, paths: Paths, seen: Seen, near: Array | None, limits: Limits
+) -> CenterEstimate:
+    basis, d = seen.basis, len(seen.basis)
+    middle = np.average(paths.mean, axis=0, weights=paths.n)
+    unseen = np.asarray(np.linalg.svd(basis)[0][:, basis.shape[1] :].T)
+    stay = middle if near is None else np.asarray(near, dtype=np.float64)
+    center, spread = drawn_in(seen, middle @ basis)
+    lean = float(((unseen @ (stay - middle)) ** 2).sum())
+    C = basis @ (spread + lean * seen.tilt) @ basis.T
+    radii = np.sqrt(seen.found.radii2)
+    radius = float(np.median(radii))
+    conditioning = radius / float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 1e-300)))
+    resultant = np.linalg.norm(seen.found.center - seen.paths.mean, axis=1) / radii
+    arc = arc_of(float(resultant.min()))
+    relative = seen.found.relative
+    return CenterEstimate(
+        method="",
+        center=basis @ center + unseen.T @ (unseen @ stay),
+        covariance=(C + C.T) / 2.0,
+        noise=float(np.sqrt(seen.found.noise2 * np.median(relative))),
+        residual=float(np.sqrt(np.average(seen.residual2, weights=paths.n))),
+        radii=radii,
+        arc=arc,
+        bound=float(np.sqrt(seen.bound2)) if len(unseen) == 0 else inf,
+        conditioning=conditioning,
+        frames=sums.frames,
+        effective_frames=float(paths.n.mean()) * (1 - seen.persistence) / (1 + seen.persistence),
+        unseen=unseen,
+        axis=unseen[0] if len(unseen) == 1 and d == 3 else None,
+        flags=_flags(seen, len(unseen)),
+        refused=_objection(arc, radius, conditioning, basis.shape, limits),
+    )
+
+
+def drawn_in(seen: Seen, middle: Array) -> tuple[Array, Array]:
+    r"""Return the center drawn in by what its uncertainty biases it outward, and its covariance.
+
+    .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
+
+    for the center d from the markers' mean. The data show a curvature whose error is nearly normal;
+    its inverse is too far on average. This is Zellner's minimum expected loss estimator of an
+    inverse (1978), as in the plane. On long arcs S is the identity.
+    """
+    R2 = float(np.median(seen.found.radii2))
+    S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)
+    return middle + S @ (seen.found.center - middle), S @ seen.spread @ S.T
+
+
+def arc_of(resultant: float) -> float:
+    r"""Return the arc φ that directions spread evenly over have this mean resultant, rad.
+
+    .. math:: |\bar u| = \frac{\sin(φ/2)}{φ/2}
+    """
+    s = min(max(resultant, 0.0), 1.0)
+    low, high = 0.0, pi
+    for _ in range(40):
+        x = (low + high) / 2.0
+        low, high = (x, high) if sin(x) > s * x else (low, x)
+    return low + high
+
+
+def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
+    flags = ["hinge"] if unseen else []
+    if seen.persistence > PERSISTENT:
+        flags.append("residuals_persist")
+    loud = np.flatnonzero(seen.found.relative > LOUD * np.median(seen.found.relative))
+    return (*flags, *(f"noisy_marker:{j}" for j in loud))
+
+
+def _objection(
+    arc: float, radius: float, conditioning: float, seen: tuple[int, ...], limits: Limits
+) -> str | None:
+    if arc < limits.min_arc:
+        return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
+    if not limits.reach[0] <= radius <= limits.reach[1]:
+        return f"the markers would be {radius:.2f} m from the center: check marker names"
+    if seen[0] - seen[1] > 1 or conditioning < MIN_CONDITIONING or (seen[0] == 2 and seen[1] < 2):
+        return f"uncertain to {1000 * radius / conditioning:.0f} mm: move this joint further"
+    return None
