@@ -1,0 +1,93 @@
+"""The pictures of a run show what happened in it, simulated or recorded, and need matplotlib."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import orjson
+import pytest
+
+from bench import timing
+from bench.timing_plots.simulated import Run, simulated
+from bench.timing_plots.trace import Trace, traced, true_errors
+from jointfit_daemon.outputs.event_log import FORMAT, encode_event
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SECONDS = 16.0
+STREAMS = {"S1", "S2", "S3", "S4", "mocap"}
+
+
+@cache
+def watched() -> tuple[Run, Trace]:
+    run = simulated(SECONDS)
+    return run, traced(run.events)
+
+
+def test_every_stream_is_traced_with_its_skew_and_the_error_of_its_stamps() -> None:
+    run, trace = watched()
+    assert set(trace.looks) == set(trace.stamps) == STREAMS
+    errors = true_errors(trace, run.taken_ns, run.unseen_ns)
+    for name in STREAMS - {"mocap"}:
+        t_s, error, synced = errors[name]
+        assert len(t_s) > 70 * SECONDS
+        assert np.abs(error[synced]).max() < 0.5, name
+    for looks in trace.looks.values():
+        assert looks[-1].skew_ppm is not None
+        assert abs(looks[-1].skew_ppm) < 80
+
+
+def test_a_lag_is_what_no_clock_can_see() -> None:
+    run, trace = watched()
+    for name, windows in trace.lags.items():
+        good = [w.estimate for w in windows if w.estimate.refused is None]
+        assert good or name == "S3"  # which reboots in the middle
+        for estimate in good:
+            assert abs(estimate.lag_ns - run.lag_ns[name]) < 4 * estimate.sigma_ns + 50_000
+
+
+def test_both_incidents_are_seen() -> None:
+    run, trace = watched()
+    gone_s = run.incidents["S3 reboots"]
+    after = [row.synced for row in trace.stamps["S3"] if row.arrival_ns > _at(trace, gone_s + 1)]
+    assert not after[0]
+    assert after[-1]
+    silent = _at(trace, run.incidents["S2 silent"])
+    steps = np.diff([row.arrival_ns for row in trace.stamps["S2"]])
+    assert steps.max() == pytest.approx(500e6, abs=30e6)
+    assert any(frame.missing for frame in trace.frames if abs(frame.t_ns - silent) < 500_000_000)
+
+
+def _at(trace: Trace, t_s: float) -> int:
+    return trace.begin_ns + round(t_s * 1e9)
+
+
+def test_a_recorded_run_is_drawn_like_a_simulated_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    log, pictures = tmp_path / "run.events.jsonl", tmp_path / "pictures"
+    lines = [orjson.dumps({"log": FORMAT}), *(encode_event(e) for e in simulated(12.0).events)]
+    log.write_bytes(b"".join(line + b"\n" for line in lines))
+    assert timing.plot(pictures, log) == 0
+    drawn = {"clocks.png", "delays.png", "alignment.png", "lags.png"}
+    assert {path.name for path in pictures.iterdir()} == drawn
+    assert all(path.stat().st_size > 10_000 for path in pictures.iterdir())
+    assert capsys.readouterr().out.count(".png") == len(drawn)
+
+
+def test_what_cannot_be_drawn_is_told_and_is_no_crash(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    (tmp_path / "empty").write_text("")
+    assert timing.plot(tmp_path, tmp_path / "absent") == 2
+    assert timing.plot(tmp_path, tmp_path / "empty") == 2
+    assert "not an event log" in capsys.readouterr().err
+    with monkeypatch.context() as without:
+        without.setattr(timing, "find_spec", lambda _: None)
+        assert timing.plot(tmp_path, None) == 2
+    assert "pip install 'jointfitd[plot]'" in capsys.readouterr().err
