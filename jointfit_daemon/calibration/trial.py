@@ -58,7 +58,12 @@ class CalibrationSettings:
     method: Method = "anchored"
     static_s: float = 5.0
     align_s: float = 30.0
-    functional_s: float = 30.0
+    functional_s: float = 60.0
+    """The movement ends by then at the latest."""
+    functional_min_s: float = 20.0
+    """And not before, however good the joint centers are: the regression wants its share."""
+    center_target_m: float = 0.003
+    """Noise part of every joint center's predicted error at which the movement is enough, m."""
     markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Markers of each segment or neighbouring body part (pelvis, foot)."""
     rigid_bodies: Mapping[str, str] = field(default_factory=dict)

@@ -284,6 +284,8 @@ def _calibration(table: CalibrationTable, mocap: Source | None) -> CalibrationSe
         static_s=table.static_s,
         align_s=table.align_s,
         functional_s=table.functional_s,
+        functional_min_s=table.functional_min_s,
+        center_target_m=table.center_target_mm / 1e3,
         holdout_share=table.holdout_share,
         markers=dict(optical.markers) if optical is not None else {},
         rigid_bodies=dict(optical.rigid_body) if optical is not None else {},

@@ -64,7 +64,23 @@ class CalibrationTable(Settings):
     method: Method = Field("anchored", description="how redundant sensors are combined")
     static_s: float = Field(5.0, gt=0, le=120, description="length of the static pose, s")
     align_s: float = Field(30.0, gt=0, le=600, description="length of the align phase, s")
-    functional_s: float = Field(30.0, gt=0, le=600, description="length of the movement phase, s")
+    functional_s: float = Field(
+        60.0, gt=0, le=600, description="greatest length of the movement phase, s"
+    )
+    functional_min_s: float = Field(
+        20.0,
+        ge=0,
+        le=600,
+        description="least length of the movement phase, s; it ends itself when every joint "
+        "center is known to center_target_mm and every joint bent far and often enough",
+    )
+    center_target_mm: float = Field(
+        3.0,
+        gt=0,
+        le=100,
+        description="wanted error of the joint centers by noise, mm; skin motion comes on top "
+        "and is told beside it",
+    )
     holdout_share: float = Field(
         0.4, gt=0, lt=1, description="last share of the movement, which judges the fit"
     )
