@@ -57,6 +57,11 @@ class CanBusSettings(Settings):
     channel: str = Field(description="`can0`, or the serial port of an SLCAN adapter")
     bitrate: int = Field(1_000_000, gt=0, description="bit/s; ignored where the kernel set it")
     baud: int = Field(115_200, gt=0, description="speed of an SLCAN adapter's serial port, baud")
+    transport: Literal["usb", "uart"] = Field(
+        "usb",
+        description="what an SLCAN adapter's port is: on `usb` bytes take no time, whatever `baud` "
+        "says; on a real `uart` stamps are back-dated by the bytes that came, at `baud`",
+    )
 
 
 class ImuSettings(Settings):

@@ -1,10 +1,8 @@
 """UDP sockets that know when a datagram arrived. Law: the one place of this driver that does I/O.
 
-The kernel stamps datagrams on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; the stamp is taken to
-CLOCK_MONOTONIC with a pair of readings made at the same wake-up. Both clocks are slewed alike, so
-their difference changes only when the wall clock is stepped; then the stamps of that wake-up are
-tried with the old difference and the new. `asyncio`'s datagram endpoint hides ancillary data, so
-the sockets are our own.
+The kernel stamps datagrams on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; ``wall_clock`` takes the
+stamp to CLOCK_MONOTONIC. `asyncio`'s datagram endpoint hides ancillary data, so the sockets are our
+own.
 """
 
 from __future__ import annotations
@@ -12,9 +10,10 @@ from __future__ import annotations
 import fcntl
 import socket
 import struct
-import sys
 import time
 from typing import NamedTuple
+
+from jointfit_drivers.wall_clock import WallClock
 
 MAX_DATAGRAM = 65_507
 DRAIN = 64
@@ -28,47 +27,6 @@ _IP_MULTICAST_ALL = 49  # 0: only groups that this socket joined
 _SIOCGIFADDR = 0x8915
 _STAMP = struct.Struct("@ll")
 _ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
-_STEP_NS = 1_000_000
-"""A larger change of the difference between the clocks is a step of the wall clock."""
-_PLAUSIBLE_NS = 2_000_000_000
-"""A datagram has not waited longer than this in the kernel."""
-
-
-class WallClock:
-    """Takes CLOCK_REALTIME to CLOCK_MONOTONIC.
-
-    Attributes
-    ----------
-    soft : int
-        Stamps replaced by the time of reading, because no clock explained them.
-    """
-
-    def __init__(self) -> None:
-        self._offset_ns = self._before_ns = _wall_minus_monotonic()
-        self.soft = 0
-
-    def pair(self) -> None:
-        """Compare the clocks anew: at every wake-up."""
-        self._before_ns, self._offset_ns = self._offset_ns, _wall_minus_monotonic()
-
-    def monotonic(self, stamp_ns: int, now_ns: int) -> int:
-        """Return a wall-clock stamp as monotonic ns, never later than `now_ns`."""
-        stepped = abs(self._offset_ns - self._before_ns) > _STEP_NS
-        for offset in (self._offset_ns, self._before_ns)[: 1 + stepped]:
-            arrival_ns = stamp_ns - offset
-            if now_ns - _PLAUSIBLE_NS <= arrival_ns <= now_ns + _STEP_NS:
-                return min(arrival_ns, now_ns)
-        self.soft += 1
-        return now_ns
-
-
-def _wall_minus_monotonic() -> int:
-    best, offset = sys.maxsize, 0
-    for _ in range(5):
-        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after - before < best:
-            best, offset = after - before, wall - (before + after) // 2
-    return offset
 
 
 class Arrival(NamedTuple):
@@ -118,6 +76,11 @@ class StampedSocket:
     def fileno(self) -> int:
         """Return the descriptor, for ``loop.add_reader``."""
         return self._socket.fileno()
+
+    @property
+    def port(self) -> int:
+        """Port it is bound to."""
+        return int(self._socket.getsockname()[1])
 
     def close(self) -> None:
         """Close; the group is left with it."""

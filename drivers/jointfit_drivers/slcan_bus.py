@@ -45,7 +45,8 @@ class SlcanBus:
     def __init__(self, settings: CanBusSettings) -> None:
         self._settings = settings
         self._port = SerialPort(settings.channel, settings.baud)
-        self._decoder = SlcanDecoder(settings.baud)
+        baud = settings.baud if settings.transport == "uart" else None
+        self._decoder = SlcanDecoder(baud, bitrate=settings.bitrate)
         self._understood = 0  # frames and answers of the handshake
         self._is_open = False
         self._reading: asyncio.Task[None] | None = None

@@ -32,7 +32,8 @@ class XbusImu:
 
     def decoder(self) -> XbusEvents:
         """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
-        return XbusEvents(self._settings.baud, self._settings.rate_hz)
+        settings = self._settings
+        return XbusEvents(settings.baud if settings.transport == "uart" else None, settings.rate_hz)
 
     async def run(self, emit: Emit) -> None:
         """Open the port, bring the device to measure, read until cancelled.

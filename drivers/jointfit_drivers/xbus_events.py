@@ -1,7 +1,8 @@
 """The pure half of the Xbus driver: chunks in, samples in SI and canonical orientation out.
 
 Law: a function of the chunks fed; no clock, no port. A sample is stamped with the arrival of its
-first byte: that of the chunk, less the bytes that followed and its own, at ten bits each.
+first byte: that of the chunk, less the bytes that followed and its own, at ten bits each; on USB,
+where bytes take no time, that of the chunk.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ class XbusEvents:
     Parameters
     ----------
     baud
-        Speed of the line, for back-dating.
+        Speed of the line, for back-dating; None: USB.
     rate_hz
         Nominal rate, used until the stream has shown its own.
     """
 
-    def __init__(self, baud: int, rate_hz: float) -> None:
+    def __init__(self, baud: int | None, rate_hz: float) -> None:
         self._xbus = XbusDecoder()
-        self._byte_ns = _BITS * 1e9 / baud
+        self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
         self._continuity = Continuity(rate_hz)
         self._gate = OrientationGate()

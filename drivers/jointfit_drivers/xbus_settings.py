@@ -16,6 +16,11 @@ class XbusSettings(ImuSettings):
 
     port: str = Field(description="serial port, best a link under /dev/serial/by-id")
     baud: int = Field(115_200, gt=0, description="speed the device runs at, baud")
+    transport: Literal["uart", "usb"] = Field(
+        "uart",
+        description="`uart`: a line at `baud`, also behind a USB bridge; stamps are back-dated by "
+        "the bytes that came. `usb`: the device's own USB port, where bytes take no time",
+    )
     persist: bool = Field(
         False,
         description="write a differing output configuration into the device; every write is "

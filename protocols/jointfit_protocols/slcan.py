@@ -1,7 +1,9 @@
 r"""SLCAN (Lawicel): CAN frames as lines of ASCII over a serial port, decode and encode, both roles.
 
 Law: bytes in, frames and lines out; no port, no clock. Stamps are computed from the arrival that
-the caller gives: the line is back-dated by the characters that came with and after it.
+the caller gives. On a real line a frame is back-dated by the characters that came with and after
+it. On USB characters take no time, whatever the port's speed says; what came in one read is
+back-dated by its time on the bus, for frames there follow each other.
 
     t iii l dd...    11-bit frame, l bytes     T iiiiiiii l dd...   29-bit frame
     r iii l          11-bit remote request     R iiiiiiii l         29-bit remote request
@@ -18,7 +20,7 @@ from __future__ import annotations
 from binascii import unhexlify
 from typing import Literal, NamedTuple
 
-from jointfit_protocols.can_frame import EXTENDED_MAX, STANDARD_MAX, CanFrame
+from jointfit_protocols.can_frame import EXTENDED_MAX, STANDARD_MAX, CanFrame, frame_bits
 from jointfit_protocols.corrupt import Corrupt
 
 Role = Literal["host", "adapter"]
@@ -102,13 +104,18 @@ class SlcanDecoder:
     Parameters
     ----------
     baud
-        Speed of the serial line, bit/s: one character lasts 10/baud seconds.
+        Speed of the serial line, bit/s: one character lasts 10/baud seconds. None: USB.
     role
         ``host`` (reads an adapter) or ``adapter`` (reads a host).
+    bitrate
+        Speed of the bus, bit/s.
     """
 
-    def __init__(self, baud: int, role: Role = "host") -> None:
-        self._character_ns = _BITS_A_CHARACTER * 1_000_000_000 / baud
+    def __init__(
+        self, baud: int | None, role: Role = "host", *, bitrate: int = BITRATES[-1]
+    ) -> None:
+        self._character_ns = 0.0 if baud is None else _BITS_A_CHARACTER * 1_000_000_000 / baud
+        self._bit_ns = 1_000_000_000 / bitrate
         self._lines = _ANSWERS if role == "host" else _COMMANDS
         self._pending = b""  # at most one line, _LONGEST bytes
         self._endless = False  # the pending line has lost its beginning
@@ -120,18 +127,20 @@ class SlcanDecoder:
         """Return what `data` completed, in wire order.
 
         A frame's ``t_ns`` is the start of its line: `t_ns`, the arrival of `data`, minus the
-        characters from the line's start on; but for a line that lies in `data` whole never before
-        the previous call's, whatever the configured speed (USB adapters ignore it).
+        characters from the line's start on (on USB: minus the frames from it on, as the bus
+        carried them); but for a line that lies in `data` whole never before the previous call's,
+        whatever the configured speed.
         """
         found: list[CanFrame | SlcanLine | Corrupt] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
         before = len(self._pending)  # bytes that came with earlier calls
-        after = before + len(data)  # bytes from a line's start to the end of `data`
+        # from a line's start to the end of `data`
+        after_ns = (before + len(data)) * self._character_ns or sum(map(self._on_bus_ns, lines))
         for line in lines:
             floor = self._previous_ns if before <= 0 else None
-            start = t_ns - round(after * self._character_ns)
+            start = t_ns - round(after_ns)
             self._line(line, start if floor is None or start > floor else floor, found)
-            after -= len(line) + 1
+            after_ns -= (len(line) + 1) * self._character_ns or self._on_bus_ns(line)
             before -= len(line) + 1
         self._pending = self._bounded(rest, found)
         self._previous_ns = t_ns
@@ -141,6 +150,15 @@ class SlcanDecoder:
         """Give up on an unfinished line."""
         rest, self._pending, self._endless = self._pending, b"", False
         return [self._corrupt(len(rest), "unfinished line")] if rest else []
+
+    def _on_bus_ns(self, line: bytes) -> float:
+        """Return how long what `line` tells of was on the bus; 0 for what is no frame."""
+        if not line or line[0] not in b"tTrR":
+            return 0.0
+        extended = line[0] in b"TR"
+        digit = line[9:10] if extended else line[4:5]
+        size = int(digit) if digit.isdigit() and line[0] in b"tT" else 0
+        return frame_bits(min(size, 8), extended) * self._bit_ns
 
     def _bounded(self, rest: bytes, found: list[CanFrame | SlcanLine | Corrupt]) -> bytes:
         """Return the unfinished line; one that is longer than any line loses all but its end."""

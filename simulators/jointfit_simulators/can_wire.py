@@ -37,6 +37,9 @@ _NS_PER_MS = 1_000_000
 class CanWire(Protocol):
     """A bus as a device sees it."""
 
+    bitrate: int | None
+    """Speed of a bus whose frames take their time, bit/s; None: they take none."""
+
     @property
     def is_open(self) -> bool:
         """Whether somebody listens, as far as the wire can tell."""
@@ -156,6 +159,7 @@ class PythonCanWire:
     def __init__(self, interface: str, channel: str) -> None:
         self._interface, self._channel = interface, channel
         self._bus: can.BusABC | None = None
+        self.bitrate: int | None = None
         self.plug()
 
     @property

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
 """Which sensor speaks what, unless asked otherwise."""
 BUS = "can0"
-_INSTANT_BAUD = 3_000_000
 _FREE_RUNNING = 0xFFFF
 _FIRST_BLOCK = 0x100
 
@@ -118,9 +117,7 @@ def _bus(hardware: Hardware, knobs: Knobs, directory: Path, can: str) -> CanWire
     else:
         wire = PythonCanWire(interface, channel)
     hardware.ports[BUS] = channel
-    table = f'[can.{BUS}]\ninterface = "{interface}"\nchannel = "{channel}"\n'
-    # a pty takes no time: at a slow line's speed the host would back-date what came in one read
-    hardware.tables.append(table + (f"baud = {_INSTANT_BAUD}\n" if interface == "slcan" else ""))
+    hardware.tables.append(f'[can.{BUS}]\ninterface = "{interface}"\nchannel = "{channel}"\n')
     return wire
 
 

@@ -6,10 +6,11 @@ listens; its group counter and its clock run on meanwhile.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.can_frame import STANDARD_MAX, CanFrame
+from jointfit_protocols.can_frame import STANDARD_MAX, CanFrame, frame_bits
 from jointfit_protocols.xcdi import (
     COUNTER_MODULUS,
     OVERFLOW,
@@ -17,6 +18,7 @@ from jointfit_protocols.xcdi import (
     DataId,
     XcdiIds,
     encode,
+    layout,
     quaternion_counts,
 )
 from jointfit_protocols.xcdi_unit import TICK_NS
@@ -84,8 +86,20 @@ class XcdiDevice:
 
     @property
     def line_ns(self) -> int:
-        """No time: a bus adapter hands frames on at once."""
-        return 0
+        """How long a group takes on the bus, ns."""
+        ids, bitrate = self._options.ids, self.wire.bitrate
+        sent = {
+            DataId.SAMPLE_TIME: ids.sample_time,
+            DataId.GROUP_COUNTER: ids.group_counter,
+            DataId.STATUS_WORD: ids.status_word,
+            DataId.QUATERNION: ids.quaternion,
+        }
+        bits = sum(
+            frame_bits(struct.calcsize(f"<{layout(data_id).fields}"), ids.extended)
+            for data_id, number in sent.items()
+            if number is not None
+        )
+        return bits * 1_000_000_000 // bitrate if bitrate else 0
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one group now; ``ImuDevice.push`` says the rest."""

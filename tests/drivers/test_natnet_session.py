@@ -16,10 +16,10 @@ from typing_extensions import override
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
 from jointfit_daemon.files.capture import read_capture
 from jointfit_daemon.model import ClockEcho, MocapFrame
-from jointfit_drivers import natnet_session, natnet_socket
+from jointfit_drivers import natnet_session
 from jointfit_drivers.natnet import NatNetMocap
 from jointfit_drivers.natnet_settings import NatNetSettings
-from jointfit_drivers.natnet_socket import StampedSocket, WallClock, local_address
+from jointfit_drivers.natnet_socket import StampedSocket, local_address
 from jointfit_protocols.natnet_messages import MessageId, ServerInfo, encode
 from jointfit_simulators.contract_scene import Listener
 from jointfit_simulators.natnet_options import NatNetServerOptions
@@ -255,27 +255,6 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
 
 
 # --- stamps -----------------------------------------------------------------------------------
-
-
-def test_a_stepped_wall_clock_moves_no_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
-    offset = [10**18]
-    monkeypatch.setattr(natnet_socket, "_wall_minus_monotonic", lambda: offset[0])
-    wall, now = WallClock(), 10**10
-    assert wall.monotonic(10**18 + now - 1000, now) == now - 1000
-    offset[0] += 3600 * 10**9  # one datagram was stamped before the step, one after
-    wall.pair()
-    assert wall.monotonic(10**18 + now - 1000, now) == now - 1000
-    assert wall.monotonic(offset[0] + now - 500, now) == now - 500
-    assert wall.soft == 0
-    wall.pair()
-    assert wall.monotonic(5, now) == now
-    assert wall.soft == 1
-
-
-def test_no_arrival_lies_in_the_future() -> None:
-    wall = WallClock()
-    now = time.monotonic_ns()
-    assert wall.monotonic(time.time_ns() + 200_000, now) <= now
 
 
 def test_the_kernel_stamps_datagrams_on_loopback() -> None:

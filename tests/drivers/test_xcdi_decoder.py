@@ -37,6 +37,8 @@ MS = 1_000_000
 class Tape:
     """A wire that keeps what is sent, stamped with a time of the test's own."""
 
+    bitrate: int | None = None
+
     is_open = True
 
     def __init__(self) -> None:
