@@ -109,9 +109,7 @@ def test_stamps_are_the_kernels_however_busy_the_loop_is() -> None:
     assert min(stamped) > -50_000
     assert sorted(stamped)[len(stamped) // 2] < 150_000
     assert sorted(stamped)[int(0.9 * len(stamped))] < 1_000_000
-    assert (
-        sorted(read)[int(0.9 * len(read))] > 1_000_000
-    )  # a stamp taken in Python would be so late
+    assert sorted(read)[int(0.9 * len(read))] > 1_000_000  # what Python would say
 
 
 # --- lines ------------------------------------------------------------------------------------
