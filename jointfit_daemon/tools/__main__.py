@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from jointfit_daemon import __version__
-from jointfit_daemon.tools import calibrate, check, decode, demo, schema
+from jointfit_daemon.tools import calibrate, check, decode, demo, report, schema
 
 app = typer.Typer(
     name="jointfit",
@@ -18,6 +18,7 @@ app.command(name="check")(check.check)
 app.command(name="demo")(demo.demo)
 app.command(name="calibrate")(calibrate.calibrate)
 app.command(name="decode")(decode.decode)
+app.command(name="report")(report.report)
 app.command(name="schema")(schema.schema)
 
 

@@ -1,0 +1,95 @@
+"""`jointfit report`: published experiments, repeated and told with what they hide."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.calibration.center.study import PairMaps, StudySetup
+
+MISUSE = 2
+
+
+def report(
+    *,
+    cor_study: Annotated[
+        bool,
+        typer.Option(
+            "--cor-study", help="Center of rotation: error over arc, noise and radius, nine maps."
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for figures (PNG, SVG) and the text.")
+    ] = None,
+    json: Annotated[
+        Path | None, typer.Option("--json", help="File for all figures, maps included.")
+    ] = None,
+    repeats: Annotated[
+        int, typer.Option("--repeats", min=2, help="Runs of every cell of a map.")
+    ] = 1000,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random numbers.")] = 1,
+) -> None:
+    """Repeat a published experiment: tables on standard output, figures with --out."""
+    if not cor_study:
+        typer.echo("jointfit report: say which report; there is: --cor-study", err=True)
+        raise typer.Exit(MISUSE)
+    try:
+        for folder in (out, json.parent if json else None):
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+        _cor_study(out, json, repeats, seed)
+    except OSError as fault:
+        typer.echo(f"jointfit report: {fault.filename}: {fault.strerror}", err=True)
+        raise typer.Exit(MISUSE) from None
+
+
+def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:
+    from jointfit_daemon.calibration.center.study import StudySetup
+    from jointfit_daemon.tools.report_tables import as_json, tables
+
+    plain = StudySetup()
+    setup = StudySetup(
+        repeats=repeats,
+        grid_repeats=min(plain.grid_repeats, repeats),
+        frames_repeats=min(plain.frames_repeats, repeats),
+        seed=seed,
+    )
+    study = _computed(setup)
+    text = tables(setup, study)
+    typer.echo(text, nl=False)
+    if json is not None:
+        import orjson
+
+        json.write_bytes(orjson.dumps(as_json(setup, study), option=orjson.OPT_INDENT_2))
+    if out is not None:
+        (out / "cor-study.txt").write_text(text, encoding="utf-8")
+        _draw(study, out)
+
+
+def _computed(setup: StudySetup) -> list[PairMaps]:
+    """Run the study, with a bar where somebody watches."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from jointfit_daemon.calibration.center.study import run_study
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("computing nine maps", total=1.0)
+        return run_study(setup, lambda share: bar.update(task, completed=share))
+
+
+def _draw(study: Sequence[PairMaps], out: Path) -> None:
+    from jointfit_daemon.tools.plotting import PlotMissing
+    from jointfit_daemon.tools.report_plot import draw_study
+
+    try:
+        for path in draw_study(study, out):
+            typer.echo(f"wrote {path}", err=True)
+    except PlotMissing as missing:
+        typer.echo(f"no figures: {missing}", err=True)

@@ -1,0 +1,94 @@
+"""The maps of the numerical experiment as figures.
+
+Law: one color scale for all maps of a row, cut off where single outliers would rule it; what no
+method answered is hatched, never colored.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.tools.plotting import new_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.calibration.center.study import PairMaps
+
+_MM = 1000.0
+_TOP_MM = {"α–σ": 50.0, "r–σ": 15.0, "r–α": 20.0}
+"""Where the color scale of each row ends."""
+_SOURCE = (
+    ("predicted", "F  prediction (equation 15)"),
+    ("three frames", "A  analytic, three frames"),
+    ("grid", "G  grid, node on the truth"),
+)
+_OURS = (
+    ("shifted grid", "three frames, grid half a step off"),
+    ("bound", "Cramér-Rao bound, all frames"),
+    ("hyper", "hyper, all frames"),
+    ("oriented", "orientation-aided, all frames"),
+)
+_AXES = {
+    "α": ("α, deg", float(np.rad2deg(1.0))),
+    "σ": ("σ, mm", _MM),
+    "r": ("r, m", 1.0),
+}
+
+
+def draw_study(study: Sequence[PairMaps], folder: Path) -> list[Path]:
+    """Write the source's figure 2 and the same maps of our estimators, PNG and SVG each."""
+    written: list[Path] = []
+    for name, methods, title in (
+        ("cor-study-figure-2", _SOURCE, "RMS error of the center, three frames"),
+        (
+            "cor-study-estimators",
+            _OURS,
+            "RMS error of the center: a grid off the truth, and all frames of the same arcs",
+        ),
+    ):
+        figure = _figure(study, methods, title)
+        for suffix in ("png", "svg"):
+            written.append(folder / f"{name}.{suffix}")
+            figure.savefig(written[-1], dpi=130)
+    return written
+
+
+def _figure(study: Sequence[PairMaps], methods: Sequence[tuple[str, str]], title: str) -> Any:
+    figure = new_figure(3.1 * len(methods) + 0.9, 8.6)
+    figure.suptitle(title)
+    grid = figure.subplots(len(study), len(methods), squeeze=False)
+    for axes_row, pair in zip(grid, study, strict=True):
+        last = None
+        for axes, (key, label) in zip(axes_row, methods, strict=True):
+            last = _map(axes, pair, key)
+            if pair is study[0]:
+                axes.set_title(label, fontsize=10)
+        bar = figure.colorbar(last, ax=list(axes_row), extend="max", shrink=0.9)
+        bar.set_label("mm")
+    return figure
+
+
+def _map(axes: Any, pair: PairMaps, key: str) -> Any:
+    """Draw one map; rows upwards, as axes go."""
+    row_name, column_name = pair.name.split("–")
+    (y_label, y_scale), (x_label, x_scale) = _AXES[row_name], _AXES[column_name]
+    axes.set_facecolor("white")
+    axes.patch.set_hatch("////")
+    axes.patch.set_edgecolor("0.7")
+    image = axes.pcolormesh(
+        pair.columns * x_scale,
+        pair.rows * y_scale,
+        np.ma.masked_invalid(_MM * pair.maps[key]),
+        vmin=0.0,
+        vmax=_TOP_MM[pair.name],
+        cmap="viridis",
+        shading="nearest",
+        rasterized=True,
+    )
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    return image
