@@ -1,0 +1,193 @@
+#!/usr/bin/env python3
+"""Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out dist]`.
+
+Law: what goes in is decided by ``requirements.lock`` and the commit, never by the machine it is
+built on; the same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels
+are only unpacked, so a package for arm64 can be built here, too.
+
+The package carries its own site-packages behind /usr/lib/jointfitd/bin/python3, a link to Debian's
+Python: nothing of it is seen by other programs, and nothing of theirs by it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import compileall
+import os
+import py_compile
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DEBIAN = Path(__file__).with_name("debian")
+HOME = Path("usr/lib/jointfitd")
+PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
+PLATFORMS = {
+    "amd64": ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"),
+    "arm64": ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64"),
+}
+COMMANDS = {
+    "jointfitd": "jointfit_daemon.__main__",
+    "jointfit": "jointfit_daemon.tools.__main__",
+    "jointfit-sim": "jointfit_simulators.__main__",
+}
+EXTRAS = "demo,c3d"
+"""Pure Python, or with wheels for both architectures."""
+LAUNCHER = """\
+#!/usr/lib/jointfitd/bin/python3 -I
+import sys
+
+from {module} import main
+
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+LOCAL_DRIVERS = "/usr/local/lib/jointfitd"
+"""Where `pip install --target` puts drivers of third parties; root's, as /usr/local is."""
+SYSTEM_FILES = {
+    "systemd/jointfitd.service": "usr/lib/systemd/system",
+    "systemd/jointfitd@.service": "usr/lib/systemd/system",
+    "systemd/70-jointfitd.rules": "usr/lib/udev/rules.d",
+    "systemd/80-jointfit-can0.network": "usr/share/jointfitd/networkd",
+    "systemd/mosquitto/jointfitd.conf": "usr/share/jointfitd/mosquitto",
+    "systemd/mosquitto/jointfitd.acl": "usr/share/jointfitd/mosquitto",
+    "examples/knee.toml": "usr/share/jointfitd/examples",
+    "LICENSE": "usr/share/doc/jointfitd",
+    "CHANGELOG.md": "usr/share/doc/jointfitd",
+}
+
+
+def main() -> int:
+    """Build one package and print its path."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--arch", choices=sorted(PLATFORMS), default="amd64")
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", metavar="DIR")
+    parser.add_argument("--version", help="as in the control file (default: that of the project)")
+    options = parser.parse_args()
+    version = options.version or f"{_project_version()}-1+py{PYTHON.replace('.', '')}"
+    epoch = os.environ.get("SOURCE_DATE_EPOCH") or _commit_time()
+    with tempfile.TemporaryDirectory(prefix="jointfitd-deb-") as scratch:
+        tree = Path(scratch) / "tree"
+        _install_python(tree, Path(scratch), options.arch, epoch)
+        _install_files(tree)
+        _write_control(tree, version, options.arch)
+        _settle(tree, int(epoch))
+        options.out.mkdir(parents=True, exist_ok=True)
+        package = options.out / f"jointfitd_{version}_{options.arch}.deb"
+        _run(["dpkg-deb", "--root-owner-group", "-Zzstd", "--build", tree, package], epoch)
+    print(package)
+    return 0
+
+
+def _run(words: list[str | Path], epoch: str, **extra: str) -> None:
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch, **extra}
+    done = subprocess.run(  # noqa: S603 - our own commands
+        [str(word) for word in words], env=environment, text=True, capture_output=True, check=False
+    )
+    if done.returncode:
+        sys.exit(f"{done.stdout}{done.stderr}{words[0]} ended with {done.returncode}")
+
+
+def _project_version() -> str:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return str(project["version"])
+
+
+def _commit_time() -> str:
+    git = shutil.which("git")
+    if git is not None:
+        done = subprocess.run(  # noqa: S603 - our own command
+            [git, "-C", ROOT, "log", "-1", "--format=%ct"],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if done.returncode == 0 and done.stdout.strip():
+            return done.stdout.strip()
+    return str(int((ROOT / "pyproject.toml").stat().st_mtime))  # an unpacked source archive
+
+
+def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) -> None:
+    """Unpack our wheel and its dependencies where Debian's Python will find them."""
+    site = tree / HOME / "lib" / f"python{PYTHON}" / "site-packages"
+    pip: list[str | Path] = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    _run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", scratch, ROOT], epoch)
+    wheel = next(scratch.glob("jointfitd-*.whl"))
+    platforms = [word for name in PLATFORMS[architecture] for word in ("--platform", name)]
+    _run(
+        [
+            *pip, "install", "--quiet", "--target", site, "--only-binary=:all:", "--no-compile",
+            "--implementation", "cp", "--python-version", PYTHON, *platforms,
+            "--constraint", ROOT / "requirements.lock", f"jointfitd[{EXTRAS}] @ {wheel.as_uri()}",
+        ],
+        epoch,
+    )  # fmt: skip
+    for leftover in ("bin", "share", "lib", "include"):  # scripts and data of wheels
+        shutil.rmtree(site / leftover, ignore_errors=True)
+    for record in site.glob("*.dist-info/direct_url.json"):  # the path on this machine
+        record.unlink()
+    _drop_tests(site)
+    (site / "local-drivers.pth").write_text(f"{LOCAL_DRIVERS}\n")
+    binaries = tree / HOME / "bin"
+    binaries.mkdir(parents=True)
+    (binaries / "python3").symlink_to("/usr/bin/python3")
+    (tree / HOME / "pyvenv.cfg").write_text(
+        "home = /usr/bin\ninclude-system-site-packages = false\n"
+    )
+    # never looked at again: the package manager is who changes these files
+    mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
+    compileall.compile_dir(
+        site, quiet=2, stripdir=str(tree), prependdir="/", invalidation_mode=mode, workers=1
+    )
+
+
+def _drop_tests(site: Path) -> None:
+    """Leave out the libraries' own tests: half of the files, and never run."""
+    for folder in sorted(site.glob("*/**/tests")):
+        if folder.is_dir():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _install_files(tree: Path) -> None:
+    for name, folder in SYSTEM_FILES.items():
+        target = tree / folder
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, target / Path(name).name)
+    binaries = tree / "usr" / "bin"
+    binaries.mkdir(parents=True)
+    for command, module in COMMANDS.items():
+        launcher = binaries / command
+        launcher.write_text(LAUNCHER.format(module=module))
+        launcher.chmod(0o755)
+
+
+def _write_control(tree: Path, version: str, architecture: str) -> None:
+    size = sum(path.lstat().st_size for path in tree.rglob("*") if not path.is_dir())
+    control = tree / "DEBIAN"
+    control.mkdir()
+    major, minor = PYTHON.split(".")
+    text = (DEBIAN / "control").read_text(encoding="utf-8")
+    (control / "control").write_text(
+        text.format(
+            version=version, architecture=architecture, kilobytes=size // 1024,
+            python=PYTHON, next_python=f"{major}.{int(minor) + 1}",
+        )
+    )  # fmt: skip
+    for name in ("postinst", "prerm", "postrm"):
+        shutil.copyfile(DEBIAN / name, control / name)
+        (control / name).chmod(0o755)
+
+
+def _settle(tree: Path, epoch: int) -> None:
+    """Give every file the rights and the date that a package's files have."""
+    for path in sorted(tree.rglob("*"), reverse=True):
+        if not path.is_symlink():
+            executable = path.is_dir() or path.stat().st_mode & 0o100
+            path.chmod(0o755 if executable else 0o644)
+        os.utime(path, (epoch, epoch), follow_symlinks=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
