@@ -9,7 +9,7 @@ never 0. See CONVENTIONS.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -48,6 +48,9 @@ class TickClock(NamedTuple):
     """Ticks after which the count starts again at 0; None if it never does."""
     ticks_per_s: int | None = None
     """Exact tick frequency where it is no whole number of nanoseconds (NatNet)."""
+    scale: Literal["own", "monotonic", "unix"] = "own"
+    """What 0 means: nothing (a clock of its own), or, declared by whoever configured the device,
+    this host's CLOCK_MONOTONIC, or UNIX time that PTP keeps on device and host alike."""
 
 
 class ImuSample(NamedTuple):

@@ -3,87 +3,88 @@
 Law: pure and streaming. Inputs are what a decoder yields, in order of arrival; nothing here reads a
 clock. A few microseconds a sample, no memory that grows.
 
-The model is ``t(u) = u + c + s (u - u_0)``, u the device time in ns. Where a device answers echoes
-(``echo_clock``) c is known to half the asymmetry of the path; elsewhere the line under the fastest
-arrivals (``envelope``) is used, which leaves the smallest delay D_min inside c: part of it may be
-configured away (`latency_ns`), the rest is found as lag from motion (``lag``).
+The model is ``t(u) = u + c + s (u - u_0)``, u the device time in ns. The best way on offer rules:
+edges of a sync line or a clock declared to be the host's (``direct``), else answered echoes
+(``echo_clock``), which leave half the asymmetry of the path in c, else the line under the fastest
+arrivals (``envelope``), which leaves the smallest delay D_min in c: what is known of it beforehand
+(`latency_ns`) is taken out, the rest is found as lag from motion (``lag``).
 
-Stamps never run backwards. Once synced they are slewed by at most 500 ppm; an error too big for
-that (5 ms) is a step and begins a new epoch. A new epoch says: do not join what is before with what
-is after.
+Stamps never run backwards and are slewed (``stamps``); an error too big for that begins a new
+epoch. A new epoch says: do not join what is before with what is after.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from math import inf
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
+from jointfit_daemon.timing import clock_news
+from jointfit_daemon.timing.delays import LastMinute
 from jointfit_daemon.timing.device_time import ArrivalTime, CounterTime, TickTime
+from jointfit_daemon.timing.direct import PulseTie, declared
 from jointfit_daemon.timing.echo_clock import STALE_NS, EchoFit
 from jointfit_daemon.timing.envelope import CRYSTAL, NOMINAL_RATE, Envelope
+from jointfit_daemon.timing.lateness import Lateness
+from jointfit_daemon.timing.stamps import STEP_NS, Estimate, Stamp, StampLine
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import ClockEcho, TickClock
+    from jointfit_daemon.timing.clock_news import ClockNews
     from jointfit_daemon.timing.device_time import DeviceTime
+    from jointfit_daemon.timing.direct import Direct, HostTime
 
-STEP_NS = 5_000_000
-"""Error that is not slewed away, and by how much data may come before its time: then a restart."""
-SLEW = 500e-6
-LATE_NS = 50_000_000
-LATE_FOR_NS = 2_000_000_000
-LATE_SIGMAS = 20.0
+__all__ = ["DeviceClock", "Stamp"]
+
 ABSENT_LIMIT = 100
 """Samples in a row without the time they used to carry, before the clock does without it."""
+MARGIN_NS = 3_000_000
+"""How far beyond its prior the smallest delay may be before a direct time is doubted."""
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
 _JITTER_GAIN = 0.01
 _ARRIVAL_SIGMA = 0.1
-
-
-class Stamp(NamedTuple):
-    """Host time of a sample, and what it is worth."""
-
-    t_ns: int
-    """Host CLOCK_MONOTONIC, ns; greater than the stamp before, unless reordered or duplicate."""
-    sigma_ns: float
-    """Standard deviation, ns; the unseen smallest delay is not in it. May be inf at first."""
-    synced: bool
-    """False while the clock settles."""
-    epoch: int
-    """Grows whenever time before and after do not belong together."""
-    duplicate: bool = False
-    """The device gave this sample the time of the one before."""
+_PRIOR_SIGMAS = 4.0
+_LOOK_EVERY = 256  # samples between two looks at the skew
 
 
 class DeviceClock:
-    """Clock of one device, by the best its samples offer: echoes, ticks, a counter, or nothing.
+    """Clock of one device, by the best on offer: sync edges, echoes, ticks, a counter, or nothing.
 
     Parameters
     ----------
     period_ns : int
         Nominal time between two samples, ns.
-    latency_ns : int
-        Known smallest delay from sampled instant to arrival, ns; subtracted where arrivals rule.
+    latency_ns, latency_sd_ns : int
+        What is known beforehand of the smallest delay from sampled instant to arrival: mean, which
+        is subtracted where arrivals rule, and standard deviation, ns.
     """
 
     __slots__ = (
-        "_absent", "_arrival_ns", "_echo", "_envelope", "_kind", "_last_t", "_last_u",
-        "_late_since", "_latency_ns", "_newest_t", "_period_ns", "_reader", "_synced",
-        "_tick_clock", "epoch", "jitter_ns", "sigma_ns",
+        "_absent", "_arrival_ns", "_direct", "_echo", "_envelope", "_kind",
+        "_lateness", "_line", "_looked", "_period_ns", "_reader", "_refused", "_state_direct",
+        "_synced", "_tick_clock", "_unix_offset_ns", "_warned", "epoch", "jitter_ns", "latency_ns",
+        "latency_sd_ns", "minute", "news", "sigma_ns",
     )  # fmt: skip
 
-    def __init__(self, period_ns: int, *, latency_ns: int = 0) -> None:
+    def __init__(self, period_ns: int, *, latency_ns: int = 0, latency_sd_ns: int = 0) -> None:
         self.epoch = 0
         self.sigma_ns: float | None = None
         """Sigma of the last stamp, ns; None before any."""
         self.jitter_ns: float | None = None
-        """Mean delay beyond the fastest sample (with echoes: beyond the sampled instant), ns."""
-        self._period_ns, self._latency_ns = period_ns, latency_ns
-        self._last_t: int | None = None
-        self._newest_t: int | None = None  # of all stamps, also those without device time
+        """Mean delay beyond the fastest sample (else beyond the sampled instant), ns."""
+        self.latency_ns, self.latency_sd_ns = latency_ns, latency_sd_ns
+        self.minute = LastMinute()
+        """Delays from sampled instant to arrival, and the rate."""
+        self.news: deque[ClockNews] = deque(maxlen=16)
+        """What is to be published; whoever does takes it out."""
+        self._unix_offset_ns: int | None = None
+        self._warned = False
+        self._period_ns = period_ns
+        self._line = StampLine(period_ns)
         self._arrival_ns = 0
         self._tick_clock: TickClock | None = None
-        self._kind, self._absent = _ARRIVAL, 0
+        self._kind, self._absent, self._looked = _ARRIVAL, 0, 0
         self._forget()
 
     def _forget(self) -> None:
@@ -91,17 +92,24 @@ class DeviceClock:
         self._reader: DeviceTime | None = None
         self._envelope = Envelope(CRYSTAL)
         self._echo: EchoFit | None = None
-        self._last_u: int | None = None
-        self._late_since: int | None = None
-        self._synced = False
+        self._direct: Direct | None = None
+        self._refused = self._state_direct = self._synced = False
+        self._line.last_u = None
+        self._lateness = Lateness()
 
     # --- what is known -----------------------------------------------------------------------
 
     @property
     def state(self) -> str:
-        """Return ``settling``, ``passive``, ``echo``, ``arrival`` (no device time) or ``stale``."""
+        """How time is told.
+
+        ``settling``, ``direct``, ``echo``, ``passive``, ``arrival`` (no device time) or ``stale``
+        (echoes stopped).
+        """
         if not self._synced:
             return "settling"
+        if self._state_direct:
+            return "direct"
         echo = self._echo
         if echo is not None and echo.settled and echo.last_ns is not None:
             return "stale" if self._arrival_ns - echo.last_ns > STALE_NS else "echo"
@@ -112,44 +120,105 @@ class DeviceClock:
         """Return s in 1e-6, positive when the device clock runs slow; None while settling."""
         if not self._synced:
             return None
-        slope = self._envelope.skew if self._echo is None else -self._echo.slope
-        return 1e6 * slope
+        direct = self._direct if self._state_direct else None
+        return 1e6 * (self.slope if direct is None else direct.slope)
+
+    @property
+    def slope(self) -> float:
+        """Return s by echoes or arrivals."""
+        return self._envelope.skew if self._echo is None else -self._echo.slope
 
     @property
     def offset_ns(self) -> int | None:
         """Return host minus device time at the last sample, ns; None before any."""
-        if self._last_t is None or self._last_u is None:
-            return None
-        return self._last_t - self._last_u
+        return self._line.offset_ns
 
     @property
     def bound_ns(self) -> float | None:
         """Return the hard limit of the unseen constant, ns; None where nothing limits it."""
         return None if self._echo is None else self._echo.bound_ns
 
+    @property
+    def last_u(self) -> int | None:
+        """Return the device time of the last sample in order, ns; None before any."""
+        return self._line.last_u
+
+    @property
+    def settled(self) -> bool:
+        """Whether ``host_ns`` means anything yet."""
+        return self._synced
+
+    def host_ns(self, u: int) -> int:
+        """Return the host time of device time `u` by echoes or arrivals, ns; not slewed."""
+        echo = self._echo
+        if echo is not None and echo.settled:
+            return echo.host_ns(u)
+        return u + self._envelope.offset_ns(u) - self.latency_ns
+
+    def sigma_at(self, u: int) -> float:
+        """Return the standard deviation of ``host_ns(u)``, ns."""
+        echo = self._echo
+        if echo is not None and echo.settled:
+            return echo.sigma_ns(echo.host_ns(u))
+        return self._envelope.sigma_ns(u)
+
     # --- what comes in -----------------------------------------------------------------------
 
     def feed_restart(self) -> None:
         """Take it that the device's clock began anew, or may have."""
-        if self._last_u is not None or self._echo is not None:
+        self._begin(None)
+
+    def _begin(self, news: ClockNews | None) -> None:
+        if self._line.last_u is not None or self._echo is not None:
             self.epoch += 1
+            if news is not None:
+                self.news.append(news)
         self._forget()
+
+    def feed_unix_offset(self, offset_ns: int) -> None:
+        """Take UNIX time minus CLOCK_MONOTONIC, ns: clocks declared to show UNIX time need it."""
+        if offset_ns != self._unix_offset_ns:
+            self._unix_offset_ns = offset_ns
+            if self._tick_clock is not None and self._tick_clock.scale == "unix":
+                self._refused = False
+                self._direct = declared(self._tick_clock, offset_ns)
 
     def feed_echo(self, echo: ClockEcho, tick_clock: TickClock | None = None) -> None:
         """Take an answered echo. Ignored while nobody knows how the device counts."""
         tick_clock = tick_clock or self._tick_clock
         if tick_clock is None:
             return
-        reader = self._ticks_reader(tick_clock)
-        u = reader.echo_ns(echo.ticks)
+        u = self._ticks_reader(tick_clock).echo_ns(echo.ticks)
         if self._echo is None:
             self._echo = EchoFit()
         elif self._echo.contradicts(u, echo.sent_ns, echo.received_ns):
-            self.feed_restart()
-            reader = self._ticks_reader(tick_clock)
-            u = reader.echo_ns(echo.ticks)
+            off = u - self._echo.device_ns((echo.sent_ns + echo.received_ns) // 2)
+            self._begin(clock_news.off_echoes(off))
+            u = self._ticks_reader(tick_clock).echo_ns(echo.ticks)
             self._echo = EchoFit()
         self._echo.feed(u, echo.sent_ns, echo.received_ns)
+
+    def edge_ns(self, ticks: int, tick_clock: TickClock | None) -> int | None:
+        """Return the device time of a sync edge, ns; None while there is nothing to tell it by.
+
+        An edge falls anywhere in a tick, so on average it is half a tick after the count.
+        """
+        if tick_clock is None or tick_clock != self._tick_clock or self._line.last_u is None:
+            return None
+        reader = self._ticks_reader(tick_clock)
+        return reader.echo_ns(ticks) + reader.to_ns(1) // 2
+
+    def feed_tie(self, u: int, v: int, reference: HostTime) -> None:
+        """Take it that device time `u` is the instant the `reference` calls `v`, ns."""
+        direct = self._direct
+        if direct is not None and not isinstance(direct, PulseTie):
+            return  # declared to be the host's own
+        if direct is None or direct.reference is not reference or direct.broken:
+            if self._refused:
+                return
+            grain = 0.0 if self._tick_clock is None else TickTime(self._tick_clock).to_ns(1)
+            self._direct = direct = PulseTie(reference, float(grain))
+        direct.feed(u, v)
 
     def feed_sample(
         self,
@@ -170,13 +239,19 @@ class DeviceClock:
             How `ticks` count; ticks without it are no time.
         """
         reader = self._reader_for(ticks, counter, tick_clock)
-        self._arrival_ns = arrival_ns
+        before_ns, self._arrival_ns = self._arrival_ns, arrival_ns
         if reader is None:
             return self._by_arrival(arrival_ns)
         u = reader.feed(ticks, counter, arrival_ns, self._envelope)
-        if u is None or self._impossible(u, arrival_ns):
-            u = self._restarted(ticks, counter, arrival_ns, tick_clock)
-        last_u = self._last_u
+        news: ClockNews | None = None
+        if u is None:
+            news = reader.explain(ticks, counter, arrival_ns - before_ns)
+        else:
+            news = self._impossible(u, arrival_ns)
+        if u is None or news is not None:
+            self._begin(news)
+            u = self._afresh(ticks, counter, arrival_ns, tick_clock)
+        last_u = self._line.last_u
         if last_u is not None and u <= last_u:
             return self._past(u, last_u)
         return self._stamp(u, arrival_ns)
@@ -187,9 +262,10 @@ class DeviceClock:
         reader = self._reader
         if not isinstance(reader, TickTime) or tick_clock != self._tick_clock:
             if reader is not None:
-                self.feed_restart()
+                self._begin(clock_news.said("it tells time in another way now"))
             self._tick_clock, self._kind = tick_clock, _TICKS
             self._reader = reader = TickTime(tick_clock)
+            self._direct = declared(tick_clock, self._unix_offset_ns)
         return reader
 
     def _reader_for(
@@ -208,96 +284,112 @@ class DeviceClock:
             self._absent += 1
             if kind < self._kind and self._absent < ABSENT_LIMIT:
                 return None
-            self.feed_restart()
+            self._begin(clock_news.said("it tells time in another way now"))
         self._kind, self._absent = kind, 0
         self._envelope = Envelope(NOMINAL_RATE)
         make = ArrivalTime if kind == _ARRIVAL else CounterTime
         self._reader = reader = make(self._period_ns)
         return reader
 
-    def _restarted(
+    def _afresh(
         self, ticks: int | None, counter: int | None, arrival_ns: int, tick_clock: TickClock | None
     ) -> int:
-        self.feed_restart()
         reader = self._reader_for(ticks, counter, tick_clock)
         u = None if reader is None else reader.feed(ticks, counter, arrival_ns, self._envelope)
         return arrival_ns if u is None else u
 
     # --- what does not fit -------------------------------------------------------------------
 
-    def _impossible(self, u: int, arrival_ns: int) -> bool:
-        """Tell whether the sample contradicts the fit: it came before its time, or stays late."""
-        last_u = self._last_u
+    def _impossible(self, u: int, arrival_ns: int) -> ClockNews | None:
+        """Say what contradicts the fit: a sample that came before its time, or that stays late."""
+        last_u = self._line.last_u
         if last_u is None or u <= last_u:
-            return False
+            return None
         echo = self._echo
         if echo is not None and echo.settled:
-            return arrival_ns - echo.host_ns(u) < -STEP_NS
+            early = echo.host_ns(u) - arrival_ns
+            return clock_news.too_early(early) if early > STEP_NS else None
         envelope = self._envelope
         excess = envelope.residual(u, arrival_ns - u)
         if excess < -STEP_NS:
             if envelope.settled:
-                return True
+                return clock_news.too_early(-excess)
             # What came before was merely late, by seconds perhaps (stale bytes): no use for a fit.
             self._envelope = Envelope(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
-            return False
-        if not envelope.settled or excess < LATE_NS or excess < LATE_SIGMAS * envelope.sigma_ns(u):
-            self._late_since = None
-            return False
-        if self._late_since is None:
-            self._late_since = arrival_ns
-        return arrival_ns - self._late_since > LATE_FOR_NS
+            return None
+        if not envelope.settled:
+            return None
+        return self._lateness.feed(excess, envelope.sigma_ns(u), arrival_ns)
 
     # --- stamps ------------------------------------------------------------------------------
 
     def _stamp(self, u: int, arrival_ns: int) -> Stamp:
-        echo, envelope = self._echo, self._envelope
-        if echo is not None and echo.settled:
-            target, skew, settled = echo.host_ns(u), -echo.slope, True
-            delay, sigma = float(arrival_ns - target), echo.sigma_ns(target)
-        else:
-            delay = abs(envelope.feed(u, arrival_ns - u))
-            target = u + envelope.offset_ns(u) - self._latency_ns
-            skew, settled, sigma = envelope.skew, envelope.settled, envelope.sigma_ns(u)
-            if self._kind == _ARRIVAL:
-                sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
+        estimate = self._estimate(u, arrival_ns)
+        if self._direct is not None:
+            estimate = self._directed(u, estimate, self._direct)
+        target, skew, settled, sigma, delay = estimate
         jitter = self.jitter_ns
         self.jitter_ns = delay if jitter is None else jitter + _JITTER_GAIN * (delay - jitter)
-        t = self._forward(self._slewed(u, target, skew))
-        self._last_u, self._last_t = u, t
+        line, slew = self._line, self._synced
+        if slew and (step := line.step_ns(u, target, skew)):
+            self.epoch += 1
+            self.news.append(clock_news.moved(step))
+            slew = False
+        t = line.stamp(u, target, skew, slew=slew)
         self._synced = settled
         self.sigma_ns = sigma = sigma + abs(t - target)
+        self.minute.feed(arrival_ns, arrival_ns - t)
+        self._looked += 1
+        if self._looked >= _LOOK_EVERY:
+            self._look()
         return Stamp(t, sigma, settled, self.epoch)
 
-    def _slewed(self, u: int, target: int, skew: float) -> int:
-        """Return the stamp nearest to `target` that neither runs backwards nor jumps."""
-        last_t, last_u = self._last_t, self._last_u
-        if last_t is None or last_u is None:
-            return target
-        step = u - last_u
-        if not self._synced:
-            return max(target, last_t + min(step, self._period_ns) // 2)
-        expected = last_t + step + round(skew * step)
-        error, limit = target - expected, round(SLEW * step)
-        if abs(error) > max(STEP_NS, limit):
-            self.epoch += 1
-            return target
-        return expected + max(-limit, min(error, limit))
+    def _estimate(self, u: int, arrival_ns: int) -> Estimate:
+        echo, envelope = self._echo, self._envelope
+        if echo is not None and echo.settled:
+            target = echo.host_ns(u)
+            delay, sigma = float(arrival_ns - target), echo.sigma_ns(target)
+            return Estimate(target, -echo.slope, True, sigma, delay)
+        delay = abs(envelope.feed(u, arrival_ns - u))
+        target, sigma = u + envelope.offset_ns(u) - self.latency_ns, envelope.sigma_ns(u)
+        if self._kind == _ARRIVAL:
+            sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
+        return Estimate(target, envelope.skew, envelope.settled, sigma, delay)
 
-    def _forward(self, t: int) -> int:
-        """Return `t`, or the first instant after every stamp given so far."""
-        if self._newest_t is not None and t <= self._newest_t:
-            t = self._newest_t + 1
-        self._newest_t = t
-        return t
+    def _directed(self, u: int, estimate: Estimate, direct: Direct) -> Estimate:
+        """Return what `direct` says, unless `estimate` contradicts it."""
+        self._state_direct = direct.usable(u)
+        if not self._state_direct:
+            return estimate
+        target = direct.host_ns(u)
+        slack = MARGIN_NS + _PRIOR_SIGMAS * (estimate.sigma + self.latency_sd_ns)
+        slack += self.bound_ns or 0.0
+        if estimate.settled and abs(target - estimate.target) > slack:
+            self.news.append(clock_news.contradicted(target, estimate.target))
+            self._direct, self._refused, self._state_direct = None, True, False
+            return estimate
+        return Estimate(target, direct.slope, True, direct.sigma_at(u), estimate.delay)
+
+    def _look(self) -> None:
+        """Tell once of a skew that no clock has."""
+        self._looked = 0
+        if self._warned or not self._synced:
+            return
+        echo = self._echo
+        kind = "echo" if echo is not None else "ticks" if self._kind == _TICKS else "samples"
+        sigma = self._envelope.skew_sigma if echo is None else echo.skew_sigma
+        warning = clock_news.skew_warning(kind, 1e6 * self.slope, 1e6 * sigma)
+        if warning is not None:
+            self._warned = True
+            self.news.append(warning)
 
     def _past(self, u: int, last_u: int) -> Stamp:
         """Stamp a duplicate (u = last) or reordered sample; it teaches nothing."""
-        last_t = last_u if self._last_t is None else self._last_t
+        last_t = last_u if self._line.last_t is None else self._line.last_t
         sigma = inf if self.sigma_ns is None else self.sigma_ns
         return Stamp(last_t - (last_u - u), sigma, self._synced, self.epoch, u == last_u)
 
     def _by_arrival(self, arrival_ns: int) -> Stamp:
         """Stamp a sample that lacks the time its neighbours have."""
-        t = arrival_ns - self._latency_ns - round(self.jitter_ns or 0.0)
-        return Stamp(self._forward(t), float(self._period_ns), synced=False, epoch=self.epoch)
+        t = arrival_ns - self.latency_ns - round(self.jitter_ns or 0.0)
+        return Stamp(self._line.forward(t), float(self._period_ns), synced=False, epoch=self.epoch)

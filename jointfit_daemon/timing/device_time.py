@@ -10,10 +10,12 @@ from __future__ import annotations
 from math import log
 from typing import TYPE_CHECKING, Protocol
 
+from jointfit_daemon.timing.clock_news import began_anew, said
 from jointfit_daemon.timing.wrap import unwrap
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import TickClock
+    from jointfit_daemon.timing.clock_news import ClockNews
     from jointfit_daemon.timing.envelope import Envelope
 
 NS = 1_000_000_000
@@ -44,6 +46,9 @@ class DeviceTime(Protocol):
         self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope
     ) -> int | None:
         """Return device time in ns, or None for a restart."""
+
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:
+        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
 
 
 class TickTime:
@@ -90,6 +95,13 @@ class TickTime:
         self._last, self._arrival_ns, self._backward = ticks, arrival_ns, 0
         self._counter = counter
         return self.to_ns(ticks)
+
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:  # noqa: ARG002 - the readers' common shape
+        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+        before, modulus = self._last or 0, self._clock.modulus
+        if modulus:
+            before %= modulus
+        return began_anew(self.to_ns(before), self.to_ns(ticks or 0), elapsed_ns)
 
     def _past(self, ticks: int, last: int) -> int | None:
         self._backward += 1
@@ -145,6 +157,11 @@ class CounterTime:
                 return number * self._period_ns if late else None
         self._last, self._raw, self._arrival_ns, self._backward = number, counter, arrival_ns, 0
         return number * self._period_ns
+
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:  # noqa: ARG002 - the readers' common shape
+        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+        period = self._period_ns
+        return began_anew(self._raw * period, (counter or 0) * period, elapsed_ns)
 
     def _unwrap(self, counter: int, last: int, elapsed_ns: int) -> int:
         period = self._period_ns
@@ -207,6 +224,12 @@ class ArrivalTime:
                 self._late_samples = 0
         self._number, self._arrival_ns = number, arrival_ns
         return number * period
+
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:  # noqa: ARG002 - the readers' common shape
+        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+        if elapsed_ns > _SILENCE_NS:
+            return said(f"nothing for {elapsed_ns / NS:.1f} s, and it does not number its samples")
+        return said("its samples are late by no whole number of periods: numbered anew")
 
     def _decided(self, arrival_ns: int) -> bool:
         waited = arrival_ns - self._late_ns

@@ -73,10 +73,7 @@ class EchoFit:
         if not self.settled:
             return False
         middle = (sent_ns + received_ns) // 2
-        excess = abs(
-            u - middle - self._theta_ref - self._line.height - self.slope * (middle - self._ref)
-        )
-        return excess > (received_ns - sent_ns) / 2 + JUMP_NS
+        return abs(u - self.device_ns(middle)) > (received_ns - sent_ns) / 2 + JUMP_NS
 
     def feed(self, u: int, sent_ns: int, received_ns: int) -> None:
         """Take one answered echo: host stamps and server time, ns. Impossible ones are ignored."""
@@ -108,6 +105,11 @@ class EchoFit:
         self._ref, self._theta_ref = ref, theta_ref
         self._line = fit_line(rows, SKEW_SD)
         self.slope = self._line.slope
+
+    def device_ns(self, host_ns: int) -> int:
+        """Return the server time at a host instant, ns."""
+        theta = self._line.height + self.slope * (host_ns - self._ref)
+        return host_ns + self._theta_ref + round(theta)
 
     def host_ns(self, u: int) -> int:
         """Return the host time of server time `u`, ns: solves ``u = m + theta(m)``."""
