@@ -14,6 +14,7 @@ see: unseen transport delay, filters inside both systems, exposure conventions.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from math import inf, nan, radians
 from typing import TYPE_CHECKING
@@ -37,10 +38,19 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag_fit import LagFit
     from jointfit_daemon.timing.rates import Floats, Rates
 
+NO_OVERLAP = "the tracks do not overlap"
+IRREGULAR = "move faster and irregularly, about several axes"
 _NYQUIST_SHARE = 0.4
-_FAR_S = 0.1
-_RIVAL = 0.95
 _LEAST_OVERLAP = 0.5
+_CANDIDATE = 0.5
+"""Share of the best correlation from which on a maximum deserves a fit of its own."""
+_CANDIDATES = 4
+_SAME_S = 0.01
+"""Fits that end this near to each other are one."""
+_RIVAL = 1.5
+"""A rival that leaves less than this times the residual variance cannot be told apart."""
+_AGREE = 0.005
+"""No two systems agree on a rate better than to this share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +67,8 @@ class LagSettings:
     """RMS angular rate of the reference, rad/s."""
     min_acceleration: float = radians(300.0)
     """RMS angular acceleration of the reference, rad/s²."""
-    max_sigma_ns: float = 300_000.0
+    max_sigma_ns: float = 500_000.0
+    """Well above what ordinary motion gives: a gate near it would choose windows by their luck."""
     min_r2: float = 0.98
     """Right data on one rigid body reach 0.998; skin-mounted sensors deserve less."""
     min_weight: float = 0.7
@@ -154,18 +165,18 @@ def estimate_lag_of_rates(
     imu, ref = low_pass(imu, cutoff), low_pass(ref, cutoff)
     if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
         return LagEstimate(nan, inf, nan, "no gapless stretch of data", valid_share=valid)
-    coarse, refused = coarse_lag(imu, ref, settings)
+    coarse, refused = coarse_lags(imu, ref, settings)
     rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)
     seen = LagEstimate(
         nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
     )
     if rate < settings.min_rate or acceleration < settings.min_acceleration:
-        return replace(seen, refused=f"too little motion: {np.degrees(rate):.1f} deg/s rms")
+        return replace(seen, refused=_too_little(rate, acceleration, settings))
     if refused is not None:
         return replace(seen, refused=refused)
-    fit = fit_lag(imu, ref, coarse, cutoff)
+    fit, rival = _best_fit(imu, ref, coarse, cutoff)
     if fit is None:
-        return replace(seen, refused="the tracks do not overlap")
+        return replace(seen, refused=NO_OVERLAP)
     estimate = replace(
         seen,
         lag_ns=1e9 * fit.tau_s,
@@ -177,36 +188,102 @@ def estimate_lag_of_rates(
         mean_weight=fit.mean_weight,
         pairs=fit.pairs,
     )
-    return replace(estimate, refused=_gate(estimate, fit, settings))
+    refused = _gate(estimate, fit, settings)
+    if refused is None and rival is not None:
+        refused = f"the motion is periodic: a lag of {1e3 * rival:.0f} ms fits as well; {IRREGULAR}"
+    return replace(estimate, refused=refused)
+
+
+def _best_fit(
+    imu: Rates, ref: Rates, starts: tuple[float, ...], cutoff_hz: float
+) -> tuple[LagFit | None, float | None]:
+    """Return the best fit from all starts, and the lag, s, of another one nearly as good."""
+    fits = [fit for start in starts if (fit := fit_lag(imu, ref, start, cutoff_hz)) is not None]
+    if not fits:
+        return None, None
+    best = min(fits, key=lambda fit: fit.residual_rms)
+    alike = _RIVAL * max(best.residual_rms, _AGREE * _rms(ref.w)) ** 2
+    rivals = [
+        fit.tau_s
+        for fit in fits
+        if abs(fit.tau_s - best.tau_s) > _SAME_S and fit.residual_rms**2 < alike
+    ]
+    return best, next(iter(rivals), None)
+
+
+def _too_little(rate: float, acceleration: float, settings: LagSettings) -> str:
+    return (
+        f"too little motion: {np.degrees(rate):.1f} deg/s rms, {np.degrees(acceleration):.0f} "
+        f"deg/s² rms; at least {np.degrees(settings.min_rate):.0f} and "
+        f"{np.degrees(settings.min_acceleration):.0f} are needed: {IRREGULAR}"
+    )
 
 
 def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | None:
-    """Return the first gate the estimate fails, in words."""
+    """Return the first gate the estimate fails, with the remedy, in words."""
+    share, bias = estimate.valid_share, float(np.degrees(np.linalg.norm(fit.bias)))
     gates = (
-        (estimate.valid_share >= settings.min_valid, "too many gaps"),
-        (fit.converged, "the fit did not converge"),
+        (
+            share >= settings.min_valid,
+            f"too many gaps: {100 * share:.0f} % of the time is covered, at least "
+            f"{100 * settings.min_valid:.0f} % are needed: stay in view of the cameras",
+        ),
+        (fit.converged, f"the fit did not converge: {IRREGULAR}"),
         (
             estimate.r2 >= settings.min_r2,
-            f"R² {estimate.r2:.3f} < {settings.min_r2}: not the same motion, or a wrong convention",
+            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: not the same motion, or a wrong "
+            "convention; check that the sensor sits on this body, and that it sits firmly",
         ),
-        (estimate.mean_weight >= settings.min_weight, "too many outliers"),
-        (float(np.linalg.norm(fit.bias)) <= settings.max_bias, "rate bias too large: wrong units?"),
+        (
+            estimate.mean_weight >= settings.min_weight,
+            "too many outliers: check for markers that swap or are hidden",
+        ),
+        (
+            bias <= math.degrees(settings.max_bias),
+            f"rate bias too large, {bias:.1f} deg/s: check the unit of the rate",
+        ),
         (
             estimate.sigma_ns <= settings.max_sigma_ns,
-            f"too uncertain: {estimate.sigma_ns * 1e-6:.2f} ms",
+            f"too uncertain: {_ms(estimate.sigma_ns)} > {_ms(settings.max_sigma_ns)}: {IRREGULAR}",
         ),
-        (abs(fit.tau_s) <= settings.span_s, "the lag is outside the searched span"),
+        (
+            abs(fit.tau_s) <= settings.span_s,
+            f"{1e3 * fit.tau_s:.0f} ms is outside the searched span of {1e3 * settings.span_s:.0f} "
+            "ms: check that both clocks are mapped",
+        ),
     )
     return next((reason for passed, reason in gates if not passed), None)
 
 
-def coarse_lag(imu: Rates, ref: Rates, settings: LagSettings) -> tuple[float, str | None]:
-    """Return the lag, s, that best correlates the magnitudes of both rates, and why not to use it.
+def _ms(value_ns: float) -> str:
+    return f"{value_ns * 1e-6:.2f} ms" if value_ns < inf else "all rests on one moment"
 
-    The magnitude needs no rotation. A maximum at the border, or a far rival nearly as high
-    (periodic motion), is refused.
+
+def coarse_lags(
+    imu: Rates, ref: Rates, settings: LagSettings
+) -> tuple[tuple[float, ...], str | None]:
+    """Return lags, s, that correlate the magnitudes of both rates, best first, or why not.
+
+    The magnitude needs no rotation. A maximum at the border of the search is none.
     """
     step, reach = settings.step_s, round(settings.span_s / settings.step_s)
+    scores = _correlations(imu, ref, step, reach)
+    best = int(np.argmax(scores))
+    if not np.isfinite(scores[best]):
+        return (), NO_OVERLAP
+    if best in {0, scores.size - 1}:
+        return (), (
+            f"no common motion within {settings.span_s:g} s: check that the sensor sits on this "
+            "body and that both clocks are mapped"
+        )
+    peaks = np.flatnonzero((scores[1:-1] > scores[:-2]) & (scores[1:-1] >= scores[2:])) + 1
+    peaks = peaks[scores[peaks] >= _CANDIDATE * scores[best]]
+    ranked = peaks[np.argsort(-scores[peaks], kind="stable")][:_CANDIDATES]
+    return tuple(((ranked - reach) * step).tolist()), None
+
+
+def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
+    """Return the normalized correlation of the magnitudes at ``(i - reach) * step``."""
     grid = np.arange(ref.t_s[0], ref.t_s[-1], step)
     wide = grid[0] + step * np.arange(-reach, grid.size + reach)
     a, a_ok = _magnitude(ref, grid)
@@ -220,17 +297,7 @@ def coarse_lag(imu: Rates, ref: Rates, settings: LagSettings) -> tuple[float, st
             y = b[shift : shift + grid.size][both]
             y = y - y.mean()
             scores[shift] = (x @ y) / np.sqrt(max((x @ x) * (y @ y), 1e-300))
-    best = int(np.argmax(scores))
-    lag = (best - reach) * step
-    if not np.isfinite(scores[best]):
-        return nan, "the tracks do not overlap"
-    if best in {0, scores.size - 1}:
-        return nan, f"no common motion within {settings.span_s:g} s"
-    peaks = np.flatnonzero((scores[1:-1] > scores[:-2]) & (scores[1:-1] >= scores[2:])) + 1
-    far = peaks[np.abs(peaks - best) * step > _FAR_S]
-    if far.size and scores[far].max() >= _RIVAL * scores[best]:
-        return nan, "the motion is periodic and the lag ambiguous: move irregularly"
-    return lag, None
+    return scores
 
 
 def _magnitude(rates: Rates, t: Floats) -> tuple[Floats, NDArray[np.bool_]]:

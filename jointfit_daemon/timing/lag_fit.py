@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.timing.lag_sigma import RIDGE, Columns, lag_sigma
 from jointfit_daemon.timing.rates import Interpolant
 
 if TYPE_CHECKING:
@@ -22,10 +23,11 @@ MEDIAN_NORM = 1.538
 """Median norm of a standard normal vector of three."""
 STEP_S = 0.020
 ITERATIONS = 30
-DONE_S = 1e-9
+DONE_S = 1e-7
+"""A step this small, twice in a row, ends the search. The rotation is not asked: about a single
+axis of motion it may turn for ever without a word to the lag."""
 LEAST_PAIRS = 16
 
-_RIDGE = 1e-9
 _TINY = 1e-12
 
 
@@ -62,14 +64,14 @@ class _Linear(NamedTuple):
     jtau: Floats
     """Of tau, shape (n, 3)."""
     omega: Floats
+    t_s: Floats
 
 
 def fit_lag(imu: Rates, ref: Rates, start_s: float, cutoff_hz: float) -> LagFit | None:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
     Gauss-Newton on all seven unknowns with Huber weights on |r|. The faster track is interpolated
-    at the instants of the slower one. The standard deviation is Newey-West's, for low-passed
-    residuals are correlated over the filter's memory.
+    at the instants of the slower one. The standard deviation is that of ``lag_sigma``.
 
     Parameters
     ----------
@@ -91,24 +93,25 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float, cutoff_hz: float) -> LagFit 
     state = _start(cubic, slow, -start_s if swapped else start_s)
     if state is None:
         return None
-    converged = False
+    converged, before = False, float("inf")
     for _ in range(ITERATIONS):
         linear = _linearize(cubic, slow, state)
         if linear is None:
             return None
         state, moved = _step(linear, state)
-        if moved < DONE_S:
+        if max(moved, before) < DONE_S:
             converged = True
             break
+        before = moved
     linear = _linearize(cubic, slow, state)
     if linear is None:
         return None
     rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
-    lags = max(1, round(2.0 / (cutoff_hz * slow.period_s)))
+    whole = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
     square = float(np.sum(linear.r**2))
     return LagFit(
         tau_s=-state.tau if swapped else state.tau,
-        sigma_s=_newey_west(linear, lags),
+        sigma_s=lag_sigma(Columns(whole, linear.r, linear.w), linear.t_s, 2.0 / cutoff_hz),
         rotation=rot,
         bias=bias,
         r2=1.0 - square / max(float(np.sum(linear.omega**2)), _TINY),
@@ -143,37 +146,18 @@ def _linearize(cubic: Interpolant, slow: Rates, state: _State) -> _Linear | None
     jac = np.concatenate(
         (rotation.skew(turned), np.broadcast_to(-np.eye(3), (*norm.shape, 3, 3))), axis=2
     )
-    return _Linear(r, weight, jac, slope[ok], omega)
+    return _Linear(r, weight, jac, slope[ok], omega, slow.t_s[ok])
 
 
 def _step(linear: _Linear, state: _State) -> tuple[_State, float]:
-    """Return the next state and how far it moved (s; a radian counts as a millisecond)."""
+    """Return the next state and how far the lag moved, s."""
     jac = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
     weighted = jac * linear.w[:, None, None]
     normal = np.einsum("nij,nik->jk", weighted, jac)
     gradient = np.einsum("nij,ni->j", weighted, linear.r)
-    normal[np.arange(3), np.arange(3)] += _RIDGE * max(np.trace(normal[:3, :3]), _TINY)
+    normal[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(normal[:3, :3]), _TINY)
     normal[6, 6] += _TINY
     move = -np.linalg.solve(normal, gradient)
     tau = float(np.clip(move[6], -STEP_S, STEP_S))
     rot = rotation.to_matrix(rotation.exp(move[:3])) @ state.rot
-    moved = max(abs(tau), 1e-3 * float(np.abs(move[:6]).max()))
-    return _State(state.tau + tau, rot, state.bias + move[3:6]), moved
-
-
-def _newey_west(linear: _Linear, lags: int) -> float:
-    """Return the standard deviation of tau, s, for residuals correlated over `lags` samples."""
-    w, jac = linear.w, linear.jac
-    weighted = jac * w[:, None, None]
-    normal = np.einsum("nij,nik->jk", weighted, jac)
-    normal[np.arange(3), np.arange(3)] += _RIDGE * max(np.trace(normal[:3, :3]), _TINY)
-    cross = np.einsum("nij,ni->j", weighted, linear.jtau)
-    jtau = linear.jtau - np.einsum("nij,j->ni", jac, np.linalg.solve(normal, cross))
-    information = float(w @ np.sum(jtau**2, axis=1))
-    score = w * np.sum(jtau * linear.r, axis=1)
-    variance = float(score @ score)
-    for lag in range(1, min(lags, len(score) - 1) + 1):
-        variance += 2.0 * (1.0 - lag / (lags + 1)) * float(score[lag:] @ score[:-lag])
-    if information <= _TINY:
-        return float("inf")
-    return float(np.sqrt(max(variance, 0.0))) / information
+    return _State(state.tau + tau, rot, state.bias + move[3:6]), abs(tau)

@@ -97,7 +97,7 @@ def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
     lag, tolerance, spread = EXPECTED_MS[excerpt.name]
     assert np.mean(found) == pytest.approx(lag, abs=tolerance)
     assert np.std(found) < spread
-    assert 0.3 < np.std(found) / np.median(sigmas) < 1.6
+    assert 0.2 < np.std(found) / np.median(sigmas) < 1.5  # low: windows overlap
 
 
 def test_gaps_do_not_move_the_lag(excerpt: Excerpt) -> None:
