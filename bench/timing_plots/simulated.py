@@ -176,7 +176,7 @@ def _sensor(
     hush: tuple[int, int],
 ) -> None:
     write: Callable[[str, int, int, int, Quaternion], tuple[int, bytes]]
-    write = _xbus_chunk if name in ON_UART else _xcdi_chunk
+    write = xbus_chunk if name in ON_UART else xcdi_chunk
     for number, ((host, device, due, dropped), q) in enumerate(
         zip(_rows(track), orientations, strict=True)
     ):
@@ -188,7 +188,7 @@ def _sensor(
         made.chunks.append((t_ns, name, data))
 
 
-def _xbus_chunk(
+def xbus_chunk(
     _name: str, number: int, ticks: int, due_ns: int, q: Quaternion
 ) -> tuple[int, bytes]:
     data = xbus.encode(
@@ -204,9 +204,7 @@ def _xbus_chunk(
     return due_ns + len(data) * 10 * NS // BAUD, data  # read when its last byte is there
 
 
-def _xcdi_chunk(
-    name: str, number: int, ticks: int, due_ns: int, q: Quaternion
-) -> tuple[int, bytes]:
+def xcdi_chunk(name: str, number: int, ticks: int, due_ns: int, q: Quaternion) -> tuple[int, bytes]:
     block = (list(SENSORS).index(name) + 1) << 8
     rows = (
         (block + 5, xcdi.DataId.SAMPLE_TIME, (ticks,)),

@@ -1,0 +1,28 @@
+"""The ten-hour row in short form, and that it would notice a leak."""
+
+from __future__ import annotations
+
+from bench.timing_rows.c_memory import Held, growth, held, watch
+
+KIB = 1024
+FULL_H = 0.06
+"""Minute-long windows are full, two minutes of echoes too."""
+
+
+def test_a_quarter_of_an_hour_leaves_nothing_behind() -> None:
+    looks, samples, states = watch(0.25, 30)
+    sizes = [look.size for look in looks if look.hours > FULL_H]
+    assert samples > 20_000
+    assert states > 4_000
+    assert len(sizes) > 4
+    assert max(sizes) - min(sizes) < 16 * KIB  # eight bytes a sample would be 170
+
+
+def test_what_is_kept_is_counted_and_its_growth_told() -> None:
+    kept: list[float] = []
+    before = held(kept, 1.0)
+    kept += [k + 0.5 for k in range(1000)]
+    after = held(kept, 2.0)
+    assert after.objects - before.objects == 1000
+    assert 30_000 < after.size - before.size < 40_000
+    assert growth([before, after, Held(3.0, 2 * after.size - before.size, 0)]) > 30_000
