@@ -58,6 +58,14 @@ class MarkerTrial:
             raise UnknownMarker("; ".join(self._explain(name) for name in unknown))
         return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
+    def direction(self, axis: Axis) -> NDArray[np.float64]:
+        """Return one of the file's axes in the world whose z is up, shape (3,)."""
+        return np.asarray(np.eye(3)["xyz".index(axis)][_TO_Z_UP[self.up_axis]])
+
+    def to_file(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take vectors (..., 3) back to the file's own axes."""
+        return np.asarray(vectors[..., np.argsort(_TO_Z_UP[self.up_axis])])
+
     def _index(self, name: str) -> int | None:
         if name in self.trajectories.names:
             return self.trajectories.names.index(name)
