@@ -138,6 +138,7 @@ def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, 
     trS, trSS = np.einsum("jaa->j", S), np.einsum("jab,jba->j", S, S)
     trSC, z0 = np.einsum("jab,jba->j", S, paths.C), np.einsum("jaa->j", paths.C)
     eta, R2 = 0.0, np.ones(len(h))
+    m, V, added = g, np.zeros(len(h)), np.ones(len(h))
     for _ in range(_STEPS):
         w = paths.n / (R2 * relative)
         D = paths.C - eta * S
@@ -161,4 +162,9 @@ def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, 
         eta += step
         if abs(step) <= 1e-13 * eta + 1e-30:
             break
-    return m + g, max(eta, 0.0), np.maximum(V, 0.0) / np.maximum(added, 1e-300) * relative, R2
+    return (
+        np.asarray(m + g),
+        max(eta, 0.0),
+        np.maximum(V, 0.0) / np.maximum(added, 1e-300) * relative,
+        R2,
+    )

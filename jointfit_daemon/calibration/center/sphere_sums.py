@@ -46,9 +46,9 @@ class SphereSums:
         """Return how many frames the weights are worth, (Σw)²/Σw² per marker, shape (k,)."""
         return np.asarray(self.weights**2 / np.maximum(self.squares, 1e-300))
 
-    def only(self, markers: Array) -> SphereSums:
-        """Return the sums of some markers, given as a mask or as indices."""
-        pick = np.arange(len(self.origin))[markers]
+    def only(self, markers: NDArray[np.bool_]) -> SphereSums:
+        """Return the sums of some markers, given as a mask."""
+        pick = np.flatnonzero(markers)
         M = self.M[pick][:, :, pick]
         return SphereSums(self.origin[pick], M, self.L[pick], self.squares[pick], self.frames)
 
@@ -70,7 +70,7 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     weights : ndarray, shape (n, k), optional
         Non-negative; one if None.
     """
-    seen = np.isfinite(points).all(axis=-1)
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
     w = np.where(seen, 1.0 if weights is None else weights, 0.0)
     known = np.where(seen[..., None], points, 0.0)
     origin = known.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]

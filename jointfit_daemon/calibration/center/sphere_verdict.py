@@ -36,6 +36,7 @@ LOUD = 9.0
 """Variance of a marker over that of the others from which it is named."""
 PERSISTENT = 0.5
 """Correlation of residuals from frame to frame from which it is flagged."""
+STRAIGHT = "the markers moved on what may be a straight line: bend the joint at least 30° each way"
 STILL = "the markers stood still in the parent: move the joint, at least 30° each way"
 
 
@@ -94,7 +95,7 @@ def center_and_spheres(
         return refusal(method, d, sums.frames, STILL), None
     seen = observe(sums, paths, basis, limits)
     if seen is None:
-        return refusal(method, d, sums.frames, _too_little(paths)), None
+        return refusal(method, d, sums.frames, STRAIGHT), None
     found = _answer(sums, paths, seen, near, limits)
     radii = np.full(len(usable), np.nan)
     radii[usable] = found.radii
@@ -117,14 +118,6 @@ def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
         effective_frames=0.0,
         unseen=np.eye(d),
         refused=reason,
-    )
-
-
-def _too_little(paths: Paths) -> str:
-    way = 1000.0 * float(np.sqrt(12.0 * np.trace(paths.C, axis1=1, axis2=2).max()))
-    return (
-        f"the markers moved {way:.0f} mm on what may be a straight line: bend the joint further, "
-        "at least 30° each way"
     )
 
 
@@ -159,7 +152,7 @@ def _answer(
         unseen=unseen,
         axis=unseen[0] if len(unseen) == 1 and d == 3 else None,
         flags=_flags(seen, len(unseen)),
-        refused=_objection(arc, radius, conditioning, basis.shape, limits),
+        refused=objection(arc, radius, conditioning, limits),
     )
 
 
@@ -198,13 +191,12 @@ def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
     return (*flags, *(f"noisy_marker:{j}" for j in loud))
 
 
-def _objection(
-    arc: float, radius: float, conditioning: float, seen: tuple[int, ...], limits: Limits
-) -> str | None:
+def objection(arc: float, radius: float, conditioning: float, limits: Limits) -> str | None:
+    """Say why a center is not to be used and what to do; None if it may."""
     if arc < limits.min_arc:
         return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
     if not limits.reach[0] <= radius <= limits.reach[1]:
         return f"the markers would be {radius:.2f} m from the center: check marker names"
-    if seen[0] - seen[1] > 1 or conditioning < MIN_CONDITIONING or (seen[0] == 2 and seen[1] < 2):
+    if conditioning < MIN_CONDITIONING:
         return f"uncertain to {1000 * radius / conditioning:.0f} mm: move this joint further"
     return None

@@ -1,0 +1,120 @@
+r"""What the noise of the parent's own markers does to a point seen from the parent.
+
+Law: the parent's frame is itself a fit to noisy markers; a point a lever arm away is moved by the
+fit's turn. Close parent markers and long levers amplify noise, and all markers of the child share
+it. In a plane with two parent markers see `planar_reduction.parent_noise`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.kinematics import rotation
+
+Array = NDArray[np.float64]
+
+
+def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
+    r"""Return the covariance of points in the coordinates of a frame fitted to noisy markers.
+
+    .. math:: Σ_x = σ^2 \left[ \left(1 + \tfrac1m\right) I + [λ]_× G^{-1} [λ]_×^T \right],
+              \quad G = \sum_j \left(|d_j|^2 I - d_j d_j^T\right), \quad λ = x - \bar y,
+              \quad d_j = y_j - \bar y
+
+    to first order in the noise, for a frame by Kabsch's fit of equal weights.
+
+    Parameters
+    ----------
+    points : ndarray, shape (..., 3)
+        In the parent, m.
+    parent : ndarray, shape (m, 3)
+        The parent's markers in its own coordinates, m.
+    noise : float
+        Standard deviation of every coordinate of every marker, m.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        m².
+
+    Raises
+    ------
+    ValueError
+        Fewer than three markers, or all on a line: they fix no frame.
+    """
+    middle = parent.mean(axis=0)
+    d = parent - middle
+    G = np.trace(d.T @ d) * np.eye(3) - d.T @ d
+    # on a line, turning about it moves no marker
+    if len(parent) < 3 or float(np.linalg.eigvalsh(G)[0]) < 1e-9 * float(np.trace(G)):
+        raise ValueError("a frame needs three markers that are not on a line: move one aside")
+    L = rotation.skew(np.asarray(points, dtype=np.float64) - middle)
+    turned = L @ np.linalg.inv(G) @ np.swapaxes(L, -1, -2)
+    return np.asarray(noise**2 * ((1.0 + 1.0 / len(parent)) * np.eye(3) + turned))
+
+
+def planar_noise(points: Array, parent: Array, noise: float) -> Array:
+    r"""Return the same in a plane, for any number of parent markers.
+
+    .. math:: Σ_x = σ^2 \left[ \left(1 + \tfrac1m\right) I
+              + \frac{λ_⊥ λ_⊥^T}{\sum_j |d_j|^2} \right]
+
+    Parameters
+    ----------
+    points : ndarray, shape (..., 2)
+        In the parent, m.
+    parent : ndarray, shape (m, 2)
+        The parent's markers, m.
+    noise : float
+        Standard deviation of every coordinate, m.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two markers, or all at one place.
+    """
+    middle = parent.mean(axis=0)
+    spread = float(((parent - middle) ** 2).sum())
+    if len(parent) < 2 or spread < 1e-12:
+        raise ValueError("a frame in a plane needs two markers apart from each other")
+    lever = np.asarray(points, dtype=np.float64) - middle
+    across = np.stack((-lever[..., 1], lever[..., 0]), axis=-1)
+    turned = across[..., :, None] * across[..., None, :] / spread
+    return np.asarray(noise**2 * ((1.0 + 1.0 / len(parent)) * np.eye(2) + turned))
+
+
+def relative(points: Array, parent: Array, center: Array) -> Array:
+    r"""Return the shape of each marker's noise for `RunningSphere`: its radial part is one.
+
+    .. math:: S_j = \overline{Σ_x} / \overline{\hat r^T Σ_x \hat r}
+
+    The noise found along the radius says nothing of the noise across it, which is larger where the
+    center is near the parent's markers; taking too little of it out leaves a bias.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, d)
+        Markers in the parent, m; NaN where not seen.
+    parent : ndarray, shape (m, d)
+        The parent's markers, m.
+    center : ndarray, shape (d,)
+        About where the center is, m.
+
+    Returns
+    -------
+    ndarray, shape (k, d, d)
+        Identity for a marker never seen.
+    """
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    d = points.shape[-1]
+    v = np.where(seen[..., None], points, center + 1.0)
+    S = (spatial_noise if d == 3 else planar_noise)(v, parent, 1.0)
+    spoke = v - center
+    spoke = spoke / np.maximum(np.linalg.norm(spoke, axis=-1, keepdims=True), 1e-9)
+    radial = np.einsum("tja,tjab,tjb->tj", spoke, S, spoke)
+    count = np.maximum(seen.sum(axis=0), 1)
+    mean = (seen[..., None, None] * S).sum(axis=0) / count[:, None, None]
+    along = (seen * radial).sum(axis=0) / count
+    found = mean / np.maximum(along, 1e-300)[:, None, None]
+    return np.where(seen.any(axis=0)[:, None, None], found, np.eye(d))
