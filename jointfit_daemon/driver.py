@@ -72,6 +72,11 @@ class ImuSettings(Settings):
     driver: str = Field(description="driver name, as `jointfit check` lists them")
     rate_hz: float = Field(100.0, gt=0, le=2000, description="samples per second asked of it")
     silence_s: float = Field(1.0, gt=0, description="no byte for this long is a lost device")
+    least_delay_ms: tuple[float, float] | None = Field(
+        None,
+        description="smallest delay from measuring to arrival and its standard deviation, ms; by "
+        "default that of the transport",
+    )
 
 
 class MocapSettings(Settings):
@@ -89,6 +94,14 @@ class MocapSettings(Settings):
         None, description="rigid body of the plate that carries the sensors in the align phase"
     )
     silence_s: float = Field(1.0, gt=0, description="no datagram for this long is a lost server")
+    least_delay_ms: tuple[float, float] | None = Field(
+        None,
+        description="smallest delay from exposure to arrival and its standard deviation, ms; for "
+        "servers that answer no echoes",
+    )
+    sync_line: int | None = Field(
+        None, description="the sync line that carries an edge at every exposure, if one is wired"
+    )
 
 
 class Decoder(Protocol):

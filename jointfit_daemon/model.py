@@ -139,8 +139,9 @@ class Corrupt:
 class DeviceEvent:
     """Something a device said or did that is not a measurement.
 
-    Kinds: ``info`` (data: model, serial, firmware, settings read back), ``restart`` (its clock
-    began anew), ``gap`` (data: lost), ``setting`` (changed while running), ``warning``, ``error``.
+    Kinds: ``info`` (data: model, serial, firmware, settings read back), ``restart`` (the device
+    began anew), ``clock`` (its time did), ``gap`` (data: lost), ``setting`` (changed while
+    running), ``warning``, ``error``.
     """
 
     kind: str

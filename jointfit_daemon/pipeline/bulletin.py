@@ -19,6 +19,7 @@ _LEVELS: dict[str, Level] = {
     "warning": "warning",
     "error": "error",
     "restart": "warning",
+    "clock": "warning",
 }
 
 
@@ -45,7 +46,7 @@ class Bulletin:
             return self._hold(
                 now_ns, source, "gap", lost if isinstance(lost, int) else 1, item.text
             )
-        kind = "clock" if item.kind == "restart" else "device"
+        kind = "clock" if item.kind in {"restart", "clock"} else "device"
         level: Level = _LEVELS.get(item.kind, "info")
         return [Notice(now_ns, kind, source, item.text, level, dict(item.data))]
 

@@ -28,6 +28,7 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.pipeline.health import health_of
 from jointfit_daemon.pipeline.session import CalibrationSession
 from jointfit_daemon.pipeline.source import SourceState, Stamped
+from jointfit_daemon.pipeline.sync_lines import SyncLines
 from jointfit_daemon.timing.align import FrameAligner, StreamSpec
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class Core:
     def __init__(self) -> None:
         self._rig: Rig | None = None
         self._sources: dict[str, SourceState] = {}
+        self._lines = SyncLines()
         self._now_ns = 0
         self._seq = 0
         self._verdicts: dict[str, dict[str, int]] = {}
@@ -128,7 +130,8 @@ class Core:
             if (state := self._sources.get(source.id)) is not None and state.source == source
         }
         self._sources = {
-            s.id: kept.get(s.id) or SourceState.of(s, self._sources.get(s.id)) for s in rig.sources
+            s.id: kept.get(s.id) or SourceState.of(s, self._sources.get(s.id), self._lines)
+            for s in rig.sources
         }
         if all(source.kind != "mocap" for source in rig.sources):
             self._mocap_used = self._mocap_idle = 0

@@ -17,14 +17,17 @@ from jointfit_daemon.model import (
     MocapFrame,
     SyncPulse,
 )
+from jointfit_daemon.pipeline.latency import latency_prior
+from jointfit_daemon.pipeline.sync_lines import SyncLines
 from jointfit_daemon.timing.clock import DeviceClock
+from jointfit_daemon.timing.sync_line import Edge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.config import Source
     from jointfit_daemon.driver import Decoder
-    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_daemon.model import Chunk, Decoded, TickClock
     from jointfit_daemon.timing.clock import Stamp
 
 _NS = 1_000_000_000
@@ -52,7 +55,7 @@ class WireCounts:
     lost: int = 0
     """Samples the device's counter says were sent and never came."""
     restarts: int = 0
-    """Times the device's clock began anew."""
+    """Times the device began anew, as it said or its clock showed."""
     opened: int = 0
     """Times the source was opened; all but the first are reconnects."""
 
@@ -63,6 +66,8 @@ class SourceState:
 
     source: Source
     clock: DeviceClock
+    lines: SyncLines = field(default_factory=SyncLines)
+    """Where edges of sync lines meet: one for the whole rig."""
     online: bool = False
     open: bool = False
     last_arrival_ns: int | None = None
@@ -72,12 +77,22 @@ class SourceState:
     _decoder: Decoder | None = None
 
     @classmethod
-    def of(cls, source: Source, before: SourceState | None = None) -> SourceState:
+    def of(
+        cls,
+        source: Source,
+        before: SourceState | None = None,
+        lines: SyncLines | None = None,
+    ) -> SourceState:
         """Return the state of a source not opened yet; `before` had its name and gives its counts.
 
         Verdicts on its samples go on, too: a count that began anew would contradict them.
         """
-        state = cls(source=source, clock=DeviceClock(round(_NS / source.rate_hz)))
+        mean_ns, sd_ns = latency_prior(source)
+        period_ns = round(_NS / source.rate_hz)
+        clock = DeviceClock(period_ns, latency_ns=mean_ns, latency_sd_ns=sd_ns)
+        state = cls(source=source, clock=clock)
+        if lines is not None:
+            state.lines = lines
         if before is not None:
             state.counts, state._withheld = before.counts, before.withheld()
         return state
@@ -115,33 +130,57 @@ class SourceState:
         return self._take(decoder.feed(chunk), decoder)
 
     def _take(
-        self,
-        decoded: list[Decoded],
-        decoder: Decoder,
+        self, decoded: list[Decoded], decoder: Decoder
     ) -> list[Stamped | Corrupt | DeviceEvent]:
         taken: list[Stamped | Corrupt | DeviceEvent] = []
-        counts, clock, now_ns = self.counts, self.clock, self.last_arrival_ns or 0
+        clock, tick_clock = self.clock, decoder.tick_clock
         for item in decoded:
-            if isinstance(item, ImuSample):
-                if item.arrival_ns > now_ns:  # a stamp of kernel or adapter that is simply wrong
-                    item = item._replace(arrival_ns=now_ns)  # noqa: PLW2901 - the sample, mended
-                counts.received += 1
-                stamp = clock.feed_sample(
-                    item.ticks, item.counter, item.arrival_ns, decoder.tick_clock
-                )
-                taken.append(Stamped(item, stamp))
-            elif isinstance(item, MocapFrame):
-                counts.received += 1
-                stamp = clock.feed_sample(
-                    item.ticks, item.number, item.arrival_ns, decoder.tick_clock
-                )
-                taken.append(Stamped(item, stamp))
-            elif isinstance(item, ClockEcho):
-                clock.feed_echo(item, decoder.tick_clock)
-            elif not isinstance(item, SyncPulse):
+            if isinstance(item, ImuSample | MocapFrame):
+                stamped = self._stamped(item, tick_clock)
+                if clock.news:  # found by this sample, and so to be known before it
+                    taken += self._told()
+                taken.append(stamped)
+                continue
+            if isinstance(item, ClockEcho):
+                clock.feed_echo(item, tick_clock)
+            elif isinstance(item, SyncPulse):
+                self._edge(item, tick_clock)
+            else:
                 self._count(item)
                 taken.append(item)
+            if clock.news:
+                taken += self._told()
         return taken
+
+    def _stamped(self, item: ImuSample | MocapFrame, tick_clock: TickClock | None) -> Stamped:
+        self.counts.received += 1
+        clock, now_ns = self.clock, self.last_arrival_ns or 0
+        if isinstance(item, ImuSample):
+            if item.arrival_ns > now_ns:  # a stamp of kernel or adapter that is simply wrong
+                item = item._replace(arrival_ns=now_ns)
+            return Stamped(
+                item, clock.feed_sample(item.ticks, item.counter, item.arrival_ns, tick_clock)
+            )
+        stamp = clock.feed_sample(item.ticks, item.number, item.arrival_ns, tick_clock)
+        number = getattr(self.source.settings, "sync_line", None)
+        if number is not None and stamp.synced and item.live and clock.last_u is not None:
+            edge = Edge(clock.host_ns(clock.last_u), clock.last_u)
+            self.lines.exposures(number, self.source.id, clock, edge)
+        return Stamped(item, stamp)
+
+    def _edge(self, pulse: SyncPulse, tick_clock: TickClock | None) -> None:
+        clock = self.clock
+        own_ns = clock.edge_ns(pulse.ticks, tick_clock)
+        if own_ns is not None and clock.settled:
+            edge = Edge(clock.host_ns(own_ns), own_ns)
+            self.lines.edge(pulse.line, self.source.id, clock, edge)
+
+    def _told(self) -> list[DeviceEvent]:
+        """Return what the clock has to tell; it goes before the sample it was found by."""
+        told = [DeviceEvent(news.kind, news.text, dict(news.data)) for news in self.clock.news]
+        self.clock.news.clear()
+        self.counts.restarts += sum(event.kind == "restart" for event in told)
+        return told
 
     def _count(self, item: Corrupt | DeviceEvent) -> None:
         if isinstance(item, Corrupt):
