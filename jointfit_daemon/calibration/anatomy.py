@@ -167,16 +167,32 @@ def _fit_centers(
             found[joint] = fit
         else:
             notes.append(f"{joint}: no center: {fit.refused}")
-    whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
-    settled = {joint: found[joint] for joint in whole}
-    for joint in sorted(found.keys() - settled.keys(), key=lambda j: _distance(chain, j, whole)):
-        settled[joint] = slide_under(found[joint], _beside(chain, joint, settled))
+    settled = settle_unseen(chain, found)
     out: dict[str, JointFound | None] = dict.fromkeys(chain.joints)
     for joint, fit in settled.items():
         gap = carried_gap(*jointed[joint], fit.center)
-        covariance = fit.covariance + SKIN_RADIAL_M**2 * fit.leverage
-        out[joint] = JointFound(fit.center, covariance, "fit", fit, gap)
+        out[joint] = JointFound(fit.center, on_skin(fit), "fit", fit, gap)
     return _plumbed(out), notes
+
+
+def settle_unseen(
+    chain: Chain, found: Mapping[str, CenterOfRotation]
+) -> dict[str, CenterOfRotation]:
+    """Move centers along the directions that no movement showed to where the static pose has them.
+
+    Beginning next to those of which everything was seen, each comes under or over its neighbours.
+    """
+    whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
+    settled = {joint: found[joint] for joint in whole}
+    hinges = [joint for joint in chain.joints if joint in found and joint not in settled]
+    for joint in sorted(hinges, key=lambda j: _distance(chain, j, whole)):
+        settled[joint] = slide_under(found[joint], _beside(chain, joint, settled))
+    return settled
+
+
+def on_skin(fit: CenterOfRotation) -> Array:
+    """Return the covariance of a center, m², with the skin motion that goes with posture."""
+    return fit.covariance + SKIN_RADIAL_M**2 * fit.leverage
 
 
 def _plumbed(found: dict[str, JointFound | None]) -> dict[str, JointFound | None]:

@@ -1,4 +1,4 @@
-"""How much a functional movement has shown so far, while it goes on.
+"""How much a functional movement has shown to the inertial sensors, while it goes on.
 
 Law: a guide for the wearer, cheap enough to run a few times a second; the fit judges for itself.
 """
@@ -24,17 +24,28 @@ SKIN_NOISE_M = 0.005
 CORRELATION_S = 0.5
 """Skin motion keeps its value about this long, so a second is worth two samples."""
 
+BENT_RAD, STRAIGHT_RAD = math.radians(30.0), math.radians(15.0)
+"""A joint bent when it turned further than the first from where it was at the beginning, and came
+back when it is nearer than the second: what one step or one squat does to a knee."""
+
 
 class _Reach:
-    """How far one orientation went about its first value."""
+    """How far one orientation went about its first value, and how often."""
 
     def __init__(self, first: np.ndarray) -> None:
         self._first = first
         self._low = self._high = np.zeros(3)
+        self._bent = False
+        self.bends = 0
 
     def take(self, q: np.ndarray) -> None:
         turned = rotation.log(rotation.multiply(rotation.conjugate(self._first), q))
         self._low, self._high = np.minimum(self._low, turned), np.maximum(self._high, turned)
+        angle = float(np.sqrt(turned @ turned))
+        if not self._bent and angle > BENT_RAD:
+            self._bent, self.bends = True, self.bends + 1
+        elif angle < STRAIGHT_RAD:
+            self._bent = False
 
     @property
     def arc(self) -> float:
@@ -43,11 +54,12 @@ class _Reach:
 
 @dataclass(slots=True)
 class MovementProgress:
-    """Arc covered by each inner joint and the joint-centre error to be expected from it.
+    """Arc and bends of each inner joint, by the sensors on either side of it.
 
-    The prediction is the Cramér-Rao bound of a circle of unknown radius seen over an arc φ,
-    ``26.8 σ / (√n φ²)`` capped at the full-circle value (bounds of a uniform arc), with n the
-    number of independent looks at the skin, not of frames.
+    Where no marker shows the joint center, the arc also predicts its error: the Cramér-Rao bound of
+    a circle of unknown radius seen over an arc φ, ``26.8 σ / (√n φ²)`` capped at the full-circle
+    value (bounds of a uniform arc), with n the number of independent looks at the skin, not of
+    frames.
     """
 
     chain: Chain
@@ -72,6 +84,13 @@ class MovementProgress:
         for (joint, _, _), reach in self._seen.items():
             arcs[joint] = max(arcs.get(joint, 0.0), reach.arc)
         return arcs
+
+    def bends(self) -> dict[str, int]:
+        """Return how often each inner joint bent so far, whichever sensors saw it."""
+        bends: dict[str, int] = {}
+        for (joint, _, _), reach in self._seen.items():
+            bends[joint] = bends.get(joint, 0) + reach.bends
+        return bends
 
     def predicted_center_errors(self, elapsed_s: float) -> dict[str, float | None]:
         """Return the expected RMS error of each inner joint centre, m; None while it is useless."""

@@ -5,14 +5,14 @@ Law: records and watches. When a phase begins, ends or is given up is the sessio
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.progress import MovementProgress
+from jointfit_daemon.calibration.movement_guide import first_of
 from jointfit_daemon.pipeline.recorder import TrialRecorder
 from jointfit_daemon.pipeline.stillness_gate import SILENT_NS, StillnessGate
 
 if TYPE_CHECKING:
+    from jointfit_daemon.calibration.movement_guide import MovementGuide, MovementLook
     from jointfit_daemon.calibration.trial import CalibrationTrial
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
@@ -26,7 +26,7 @@ TEXTS = {
     "static": "stand still and upright, facing one way, joints straight",
     "functional": "move every joint through its range: walk, squat, circle",
 }
-_KEEP_ON = {"align": "keep turning the plate about several axes", "functional": "keep moving"}
+_KEEP_TURNING = "keep turning the plate about several axes"
 
 
 class Phase:
@@ -35,22 +35,37 @@ class Phase:
     Parameters
     ----------
     name : {"align", "static", "functional"}
-        Static ends after so long a stillness, the others after so long a time.
+        Static ends after so long a stillness, align after so long a time, functional when its
+        guide misses nothing any more, after so long a time at the latest.
     chain : Chain
         Whose sensors take part.
     began_ns : int
         Now.
     wanted_s : float
         Length, s.
+    guide : MovementGuide, optional
+        Of the functional phase.
+    least_s : float
+        What a guide may not end before, s.
     """
 
-    def __init__(self, name: str, chain: Chain, began_ns: int, wanted_s: float) -> None:
+    def __init__(
+        self,
+        name: str,
+        chain: Chain,
+        began_ns: int,
+        wanted_s: float,
+        *,
+        guide: MovementGuide | None = None,
+        least_s: float = 0.0,
+    ) -> None:
         self.name, self.wanted_s = name, wanted_s
+        self._guide, self._least_s = guide, min(least_s, wanted_s)
+        self._look: MovementLook | None = None
         self._began_ns = self._told_ns = began_ns
         self._recorder = TrialRecorder()
         sensors = [sensor for group in chain.sensors for sensor in group]
         self._gate = StillnessGate(sensors) if name == "static" else None
-        self._movement = MovementProgress(chain) if name == "functional" else None
         self._latest: dict[str, Quaternion] = {}
         self._heard_ns = dict.fromkeys(sensors, began_ns)
         if name != "static":
@@ -66,6 +81,8 @@ class Phase:
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
         """Take one camera frame."""
         self._recorder.add_mocap(t_ns, frame)
+        if self._guide is not None:
+            self._guide.add_mocap(frame)
         if CAMERAS in self._heard_ns:
             self._heard_ns[CAMERAS] = t_ns
 
@@ -84,24 +101,39 @@ class Phase:
             return self._share(still_s), text, {"still_s": round(still_s, 2)}
         elapsed_s = (now_ns - self._began_ns) / _NS
         silent = [name for name, t in self._heard_ns.items() if now_ns - t > SILENT_NS]
-        text = _KEEP_ON[self.name]
+        done, text = self._share(elapsed_s), _KEEP_TURNING
+        data: dict[str, object] = {}
+        if self._guide is not None:
+            done, text, data = self._guided(self._guide, elapsed_s, silent)
         if silent:
             text = f"no data from {', '.join(silent)}; {text}"
-        return self._share(elapsed_s), text, self._shown(elapsed_s, silent)
+        return done, text, data
 
     def _share(self, seconds: float) -> float:
         return min(1.0, max(0.0, seconds / self.wanted_s))
 
-    def _shown(self, elapsed_s: float, silent: list[str]) -> dict[str, object]:
-        if self._movement is None:
-            return {}
+    def _guided(
+        self, guide: MovementGuide, elapsed_s: float, silent: list[str]
+    ) -> tuple[float, str, dict[str, object]]:
+        """Return how far a movement is: the whole of it once nothing is missing."""
         alive = {name: q for name, q in self._latest.items() if name not in silent}
-        self._movement.look(alive)
-        arcs = self._movement.arcs()
-        return {
-            "arc_deg": {joint: round(math.degrees(arc), 1) for joint, arc in arcs.items()},
-            "predicted_center_error_m": self._movement.predicted_center_errors(elapsed_s),
+        look = self._look = guide.look(alive, elapsed_s)
+        data: dict[str, object] = {
+            "joints": look.joints,
+            "parts": look.parts,
+            "missing": list(look.missing),
         }
+        if not look.ready or silent:
+            return self._share(elapsed_s), first_of(look.missing) or "keep moving", data
+        left_s = self._least_s - elapsed_s
+        if left_s > 0.0:
+            return self._share(elapsed_s), f"all joints known; keep moving, {left_s:.0f} s", data
+        return 1.0, f"all joints known after {elapsed_s:.0f} s", data
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What the wearer has not shown so far, each with its remedy."""
+        return () if self._look is None else self._look.missing
 
     def given_up(self, now_ns: int) -> bool:
         """Tell whether a stillness has been waited for long enough."""

@@ -14,6 +14,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.calibration.alignment_phase import PLATE
+from jointfit_daemon.calibration.movement_guide import MovementGuide
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.pipeline.events import (
     CalibrationProgress,
@@ -175,10 +177,33 @@ class CalibrationSession:
             return "phase", f"the phase {self.phase!r} is running: wait for it or send abort"
         if wanted in ("align", "functional") and not self._mocap:
             return "phase", f"{wanted!r} needs an optical system: add [mocap] to rig.toml"
-        if wanted == "functional" and self._static is None:
-            return "phase", "a static pose comes first: send static, stand still, then functional"
-        if wanted == "functional" and self._static is not None and self._static.optical is None:
-            return "phase", "the cameras saw nothing of the static pose: repeat it in their view"
+        unready = self._unmarked(wanted) or (self._unposed() if wanted == "functional" else None)
+        return None if unready is None else ("phase", unready)
+
+    def _unposed(self) -> str | None:
+        """Return what a movement lacks of a static pose."""
+        if self._static is None:
+            return "a static pose comes first: send static, stand still, then functional"
+        if self._static.optical is None:
+            return "the cameras saw nothing of the static pose: repeat it in their view"
+        return None
+
+    def _unmarked(self, wanted: str) -> str | None:
+        """Return what the cameras could not recognise in a phase, and how to name it."""
+        settings = self._settings
+        if wanted == "align" and settings.plate is None and PLATE not in settings.markers:
+            return (
+                "'align' needs the plate that carries the sensors: name its rigid body in rig.toml "
+                '([mocap] plate = "Plate") or its markers (markers.plate = [...])'
+            )
+        named = {*settings.markers, *settings.rigid_bodies}
+        bare = [segment for segment in self._chain.segments if segment not in named]
+        if wanted == "functional" and bare:
+            return (
+                f"'functional' needs markers on {', '.join(bare)}: name three or more in rig.toml "
+                f"([mocap] markers.{bare[0]} = [...]) or a rigid body (rigid_body.{bare[0]} = "
+                '"..."), then repeat the static pose'
+            )
         return None
 
     def _default_s(self, wanted: str) -> float:
@@ -190,8 +215,15 @@ class CalibrationSession:
         }[wanted]
 
     def _begin(self, t_ns: int, name: str, wanted_s: float) -> list[Output]:
-        self._phase = Phase(name, self._chain, t_ns, min(wanted_s, LONGEST_S))
-        return [self._tell(t_ns, name, f"{TEXTS[name]}, {self._phase.wanted_s:g} s")]
+        guide, settings = None, self._settings
+        if name == "functional":
+            standing = None if self._static is None else self._static.optical
+            guide = MovementGuide(self._chain, settings, standing)
+        wanted_s = min(wanted_s, LONGEST_S)
+        least_s = settings.functional_min_s
+        self._phase = Phase(name, self._chain, t_ns, wanted_s, guide=guide, least_s=least_s)
+        most = "at most " if guide is not None else ""
+        return [self._tell(t_ns, name, f"{TEXTS[name]}, {most}{wanted_s:g} s")]
 
     # --- phases end --------------------------------------------------------------------------
 
@@ -215,9 +247,11 @@ class CalibrationSession:
         if phase.overflowed:
             text = f"{phase.overflowed} measurements found no room: ask for a shorter phase"
             outputs.append(Notice(now_ns, "calibration", phase.name, text, "warning"))
+        outputs += _notes(now_ns, phase.name, phase.missing)
+        said = "; ".join((f"fitting the {phase.name} trial", *phase.missing))
         return [
             *outputs,
-            self._tell(now_ns, "fitting", f"fitting the {phase.name} trial"),
+            self._tell(now_ns, "fitting", said),
             FitJob(self._jobs, phase.name, payload),
         ]
 

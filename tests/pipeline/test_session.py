@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 
 SENSORS = ("S1", "S2", "S3", "S4")
 CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (SENSORS[:2], SENSORS[2:]))
-SETTINGS = CalibrationSettings(static_s=3.0, align_s=4.0, functional_s=4.0)
+MARKERS = {segment: tuple(f"{segment}{k}" for k in range(3)) for segment in CHAIN.segments}
+SETTINGS = CalibrationSettings(
+    static_s=3.0, align_s=4.0, functional_s=4.0, markers=MARKERS, plate="Plate"
+)
 SECOND = 1_000_000_000
 LAYOUT = MocapLayout((), ())
 PLAIN = Calibration(
