@@ -5,19 +5,35 @@ Law: a name, a movement, one `CenterEstimate`; what a method needs is said by `M
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.calibration.center import in_plane
+from jointfit_daemon.calibration.center.movement import Movement
+from jointfit_daemon.calibration.center.running_sphere import RunningSphere
+from jointfit_daemon.calibration.center.sara import fit_axis
+from jointfit_daemon.calibration.center.score import fit_score
+from jointfit_daemon.calibration.center.sphere import (
+    SphereOptions,
+    fit_sphere,
+    gamage_lasenby,
+    halvorsen,
+)
+from jointfit_daemon.calibration.center.sphere_verdict import refusal
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.calibration.center.movement import Movement
+    from jointfit_daemon.calibration.center.movement import BodyPoses
     from jointfit_daemon.calibration.center.result import CenterEstimate
 
 Array = NDArray[np.float64]
+
+_ASK_EVERY = 50
+"""Frames after which a stream is asked, so that it knows what leaves its spheres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +50,6 @@ class Method:
     run: Callable[[Movement], CenterEstimate]
 
 
-METHODS: dict[str, Method] = {}
-"""``kasa pratt taubin hyper geometric running_circle oriented grid three_frames`` (plane),
-``gamage_lasenby halvorsen sphere running_sphere score sara`` (space), by name."""
-
-
 def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterEstimate:
     """Estimate a center of rotation by any method.
 
@@ -47,8 +58,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     movement : Movement or ndarray
         An array, shape (n, k, d) or (n, d), stands for `Movement` with these points only.
     method : str
-        A key of `METHODS`, or ``auto``: ``sphere`` or, with both bodies' poses and no points,
-        ``score``; in a plane ``hyper``.
+        A key of `METHODS`, or ``auto``: ``sphere``; in a plane ``geometric``; ``score`` where there
+        are no points but both bodies' poses.
 
     Returns
     -------
@@ -60,4 +71,122 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     ValueError
         Unknown method, or the movement lacks what it needs: wrong calls, not bad data.
     """
-    raise NotImplementedError
+    if not isinstance(movement, Movement):
+        movement = Movement(np.asarray(movement, dtype=np.float64))
+    movement = _checked(movement)
+    chosen = METHODS.get(_auto(movement) if method == "auto" else method)
+    if chosen is None:
+        raise ValueError(f"no method {method!r}; there are: {', '.join(sorted(METHODS))}")
+    if missing := [name for name in chosen.needs if getattr(movement, name) is None]:
+        raise ValueError(f"{chosen.name} needs {' and '.join(missing)}, which the movement lacks")
+    points = movement.points if "points" in chosen.needs else None
+    if points is not None and not chosen.planar and points.shape[-1] != 3:
+        raise ValueError(f"{chosen.name} needs points in space, shape (n, k, 3)")
+    if points is not None and not np.isfinite(points).any():
+        reason = "no marker was seen in any frame: check marker names, cameras and what covers them"
+        return refusal(chosen.name, points.shape[-1], 0, reason)
+    return chosen.run(movement)
+
+
+def _checked(movement: Movement) -> Movement:
+    points = movement.points
+    if points is None:
+        return movement
+    points = np.asarray(points, dtype=np.float64)
+    points = points[:, None] if points.ndim == 2 else points
+    if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] not in {2, 3}:
+        raise ValueError(f"points have shape {points.shape}, expected (n, k, 2) or (n, k, 3)")
+    whole = np.isfinite(points).all(axis=-1, keepdims=True)
+    return replace(movement, points=np.where(whole, points, np.nan))
+
+
+def _auto(movement: Movement) -> str:
+    if movement.points is None:
+        return "score"
+    return "geometric" if movement.points.shape[-1] == 2 else "sphere"
+
+
+def _points(movement: Movement) -> Array:
+    if movement.points is None:
+        raise ValueError("points are needed")
+    return movement.points
+
+
+def _bodies(movement: Movement) -> tuple[BodyPoses, BodyPoses]:
+    if movement.parent is None or movement.child is None:
+        raise ValueError("both bodies' poses are needed")
+    return movement.parent, movement.child
+
+
+def _stream(movement: Movement) -> CenterEstimate:
+    points = _points(movement)
+    stream = RunningSphere(points.shape[1], dimension=points.shape[2], near=movement.near)
+    for number, frame in enumerate(points, 1):
+        stream.feed(frame)
+        if number % _ASK_EVERY == 0:
+            stream.estimate()
+    return stream.estimate()
+
+
+def _planar(
+    name: str, about: str, run: Callable[[Array, Movement], CenterEstimate], *more: str
+) -> Method:
+    return Method(name, about, ("points", *more), True, in_plane.in_plane(run, name))
+
+
+_ALL = (
+    _planar("kasa", "linear circle fit; biased on short arcs", in_plane.circle("kasa")),
+    _planar("pratt", "algebraic circle fit; the center is hyper's", in_plane.circle("pratt")),
+    _planar("taubin", "algebraic circle fit, nearly unbiased", in_plane.circle("taubin")),
+    _planar("hyper", "algebraic circle fit without essential bias", in_plane.circle("hyper")),
+    _planar("geometric", "circles of all markers at once, robust", in_plane.geometric),
+    _planar("running_circle", "hyper, one frame at a time", in_plane.running),
+    _planar("oriented", "circle and the child's measured angle", in_plane.oriented, "angles"),
+    _planar("grid", "search on a grid: the published baseline", in_plane.grid),
+    _planar("three_frames", "closed form through three frames", in_plane.three_frames),
+    Method(
+        "gamage_lasenby",
+        "linear sphere fit; biased on short arcs",
+        ("points",),
+        False,
+        lambda m: gamage_lasenby(_points(m)),
+    ),
+    Method(
+        "halvorsen",
+        "linear sphere fit, bias taken out",
+        ("points",),
+        False,
+        lambda m: halvorsen(_points(m)),
+    ),
+    Method(
+        "sphere",
+        "geometric sphere fit of all markers, robust; tells a hinge from a ball joint",
+        ("points",),
+        False,
+        lambda m: fit_sphere(_points(m), SphereOptions(start=m.near)),
+    ),
+    Method(
+        "running_sphere",
+        "spheres of all markers one frame at a time; tells a hinge from a ball joint",
+        ("points",),
+        True,
+        _stream,
+    ),
+    Method(
+        "score",
+        "both bodies treated alike; needs three markers on each",
+        ("parent", "child"),
+        False,
+        lambda m: fit_score(*_bodies(m), near=m.near),
+    ),
+    Method(
+        "sara",
+        "axis of a hinge from both bodies",
+        ("parent", "child"),
+        False,
+        lambda m: fit_axis(*_bodies(m), near=m.near, toward=m.axis),
+    ),
+)
+METHODS: dict[str, Method] = {method.name: method for method in _ALL}
+"""``kasa pratt taubin hyper geometric running_circle oriented grid three_frames`` (plane),
+``gamage_lasenby halvorsen sphere running_sphere score sara`` (space), by name."""

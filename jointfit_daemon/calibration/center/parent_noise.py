@@ -106,7 +106,7 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     ndarray, shape (k, d, d)
         Identity for a marker never seen.
     """
-    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=-1))
     d = points.shape[-1]
     v = np.where(seen[..., None], points, center + 1.0)
     S = (spatial_noise if d == 3 else planar_noise)(v, parent, 1.0)
@@ -117,4 +117,4 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     mean = (seen[..., None, None] * S).sum(axis=0) / count[:, None, None]
     along = (seen * radial).sum(axis=0) / count
     found = mean / np.maximum(along, 1e-300)[:, None, None]
-    return np.where(seen.any(axis=0)[:, None, None], found, np.eye(d))
+    return np.where((seen.sum(axis=0) > 0)[:, None, None], found, np.eye(d))

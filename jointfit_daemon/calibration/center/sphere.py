@@ -114,6 +114,12 @@ def halvorsen(points: Array) -> CenterEstimate:
     return _linear(points, "halvorsen", _HALVORSEN_STEPS)
 
 
+FLAT = (
+    "the markers moved about one axis or not at all, which shows this method no center: move in "
+    "other directions, too, or use sphere, which finds a hinge"
+)
+
+
 def _few(frames: int) -> str:
     return f"{frames} usable frames, at least {MIN_FRAMES} are needed: keep the markers in view"
 
@@ -127,13 +133,7 @@ def _linear(points: Array, method: str, steps: int) -> CenterEstimate:
     paths = paths_of(centered(sum_up(points[:, enough])))
     A = paths.C.sum(axis=0)
     if float(np.linalg.eigvalsh(A)[0]) <= 1e-12 * float(np.trace(A)):
-        return refusal(
-            method,
-            3,
-            frames,
-            "the markers moved in a plane or not at all, which shows this "
-            "method no center: move in other directions, too, or ask sara for the axis",
-        )
+        return refusal(method, 3, frames, FLAT)
     b = np.einsum("jab,jb->a", paths.C, paths.mean) + paths.c.sum(axis=0) / 2.0
     m = np.linalg.solve(A, b)
     free = seen[:, enough].sum() - len(paths.n) - 3
@@ -142,11 +142,17 @@ def _linear(points: Array, method: str, steps: int) -> CenterEstimate:
         noise2 = float(np.nansum(e * e)) / max(free, 1)
         m = np.linalg.solve(A, b - noise2 * (paths.mean - m).sum(axis=0))
     options = SphereOptions(huber=np.inf)
-    fit = _at(points[:, enough], m, seen[:, enough].astype(np.float64), np.eye(3))
+    w = seen[:, enough].astype(np.float64)
+    fit = _at(points[:, enough], m, w, np.eye(3))
+    scale = float(np.sqrt((fit.residuals**2).sum() / w.sum()))
+    v = np.where(w[..., None] > 0.0, points[:, enough], 0.0)
+    if _observed(v, w, m, scale, options).shape[1] < 3:
+        return refusal(method, 3, frames, FLAT)
     found = judge_sphere(fit, method, frames, Limits(), options)
     radii = np.full(len(enough), np.nan)
     radii[enough] = found.radii
-    return replace(found, radii=radii) if len(found.radii) else found
+    flags = found.flags if steps else (*found.flags, "biased_on_short_arcs")
+    return replace(found, radii=radii, flags=flags) if len(found.radii) else found
 
 
 def fit_sphere(

@@ -7,12 +7,13 @@ nothing, and that is said. Where to stay along an unseen direction is the caller
 from __future__ import annotations
 
 from dataclasses import replace
-from math import degrees, inf, pi, sin
+from math import degrees, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.calibration.center.planar_estimate import arc_of_spread
 from jointfit_daemon.calibration.center.result import CenterEstimate
 from jointfit_daemon.calibration.center.sphere_algebra import paths_of
 from jointfit_daemon.calibration.center.sphere_directions import (
@@ -171,16 +172,8 @@ def drawn_in(seen: Seen, middle: Array) -> tuple[Array, Array]:
 
 
 def arc_of(resultant: float) -> float:
-    r"""Return the arc φ that directions spread evenly over have this mean resultant, rad.
-
-    .. math:: |\bar u| = \frac{\sin(φ/2)}{φ/2}
-    """
-    s = min(max(resultant, 0.0), 1.0)
-    low, high = 0.0, pi
-    for _ in range(40):
-        x = (low + high) / 2.0
-        low, high = (x, high) if sin(x) > s * x else (low, x)
-    return low + high
+    """Return the arc that directions spread evenly over have this mean resultant, rad."""
+    return arc_of_spread(1.0 - min(max(resultant, 0.0), 1.0) ** 2)
 
 
 def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
