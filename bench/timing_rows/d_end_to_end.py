@@ -30,9 +30,8 @@ def _arrivals(_: Path) -> list[Figure]:
 
 
 async def _live() -> Outcome:
-    # imported here: a test rig needs packages that a table of figures does without
-    from bench.restarts import live  # noqa: PLC0415
-    from tests.broker_fixture import MosquittoBroker  # noqa: PLC0415
+    from bench.restarts import live  # noqa: PLC0415 - a rig needs packages other rows do without
+    from tests.broker_fixture import MosquittoBroker  # noqa: PLC0415 - so do brokers
 
     with tempfile.TemporaryDirectory() as folder:
         broker = MosquittoBroker(Path(folder))

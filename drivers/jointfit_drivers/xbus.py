@@ -12,6 +12,7 @@ from jointfit_drivers.byte_stream import SerialPort
 from jointfit_drivers.xbus_events import XbusEvents
 from jointfit_drivers.xbus_handshake import Handshake
 from jointfit_drivers.xbus_settings import XbusSettings
+from jointfit_drivers.xbus_sync import wires
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
@@ -33,7 +34,8 @@ class XbusImu:
     def decoder(self) -> XbusEvents:
         """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
         settings = self._settings
-        return XbusEvents(settings.baud if settings.transport == "uart" else None, settings.rate_hz)
+        baud = settings.baud if settings.transport == "uart" else None
+        return XbusEvents(baud, settings.rate_hz, wires(settings.sync or ()))
 
     async def run(self, emit: Emit) -> None:
         """Open the port, bring the device to measure, read until cancelled.

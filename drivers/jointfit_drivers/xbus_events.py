@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.xbus_continuity import Continuity
+from jointfit_drivers.xbus_sync import describe
 from jointfit_protocols import xbus_messages as setup
-from jointfit_protocols.mtdata2 import Item, decode_item, split, world_of
+from jointfit_protocols.mtdata2 import Item, Trigger, decode_item, split, world_of
 from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
 from jointfit_protocols.xbus import MAX_MESSAGE, MessageId, XbusDecoder, XbusMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_protocols.corrupt import Corrupt as WireCorrupt
@@ -41,9 +42,14 @@ class XbusEvents:
         Speed of the line, for back-dating; None: USB.
     rate_hz
         Nominal rate, used until the stream has shown its own.
+    wires
+        Items that tell of edges, and the wire of the rig that each is about.
     """
 
-    def __init__(self, baud: int | None, rate_hz: float) -> None:
+    def __init__(
+        self, baud: int | None, rate_hz: float, wires: Mapping[int, int] | None = None
+    ) -> None:
+        self._wires = wires or {}
         self._xbus = XbusDecoder()
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
@@ -111,7 +117,7 @@ class XbusEvents:
         values, world_id = {}, 0
         for data_id, raw in items:
             kind = data_id & 0xFFF0
-            if kind in _WANTED:
+            if kind in _WANTED or kind in self._wires:
                 values[kind] = decode_item(data_id, raw)
                 if values[kind] is None:
                     return [self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
@@ -119,19 +125,29 @@ class XbusEvents:
         counter = cast("int | None", values.get(_COUNTER))
         if counter is not None:
             self._continuity.message(counter)
+        pulses = self._pulses(message, values) if self._wires else []
         native = cast("Quaternion | None", values.get(_QUATERNION))
         if native is None:
-            return []
+            return pulses
         self._measuring = True
         ticks = cast("int | None", values.get(_TIME))
         status = cast("int | None", values.get(_STATUS_WORD, values.get(_STATUS_BYTE)))
-        out = self._continued(ticks)
+        out = self._continued(ticks) + pulses
         q = self._gate.admit(canonical(native, world_of(world_id) or "ENU"))
         if q is None:
             out.append(self._refuse(message, "quaternion norm is not 1"))
         else:
             out.append(ImuSample(self._arrived(message), q, native, ticks, counter, status))
         return out if self._warned else out + self._judged()
+
+    def _pulses(self, message: XbusMessage, values: Mapping[int, object]) -> list[Decoded]:
+        """Return the edges that a message tells of."""
+        found = [(wire, values.get(item)) for item, wire in self._wires.items()]
+        return [
+            SyncPulse(self._arrived(message), edge.time, wire, edge.frame)
+            for wire, edge in found
+            if isinstance(edge, Trigger)
+        ]
 
     def _continued(self, ticks: int | None) -> list[Decoded]:
         """Return a gap or a restart, if there was one."""
@@ -206,10 +222,16 @@ def _outputs(data: bytes) -> dict[str, int] | None:
     return None if outputs is None else {f"0x{data_id:04X}": rate for data_id, rate in outputs}
 
 
+def _sync(data: bytes) -> list[str] | None:
+    entries = setup.decode_sync(data)
+    return None if entries is None else [describe(entry) for entry in entries]
+
+
 _TOLD: dict[int, tuple[str, Callable[[bytes], object]]] = {
     MessageId.DEVICE_ID: ("serial", setup.decode_device_id),
     MessageId.PRODUCT_CODE: ("model", setup.decode_text),
     MessageId.FIRMWARE: ("firmware", _firmware),
     MessageId.FILTER_PROFILE_ACK: ("filter_profile", setup.decode_filter_profile),
     MessageId.OUTPUT_CONFIGURATION_ACK: ("outputs", _outputs),
+    MessageId.SYNC_SETTINGS_ACK: ("sync", _sync),
 }

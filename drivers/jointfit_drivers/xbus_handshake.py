@@ -11,6 +11,7 @@ import logging
 from typing import TYPE_CHECKING, NoReturn
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_drivers import xbus_sync
 from jointfit_drivers.xbus_conversation import Conversation
 from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item, real_id
@@ -30,6 +31,7 @@ _RESETS, _RESET_WAIT_S = 50, 0.1  # 5 s: a stuck MTi-G-700 answered 1.8 s after 
 _SMALLEST_BYTES = 36  # counter, time and quaternion in one message
 _BITS = 10  # of one byte on the line, 8N1
 _FRAMES = (0, 1)  # of the alignment rotations: sensor, local
+_NO_SYNC = bytes(12)  # an entry that is off: a request without data would only ask
 
 
 class Handshake:
@@ -54,6 +56,8 @@ class Handshake:
         self._hunt = hunt
         self._talk = Conversation(port, emit)
         self._who = f"{settings.id} ({settings.port})"
+        self._product_code = ""
+        self._triggers = tuple(map(Item, xbus_sync.wires(settings.sync or ())))
 
     async def ensure_measuring(self) -> None:
         """Return when the device measures as the settings ask.
@@ -72,6 +76,7 @@ class Handshake:
             await self._explain_silence()
         await self._read_identity()
         await self._ensure_outputs()
+        await self._ensure_sync()
         await self._start()
 
     def _refuse_too_much_for_the_line(self) -> None:
@@ -97,7 +102,9 @@ class Handshake:
         """Ask for what the decoder hands on as information; only the id is owed."""
         await self._answer(MessageId.REQ_DEVICE_ID)
         for mid in (MessageId.REQ_PRODUCT_CODE, MessageId.REQ_FIRMWARE, MessageId.FILTER_PROFILE):
-            await self._talk.ask(mid)  # its reply is emitted; older devices refuse some
+            reply = await self._talk.ask(mid)  # it is emitted; older devices refuse some
+            if reply is not None and reply.mid == MessageId.PRODUCT_CODE:
+                self._product_code = setup.decode_text(reply.data)
         for frame in _FRAMES:
             await self._talk.ask(MessageId.ALIGNMENT_ROTATION, bytes((frame,)))
 
@@ -113,38 +120,68 @@ class Handshake:
         rate = int(self._settings.rate_hz)
         reply = await self._answer(MessageId.OUTPUT_CONFIGURATION)
         found = _outputs_of(reply)
-        faults = differences(found, rate)
+        faults = differences(found, rate, self._triggers)
         if not faults:
             return
-        listed = "; ".join(faults)
-        if not self._settings.persist:
-            raise DeviceMisconfigured(
-                f"{self._who}: {listed}{_rate_hint(found)}: set persist = true once to write it "
-                "into the device's flash, or configure the device with the vendor's tool"
-            )
-        log.warning("%s: writing its output configuration: %s", self._who, listed)
+        self._refuse_to_write(faults, _rate_hint(found))
+        log.warning("%s: writing its output configuration: %s", self._who, "; ".join(faults))
         wanted = (
             (Item.PACKET_COUNTER, setup.MAX_RATE),
             (Item.SAMPLE_TIME_FINE, setup.MAX_RATE),
             (Item.STATUS_WORD, setup.MAX_RATE),
             (real_id(Item.QUATERNION, world=self._settings.world), rate),
+            *((item, setup.MAX_RATE) for item in self._triggers),
         )
         reply = await self._answer(MessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(wanted))
         self._refuse_error(reply, f"refuses quaternions at {rate} Hz")
-        left = differences(_outputs_of(reply), rate)
+        left = differences(_outputs_of(reply), rate, self._triggers)
         if left:
             hint = _rate_hint(_outputs_of(reply))
             raise DeviceMisconfigured(f"{self._who}: cannot do as asked: {'; '.join(left)}{hint}")
+
+    def _refuse_to_write(self, faults: list[str], hint: str = "") -> None:
+        """Say what would have to be written, unless it may be."""
+        if not self._settings.persist:
+            raise DeviceMisconfigured(
+                f"{self._who}: {'; '.join(faults)}{hint}: set persist = true once to write it "
+                "into the device's flash, or configure the device with the vendor's tool"
+            )
+
+    async def _ensure_sync(self) -> None:
+        """Have the sync lines do what is asked of them; nothing asked leaves them alone."""
+        if self._settings.sync is None:
+            return
+        asked = xbus_sync.wanted(self._settings.sync, self._product_code)
+        faults = xbus_sync.differences(await self._sync_stored(), asked)
+        if not faults:
+            return
+        self._refuse_to_write(faults)
+        log.warning("%s: writing its sync settings: %s", self._who, "; ".join(faults))
+        reply = await self._answer(MessageId.SYNC_SETTINGS, setup.encode_sync(asked) or _NO_SYNC)
+        self._refuse_error(reply, "refuses these sync settings", "`sync`")
+        left = xbus_sync.differences(await self._sync_stored(), asked)
+        if left:
+            raise DeviceMisconfigured(
+                f"{self._who}: cannot do as `sync` asks: {'; '.join(left)}: change `sync`"
+            )
+
+    async def _sync_stored(self) -> tuple[setup.SyncSetting, ...]:
+        reply = await self._answer(MessageId.SYNC_SETTINGS)
+        self._refuse_error(reply, "has no sync settings", "`sync`: leave it out")
+        entries = setup.decode_sync(reply.data) or ()
+        return tuple(entry for entry in entries if entry.polarity)  # those that are off are none
 
     async def _start(self) -> None:
         reply = await self._answer(MessageId.GOTO_MEASUREMENT)
         self._refuse_error(reply, "does not start to measure")
 
-    def _refuse_error(self, reply: XbusMessage, what: str) -> None:
+    def _refuse_error(
+        self, reply: XbusMessage, what: str, change: str = "`rate_hz` or `baud`"
+    ) -> None:
         if reply.mid == MessageId.ERROR:
             code = reply.data[0] if reply.data else 0
             raise DeviceMisconfigured(
-                f"{self._who}: {what} ({setup.error_text(code)}): change `rate_hz` or `baud`"
+                f"{self._who}: {what} ({setup.error_text(code)}): change {change}"
             )
 
     async def _explain_silence(self) -> NoReturn:
@@ -194,17 +231,23 @@ class Handshake:
         return await self._talk.enter_config(tries=1, wait_s=_LISTEN_S)
 
 
-def differences(found: tuple[setup.Output, ...], rate: int) -> list[str]:
+def differences(
+    found: tuple[setup.Output, ...], rate: int, triggers: tuple[Item, ...] = ()
+) -> list[str]:
     """Return in words what an output configuration lacks; empty if it will do.
 
-    It will do with a counter, a fine time and a quaternion at `rate` Hz; precision, world and
-    further items do not matter, for the decoder understands them all.
+    It will do with a counter, a fine time, a quaternion at `rate` Hz and the items that tell of
+    edges (`triggers`); precision, world and further items do not matter, for the decoder
+    understands them all.
     """
     faults = []
     kinds = {output.data_id & 0xFFF0: output.rate for output in found}
     for item, name in ((Item.PACKET_COUNTER, "packet counter"), (Item.SAMPLE_TIME_FINE, "time")):
         if item not in kinds:
             faults.append(f"it sends no {name} (0x{item:04X})")
+    faults += [
+        f"it does not tell of edges (0x{item:04X})" for item in triggers if item not in kinds
+    ]
     if Item.QUATERNION not in kinds:
         faults.append("it sends no quaternion (0x2010)")
     elif kinds[Item.QUATERNION] != rate:

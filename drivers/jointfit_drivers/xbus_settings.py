@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from jointfit_daemon.driver import ImuSettings
+from jointfit_drivers.xbus_sync import XbusSyncSettings  # noqa: TC001 - pydantic reads it
 
 MAX_RATE_HZ = 400
 
@@ -30,6 +31,11 @@ class XbusSettings(ImuSettings):
         "ENU",
         description="world asked of the device when `persist` writes; every message says its own, "
         "so any is understood",
+    )
+    sync: tuple[XbusSyncSettings, ...] | None = Field(
+        None,
+        description="what its sync lines do, all of them; written only where they differ and "
+        "`persist` allows it. Left out: they stay as they are",
     )
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"

@@ -50,6 +50,9 @@ class Item(IntEnum):
     """Specific force, m/s^2."""
     FREE_ACCELERATION = 0x4030
     """m/s^2, gravity removed, world coordinates."""
+    TRIGGER_IN1 = 0x4810
+    """An edge on a sync input; only in messages that follow one."""
+    TRIGGER_IN2 = 0x4820
     GNSS_PVT = 0x7010
     """94 bytes, handed on as they are."""
     RATE_OF_TURN = 0x8020
@@ -85,7 +88,18 @@ class UtcTime(NamedTuple):
     """1 time of week valid, 2 week valid, 4 UTC valid."""
 
 
-Value = int | Reals | UtcTime | bytes
+class Trigger(NamedTuple):
+    """Items 0x4810 and 0x4820: an edge on a sync input."""
+
+    line: int
+    polarity: int
+    time: int
+    """Ticks of SampleTimeFine."""
+    frame: int
+    """Counts edges, as far as known."""
+
+
+Value = int | Reals | UtcTime | Trigger | bytes
 
 FILTER_VALID = 1 << 1
 GNSS_FIX = 1 << 2
@@ -116,6 +130,8 @@ _COUNTS: dict[int, int] = {
 }
 _BYTES = (4, 4, 6, 8)  # of one real, by precision
 _UTC = struct.Struct(">IHBBBBBB")
+_TRIGGER = struct.Struct(">BBIH")
+_TRIGGERS = {int(Item.TRIGGER_IN1), int(Item.TRIGGER_IN2)}
 _GNSS_PVT_BYTES = 94
 _ITEM_HEAD = 3
 _FOUR_FLOATS = struct.Struct(">4f")
@@ -167,6 +183,8 @@ def decode_item(data_id: int, raw: bytes) -> Value | None:
         return int.from_bytes(raw, "big") if len(raw) == _COUNTS[data_id] else None
     if data_id == Item.UTC_TIME:
         return UtcTime(*_UTC.unpack(raw)) if len(raw) == _UTC.size else None
+    if data_id in _TRIGGERS:
+        return Trigger(*_TRIGGER.unpack(raw)) if len(raw) == _TRIGGER.size else None
     if data_id == Item.GNSS_PVT:
         return raw if len(raw) == _GNSS_PVT_BYTES else None
     count = _REALS.get(data_id & 0xFFF0)
@@ -209,6 +227,8 @@ def encode_item(data_id: int, value: Value) -> bytes:
         raw = value
     elif isinstance(value, UtcTime):
         raw = _UTC.pack(*value)
+    elif isinstance(value, Trigger):
+        raw = _TRIGGER.pack(*value)
     elif isinstance(value, int):
         raw = value.to_bytes(_COUNTS[data_id], "big")
     else:

@@ -80,6 +80,8 @@ def _parser() -> argparse.ArgumentParser:
                       help="skew of a sensor's or mocap's clock; seconds it is up")  # fmt: skip
     play.add_argument("--at", action="append", default=[], metavar="SECONDS=COMMAND",
                       help="a command and its time, from the beginning of the run")  # fmt: skip
+    play.add_argument("--sync-line", action="store_true",
+                      help="a wire from the cameras' sync output to every UART sensor")  # fmt: skip
     play.add_argument("--sample-log", action="store_true",
                       help="write samples.jsonl: when each sample was truly taken")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
@@ -161,6 +163,7 @@ async def _play(options: argparse.Namespace) -> None:
         rig=rig,
         clocks={name: ClockFault.parse(text) for name, text in _pairs(options.clock)},
         script=tuple((float(at_s), command) for at_s, command in _pairs(options.at)),
+        sync_line=options.sync_line,
         sample_log=options.sample_log,
     )
     subject = _subject(options, knobs)

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.mtdata2 import Item
+from jointfit_protocols.xbus_messages import SyncSetting
+from jointfit_protocols.xbus_sync import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.can_wire import CanWire, PythonCanWire, SlcanAdapter
 from jointfit_simulators.line_noise import line_noise
@@ -31,6 +33,11 @@ WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
 """Which sensor speaks what, unless asked otherwise."""
 BUS = "can0"
 _FREE_RUNNING = 0xFFFF
+_EVERY = 12  # exposures an edge that is told: ten a second at 120 Hz
+_SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _EVERY - 1),)
+_SYNC_TOML = (
+    f'sync = [{{ function = "trigger_indication", line = "in1", skip_factor = {_EVERY - 1} }}]'
+)
 _FIRST_BLOCK = 0x100
 
 
@@ -54,6 +61,7 @@ def wire_up(
     wires: Mapping[str, str],
     can: str,
     now_ns: int,
+    sync_line: bool = False,
 ) -> Hardware:
     """Return the powered devices of a scene.
 
@@ -71,11 +79,14 @@ def wire_up(
         ``slcan``, or INTERFACE:CHANNEL of python-can, such as ``socketcan:vcan0``.
     now_ns
         Host time at which the run begins.
+    sync_line
+        A sync line reaches them: those that can tell of edges are configured to.
     """
     hardware = Hardware()
     for number, (name, segment) in enumerate(sensors.items(), start=1):
         if wires[name] == "xbus":
-            _on_uart(hardware, knobs, name, segment, directory=directory, now_ns=now_ns)
+            sync = _SYNC if sync_line else ()
+            _on_uart(hardware, knobs, name, segment, directory=directory, now_ns=now_ns, sync=sync)
             continue
         if hardware.bus is None:
             hardware.bus = _bus(hardware, knobs, directory, can)
@@ -84,7 +95,14 @@ def wire_up(
 
 
 def _on_uart(
-    hardware: Hardware, knobs: Knobs, name: str, segment: str, *, directory: Path, now_ns: int
+    hardware: Hardware,
+    knobs: Knobs,
+    name: str,
+    segment: str,
+    *,
+    directory: Path,
+    now_ns: int,
+    sync: tuple[SyncSetting, ...],
 ) -> None:
     port = directory / f"tty{name}"
     outputs = (
@@ -92,20 +110,20 @@ def _on_uart(
         (Item.SAMPLE_TIME_FINE, _FREE_RUNNING),
         (Item.STATUS_WORD, _FREE_RUNNING),
         (Item.QUATERNION, round(knobs.rate_hz)),
+        *(((Item.TRIGGER_IN1, _FREE_RUNNING),) if sync else ()),
     )
     identity = bytes([0x03, 0x60, 0xA1, *name.encode()[-1:]])
     device = XbusDevice(
         port,
-        options=XbusDeviceOptions(device_id=identity, outputs=outputs),
+        options=XbusDeviceOptions(device_id=identity, outputs=outputs, sync=sync),
         wire_noise=line_noise(knobs, name),
     )
     hardware.streams[name] = ImuStream(
         knobs, name, device, latency_ms=knobs.latency_uart_ms, shared_wire=False, now_ns=now_ns
     )
     hardware.ports[name] = str(port)
-    hardware.tables.append(
-        _imu_table(knobs, name, segment, "xbus", [f'port = "{port}"', "baud = 921600"])
-    )
+    where = [f'port = "{port}"', "baud = 921600", *([_SYNC_TOML] if sync else [])]
+    hardware.tables.append(_imu_table(knobs, name, segment, "xbus", where))
 
 
 def _bus(hardware: Hardware, knobs: Knobs, directory: Path, can: str) -> CanWire:

@@ -59,6 +59,8 @@ class Player:
         Where the truth goes.
     origin_ns
         Host time at which the subject's time is 0.
+    sync_line
+        A wire goes from the cameras' sync output to all sensors: an edge an exposure.
     """
 
     def __init__(
@@ -69,7 +71,9 @@ class Player:
         truth: TruthLog,
         *,
         origin_ns: int,
+        sync_line: bool = False,
     ) -> None:
+        self._sync_line = sync_line
         self._subject, self._optical, self._truth = subject, optical, truth
         self._imus = [imus[name] for name in subject.sensors]
         self._streams: list[Stream] = [*self._imus, optical]
@@ -127,6 +131,9 @@ class Player:
         begin_ns, end_ns = self._planned_ns, self._planned_ns + BLOCK_NS
         imu_ns = [imu.plan(begin_ns, end_ns) for imu in self._imus]
         exposures_ns = self._optical.plan(begin_ns, end_ns)
+        if self._sync_line:
+            for imu in self._imus:
+                imu.wire(exposures_ns)
         first = -(-begin_ns // TRUTH_NS) * TRUTH_NS
         truth_ns = np.arange(first, end_ns, TRUTH_NS, dtype=np.int64)
         imu_s = [self._seconds(t_ns) for t_ns in imu_ns]

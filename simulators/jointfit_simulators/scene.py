@@ -55,6 +55,8 @@ class SceneOptions:
     """Clocks that are asked for, by sensor or ``mocap``; the dice give the others."""
     script: tuple[tuple[float, str], ...] = ()
     """Commands and when to obey them, s from the beginning of the run."""
+    sync_line: bool = False
+    """A wire from the cameras' sync output to the first sync input of every UART sensor."""
     sample_log: bool = False
     """Tell the true instant of every sample sent."""
 
@@ -90,6 +92,7 @@ class Scene:
             wires=options.wires,
             can=options.can,
             now_ns=now_ns,
+            sync_line=options.sync_line,
         )
         cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
         samples = options.directory / SAMPLES_FILE
@@ -108,7 +111,12 @@ class Scene:
         self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
         self._player = Player(
-            subject, self._hardware.streams, self._optical, self._truth, origin_ns=now_ns
+            subject,
+            self._hardware.streams,
+            self._optical,
+            self._truth,
+            origin_ns=now_ns,
+            sync_line=options.sync_line,
         )
         self._quit = asyncio.Event()
         self._verbs: dict[str, Callable[[str], None]] = {

@@ -28,8 +28,14 @@ SampleTold = Callable[[str, int, int], None]
 """Told of every sample sent: device, its number as sent, true instant on the host's clock, ns."""
 
 
+_EDGES = 4096
+
+
 class WornDevice(ImuDevice, Protocol):
     """A virtual IMU with the faults this scene plays."""
+
+    def edge(self, device_ns: int) -> None:
+        """Take an edge on its sync input, at a time of its own clock; nothing where it has none."""
 
     @property
     def counter(self) -> int:
@@ -90,12 +96,17 @@ class ImuStream:
         self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
         self._unplugged = False
         self._waiting: deque[tuple[int, int, Quaternion | None]] = deque()
+        self._edges: deque[int] = deque(maxlen=_EDGES)
         self.dropped_out = 0
         """Samples taken while measuring and never sent, as the knob wants it."""
         self.unheard = 0
         """Samples that nobody could hear: unplugged, paused, or not told to measure."""
         self.refused = 0
         """Samples the line had no room for."""
+
+    def wire(self, edges_ns: NDArray[np.int64]) -> None:
+        """Let edges come on its sync line at these host instants."""
+        self._edges.extend(edges_ns.tolist())
 
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
         """Take the samples of a block; return their true host instants."""
@@ -118,6 +129,8 @@ class ImuStream:
     def emit(self, *, heard: bool = True) -> None:
         """Put the next sample on the wire, or drop it where nobody is to hear it."""
         true_ns, stamp, q = self._waiting.popleft()
+        while self._edges and self._edges[0] <= true_ns:
+            self.device.edge(self.ticker.device_ns(self._edges.popleft()))
         if self._unplugged or not heard or not self.device.streaming:
             self.unheard += 1
             return

@@ -19,14 +19,16 @@ from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item
 from jointfit_protocols.orientation import native_of
 from jointfit_protocols.xbus import MASTER, MessageId, XbusDecoder, XbusMessage, encode
+from jointfit_protocols.xbus_sync import IN1
 from jointfit_simulators.imu_device import clean_wire
 from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.xbus_sync_lines import SyncLines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from jointfit_protocols.mtdata2 import Value
+    from jointfit_protocols.mtdata2 import Trigger, Value
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 WAKE_UP_S = 0.5
@@ -58,6 +60,8 @@ class XbusDeviceOptions:
         (Item.QUATERNION, 100),
     )
     """Output configuration in flash at the start."""
+    sync: tuple[setup.SyncSetting, ...] = ()
+    """Synchronisation settings in flash at the start."""
     baud: int | None = None
     """Speed it runs at; where the host's differs, both sides see garbage. None: any (USB)."""
     measures_at_once: bool = False
@@ -98,6 +102,7 @@ class XbusDevice:
         self._options = options = options or XbusDeviceOptions()
         self._line = PtyLine(link)
         self._noise = wire_noise
+        self._sync = SyncLines(options.sync)
         self._decoder = XbusDecoder()
         self._outputs = tuple(setup.Output(*output) for output in options.outputs)
         self._alignment = dict.fromkeys((0, 1), options.alignment)
@@ -137,7 +142,7 @@ class XbusDevice:
     def line_ns(self) -> int:
         """How long a sample takes on a real line of the host's speed, ns."""
         baud = self._line.host_baud
-        size = len(encode(MessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0))))
+        size = len(encode(MessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
         return size * _BITS * 1_000_000_000 // baud if baud else 0
 
     @property
@@ -155,6 +160,15 @@ class XbusDevice:
         if self._measure(self._ticks(device_ns), q_world_sensor):
             self.sent += 1
 
+    def edge(self, device_ns: int) -> None:
+        """Take a rising edge on the first sync input."""
+        self._sync.edge(IN1, self._ticks(device_ns) % self._modulus)
+
+    @property
+    def sync(self) -> tuple[setup.SyncSetting, ...]:
+        """Synchronisation settings in force."""
+        return self._sync.entries
+
     def lose(self, count: int) -> None:
         """Lose the next `count` messages: they take a counter value and are not sent."""
         self._to_lose += count
@@ -163,6 +177,7 @@ class XbusDevice:
         """Lose power for a moment: clock and counter begin anew, then the wake-up choice."""
         self._stuck, self._measuring = False, False
         self._epoch_ns, self._counter = self._last_ns, self._options.first_counter
+        self._sync.forget()
         self._send(MessageId.WAKE_UP)
         self._waking = True
         self._after(WAKE_UP_S, self._measure_by_itself)
@@ -265,6 +280,14 @@ class XbusDevice:
             self.flash_writes += 1
         return MessageId.OUTPUT_CONFIGURATION_ACK, setup.encode_outputs(self._outputs)
 
+    def _sync_settings(self, data: bytes) -> tuple[int, bytes]:
+        if not data:
+            return MessageId.SYNC_SETTINGS_ACK, setup.encode_sync(self._sync.entries)
+        if not self._sync.store(data):
+            return MessageId.ERROR, _INVALID
+        self.flash_writes += 1
+        return MessageId.SYNC_SETTINGS_ACK, b""
+
     _ANSWERS: dict[int, Callable[[XbusDevice, bytes], tuple[int, bytes]]] = {  # noqa: RUF012 - a table
         MessageId.GOTO_MEASUREMENT: _go_to_measurement,
         MessageId.REQ_DEVICE_ID: _device_id,
@@ -273,6 +296,7 @@ class XbusDevice:
         MessageId.FILTER_PROFILE: _filter_profile,
         MessageId.ALIGNMENT_ROTATION: _alignment_rotation,
         MessageId.OUTPUT_CONFIGURATION: _output_configuration,
+        MessageId.SYNC_SETTINGS: _sync_settings,
     }
 
     # --- what it says -------------------------------------------------------------------------
@@ -303,14 +327,18 @@ class XbusDevice:
         if self._to_lose:
             self._to_lose -= 1
             return False
-        return self._send(MessageId.MT_DATA2, self._content(counter, ticks % self._modulus, q))
+        edges = self._sync.next_triggers([data_id for data_id, _ in self._outputs])
+        data = self._content(counter, ticks % self._modulus, q, edges)
+        return self._send(MessageId.MT_DATA2, data)
 
-    def _content(self, counter: int, ticks: int, q: Quaternion | None) -> bytes:
+    def _content(
+        self, counter: int, ticks: int, q: Quaternion | None, edges: Mapping[int, Trigger]
+    ) -> bytes:
         """Return the data of one MTData2."""
         return mtdata2.encode_items(
             (data_id, value)
             for data_id, _ in self._outputs
-            if (value := _value(data_id, counter, ticks, q)) is not None
+            if (value := edges.get(data_id, _value(data_id, counter, ticks, q))) is not None
         )
 
 

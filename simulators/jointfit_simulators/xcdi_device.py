@@ -79,6 +79,9 @@ class XcdiDevice:
         """Groups a second, as configured."""
         return self._options.rate_hz
 
+    def edge(self, device_ns: int) -> None:
+        """Take an edge and say nothing: there is no message for it."""
+
     @property
     def counter(self) -> int:
         """Number of the next group."""

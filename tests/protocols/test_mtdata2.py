@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jointfit_protocols import mtdata2
-from jointfit_protocols.mtdata2 import Item, Precision, UtcTime
+from jointfit_protocols.mtdata2 import Item, Precision, Trigger, UtcTime
 from jointfit_protocols.orientation import canonical
 from jointfit_protocols.xbus import XbusDecoder, XbusMessage
 
@@ -96,8 +96,24 @@ def test_counts_come_back(data: st.DataObject, item: Item) -> None:
     assert mtdata2.decode_item(item, wire[3:]) == number
 
 
+@given(
+    st.builds(
+        Trigger,
+        st.integers(0, 255),
+        st.integers(0, 3),
+        st.integers(0, 2**32 - 1),
+        st.integers(0, 2**16 - 1),
+    )
+)
+def test_edges_come_back(edge: Trigger) -> None:
+    wire = mtdata2.encode_item(Item.TRIGGER_IN1, edge)
+    assert wire[:3] == b"\x48\x10\x08"
+    assert mtdata2.decode_item(Item.TRIGGER_IN1, wire[3:]) == edge
+    assert mtdata2.decode_item(Item.TRIGGER_IN1, wire[3:-1]) is None
+
+
 def test_every_item_is_known_to_the_codec() -> None:
-    other = {Item.UTC_TIME, Item.GNSS_PVT}
+    other = {Item.UTC_TIME, Item.GNSS_PVT, Item.TRIGGER_IN1, Item.TRIGGER_IN2}
     assert set(REALS) | set(COUNTS) | other == set(Item)
 
 

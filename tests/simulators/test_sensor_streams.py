@@ -43,6 +43,8 @@ class Listed:
 
     def power_cycle(self) -> None: ...
 
+    def edge(self, device_ns: int) -> None: ...
+
     def unplug(self) -> None:
         self.plugged = False
 
