@@ -26,6 +26,7 @@ from jointfit_daemon.pipeline.events import (
     Tick,
 )
 from jointfit_daemon.pipeline.health import health_of
+from jointfit_daemon.pipeline.lag_watch import LagWatch
 from jointfit_daemon.pipeline.session import CalibrationSession
 from jointfit_daemon.pipeline.source import SourceState, Stamped
 from jointfit_daemon.pipeline.sync_lines import SyncLines
@@ -73,6 +74,7 @@ class Core:
         self._optical_origin: OpticalOrigin | None = None
         self._origin: Vector | None = None
         self._lag_ns: dict[str, int] = {}
+        self._lags: LagWatch | None = None
 
     # --- events ------------------------------------------------------------------------------
 
@@ -110,8 +112,10 @@ class Core:
             return {"devices": {}, "frames": {}, "calibration": {}}
         mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
         verdicts = {"mocap": mocap} | {name: self._counts(name) for name in self._aligned}
+        lags = {} if self._lags is None else self._lags.health()
         return health_of(self._sources, verdicts, self._session, now_ns) | {
-            "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames}
+            "lags": lags,
+            "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames},
         }
 
     def _counts(self, name: str) -> dict[str, int]:
@@ -163,6 +167,8 @@ class Core:
         if rig is not None:
             self._fuser = LimbFuser(rig.chain, calibration)
             self._optical_origin, self._origin = None, None
+            worn = calibration if calibration and calibration.fits(rig.chain) else None
+            self._lags = LagWatch(rig.chain, worn, self._lags)
             if calibration is not None and calibration.fits(rig.chain):
                 self._optical_origin = OpticalOrigin(rig.chain, calibration)
             self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
@@ -237,10 +243,12 @@ class Core:
             t_ns - self._lag_ns.get(source, 0),
             sample.arrival_ns,
             sample.q_world_sensor,
-            synced=stamp.synced,
+            synced=True,
             epoch=stamp.epoch,
             rate=sample.rate,
         )
+        if self._lags is not None and stamp.synced:
+            self._lags.add_sample(source, t_ns, sample.q_world_sensor, stamp.epoch)
         if self._session.collecting:
             return self._session.add_sample(source, t_ns, sample.q_world_sensor)
         return []
@@ -251,6 +259,8 @@ class Core:
             return
         if frame.live:
             self._mocap_ns = self._now_ns
+            if self._lags is not None and item.stamp.synced:
+                self._lags.add_mocap(item.stamp.t_ns, frame, item.stamp.epoch)
         wanted = frame.live and self._session.collecting
         if wanted:
             self._session.add_mocap(item.stamp.t_ns, frame)
@@ -269,6 +279,8 @@ class Core:
             return []
         now_ns = self._now_ns
         outputs: list[Output] = [self._fuse(frame) for frame in self._aligner.advance(now_ns)]
+        if outputs and self._lags is not None:
+            outputs += self._lags.step(now_ns)
         if self._session.collecting:
             outputs += self._session.advance(now_ns)
         outputs += self._bulletin.due(now_ns)

@@ -14,7 +14,6 @@ see: unseen transport delay, filters inside both systems, exposure conventions.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from math import inf, nan, radians
 from typing import TYPE_CHECKING
@@ -32,6 +31,8 @@ from jointfit_daemon.timing.rates import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from numpy.typing import NDArray
 
     from jointfit_daemon.model import Quaternion, Vector
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.rates import Floats, Rates
 
 NO_OVERLAP = "the tracks do not overlap"
+STAY = "stay in view of the cameras"
 IRREGULAR = "move faster and irregularly, about several axes"
 _NYQUIST_SHARE = 0.4
 _LEAST_OVERLAP = 0.5
@@ -159,24 +161,49 @@ def estimate_lag_of_rates(
 
     See ``estimate_lag``.
     """
+    work = estimate_in_steps(imu, ref, settings)
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            estimate: LagEstimate = done.value
+            return estimate
+
+
+def estimate_in_steps(
+    imu: Rates, ref: Rates, settings: LagSettings | None = None
+) -> Generator[None, None, LagEstimate]:
+    """Do ``estimate_lag_of_rates`` in steps of a few milliseconds, so that nothing need wait."""
     settings = settings or LagSettings()
     cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE / max(imu.period_s, ref.period_s))
     valid = min(imu.valid_share, ref.valid_share)
     imu, ref = low_pass(imu, cutoff), low_pass(ref, cutoff)
     if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
-        return LagEstimate(nan, inf, nan, "no gapless stretch of data", valid_share=valid)
-    coarse, refused = coarse_lags(imu, ref, settings)
+        refused = f"no gapless stretch of data: {STAY}"
+        return LagEstimate(nan, inf, nan, refused, valid_share=valid)
     rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)
     seen = LagEstimate(
         nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
     )
     if rate < settings.min_rate or acceleration < settings.min_acceleration:
         return replace(seen, refused=_too_little(rate, acceleration, settings))
-    if refused is not None:
-        return replace(seen, refused=refused)
-    fit, rival = _best_fit(imu, ref, coarse, cutoff)
-    if fit is None:
+    yield
+    coarse, why = coarse_lags(imu, ref, settings)
+    if why is not None:
+        return replace(seen, refused=why)
+    fits: list[LagFit] = []
+    for start in coarse:
+        yield
+        found = yield from fit_lag(imu, ref, start, cutoff)
+        fits += [] if found is None else [found]
+    if not fits:
         return replace(seen, refused=NO_OVERLAP)
+    return _judged(seen, fits, settings)
+
+
+def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
+    """Return the best of the fits, and why not to use it."""
+    fit = min(fits, key=lambda one: one.residual_rms)
     estimate = replace(
         seen,
         lag_ns=1e9 * fit.tau_s,
@@ -188,27 +215,17 @@ def estimate_lag_of_rates(
         mean_weight=fit.mean_weight,
         pairs=fit.pairs,
     )
-    refused = _gate(estimate, fit, settings)
-    if refused is None and rival is not None:
-        refused = f"the motion is periodic: a lag of {1e3 * rival:.0f} ms fits as well; {IRREGULAR}"
-    return replace(estimate, refused=refused)
+    return replace(estimate, refused=_gate(estimate, fit, settings) or _rival(fit, fits, seen))
 
 
-def _best_fit(
-    imu: Rates, ref: Rates, starts: tuple[float, ...], cutoff_hz: float
-) -> tuple[LagFit | None, float | None]:
-    """Return the best fit from all starts, and the lag, s, of another one nearly as good."""
-    fits = [fit for start in starts if (fit := fit_lag(imu, ref, start, cutoff_hz)) is not None]
-    if not fits:
-        return None, None
-    best = min(fits, key=lambda fit: fit.residual_rms)
-    alike = _RIVAL * max(best.residual_rms, _AGREE * _rms(ref.w)) ** 2
-    rivals = [
-        fit.tau_s
-        for fit in fits
-        if abs(fit.tau_s - best.tau_s) > _SAME_S and fit.residual_rms**2 < alike
-    ]
-    return best, next(iter(rivals), None)
+def _rival(best: LagFit, fits: list[LagFit], seen: LagEstimate) -> str | None:
+    """Say so where another lag fits nearly as well."""
+    alike = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2
+    for fit in fits:
+        if abs(fit.tau_s - best.tau_s) > _SAME_S and fit.residual_rms**2 < alike:
+            other = 1e3 * fit.tau_s
+            return f"the motion is periodic: a lag of {other:.0f} ms fits as well; {IRREGULAR}"
+    return None
 
 
 def _too_little(rate: float, acceleration: float, settings: LagSettings) -> str:
@@ -226,7 +243,7 @@ def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | No
         (
             share >= settings.min_valid,
             f"too many gaps: {100 * share:.0f} % of the time is covered, at least "
-            f"{100 * settings.min_valid:.0f} % are needed: stay in view of the cameras",
+            f"{100 * settings.min_valid:.0f} % are needed: {STAY}",
         ),
         (fit.converged, f"the fit did not converge: {IRREGULAR}"),
         (
@@ -239,7 +256,7 @@ def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | No
             "too many outliers: check for markers that swap or are hidden",
         ),
         (
-            bias <= math.degrees(settings.max_bias),
+            bias <= float(np.degrees(settings.max_bias)),
             f"rate bias too large, {bias:.1f} deg/s: check the unit of the rate",
         ),
         (

@@ -15,6 +15,8 @@ from jointfit_daemon.timing.lag_sigma import RIDGE, Columns, lag_sigma
 from jointfit_daemon.timing.rates import Interpolant
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from jointfit_daemon.timing.rates import Floats, Rates
 
 HUBER = 2.4
@@ -67,7 +69,9 @@ class _Linear(NamedTuple):
     t_s: Floats
 
 
-def fit_lag(imu: Rates, ref: Rates, start_s: float, cutoff_hz: float) -> LagFit | None:
+def fit_lag(
+    imu: Rates, ref: Rates, start_s: float, cutoff_hz: float
+) -> Generator[None, None, LagFit | None]:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
     Gauss-Newton on all seven unknowns with Huber weights on |r|. The faster track is interpolated
@@ -81,6 +85,11 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float, cutoff_hz: float) -> LagFit 
         Coarse lag, s.
     cutoff_hz : float
         Of the filter: it sets how far residuals are correlated.
+
+    Yields
+    ------
+    None
+        After every iteration: about a millisecond of work.
 
     Returns
     -------
@@ -103,9 +112,11 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float, cutoff_hz: float) -> LagFit 
             converged = True
             break
         before = moved
+        yield
     linear = _linearize(cubic, slow, state)
     if linear is None:
         return None
+    yield
     rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
     whole = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
     square = float(np.sum(linear.r**2))

@@ -82,6 +82,14 @@ class LagTracker:
         self._start(t_ns, tau, variance)
         return self._now(step_ns=1e9 * innovation)
 
+    def widen(self, sd_ns: float) -> None:
+        """Doubt the lag, but keep it: a clock behind it began anew and may have settled elsewhere.
+
+        The next window within `sd_ns` moves it as far as the data ask, and is no step.
+        """
+        self._tt += (sd_ns * 1e-9) ** 2
+        self._refused = []
+
     def _start(self, t_ns: int, tau: float, variance: float) -> None:
         self._t_ns, self._tau, self._drift = t_ns, tau, 0.0
         self._tt, self._pt, self._pp = variance, 0.0, DRIFT_SD**2
