@@ -18,6 +18,7 @@ from jointfit_daemon.calibration.center.moments import (
     Number,
     judge,
     moments_of,
+    moments_of_one,
 )
 
 if TYPE_CHECKING:
@@ -208,6 +209,29 @@ def fit_circles(
         np.where(valid, np.where(judged.noise == 0.0, np.inf, conditioning), 0.0),
         valid,
     )
+
+
+def fit_circle(points: ArrayLike, *, method: Method = "hyper") -> tuple[float, float, float]:
+    """Return center and radius, m, of one plain circle, unjudged, as fast as can be.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2)
+        m; all of them seen.
+    method : str
+        ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three points, points on a line or at one place: there is no circle.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    m = moments_of_one(p) if len(p) > 2 else None
+    if m is None or not m.xx * m.yy - m.xy * m.xy > ROUNDING * (m.xx + m.yy) ** 2:
+        raise ValueError("no circle: three points or more are needed, seen and not on a line")
+    a, b, square = circle_from_root(m, smallest_root(m, method), method)
+    return m.x + a, m.y + b, abs(square) ** 0.5
 
 
 def _lagged(points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, square: Array) -> Array:

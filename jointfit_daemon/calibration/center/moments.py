@@ -98,6 +98,24 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     return CircleMoments(total, effective, middle[..., 0], middle[..., 1], xx, xy, yy, xz, yz, zz)
 
 
+def moments_of_one(points: Array, weights: Array | None = None) -> CircleMoments[float]:
+    """Return `moments_of` one set of points, shape (n, 2), all of them seen; several times faster.
+
+    Weights, shape (n,), are not negative and not all zero.
+    """
+    n = len(points)
+    w = weights if weights is not None else np.ones(n)
+    total = float(w.sum())
+    middle = w @ points / total
+    columns = np.empty((3, n))
+    np.subtract(points.T, middle[:, None], out=columns[:2])
+    np.einsum("cn,cn->n", columns[:2], columns[:2], out=columns[2])
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = ((columns * (w / total)) @ columns.T).tolist()
+    effective = total * total / float(w @ w)
+    x, y = middle.tolist()
+    return CircleMoments(total, effective, x, y, xx, xy, yy, xz, yz, zz)
+
+
 def sum_of_squares(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Number:
     r"""Return the mean of (|p - c|² - R²)² for the center (a, b) from the centroid, m⁴.
 

@@ -179,7 +179,7 @@ def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array,
     x = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     theta = np.asarray(angles, dtype=np.float64).ravel()
     seen = np.asarray(np.isfinite(x).all(axis=-1) & np.isfinite(theta))
-    times = interval * np.arange(len(x))[seen]
+    times = np.asarray(interval * np.flatnonzero(seen), dtype=np.float64)
     x, theta = x[seen], np.asarray(np.unwrap(theta[seen]), dtype=np.float64)
     if len(x) <= MAX_FRAMES:
         return x, theta, times

@@ -26,7 +26,7 @@ from jointfit_daemon.calibration.center.moments import (
     Judged,
     ellipse_scale,
     judge,
-    moments_of,
+    moments_of_one,
 )
 from jointfit_daemon.calibration.center.result import CenterEstimate
 
@@ -83,13 +83,15 @@ def circle_estimate(
     p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     seen = np.asarray(np.isfinite(p).all(axis=-1))
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
-    m = CircleMoments(*(float(v) for v in moments_of(p, w)))
+    x = p if seen.all() else np.where(seen[:, None], p, 0.0)
+    empty = CircleMoments(*(0.0,) * 10)
+    m = moments_of_one(x, w) if w.any() else empty
 
     def lagged(a: float, b: float, square: float) -> float:
-        d = np.where(seen[:, None], p, 0.0) - (m.x + a, m.y + b)
-        e = ((d**2).sum(axis=-1) - square) / (2.0 * sqrt(square))
+        d = x - np.array([m.x + a, m.y + b])
+        e = np.einsum("nc,nc->n", d, d) - square
         pair = w[1:] * w[:-1]
-        return float((pair * e[1:] * e[:-1]).sum() / max(float(pair.sum()), 1e-300))
+        return float((pair * e[1:]) @ e[:-1] / (4.0 * square * max(float(pair.sum()), 1e-300)))
 
     return publish(m, lagged, method=method, frames=int(seen.sum()), limits=limits or Limits())
 

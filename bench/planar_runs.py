@@ -1,0 +1,95 @@
+"""Simulated runs of planar centers: many at once, and how they are judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration.center.bounds import circle_rms_bound
+from jointfit_daemon.calibration.center.circle import Method, fit_circles
+from jointfit_daemon.calibration.center.moments import GATE, ellipse_scale
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Array = NDArray[np.float64]
+
+_AT_ONCE = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Centers of many runs about the origin."""
+
+    centers: Array
+    """m, shape (runs, 2); NaN where there was no circle."""
+    covariances: Array
+    conditioning: Array
+    bound: float
+    """m, RMS."""
+
+    @property
+    def published(self) -> NDArray[np.bool_]:
+        return np.asarray(self.conditioning >= GATE)
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.nanmean((self.centers**2).sum(axis=1))))
+
+    @property
+    def claimed(self) -> float:
+        return float(np.sqrt(np.nanmean(np.trace(self.covariances, axis1=1, axis2=2))))
+
+
+def arc_points(angles: ArrayLike, radius: float) -> Array:
+    """Return points of a circle about the origin, shape (..., 2)."""
+    t = np.asarray(angles, dtype=np.float64)
+    return radius * np.stack((np.cos(t), np.sin(t)), axis=-1)
+
+
+@cache
+def runs_on(
+    n: int,
+    arc: float,
+    noise: float,
+    *,
+    radius: float = 0.3,
+    runs: int = 20_000,
+    method: Method = "hyper",
+    tempered: bool = True,
+    correlated: bool = False,
+) -> Runs:
+    """Fit `runs` noisy arcs of `n` points evenly over `arc` degrees, both ends included."""
+    rng = np.random.default_rng(round(1000 * arc) + n)
+    t = np.linspace(-0.5, 0.5, n) * np.deg2rad(arc)
+    truth = arc_points(t, radius)
+    parts = []
+    for _ in range(runs // _AT_ONCE):
+        p = truth + rng.normal(0.0, noise, (_AT_ONCE, n, 2))
+        parts.append(fit_circles(p, method=method, tempered=tempered, correlated=correlated))
+    return Runs(
+        np.concatenate([part.center for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        np.concatenate([part.conditioning for part in parts]),
+        circle_rms_bound(t, noise),
+    )
+
+
+def upper_rms(found: Runs) -> float:
+    """Return the upper 95 % limit of the RMS error, from the scatter of the squares."""
+    square = (found.centers**2).sum(axis=1)
+    square = square[np.isfinite(square)]
+    return float(np.sqrt(square.mean() + 1.645 * square.std() / np.sqrt(len(square))))
+
+
+def share_covered(found: Runs, n: int) -> float:
+    """Return the share of published centers whose 95 % ellipse holds the origin."""
+    passed = found.published
+    e, covariances = found.centers[passed], found.covariances[passed]
+    d2 = np.einsum("ri,rij,rj->r", e, np.linalg.inv(covariances), e)
+    scales = [ellipse_scale(float(n), float(t)) for t in found.conditioning[passed]]
+    return float(np.mean(d2 <= scales))
