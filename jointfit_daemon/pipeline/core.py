@@ -243,7 +243,7 @@ class Core:
             t_ns - self._lag_ns.get(source, 0),
             sample.arrival_ns,
             sample.q_world_sensor,
-            synced=True,
+            synced=stamp.synced,
             epoch=stamp.epoch,
             rate=sample.rate,
         )
