@@ -69,6 +69,17 @@ class JointFound:
     gap_rms: float | None
     """How far apart the two body parts carry the center, RMS, m."""
 
+    @property
+    def told(self) -> str:
+        """Return in words where the center comes from.
+
+        ``markers``; ``markers, static pose`` where the movement did not show a direction; or
+        ``configured``: a length from another joint.
+        """
+        if self.fit is None:
+            return "configured"
+        return "markers, static pose" if len(self.fit.unseen) > 0 else "markers"
+
 
 @dataclass(frozen=True, slots=True)
 class FlexionAxis:
@@ -91,6 +102,8 @@ class Anatomy:
     """q_static-world_segment per segment, shape (4,)."""
     lengths: Mapping[str, tuple[float | None, float | None]]
     """Length and its standard deviation per segment, m."""
+    length_sources: Mapping[str, str]
+    """``configured``, ``markers`` (the distance of its joint centers) or ``unknown``."""
     axes: Mapping[str, FlexionAxis]
     flags: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
@@ -128,7 +141,7 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
         for segment, end in zip(chain.segments, ends, strict=True)
         if None in end
     ]
-    q_static, lengths = {}, {}
+    q_static, lengths, sources = {}, {}, {}
     for i, segment in enumerate(chain.segments):
         x = _right_axis(chain, i, axes)
         if x is None and _jointed(chain, tracks):
@@ -140,8 +153,9 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
             flags.append("facing_unknown")
             x = np.array([1.0, 0.0, 0.0])
         q_static[segment] = _STANDING.copy() if chain.static_axes else _frame(segment, x, z[i])
-        lengths[segment] = _length(chain, i, *ends[i])
-    return Anatomy(joints, q_static, lengths, axes, tuple(dict.fromkeys(flags)), tuple(notes))
+        lengths[segment], sources[segment] = _length(chain, i, *ends[i])
+    flags = list(dict.fromkeys(flags))
+    return Anatomy(joints, q_static, lengths, sources, axes, tuple(flags), tuple(notes))
 
 
 def _jointed(
@@ -331,14 +345,14 @@ def _frame(segment: str, x: Array, z: Array) -> Array:
 
 def _length(
     chain: Chain, i: int, top: JointFound | None, bottom: JointFound | None
-) -> tuple[float | None, float | None]:
+) -> tuple[tuple[float | None, float | None], str]:
     configured = chain.lengths[i] if i < len(chain.lengths) else None
     if configured is not None:
-        return configured, CONFIGURED_SD_M
+        return (configured, CONFIGURED_SD_M), "configured"
     if top is None or bottom is None:
-        return None, None
+        return (None, None), "unknown"
     z = top.center - bottom.center
     length = float(np.linalg.norm(z))
     u = z / length
     variance = u @ (top.covariance + bottom.covariance) @ u + SKIN_SD_M**2
-    return length, float(np.sqrt(variance))
+    return (length, float(np.sqrt(variance))), "markers"

@@ -289,7 +289,7 @@ def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:
     return {
         "joints": {
             name: {
-                "source": "unknown" if found is None else found.source,
+                "source": "unknown" if found is None else found.told,
                 "sd_m": _joint(found).sd,
                 "residual_rms_m": _joint(found).residual_rms,
                 "gap_rms_m": None if found is None else found.gap_rms,
@@ -301,6 +301,8 @@ def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:
             for name, found in anatomy.joints.items()
         },
         "lengths_m": {name: length for name, (length, _) in anatomy.lengths.items()},
+        "length_sd_m": {name: sd for name, (_, sd) in anatomy.lengths.items()},
+        "length_sources": dict(anatomy.length_sources),
         "flexion_axes": {
             name: {"rms_rad": axis.rms, "off_plane_rad": axis.off}
             for name, axis in anatomy.axes.items()

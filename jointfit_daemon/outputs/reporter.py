@@ -6,6 +6,7 @@ The topics, their rates and their retained flags are the contract of docs/mqtt.m
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,9 @@ from jointfit_daemon import __version__
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.figures import shown
 from jointfit_daemon.outputs.mqtt import PAYLOAD_VERSION
-from jointfit_daemon.outputs.payloads import UnixClock, encode, encode_joint, encode_pose
+from jointfit_daemon.outputs.payloads import encode, encode_joint, encode_pose
 from jointfit_daemon.outputs.publisher import OFFLINE, ONLINE
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
     CalibrationProgress,
     CalibrationStatus,
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.outbox import Outbox
     from jointfit_daemon.pipeline.events import Output
+
+log = logging.getLogger(__name__)
 
 _NS_PER_S = 1_000_000_000
 
@@ -101,7 +105,7 @@ class Reporter:
                 pass
 
     def _limb_state(self, state: LimbState) -> None:
-        offset_ns, now_ns = self._clock.offset_ns(), time.monotonic_ns()
+        offset_ns, now_ns = self._offset_ns(), time.monotonic_ns()
         pose = encode_pose(state, offset_ns, now_ns)
         self._outbox.stream(self._pose_topic, pose)
         if self._pose_ui.due(state.t_ns):
@@ -122,7 +126,7 @@ class Reporter:
 
     def _calibration(self, status: CalibrationStatus) -> None:
         said: dict[str, Any] = {"phase": status.phase, "text": status.text}
-        said |= {"version": status.version, "quality": shown(status.quality)}
+        said |= {"version": status.version, "kept": status.kept, "quality": shown(status.quality)}
         self._outbox.retain(f"{self._base}/calibration", self._stamped(said, status.t_ns))
         event = Notice(status.t_ns, "calibration", status.phase, status.text)
         self.event(event)
@@ -150,8 +154,19 @@ class Reporter:
         said = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
         self._outbox.stream(f"{self._base}/bridge/log", self._stamped(said, time.monotonic_ns()))
 
+    def _offset_ns(self) -> int:
+        """Return UNIX minus monotonic time; tell of a step first."""
+        offset_ns, step_ns = self._clock.offset_ns(), self._clock.take_step_ns()
+        if step_ns:
+            way, step_s = "forward" if step_ns > 0 else "back", step_ns / _NS_PER_S
+            text = f"UNIX time was set {way} by {abs(step_s):.3f} s"
+            log.warning("%s", text)
+            now_ns = time.monotonic_ns()
+            self.event(Notice(now_ns, "clock", "host", text, "warning", {"step_s": step_s}))
+        return offset_ns
+
     def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
-        stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}
+        stamp = {} if t_ns is None else {"t_us": (t_ns + self._offset_ns()) // 1000}
         return encode({"v": PAYLOAD_VERSION} | stamp | dict(data))
 
 

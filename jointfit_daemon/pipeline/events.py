@@ -150,6 +150,8 @@ class CalibrationStatus:
     """Of the calibration in force; None while there is none, or it is not stored (yet)."""
     quality: Mapping[str, object] = field(default_factory=dict)
     """Figures of what just ended, else of the calibration in force."""
+    kept: str | None = None
+    """Why the result that just came was not taken and the calibration in force stays."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -287,7 +287,7 @@ class CalibrationSession:
             data = {"quality": quality}
             return [
                 Notice(t_ns, "calibration", kind, text, "warning", data),
-                self._tell(t_ns, self.phase, text),
+                replace(self._tell(t_ns, self.phase, text), kept=str(keep)),
             ]
         self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
         phase = "posed" if kind == "static" else "calibrated"

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Mapping, Sequence
 
     from rich.console import Console
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt_client import MqttClient
     from jointfit_daemon.tools.calibration_guide import CalibrationWatch
 
-MISUSE = 2
+MISUSE, NOT_TAKEN = 2, 3
 LONGEST_S = 600.0
 ORDER = ("align", "static", "functional")
 SAYS = {
@@ -57,7 +57,11 @@ def calibrate(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before each phase.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the last status as JSON.")] = False,
 ) -> None:
-    """Lead through a calibration of the running daemon; Ctrl-C ends the phase."""
+    """Lead through a calibration of the running daemon; Ctrl-C ends the phase.
+
+    Exit code 1: a phase was refused or given up; 3: the result is worse than what is stored, which
+    stays (--force takes it).
+    """
     import orjson
 
     from jointfit_daemon.config import ConfigError, load_rig
@@ -88,6 +92,9 @@ def calibrate(
     else:
         for line in (str(status.get("text", "done")), *report(status.get("quality") or {})):
             typer.echo(line)
+    if status.get("kept") is not None:
+        typer.echo(f"jointfit calibrate: not taken: {status['kept']}", err=True)
+        raise typer.Exit(NOT_TAKEN)
 
 
 async def _lead(
@@ -131,23 +138,35 @@ async def _phase(
         with suppress(Exception):
             await client.request("calibrate", {"phase": "abort"}, timeout_s=1.0)
         raise
-    return dict(ended if name == "align" else await watch.stored(ended))
+    final = name == "align" or ended.get("kept") is not None
+    return dict(ended if final else await watch.stored(ended))
 
 
 @asynccontextmanager
 async def _watching(client: MqttClient, console: Console) -> AsyncIterator[CalibrationWatch]:
     """Show what the daemon says, as a bar on a terminal, else as lines, while the block lasts."""
+    from rich.console import Group
+    from rich.live import Live
     from rich.progress import Progress
+    from rich.text import Text
 
     from jointfit_daemon.tools.calibration_guide import CalibrationWatch
+    from jointfit_daemon.tools.calibration_report import movement_lines
 
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=1.0)
+    bar, joints = Progress(console=console), Text()
+    task = bar.add_task("", total=1.0)
+    screen = Live(Group(bar, joints), console=console, transient=True, auto_refresh=False)
+    with screen if console.is_terminal else nullcontext():
 
         def show(name: str, done: float, text: str) -> None:
-            bar.update(task, completed=done, description=f"{name}: {text}")
+            bar.update(task, completed=done, description=name)
+            joints.plain = text
 
-        watch = CalibrationWatch(show)
+        def figures(data: Mapping[str, Any]) -> None:
+            joints.plain = "\n".join((joints.plain, *movement_lines(data)))
+            screen.refresh()
+
+        watch = CalibrationWatch(show, figures)
         listening = asyncio.create_task(_listen(client, watch, console), name="calibrate listener")
         try:
             yield watch

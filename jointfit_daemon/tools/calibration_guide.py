@@ -31,6 +31,8 @@ class CalibrationWatch:
 
     show: Callable[[str, float, str], None]
     """Called with phase, progress 0 to 1, text."""
+    figures: Callable[[Mapping[str, Any]], None] | None = None
+    """Called with the figures of the progress, after `show`."""
     status: Mapping[str, Any] = field(default_factory=dict)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
     _seen: list[Mapping[str, Any]] = field(default_factory=list)
@@ -46,6 +48,8 @@ class CalibrationWatch:
         """Take a message of topic ``calibration/progress``."""
         done = payload.get("progress") or 0.0
         self.show(str(payload.get("phase", "")), float(done), str(payload.get("text", "")))
+        if self.figures is not None:
+            self.figures(payload.get("data") or {})
 
     def lose(self, why: Exception) -> None:
         """Take that nothing more will come; who waits gets `why`."""

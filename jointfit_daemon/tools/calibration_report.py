@@ -28,12 +28,37 @@ def report(quality: Mapping[str, Any]) -> list[str]:
         sd_m = joint.get("sd_m")
         spread = "" if sd_m is None else f", sd {1000 * sd_m:.0f} mm"
         lines.append(f"{name}: center by {joint.get('source')}{spread}")
+    sources: Mapping[str, Any] = anatomy.get("length_sources") or {}
     for name, length_m in (anatomy.get("lengths_m") or {}).items():
+        by = f", by {sources[name]}" if sources.get(name) else ""
         if length_m is not None:
-            lines.append(f"{name}: {length_m:.3f} m long")
+            lines.append(f"{name}: {length_m:.3f} m long{by}")
     if "alignment" in quality and quality["alignment"] is None:
         lines.append("no align phase: headings come from the static pose")
     return lines
+
+
+def movement_lines(data: Mapping[str, Any]) -> list[str]:
+    """Return what ``data`` of topic ``calibration/progress`` says of a movement, a joint a line.
+
+    The first figure is what more movement makes smaller; the second is what to expect on skin.
+    """
+    lines = []
+    for name, joint in (data.get("joints") or {}).items():
+        noise, total = joint.get("noise_error_mm"), joint.get("predicted_error_mm")
+        words = [
+            "center unknown" if total is None else f"center ± {_tenth(total)} mm with skin",
+            *([] if noise is None else [f"{_tenth(noise)} mm by noise"]),
+            *([] if joint.get("arc_deg") is None else [f"{joint['arc_deg']:.0f}° seen"]),
+            *([] if joint.get("bends") is None else [f"bent {joint['bends']}×"]),
+            *([] if joint.get("source") == "markers" else [f"by {joint.get('source')}"]),
+        ]
+        lines.append(f"{'✔' if joint.get('met') else '…'} {name}: {', '.join(words)}")
+    return lines
+
+
+def _tenth(value: float) -> str:
+    return f"{value:.1f}"
 
 
 def _against_mean(what: str, by_method: Mapping[str, Any], method: str) -> str:

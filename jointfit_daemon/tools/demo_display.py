@@ -18,6 +18,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from jointfit_daemon.tools.calibration_report import movement_lines
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
@@ -47,6 +49,7 @@ class Display:
         self._headless = headless
         self._step, self._done, self._text = "connect", 0.0, ""
         self._said = ""
+        self._joints: list[str] = []
         self._frame = 0
         self._pose: Mapping[str, Any] = {}
         self._truth: Truth | None = None
@@ -69,8 +72,17 @@ class Display:
         self._step, self._done, self._text = name, done, text
         if self._headless and name != self._said:
             self._said = name
+            for line in self._joints:
+                print(f"  {line}", file=sys.stderr)
+            self._joints = []
             print(f"{name}: {_SAYS.get(name, text)}", file=sys.stderr, flush=True)
         self._draw()
+
+    def figures(self, data: Mapping[str, Any]) -> None:
+        """Show what a movement has told of the joints so far; nothing in other phases."""
+        if self._step == "functional":
+            self._joints = movement_lines(data)
+            self._draw()
 
     def live(
         self, pose: Mapping[str, Any], truth: Truth | None, figures: Mapping[str, object]
@@ -110,7 +122,9 @@ class Display:
             table.add_row(
                 Text(f"{mark} {name}", style=style), ProgressBar(1.0, done, width=24), says
             )
-        return Panel(table, title="jointfit demo", title_align="left", border_style="cyan")
+        known = Text("\n".join(self._joints), style="cyan" if STEPS[now] == "functional" else "dim")
+        shown = Group(table, known) if self._joints else table
+        return Panel(shown, title="jointfit demo", title_align="left", border_style="cyan")
 
     def _knee_panel(self) -> Panel:
         knee, truth = _knee(self._pose), self._truth

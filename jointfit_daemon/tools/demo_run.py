@@ -128,7 +128,7 @@ class Demo:
         await asyncio.sleep(SETTLE_S)  # clocks settle
 
     async def _calibrate(self, client: MqttClient) -> None:
-        self._watch = CalibrationWatch(self.display.step)
+        self._watch = CalibrationWatch(self.display.step, self.display.figures)
         for phase, motions in PHASES:
             await self.simulator.say(f"play {motions[0][0]}")
             await asyncio.sleep(SETTLE_S)

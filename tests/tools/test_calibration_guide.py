@@ -70,16 +70,17 @@ def test_the_report_names_errors_centers_and_a_missing_align_phase() -> None:
                 "flexion_deg": {"knee": {"anchored": None}},
             },
             "anatomy": {
-                "joints": {"knee": {"source": "fit", "sd_m": 0.024}},
+                "joints": {"knee": {"source": "markers", "sd_m": 0.024}},
                 "lengths_m": {"thigh": 0.41, "shank": None},
+                "length_sources": {"thigh": "configured", "shank": "unknown"},
             },
         }
     )
     assert lines == [
         "thigh: orientation error 2.1°; the mean of the sensors has 4.1°",
         "knee: flexion error unknown",
-        "knee: center by fit, sd 24 mm",
-        "thigh: 0.410 m long",
+        "knee: center by markers, sd 24 mm",
+        "thigh: 0.410 m long, by configured",
         "no align phase: headings come from the static pose",
     ]
 
