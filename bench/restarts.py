@@ -32,14 +32,15 @@ class Outcome(NamedTuple):
     replayed: bool
     """The event log gave the limb states of the live run byte for byte."""
 
-    def errors_ns(self, source: str | None = None) -> list[int]:
-        """Return the errors of all stamps that called themselves synced."""
+    def errors_ns(self, source: str, method: str = "") -> list[int]:
+        """Return the errors of all stamps that called themselves synced (and came about so)."""
         return [
             sample.error_ns
             for sample in self.core.samples
             if sample.synced
             and sample.error_ns is not None
-            and (source is None or sample.source == source)
+            and sample.source == source
+            and method in {"", sample.method}
         ]
 
     @property
@@ -74,7 +75,9 @@ async def recovers(listener: Listener, name: str) -> None:
     await listener.until(lambda: locked(listener), 15)
 
 
-async def live(folder: Path, port: int, reboots: Sequence[str], rest_s: float) -> Outcome:
+async def live(
+    folder: Path, port: int, reboots: Sequence[str], rest_s: float, more: Sequence[str] = ()
+) -> Outcome:
     """Run a rig; reboot devices one by one; judge what was recorded.
 
     Parameters
@@ -85,9 +88,11 @@ async def live(folder: Path, port: int, reboots: Sequence[str], rest_s: float) -
         Sensors, or `mocap`, in order.
     rest_s
         How long the rig runs well before each reboot and at the end.
+    more
+        Further words for the simulator.
     """
     clocks = [word for name, ppm in SKEWS_PPM.items() for word in ("--clock", f"{name}={ppm}")]
-    options = ("--sample-log", "--programme", "walk", *clocks)
+    options = ("--sample-log", "--programme", "walk", *clocks, *more)
     station = Station(folder, port, options, more_toml="[recording]\n")
     async with running(station) as (simulator, daemon, listener):
         await listener.until(lambda: locked(listener), 20)

@@ -1,8 +1,10 @@
 """Stamps of a real daemon against the instants at which its samples were truly taken.
 
 Law: the daemon's event log, fed to the same core again, gives every stamp that the live run gave;
-the simulator's sample log says when each sample was taken. Their difference, less the constant that
-no clock can see (the least delay of the transport) and less the lag in force, is the error.
+the simulator's sample log says when each sample was taken. Their difference is the error, but for
+the constant that no arrival can tell: where a stamp rests on arrivals, the transport's true least
+delay takes the place of the one the daemon assumed. With a lag in force, or edges of a sync line,
+nothing is taken off.
 """
 
 from __future__ import annotations
@@ -42,6 +44,8 @@ class Judged(NamedTuple):
     t_ns: int
     """As it went into frames: its stamp less the lag in force."""
     synced: bool
+    method: str
+    """How its clock told time: `passive`, `echo`, `direct` …"""
     error_ns: int | None
     """None: the simulator knows of no such sample."""
 
@@ -114,19 +118,22 @@ class WatchedCore(Core):
     ) -> list[Output]:
         for item in items:
             if isinstance(item, Stamped):
-                self._judge(source, item)
+                self._judge(source, item, state)
         return super()._take(source, state, items)
 
-    def _judge(self, source: str, item: Stamped) -> None:
+    def _judge(self, source: str, item: Stamped, state: SourceState) -> None:
         measured, stamp = item.measurement, item.stamp
         number = measured.counter if isinstance(measured, ImuSample) else measured.number
         lag_ns = self._lag_ns.get(source, 0)
         t_ns = stamp.t_ns - lag_ns
         arrival_ns = self._now_ns  # a sample's own is back-dated, and may be before its time
         taken_ns = None if number is None else self._truth.taken_ns(source, number, arrival_ns)
-        unseen_ns = 0 if lag_ns else self._delay_ns.get(source, 0)
+        known = lag_ns or state.clock.state not in {"passive", "settling", "arrival"}
+        unseen_ns = 0 if known else self._delay_ns.get(source, 0) - state.clock.latency_ns
         error_ns = None if taken_ns is None else t_ns - unseen_ns - taken_ns
-        self.samples.append(Judged(source, arrival_ns, t_ns, stamp.synced, error_ns))
+        self.samples.append(
+            Judged(source, arrival_ns, t_ns, stamp.synced, state.clock.state, error_ns)
+        )
         recent = self._recent[source]
         recent.t_ns.append(t_ns)
         recent.error_ns.append(error_ns)

@@ -192,7 +192,8 @@ def optical_server(
     return NatNetServer(options)
 
 
-def mocap_table(server: NatNetServer) -> str:
-    """Return the first lines of ``[mocap]`` for that server."""
+def mocap_table(server: NatNetServer, *, sync_line: bool = False) -> str:
+    """Return the first lines of ``[mocap]`` for that server, its sync output wired or not."""
+    wired = "\nsync_line = 0" if sync_line else ""
     where = f'server = "127.0.0.1"\ncommand_port = {server.command_port}'
-    return f'[mocap]\ndriver = "natnet"\n{where}\nup_axis = "{server.options.up_axis}"'
+    return f'[mocap]\ndriver = "natnet"\n{where}\nup_axis = "{server.options.up_axis}"{wired}'

@@ -209,13 +209,18 @@ class Scene:
         text = rig_toml(
             self._options.rig,
             devices=self._hardware.tables,
-            mocap=mocap_table(self._server) if self._server else "",
+            mocap=self._mocap_table(),
             clusters=self._subject.clusters,
             bones=self._subject.visible_bones,
             plate="plate" in self._subject.templates,
         )
         path.write_text(text, encoding="utf-8")
         return path
+
+    def _mocap_table(self) -> str:
+        if self._server is None:
+            return ""
+        return mocap_table(self._server, sync_line=self._options.sync_line)
 
     def command(self, line: str) -> dict[str, object] | None:
         """Obey one line; return the answer of ``status``.
