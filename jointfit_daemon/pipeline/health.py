@@ -5,6 +5,7 @@ Law: a snapshot, computed when asked for; nothing here changes anything.
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -70,14 +71,23 @@ def _wire(state: SourceState, now_ns: int) -> dict[str, object]:
 
 def _clock(state: SourceState) -> dict[str, object]:
     clock = state.clock
+    delays, rate = clock.minute.delays, clock.minute.rate_hz
     return {
         "clock": clock.state,
         "epoch": clock.epoch,
+        "offset_us": _us(clock.offset_ns),
         "skew_ppm": None if clock.skew_ppm is None else round(clock.skew_ppm, 2),
         "sigma_us": _us(clock.sigma_ns),
+        "bound_us": _us(clock.bound_ns),
+        "latency_prior_us": [_us(clock.latency_ns), _us(clock.latency_sd_ns)],
         "jitter_us": _us(clock.jitter_ns),
+        "delay_us": None
+        if delays is None
+        else {"p50": _us(delays.p50_ns), "p99": _us(delays.p99_ns), "max": _us(delays.max_ns)},
+        "rate_hz": None if rate is None else round(rate, 2),
     }
 
 
 def _us(value_ns: float | None) -> float | None:
-    return None if value_ns is None else round(value_ns / _NS_PER_US, 1)
+    """Return microseconds; unknown where there is no figure yet, infinity included."""
+    return None if value_ns is None or not isfinite(value_ns) else round(value_ns / _NS_PER_US, 1)

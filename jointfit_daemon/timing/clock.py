@@ -38,6 +38,7 @@ __all__ = ["DeviceClock", "Stamp"]
 
 ABSENT_LIMIT = 100
 """Samples in a row without the time they used to carry, before the clock does without it."""
+CAUGHT_UP_NS = 50_000
 MARGIN_NS = 3_000_000
 """How far beyond its prior the smallest delay may be before a direct time is doubted."""
 
@@ -336,7 +337,8 @@ class DeviceClock:
             self.news.append(clock_news.moved(step))
             slew = False
         t = line.stamp(u, target, skew, slew=slew)
-        self._synced = settled
+        # a stamp held back by those before it has yet to catch up with what is known by now
+        self._synced = settled = settled and (self._synced or t - target < CAUGHT_UP_NS)
         self.sigma_ns = sigma = sigma + abs(t - target)
         self.minute.feed(arrival_ns, arrival_ns - t)
         self._looked += 1
@@ -354,7 +356,8 @@ class DeviceClock:
         target, sigma = u + envelope.offset_ns(u) - self.latency_ns, envelope.sigma_ns(u)
         if self._kind == _ARRIVAL:
             sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
-        return Estimate(target, envelope.skew, envelope.settled, sigma, delay)
+        settled = envelope.settled and not (echo is not None and echo.expects_more(arrival_ns))
+        return Estimate(target, envelope.skew, settled, sigma, delay)
 
     def _directed(self, u: int, estimate: Estimate, direct: Direct) -> Estimate:
         """Return what `direct` says, unless `estimate` contradicts it."""

@@ -21,6 +21,8 @@ MEMORY_NS = 120_000_000_000
 CAPACITY = 256
 BURST = 10
 """Echoes after which the fit may be used as it is."""
+BURST_GAP_NS = 2_000_000_000
+"""Echoes further apart than this make no burst that is worth waiting for."""
 LEAST_MARGIN_NS = 50_000
 STAMP_SD_NS = 20_000.0
 SKEW_SD = 50e-6
@@ -62,6 +64,11 @@ class EchoFit:
     def last_ns(self) -> int | None:
         """Host time of the last echo; None before the first."""
         return self._echoes[-1].middle_ns if self._echoes else None
+
+    def expects_more(self, now_ns: int) -> bool:
+        """Tell whether the burst goes on: no worse estimate need be believed meanwhile."""
+        last_ns = self.last_ns
+        return not self.settled and last_ns is not None and now_ns - last_ns < BURST_GAP_NS
 
     @property
     def skew_sigma(self) -> float:
