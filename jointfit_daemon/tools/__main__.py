@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from jointfit_daemon import __version__
-from jointfit_daemon.tools import calibrate, check, decode, demo, report, schema
+from jointfit_daemon.tools import calibrate, center, check, decode, demo, report, schema
 
 app = typer.Typer(
     name="jointfit",
@@ -17,6 +17,7 @@ app = typer.Typer(
 app.command(name="check")(check.check)
 app.command(name="demo")(demo.demo)
 app.command(name="calibrate")(calibrate.calibrate)
+app.command(name="center")(center.center)
 app.command(name="decode")(decode.decode)
 app.command(name="report")(report.report)
 app.command(name="schema")(schema.schema)

@@ -1,0 +1,124 @@
+"""Joint centers that musculoskeletal models have in real trials, by OpenSim.
+
+Law: the judge is independent: its model was scaled by others and follows markers by inverse
+kinematics; it shares no code with the estimators. It is no truth either: a model's hip comes from a
+regression or a scaling factor, and its joints follow skin markers.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from contextlib import chdir, contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.files.marker_trial import read_marker_trial
+from jointfit_daemon.files.npz import vectors_z_up
+from jointfit_daemon.files.sto import TimeTable, read_sto
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.files.marker_trial import MarkerTrial
+
+_EVERY = {"squats1": 5, "STS1": 5}
+"""Model poses computed: every so many frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelTrial:
+    """A marker trial and where a model has its joints in it."""
+
+    markers: MarkerTrial
+    frames: NDArray[np.int64]
+    """Frames of `markers` that the model was fitted to."""
+    centers: dict[str, NDArray[np.float64]]
+    """By joint of the model, m, world z up, shape (len(frames), 3)."""
+
+
+@cache
+def opencap(data: Path, trial: str) -> ModelTrial:
+    """Return a trial of OpenCap's subject 4 with the manually scaled model."""
+    folder = data / "opencap_subject4"
+    motion = folder / "ik" / f"{trial}_manual_scaling_ik.mot"
+    model = folder / "models" / "manually_scaled.osim"
+    markers = read_marker_trial(folder / "trc" / f"{trial}.trc")
+    joints = ("hip_r", "hip_l", "walker_knee_r", "walker_knee_l")
+    return _followed(markers, model, motion, joints, _EVERY.get(trial, 1))
+
+
+@cache
+def gait2354(data: Path) -> ModelTrial:
+    """Return the walk of OpenSim's gait2354, after its own inverse kinematics, 0.4 to 1.6 s."""
+    import opensim  # noqa: PLC0415 - optional, and slow to import
+
+    source = data / "opensim_gait2354"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(shutil.copytree(source, Path(name) / "gait"))
+        for path in (folder, *folder.iterdir()):
+            path.chmod(0o755)
+        with chdir(folder), _quiet():
+            opensim.Logger.setLevelString("off")
+            opensim.InverseKinematicsTool("subject01_Setup_IK.xml").run()
+            motion = next(path for path in folder.glob("*.mot") if "ik" in path.name.lower())
+        markers = read_marker_trial(folder / "subject01_walk1.trc")
+        joints = ("hip_r", "hip_l", "knee_r", "knee_l")
+        return _followed(markers, folder / "subject01_simbody.osim", motion, joints, 1)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the descriptor of standard output from what C++ prints: tables go there."""
+    sys.stdout.flush()
+    kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(sink)
+
+
+def _followed(
+    markers: MarkerTrial, model: Path, motion: Path, joints: tuple[str, ...], every: int
+) -> ModelTrial:
+    table = read_sto(motion)
+    rate = markers.trajectories.rate_hz
+    first = markers.trajectories.t_s[0]
+    frames = np.rint((table.t_s - first) * rate).astype(np.int64)[::every]
+    return ModelTrial(markers, frames, _positions(model, table, every, joints))
+
+
+def _positions(
+    path: Path, table: TimeTable, every: int, joints: tuple[str, ...]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the origin of every joint's child frame in every pose; z up."""
+    import opensim  # noqa: PLC0415 - optional, and slow to import
+
+    opensim.Logger.setLevelString("off")
+    model: Any = opensim.Model(os.fspath(path))
+    state = model.initSystem()
+    coordinates = model.getCoordinateSet()
+    found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in joints}
+    turns = {c.getName(): c.getMotionType() == opensim.Coordinate.Rotational for c in coordinates}
+    scale = [np.pi / 180.0 if table.in_degrees and turns.get(c) else 1.0 for c in table.columns]
+    for row in table.values[::every] * scale:
+        for name, value in zip(table.columns, row, strict=True):
+            if name in turns:
+                coordinates.get(name).setValue(state, float(value), False)
+        model.assemble(state)
+        model.realizePosition(state)
+        for name in joints:
+            child = model.getJointSet().get(name).getChildFrame()
+            found[name].append(child.getPositionInGround(state).to_numpy())
+    return {name: vectors_z_up(np.array(rows)) for name, rows in found.items()}

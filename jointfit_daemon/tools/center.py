@@ -1,0 +1,136 @@
+"""`jointfit center`: the center of rotation of a joint from a marker trial, C3D or TRC."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
+    from jointfit_daemon.tools.center_trial import Answer, Reduced
+
+MISUSE = 2
+REFUSED = 1
+
+
+def center(
+    trial: Annotated[Path, typer.Argument(help="Marker trial, .c3d or .trc.")],
+    *,
+    parent: Annotated[
+        str, typer.Option("--parent", help="Markers of the parent, M1,M2,M3: 3, or 2 with --plane.")
+    ],
+    markers: Annotated[str, typer.Option("--markers", help="Markers of the child: M4,M5,...")],
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method",
+            help="sphere, score, sara, halvorsen, ...; with --plane hyper, pratt, taubin, kasa, "
+            "geometric, ...; auto chooses.",
+        ),
+    ] = "auto",
+    plane: Annotated[
+        str | None,
+        typer.Option("--plane", help="The movement is in a plane: the file's axis across it."),
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option("--window", min=0.05, help="One answer every so many seconds.")
+    ] = None,
+    up: Annotated[
+        str | None, typer.Option("--up", help="The file's axis that is up, if it does not say.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")] = False,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw markers and center: .png, .svg or .pdf.")
+    ] = None,
+) -> None:
+    """Find where a joint turns, and how far off that may be.
+
+    The parent's markers give the coordinates; the child's move about the center. Ends with 1 where
+    every answer had to be refused.
+    """
+    from jointfit_daemon.files.c3d import PackageMissing
+    from jointfit_daemon.tools.plotting import PlotMissing
+
+    try:
+        _check_axes(plane=plane, up=up)
+        asked = _names(parent), _names(markers)
+        read, reduced, found = _found(
+            trial, asked, method=method, plane=plane, window=window, up=up
+        )
+        _print(read, asked, reduced, found, as_table=window is not None, as_json=json)
+        if plot is not None:
+            _draw(plot, trial, reduced, asked[1], found)
+    except (OSError, ValueError, PackageMissing, PlotMissing) as fault:
+        why = f"{fault.filename}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
+        typer.echo(f"jointfit center: {why}", err=True)
+        raise typer.Exit(MISUSE) from None
+    if all(answer.estimate.refused for answer in found):
+        raise typer.Exit(REFUSED)
+
+
+def _check_axes(**axes: str | None) -> None:
+    for name, axis in axes.items():
+        if axis is not None and axis not in ("x", "y", "z"):
+            raise ValueError(f"--{name} is {axis!r}, expected x, y or z")
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    return list(dict.fromkeys(names))
+
+
+def _found(
+    path: Path,
+    asked: tuple[list[str], list[str]],
+    *,
+    method: str,
+    plane: str | None,
+    window: float | None,
+    up: str | None,
+) -> tuple[MarkerTrial, Reduced, list[Answer]]:
+    from typing import cast
+
+    from jointfit_daemon.files.marker_trial import read_marker_trial
+    from jointfit_daemon.tools.center_trial import answers, reduce
+
+    trial = read_marker_trial(path, cast("Axis | None", up))
+    trial.points([*asked[0], *asked[1]])  # all unknown names at once, whoever's they are
+    reduced = reduce(trial, *asked, cast("Axis | None", plane))
+    return trial, reduced, list(answers(trial, reduced, method, window))
+
+
+def _print(
+    trial: MarkerTrial,
+    asked: tuple[list[str], list[str]],
+    reduced: Reduced,
+    found: Sequence[Answer],
+    *,
+    as_table: bool,
+    as_json: bool,
+) -> None:
+    from jointfit_daemon.tools import center_report
+
+    if as_json:
+        import orjson
+
+        typer.echo(orjson.dumps(center_report.as_json(trial, *asked, reduced, found)))
+        return
+    typer.echo(center_report.head(trial, *asked, reduced))
+    if as_table:
+        typer.echo(f"method    {found[0].estimate.method}\n")
+        typer.echo(center_report.windows(found))
+    else:
+        typer.echo(center_report.details(found[0]))
+
+
+def _draw(
+    plot: Path, trial: Path, reduced: Reduced, markers: Sequence[str], found: Sequence[Answer]
+) -> None:
+    from jointfit_daemon.tools.center_plot import draw_center
+
+    draw_center(plot, reduced, markers, found, f"{trial.name}: {found[0].estimate.method}")
+    typer.echo(f"wrote {plot}", err=True)

@@ -1,0 +1,77 @@
+"""Markers in the parent's coordinates with the center they turn about, seen from three sides.
+
+Law: equal scales, so that a circle is a circle; the 95 % ellipse is drawn as it is, never enlarged.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.tools.center_trial import CHI2_95
+from jointfit_daemon.tools.plotting import new_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.tools.center_trial import Answer, Reduced
+
+_MM = 1000.0
+_MOST_POINTS = 600
+
+
+def draw_center(
+    path: Path, reduced: Reduced, markers: Sequence[str], found: Sequence[Answer], title: str
+) -> None:
+    """Write one figure; its format is the ending of the name."""
+    points = reduced.movement.points
+    if points is None:
+        return
+    sides = ((0, 1),) if points.shape[-1] == len("xy") else ((0, 1), (1, 2), (0, 2))
+    figure = new_figure(4.8 * len(sides) + 1.6, 5.2)
+    figure.suptitle(title)
+    for axes, side in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides, strict=True):
+        _side(axes, points, markers, found, side)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+def _side(
+    axes: Any,
+    points: NDArray[np.float64],
+    markers: Sequence[str],
+    found: Sequence[Answer],
+    side: tuple[int, int],
+) -> None:
+    step = max(1, len(points) // _MOST_POINTS)
+    for k, name in enumerate(markers):
+        x, y = _MM * points[::step, k, side[0]], _MM * points[::step, k, side[1]]
+        axes.plot(x, y, ".", markersize=2.5, label=name)
+    for number, answer in enumerate(found):
+        _center(axes, answer, side, labelled=number == 0)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(f"{'xyz'[side[0]]} of the parent, mm")
+    axes.set_ylabel(f"{'xyz'[side[1]]} of the parent, mm")
+    axes.grid(alpha=0.3)
+
+
+def _center(axes: Any, answer: Answer, side: tuple[int, int], *, labelled: bool) -> None:
+    e = answer.estimate
+    if not np.isfinite(e.center).all():
+        return
+    at = _MM * e.center[list(side)]
+    refused = e.refused is not None
+    label = ("center, refused" if refused else "center, 95 % ellipse") if labelled else None
+    axes.plot(*at, "kx" if refused else "k+", markersize=9, label=label)
+    if refused:
+        return
+    values, vectors = np.linalg.eigh(e.covariance[np.ix_(side, side)])
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    lengths = _MM * np.sqrt(CHI2_95[2] * np.maximum(values, 0.0))
+    outline = vectors @ (lengths[:, None] * np.stack((np.cos(turn), np.sin(turn))))
+    axes.plot(at[0] + outline[0], at[1] + outline[1], "k-", linewidth=0.8)
