@@ -7,7 +7,6 @@ null). UNIX time appears here and nowhere deeper.
 from __future__ import annotations
 
 import math
-import time
 from typing import TYPE_CHECKING, Any
 
 import orjson
@@ -20,32 +19,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import JointState, LimbState, SegmentState
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_NON_STR_KEYS
-_NS_PER_US, _NS_PER_MS, _NS_PER_S = 1_000, 1_000_000, 1_000_000_000
-
-
-class UnixClock:
-    """The offset from CLOCK_MONOTONIC to UNIX time, measured at most once a second.
-
-    Between measurements stamps keep their spacing; a step of the system's clock is followed
-    within a second.
-    """
-
-    def __init__(self) -> None:
-        self._offset_ns = 0
-        self._until_ns = -1
-
-    def offset_ns(self) -> int:
-        """Return what to add to a monotonic stamp to get UNIX time."""
-        now_ns = time.monotonic_ns()
-        if now_ns >= self._until_ns:
-            self._offset_ns = min(_offset() for _ in range(3))  # least delay between the two reads
-            self._until_ns = now_ns + _NS_PER_S
-        return self._offset_ns
-
-
-def _offset() -> int:
-    before_ns = time.monotonic_ns()
-    return time.time_ns() - before_ns
+_NS_PER_US, _NS_PER_MS = 1_000, 1_000_000
 
 
 def encode(payload: Mapping[str, Any]) -> bytes:
@@ -71,6 +45,7 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
             "seq": state.seq,
             "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
             "completed_us": (state.completed_ns + offset_ns) // _NS_PER_US,
+            "mono_us": state.t_ns // _NS_PER_US,
             "age_ms": round((now_ns - state.t_ns) / _NS_PER_MS, 2),
             "mode": state.mode,
             "sync": state.sync,

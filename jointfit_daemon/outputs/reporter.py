@@ -158,8 +158,10 @@ class Reporter:
         """Return UNIX minus monotonic time; tell of a step first."""
         offset_ns, step_ns = self._clock.offset_ns(), self._clock.take_step_ns()
         if step_ns:
-            way, step_s = "forward" if step_ns > 0 else "back", step_ns / _NS_PER_S
-            text = f"UNIX time was set {way} by {abs(step_s):.3f} s"
+            step_s = step_ns / _NS_PER_S
+            text = f"UNIX time was set back by {-step_s:.3f} s"
+            if step_s > 0:  # in suspend CLOCK_MONOTONIC stands still
+                text = f"UNIX time was set forward by {step_s:.3f} s, or the host slept so long"
             log.warning("%s", text)
             now_ns = time.monotonic_ns()
             self.event(Notice(now_ns, "clock", "host", text, "warning", {"step_s": step_s}))
