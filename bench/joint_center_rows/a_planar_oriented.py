@@ -41,17 +41,18 @@ def angle_error(kind: Kind, size: float, rng: np.random.Generator) -> Array:
     """Return errors of the angle, RMS `size`, shape (FRAMES,)."""
     n = FRAMES
     if kind == "white":
-        return size * rng.normal(size=n)
+        return np.asarray(size * rng.normal(size=n))
     if kind == "slow":
         phase = 2.0 * np.pi * rng.random() + np.linspace(0.0, 2.0 * np.pi, n) * rng.uniform(
             0.3, 1.5
         )
         return np.asarray(size * np.sqrt(2.0) * np.sin(phase))
     if kind == "gain":
-        return size * np.sqrt(12.0) * rng.normal() * np.linspace(-0.5, 0.5, n)
+        scale = float(size * np.sqrt(12.0) * rng.normal())
+        return np.asarray(scale * np.linspace(-0.5, 0.5, n))
     t = np.linspace(0.0, SECONDS, n)
-    L = np.linalg.cholesky(np.exp(-np.abs(t[:, None] - t)) + 1e-12 * np.eye(n))  # noqa: N806
-    return np.asarray(size * (L @ rng.normal(size=n)))
+    root = np.linalg.cholesky(np.exp(-np.abs(t[:, None] - t)) + 1e-12 * np.eye(n))
+    return np.asarray(size * (root @ rng.normal(size=n)))
 
 
 @cache

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.circle import fit_circles
-from jointfit_daemon.calibration.center.moments import ellipse_scale
+from jointfit_daemon.calibration.center.moments import ellipse_scale, seen_places
 from jointfit_daemon.calibration.center.planar_estimate import (
     Limits,
     arc_about,
@@ -64,7 +64,7 @@ def geometric_estimate(
     """
     p = np.asarray(points, dtype=np.float64)
     p = p[:, None, :] if p.ndim == 2 else p
-    seen = np.asarray(np.isfinite(p).all(axis=-1))
+    seen = seen_places(p)
     frames = int(seen.any(axis=1).sum())
     begin = _begin(p) if start is None else np.asarray(start, dtype=np.float64)
     if seen.sum() < 2 + p.shape[1] + 1 or begin is None:

@@ -22,6 +22,8 @@ Number = TypeVar("Number", float, Array)
 GATE = 6.0
 """T from which on a center is published: its error is within 15 % of the bound there."""
 LOG_20 = log(20.0)
+FARTHEST_M = 1e4
+"""Coordinates beyond are no measurement: "not seen", like NaN."""
 ROUNDING = 1e-13
 """Share of the points' own variance below which a difference of moments is rounding."""
 
@@ -62,6 +64,11 @@ class Judged(NamedTuple, Generic[Number]):
     """Its larger eigenvalue, m²; not above zero where the noise hides the arc."""
 
 
+def seen_places(points: Array) -> NDArray[np.bool_]:
+    """Say which of the points, shape (..., 2), are measurements at all, shape (...)."""
+    return np.asarray((np.abs(points) < FARTHEST_M).all(axis=-1))
+
+
 def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMoments[Array]:
     """Return the moments of any number of point sets.
 
@@ -78,7 +85,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
         Arrays of shape (...); zeros where nothing was seen.
     """
     p = np.asarray(points, dtype=np.float64)
-    seen = np.asarray(np.isfinite(p).all(axis=-1))
+    seen = seen_places(p)
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     p = np.where(seen[..., None], p, 0.0)
     total = w.sum(axis=-1)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.circle import Circles, fit_circles
-from jointfit_daemon.calibration.center.moments import GATE
+from jointfit_daemon.calibration.center.moments import GATE, seen_places
 from jointfit_daemon.calibration.center.planar_estimate import (
     Limits,
     arc_about,
@@ -134,6 +134,8 @@ def oriented_estimate(
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
     Sigma = (noise or AngleNoise()).covariance(times, _smooth(x, theta))
     aided = _solve(x, theta, sigma, Sigma, near)
+    if aided is None and alone.refused is None:
+        return replace(_path_alone(x, allowed), flags=("orientation_inconsistent",))
     if aided is None:
         reason = "path and angles do not fit one center: check the axis, or move the joint further"
         return nothing(METHOD, (0.0, 0.0), len(x), reason)
@@ -178,7 +180,7 @@ def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array,
     """Drop what was not seen; average to at most `MAX_FRAMES`."""
     x = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     theta = np.asarray(angles, dtype=np.float64).ravel()
-    seen = np.asarray(np.isfinite(x).all(axis=-1) & np.isfinite(theta))
+    seen = seen_places(x) & np.isfinite(theta)
     times = np.asarray(interval * np.flatnonzero(seen), dtype=np.float64)
     x, theta = x[seen], np.asarray(np.unwrap(theta[seen]), dtype=np.float64)
     if len(x) <= MAX_FRAMES:
@@ -188,6 +190,10 @@ def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array,
     averaged: Array = np.add.reduceat(np.column_stack((x, theta, times)), parts, axis=0)
     averaged = averaged / count[:, None]
     return averaged[:, :2], averaged[:, 2], averaged[:, 3]
+
+
+def _path_alone(x: Array, limits: Limits) -> CenterEstimate:
+    return replace(circle_estimate(x, limits=limits), method=METHOD)
 
 
 def _smooth(x: Array, theta: Array) -> Array:

@@ -27,6 +27,7 @@ from jointfit_daemon.calibration.center.moments import (
     ellipse_scale,
     judge,
     moments_of_one,
+    seen_places,
 )
 from jointfit_daemon.calibration.center.result import CenterEstimate
 
@@ -81,7 +82,7 @@ def circle_estimate(
         The same, to rounding, as a `RunningCircle` fed with these points gives.
     """
     p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    seen = np.asarray(np.isfinite(p).all(axis=-1))
+    seen = seen_places(p)
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     x = p if seen.all() else np.where(seen[:, None], p, 0.0)
     empty = CircleMoments(*(0.0,) * 10)
@@ -216,8 +217,6 @@ def _no_circle(m: CircleMoments[float], frames: int) -> str | None:
     spread = m.xx + m.yy
     if frames == 0:
         return "the marker was never seen: check its name, the cameras and what covers it"
-    if not isfinite(m.zz):
-        return "a coordinate is absurdly large: check the units and the marker's name"
     if frames < 4 or m.effective <= 3.0:
         return f"{frames} usable frames, at least 4 are needed: record for longer"
     if spread < STILL_M**2:

@@ -8,13 +8,18 @@ more than the arithmetic.
 from __future__ import annotations
 
 from collections import deque
-from math import inf, isfinite, sqrt
+from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_daemon.calibration.center.circle import Method, circle_from_root, smallest_root
-from jointfit_daemon.calibration.center.moments import ROUNDING, CircleMoments, sum_of_squares
+from jointfit_daemon.calibration.center.moments import (
+    FARTHEST_M,
+    ROUNDING,
+    CircleMoments,
+    sum_of_squares,
+)
 from jointfit_daemon.calibration.center.planar_estimate import Limits, publish
 
 if TYPE_CHECKING:
@@ -88,7 +93,7 @@ class RunningCircle:
 
         So is a weight that is not above zero.
         """
-        if not (isfinite(x) and isfinite(y) and 0.0 < weight < inf):
+        if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
             self._pass()
             return
         if self._origin is None:
@@ -132,6 +137,7 @@ class RunningCircle:
         mu = self._forgetting
         if mu < 1.0:
             self._sums = _scaled(self._sums, mu)
+            self._lagged = _scaled(self._lagged, mu * mu)
             self._squares *= mu * mu
         self._before = (0.0, 0.0, 0.0)
         if self._window is not None and self._kept and self._kept[-1][2] > 0.0:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jointfit_daemon.calibration.center.error_prediction import triangle_error
+from jointfit_daemon.calibration.center.moments import seen_places
 from jointfit_daemon.calibration.center.planar_reduction import in_segment_plane
 from jointfit_daemon.calibration.center.result import CenterEstimate
 
@@ -76,7 +77,7 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
         on a line, not seen, or closer to a line than the noise.
     """
     p = np.asarray(points, dtype=np.float64)
-    if not np.isfinite(p).all():
+    if not seen_places(p).all():
         return _refusal(p, noise, "a marker is not seen in one of the frames: choose other frames")
     center = three_frame_center(p)
     if not np.isfinite(center).all():
@@ -108,7 +109,7 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
 
 
 def _refusal(points: Array, noise: float, reason: str) -> CenterEstimate:
-    seen = points[np.isfinite(points).all(axis=-1)]
+    seen = points[seen_places(points)]
     return CenterEstimate(
         method="three_frames",
         center=seen.mean(axis=0) if len(seen) else np.zeros(2),

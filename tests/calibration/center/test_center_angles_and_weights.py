@@ -1,0 +1,149 @@
+"""Measured angles help and cannot ruin; least distance bears outliers and joins markers."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jointfit_daemon.calibration.center.circle import fit_circles
+from jointfit_daemon.calibration.center.geometric import combine, geometric_estimate
+from jointfit_daemon.calibration.center.oriented import AngleNoise, guarded, oriented_estimate
+from jointfit_daemon.calibration.center.planar_estimate import Limits, circle_estimate
+
+WIDE = Limits(0.0, (0.0, inf), 0.0, inf)
+values = st.one_of(st.floats(-1.0, 1.0), st.just(nan), st.just(0.0))
+
+
+def arc(degrees, n=100, seed=0, at=0.0, noise=0.002):
+    rng = np.random.default_rng(seed)
+    t = np.linspace(-0.5, 0.5, n) * np.deg2rad(degrees)
+    p = 0.3 * np.stack((np.cos(t + at), np.sin(t + at)), axis=-1)
+    return p + rng.normal(0.0, noise, p.shape), t
+
+
+def rms(centers):
+    return float(np.sqrt((np.array(centers) ** 2).sum(axis=1).mean()))
+
+
+def test_angles_halve_the_error_of_a_short_arc():
+    rng, aided, alone = np.random.default_rng(0), [], []
+    for seed in range(60):
+        p, t = arc(20.0, seed=seed)
+        measured = t + np.deg2rad(1.0) * rng.normal(size=100)
+        aided.append(oriented_estimate(p, measured, 0.02, limits=WIDE).center)
+        alone.append(circle_estimate(p, limits=WIDE).center)
+    assert rms(aided) < 0.65 * rms(alone)
+
+
+def test_angles_of_another_limb_do_little_harm():
+    aided, alone, flagged = [], [], 0
+    for seed in range(60):
+        p, t = arc(60.0, seed=seed)
+        found = oriented_estimate(p, 1.6 * t, 0.02, limits=WIDE)
+        aided.append(found.center)
+        alone.append(circle_estimate(p, limits=WIDE).center)
+        flagged += "orientation_inconsistent" in found.flags
+    assert rms(aided) < 1.25 * rms(alone)
+    assert flagged > 50
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+@settings(max_examples=40, deadline=None)
+def test_an_answer_never_leaves_the_circle_by_more_than_its_guard_allows(x, y):
+    circle = fit_circles(arc(90.0)[0])
+    held, covariance, _ = guarded(np.array([x, y]), circle.covariance * 0.1, circle)
+    away = held - circle.center
+    apart = np.linalg.inv(0.9 * circle.covariance)
+    assert away @ apart @ away <= (0.7 * 1.05) ** 2
+    assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+
+
+def test_more_frames_than_needed_are_averaged():
+    p, t = arc(60.0, n=1500)
+    found = oriented_estimate(p, t, 0.01)
+    assert found.refused is None
+    assert np.linalg.norm(found.center) < 0.005
+
+
+def test_a_place_that_is_known_pulls():
+    p, t = arc(20.0, seed=3)
+    near = (np.zeros(2), 0.005)
+    found = oriented_estimate(p, t, 0.02, near=near, limits=WIDE)
+    far = oriented_estimate(p, t, 0.02, limits=WIDE)
+    assert np.linalg.norm(found.center) < 0.02
+    assert found.sd < far.sd
+
+
+def test_what_the_angles_may_be_wrong_by_is_the_callers():
+    p, t = arc(30.0, seed=1)
+    t = t + 0.05 * np.random.default_rng(0).normal(size=100)
+    sure = oriented_estimate(p, t, 0.02, noise=AngleNoise(0.001, 1.0, 0.06, 0.001), limits=WIDE)
+    unsure = oriented_estimate(p, t, 0.02, noise=AngleNoise(0.2, 1.0, 0.2, 0.5), limits=WIDE)
+    assert sure.sd < unsure.sd
+
+
+@pytest.mark.parametrize(
+    ("points", "angles", "cause"),
+    [
+        (np.full((50, 2), nan), np.linspace(0, 1, 50), "0 frames"),
+        (np.ones((50, 2)), np.linspace(0, 1, 50), "no motion"),
+        (arc(60.0)[0], np.zeros(100), "turned 0°"),
+        (arc(60.0)[0], np.full(100, nan), "0 frames"),
+    ],
+)
+def test_angles_without_a_movement_are_refused(points, angles, cause):
+    found = oriented_estimate(points, angles, 0.01)
+    assert found.refused is not None
+    assert cause in found.refused
+    assert ":" in found.refused
+
+
+@given(
+    st.lists(st.tuples(values, values, st.floats(-4.0, 4.0)), max_size=30),
+)
+@settings(deadline=None, max_examples=60)
+def test_any_input_gives_a_finite_center_or_a_reason(rows):
+    data = np.reshape(rows, (-1, 3))
+    aided = oriented_estimate(data[:, :2], data[:, 2], 0.01)
+    for found in (aided, geometric_estimate(data[:, :2])):
+        assert np.isfinite(found.center).all()
+        assert np.isfinite(found.covariance).all()
+        if found.refused is not None:
+            assert ":" in found.refused or ";" in found.refused
+
+
+def test_least_distance_is_hyper_on_clean_points_and_bears_outliers():
+    p, _ = arc(90.0)
+    plain = circle_estimate(p)
+    found = geometric_estimate(p, robust=False)
+    assert found.center == pytest.approx(plain.center, abs=2e-4)
+    assert found.sd == pytest.approx(plain.sd, rel=0.1)
+    p[::10] += (0.04, 0.02)
+    assert np.linalg.norm(geometric_estimate(p).center) < 0.006
+    assert np.linalg.norm(circle_estimate(p).center) > 0.01
+
+
+def test_a_known_radius_makes_a_short_arc_enough():
+    p, _ = arc(15.0, seed=2)
+    found = geometric_estimate(p, radii=[0.3], robust=False, start=(0.02, 0.0))
+    assert np.linalg.norm(found.center) < 0.008
+    assert found.sd < 0.005
+    assert found.refused is None
+
+
+def test_markers_round_the_joint_share_their_center():
+    each = [arc(20.0, seed=k, at=a)[0] for k, a in enumerate((0.0, 0.25, -0.3, 0.6))]
+    together = geometric_estimate(np.stack(each, axis=1), robust=False)
+    joined, C = combine([circle_estimate(p, limits=WIDE) for p in each])
+    assert np.linalg.norm(together.center) < 0.01
+    assert np.linalg.norm(joined) < 0.012
+    assert np.sqrt(np.trace(C)) == pytest.approx(together.sd, rel=0.3)
+
+
+def test_nothing_cannot_be_combined():
+    with pytest.raises(ValueError, match="nothing"):
+        combine([circle_estimate(np.ones((9, 2)))])
