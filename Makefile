@@ -40,6 +40,7 @@ imports: $(STAMP)  ## who may import whom
 
 bench: $(STAMP)  ## measure speed and accuracy; fails where a floor is missed
 	@$(BIN)/python bench/accuracy.py
+	@$(BIN)/python bench/joint_center.py
 	@$(BIN)/python bench/speed.py $(ARGS)
 
 docs: $(STAMP)  ## the documentation as a site, warnings are errors
