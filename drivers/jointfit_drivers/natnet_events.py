@@ -16,6 +16,7 @@ from jointfit_drivers.natnet_continuity import Continuity
 from jointfit_drivers.natnet_names import bind
 from jointfit_drivers.natnet_poses import Poses
 from jointfit_drivers.natnet_terms import bitstream_response, same_instance
+from jointfit_drivers.natnet_time import FrameTime
 from jointfit_protocols.corrupt import Corrupt as WireCorrupt
 from jointfit_protocols.natnet_frame import (
     FRAME_BITSTREAM_CHANGED,
@@ -68,6 +69,7 @@ class NatNetEvents:
     def __init__(self, settings: NatNetSettings) -> None:
         self._wanted_version = settings.wanted_version
         self._latency_ms = settings.latency_ms
+        self._time = FrameTime(settings)
         self._wanted_markers = {
             name: f"markers.{part}" for part, names in settings.markers.items() for name in names
         }
@@ -99,7 +101,12 @@ class NatNetEvents:
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """The server's high-resolution counter, once the server has said its frequency."""
+        """The server's high-resolution counter, once the server has said its frequency.
+
+        UNIX time where cameras on PTP stamp the frames.
+        """
+        if self._time.precise:
+            return self._time.tick_clock
         hz = self._info.clock_hz if self._info is not None else None
         return TickClock(0, None, hz) if hz else None
 
@@ -216,7 +223,7 @@ class NatNetEvents:
     def _echo(self, chunk: Chunk, message: Message) -> list[Decoded]:
         stamp, ticks = cast("EchoResponse", message)
         sent_ns = self._asked.pop(stamp, stamp)
-        if not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
+        if self._time.precise or not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
             return []
         return [ClockEcho(sent_ns, chunk.t_ns, ticks)]
 
@@ -237,6 +244,7 @@ class NatNetEvents:
         if binding is None:
             self.unpublished += 1
             return out
+        self._time.tell_timecode(frame, out)
         found = self._poses.columns(frame, binding)
         if found.suspicious or found.unknown:
             out += self._doubts(found.suspicious, found.unknown)
@@ -244,7 +252,7 @@ class NatNetEvents:
             MocapFrame(
                 chunk.t_ns,
                 frame.number,
-                frame.exposure or self._exposure(frame, out),
+                self._instant(frame, out),
                 binding.layout,
                 found.markers,
                 found.body_positions,
@@ -253,6 +261,12 @@ class NatNetEvents:
             )
         )
         return out
+
+    def _instant(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
+        """Return when the frame was exposed, in ticks of the clock that counts."""
+        if self._time.precise:
+            return self._time.unix_ns(frame, out)
+        return frame.exposure or self._exposure(frame, out)
 
     def _exposure(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
         """Return the exposure as configured, where the cameras do not stamp it."""

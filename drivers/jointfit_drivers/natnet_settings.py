@@ -34,6 +34,15 @@ class NatNetSettings(MocapSettings):
         le=1000,
         description="from exposure to transmission, for cameras without exposure stamp (USB), ms",
     )
+    time: Literal["server", "ptp", "utc"] = Field(
+        "server",
+        description="clock of the frames: the `server`'s own counter, asked by echoes; or the "
+        "precision timestamp of cameras on PTP (bitstream 4.1), where PTP keeps this host's clock, "
+        "too: `ptp` counts as PTP does (TAI), `utc` as UNIX time does",
+    )
+    tai_minus_utc_s: int = Field(
+        37, ge=0, le=100, description="leap seconds by which PTP time is ahead of UTC"
+    )
     silence_s: float = Field(5.0, gt=0, description="no frame for this long is a lost server, s")
 
     @property
