@@ -25,14 +25,15 @@ from jointfit_daemon.timing.device_time import ArrivalTime, CounterTime, TickTim
 from jointfit_daemon.timing.direct import PulseTie, declared
 from jointfit_daemon.timing.echo_clock import STALE_NS, EchoFit
 from jointfit_daemon.timing.envelope import CRYSTAL, NOMINAL_RATE, Envelope
-from jointfit_daemon.timing.lateness import Lateness
-from jointfit_daemon.timing.stamps import STEP_NS, Estimate, Stamp, StampLine
+from jointfit_daemon.timing.lateness import LATE_NS, Lateness
+from jointfit_daemon.timing.stamps import STEP_NS, Stamp, StampLine
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import ClockEcho, TickClock
     from jointfit_daemon.timing.clock_news import ClockNews
     from jointfit_daemon.timing.device_time import DeviceTime
     from jointfit_daemon.timing.direct import Direct, HostTime
+    from jointfit_daemon.timing.stamps import Estimate
 
 __all__ = ["DeviceClock", "Stamp"]
 
@@ -275,6 +276,8 @@ class DeviceClock:
         """Return the reader of the best time on offer; None for a sample without the usual one."""
         if ticks is not None and tick_clock is not None:
             self._absent = 0
+            if tick_clock is self._tick_clock and self._kind == _TICKS and self._reader is not None:
+                return self._reader
             return self._ticks_reader(tick_clock)
         kind = _ARRIVAL if counter is None else _COUNTER
         reader = self._reader
@@ -318,7 +321,8 @@ class DeviceClock:
             # What came before was merely late, by seconds perhaps (stale bytes): no use for a fit.
             self._envelope = Envelope(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
             return None
-        if not envelope.settled:
+        if excess < LATE_NS or not envelope.settled:
+            self._lateness.on_time()
             return None
         return self._lateness.feed(excess, envelope.sigma_ns(u), arrival_ns)
 
@@ -331,12 +335,10 @@ class DeviceClock:
         target, skew, settled, sigma, delay = estimate
         jitter = self.jitter_ns
         self.jitter_ns = delay if jitter is None else jitter + _JITTER_GAIN * (delay - jitter)
-        line, slew = self._line, self._synced
-        if slew and (step := line.step_ns(u, target, skew)):
+        t, step = self._line.stamp(u, target, skew, slew=self._synced)
+        if step:
             self.epoch += 1
             self.news.append(clock_news.moved(step))
-            slew = False
-        t = line.stamp(u, target, skew, slew=slew)
         # a stamp held back by those before it has yet to catch up with what is known by now
         self._synced = settled = settled and (self._synced or t - target < CAUGHT_UP_NS)
         self.sigma_ns = sigma = sigma + abs(t - target)
@@ -351,13 +353,13 @@ class DeviceClock:
         if echo is not None and echo.settled:
             target = echo.host_ns(u)
             delay, sigma = float(arrival_ns - target), echo.sigma_ns(target)
-            return Estimate(target, -echo.slope, True, sigma, delay)
+            return target, -echo.slope, True, sigma, delay
         delay = abs(envelope.feed(u, arrival_ns - u))
         target, sigma = u + envelope.offset_ns(u) - self.latency_ns, envelope.sigma_ns(u)
         if self._kind == _ARRIVAL:
             sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
-        settled = envelope.settled and not (echo is not None and echo.expects_more(arrival_ns))
-        return Estimate(target, envelope.skew, settled, sigma, delay)
+        settled = envelope.settled and (echo is None or not echo.expects_more(arrival_ns))
+        return target, envelope.skew, settled, sigma, delay
 
     def _directed(self, u: int, estimate: Estimate, direct: Direct) -> Estimate:
         """Return what `direct` says, unless `estimate` contradicts it."""
@@ -365,13 +367,13 @@ class DeviceClock:
         if not self._state_direct:
             return estimate
         target = direct.host_ns(u)
-        slack = MARGIN_NS + _PRIOR_SIGMAS * (estimate.sigma + self.latency_sd_ns)
-        slack += self.bound_ns or 0.0
-        if estimate.settled and abs(target - estimate.target) > slack:
-            self.news.append(clock_news.contradicted(target, estimate.target))
+        estimated, _, settled, sigma, delay = estimate
+        slack = MARGIN_NS + _PRIOR_SIGMAS * (sigma + self.latency_sd_ns) + (self.bound_ns or 0.0)
+        if settled and abs(target - estimated) > slack:
+            self.news.append(clock_news.contradicted(target, estimated))
             self._direct, self._refused, self._state_direct = None, True, False
             return estimate
-        return Estimate(target, direct.slope, True, direct.sigma_at(u), estimate.delay)
+        return target, direct.slope, True, direct.sigma_at(u), delay
 
     def _look(self) -> None:
         """Tell once of a skew that no clock has."""

@@ -1,6 +1,6 @@
 """The line under the fastest samples: device clock to host clock without asking the device.
 
-Law: pure, integers in, constant memory, constant time a sample (a refit a second).
+Law: pure, integers in, constant memory, constant time a sample (a refit now and then).
 
 With device time u and arrival A the difference ``y = A - u = c + s u + D`` has a delay
 ``D >= D_min`` of unknown shape. The line wanted passes below every point and as close as it can:
@@ -11,7 +11,7 @@ leaves it unbiased but for D_min, which nobody can see from one side.
 from __future__ import annotations
 
 from collections import deque
-from math import hypot, inf, sqrt
+from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.timing.feasible import mean_feasible_line
@@ -24,7 +24,7 @@ BUCKET_NS = 250_000_000
 BUCKETS = 240
 """One minute: long against jitter, short against the temperature of a crystal."""
 YOUNG_NS = 10_000_000_000
-"""Until this span every bucket is worth a refit; later one a second is."""
+"""Until this span every bucket is worth a refit; later one in two seconds is."""
 SETTLED_NS = 2_000_000_000
 SETTLED_POINTS = 10
 FLOOR_NS = 10_000.0
@@ -34,7 +34,8 @@ CRYSTAL = 50e-6
 NOMINAL_RATE = 5000e-6
 """Prior standard deviation of a sample rate against its nominal value."""
 
-_OLD_REFIT_BUCKETS = 4
+_OLD_REFIT_BUCKETS = 8
+_FLOOR_VAR = FLOOR_NS**2
 _LINE_POINTS = 3  # two make a line, the third a doubt
 
 
@@ -52,12 +53,14 @@ class Envelope:
 
     __slots__ = (
         "_best", "_best_key", "_bucket_end", "_c", "_points", "_prior", "_prior_sd", "_ref",
-        "_sealed", "_span", "_variance", "_y0", "skew",
+        "_sealed", "_span", "_variance", "_y0", "settled", "skew",
     )  # fmt: skip
 
     def __init__(self, skew_sd: float = CRYSTAL) -> None:
         self.skew = 0.0
         """Slope s, dimensionless: positive when the device clock runs slow."""
+        self.settled = False
+        """Whether the line rests on enough."""
         self._prior, self._prior_sd = 0.0, skew_sd
         self._points: deque[Point] = deque(maxlen=BUCKETS)
         self._best: Point | None = None
@@ -65,11 +68,6 @@ class Envelope:
         self._bucket_end = self._ref = self._y0 = self._sealed = self._span = 0
         self._c = 0.0
         self._variance = (inf, 0.0, skew_sd**2)
-
-    @property
-    def settled(self) -> bool:
-        """Whether the line rests on enough."""
-        return len(self._points) >= SETTLED_POINTS and self._span >= SETTLED_NS
 
     @property
     def skew_sigma(self) -> float:
@@ -90,7 +88,8 @@ class Envelope:
         """Return the standard deviation of the line at `u`, ns; inf before the third bucket."""
         height, both, slope = self._variance
         ahead = u - self._ref
-        return hypot(FLOOR_NS, sqrt(max(0.0, height + ahead * (2.0 * both + ahead * slope))))
+        spread = height + ahead * (2.0 * both + ahead * slope)
+        return sqrt(_FLOOR_VAR + spread) if spread > 0.0 else FLOOR_NS
 
     def feed(self, u: int, y: int) -> float:
         """Take a point with increasing `u`; return how far above the line it was, ns.
@@ -120,6 +119,7 @@ class Envelope:
         while points and points[0][0] < oldest:
             points.popleft()
         self._span = u - points[0][0] if points else 0
+        self.settled = len(points) >= SETTLED_POINTS and self._span >= SETTLED_NS
         self._sealed += 1
         if not points:  # a silence of a whole window: the slope is still a good guess
             self._prior, self._prior_sd = self.skew, CRYSTAL / 10

@@ -26,9 +26,13 @@ class Lateness:
     def __init__(self) -> None:
         self._since: int | None = None
 
+    def on_time(self) -> None:
+        """Take a sample that was not late by ``LATE_NS``."""
+        self._since = None
+
     def feed(self, excess_ns: float, sigma_ns: float, arrival_ns: int) -> ClockNews | None:
         """Take how far above a settled envelope a sample is; return what follows, if anything."""
-        if excess_ns < LATE_NS or excess_ns < LATE_SIGMAS * sigma_ns:
+        if excess_ns < LATE_SIGMAS * sigma_ns:
             self._since = None
             return None
         if self._since is None:

@@ -29,16 +29,9 @@ class Stamp(NamedTuple):
     """The device gave this sample the time of the one before."""
 
 
-class Estimate(NamedTuple):
-    """What is known of a sample's host time before it is made a stamp."""
-
-    target: int
-    """Host time, ns."""
-    skew: float
-    settled: bool
-    sigma: float
-    delay: float
-    """Beyond the fastest sample, or with echoes beyond the sampled instant, ns."""
+Estimate = tuple[int, float, bool, float, float]
+"""Host time, ns; skew; whether it is settled; standard deviation, ns; and the delay beyond the
+fastest sample, or with echoes beyond the sampled instant, ns."""
 
 
 class StampLine:
@@ -67,27 +60,27 @@ class StampLine:
             return None
         return self.last_t - self.last_u
 
-    def step_ns(self, u: int, target: int, skew: float) -> int:
-        """Return by how much `target` is off what is due at `u`, if too much to slew; else 0."""
-        if self.last_t is None or self.last_u is None:
-            return 0
-        passed = u - self.last_u
-        error = target - self.last_t - passed - round(skew * passed)
-        return error if abs(error) > max(STEP_NS, round(SLEW * passed)) else 0
+    def stamp(self, u: int, target: int, skew: float, *, slew: bool) -> tuple[int, int]:
+        """Return the stamp nearest to `target` that neither runs backwards nor, if asked, jumps.
 
-    def stamp(self, u: int, target: int, skew: float, *, slew: bool) -> int:
-        """Return the stamp nearest to `target` that neither runs backwards nor, if asked, jumps."""
-        last_t, last_u = self.last_t, self.last_u
+        And the error that was too big to slew, ns: 0 if the stamp joins those before it.
+        """
+        last_t, last_u, step = self.last_t, self.last_u, 0
         if last_t is not None and last_u is not None:
             passed = u - last_u
             if slew:
-                due, limit = last_t + passed + round(skew * passed), round(SLEW * passed)
-                target = due + max(-limit, min(target - due, limit))
+                due = last_t + passed + round(skew * passed)
+                error, limit = target - due, round(SLEW * passed)
+                if not -limit <= error <= limit:
+                    if abs(error) > max(STEP_NS, limit):
+                        step = error
+                    else:
+                        target = due + (limit if error > 0 else -limit)
             else:
                 target = max(target, last_t + min(passed, self._period_ns) // 2)
         t = self.forward(target)
         self.last_u, self.last_t = u, t
-        return t
+        return t, step
 
     def forward(self, t: int) -> int:
         """Return `t`, or the first instant after every stamp given so far."""
