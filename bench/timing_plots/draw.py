@@ -256,7 +256,7 @@ def lags(trace: Trace, about: Run) -> Figure:
             why = bad[0].estimate.refused
             axis.plot(at_s, [low] * len(bad), "x", color="0.5", label=f"refused: {why}")
         if name in about.lag_ns:
-            truth = about.lag_ns[name] / NS_PER_MS
+            truth = (about.lag_ns[name] - trace.latency_ns[name]) / NS_PER_MS
             axis.axhline(truth, color="0.4", lw=0.9, ls="--", label="truth")
         axis.margins(y=0.3)  # room for the legend
         if good or bad:

@@ -80,7 +80,8 @@ class Trace:
     """All of a run."""
 
     begin_ns: int = 0
-    period_ns: dict[str, int] = field(default_factory=dict)
+    latency_ns: dict[str, int] = field(default_factory=dict)
+    """What the clocks take for the least delay of their transports, and subtract."""
     stamps: dict[str, list[Stamping]] = field(default_factory=dict)
     looks: dict[str, list[Look]] = field(default_factory=dict)
     frames: list[Frame] = field(default_factory=list)
@@ -117,7 +118,7 @@ class TracingCore(Core):
 
     def _write(self, source: str, state: SourceState, item: Stamped) -> None:
         trace, measured, stamp = self.trace, item.measurement, item.stamp
-        trace.period_ns.setdefault(source, round(NS / state.source.rate_hz))
+        trace.latency_ns.setdefault(source, state.clock.latency_ns)
         row = Stamping(
             measured.arrival_ns, stamp.t_ns, stamp.sigma_ns, stamp.synced, measured.ticks
         )
@@ -227,6 +228,8 @@ def true_errors(
     for name, rows in trace.stamps.items():
         known = [row for row in rows if (name, row.ticks) in taken_ns and row.ticks is not None]
         unseen = unseen_ns.get(name, 0)
+        if unseen:  # part of it was guessed from the transport and is in the stamps already
+            unseen -= trace.latency_ns[name]
         t_s = np.array([(row.arrival_ns - trace.begin_ns) / NS for row in known])
         error = [(row.t_ns - unseen - taken_ns[name, row.ticks or 0]) / 1e6 for row in known]
         errors[name] = (t_s, np.array(error), np.array([row.synced for row in known]))

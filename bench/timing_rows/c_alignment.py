@@ -7,6 +7,7 @@ gyro added up, of which every third or fifth sample goes in and the others are t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from math import cos, degrees, sin
 from typing import TYPE_CHECKING, Literal
@@ -23,13 +24,14 @@ from jointfit_daemon.kinematics.rotation_scalar import (
     multiply_one,
     normalize_one,
 )
+from jointfit_daemon.timing import interpolate
 from jointfit_daemon.timing.align import FrameAligner, StreamSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from jointfit_daemon.model import Quaternion
+    from jointfit_daemon.model import Quaternion, Vector
     from jointfit_daemon.timing.align import AlignedFrame, Mode
 
     Motion = Callable[[int], Quaternion]
@@ -156,6 +158,60 @@ def board(data: Path) -> list[Figure]:
     return figures
 
 
+# --- ahead of the last sample -----------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Sample:
+    t_ns: int
+    q: Quaternion
+    rate: Vector | None = None
+
+
+def _ahead_rms(
+    truth: Sequence[Quaternion], rate_hz: float, scatter_rad: float, bend: float
+) -> float:
+    """Return the error of up to one period ahead of every third sample, deg RMS."""
+    dice, period_ns = np.random.default_rng(5), round(NS / rate_hz)
+    samples = []
+    for k in range(0, len(truth), 3):
+        x, y, z = (dice.standard_normal(3) * scatter_rad / np.sqrt(3)).tolist()
+        samples.append(_Sample(k * period_ns, multiply_one(truth[k], exp_one((x, y, z)))))
+    ours, found = interpolate.BEND, []
+    interpolate.BEND = bend
+    try:
+        for last in range(2, len(samples) - 1):
+            for ahead in (1, 2, 3):
+                k = 3 * last + ahead
+                earlier, before, a = samples[last - 2 : last + 1]
+                q = interpolate.beyond(earlier, before, a, k * period_ns)
+                found.append(degrees(angle_between_one(q, truth[k])))
+    finally:
+        interpolate.BEND = ours
+    return _rms(found)
+
+
+def ahead(data: Path) -> list[Figure]:
+    """Straight on, bent as it is in the daemon, and bent in full."""
+    figures = []
+    for trial, name, scatter_deg, goal in (
+        (FAST, "fast", 0.0, 0.45),
+        (FAST, "fast, scatter 0.3 deg", 0.3, 0.9),
+        (SLOW, "slow, scatter 0.03 deg", 0.03, 0.1),
+    ):
+        truth, rate_hz = _board(data, trial)
+        straight, bent, full = (
+            _ahead_rms(truth, rate_hz, np.radians(scatter_deg), bend)
+            for bend in (0.0, interpolate.BEND, 1.0)
+        )
+        figures += [
+            Figure(f"{name}: RMS", bent, goal),
+            Figure(f"{name}: straight on", straight, float("inf")),
+            Figure(f"{name}: bent in full", full, float("inf")),
+        ]
+    return figures
+
+
 # --- latency ----------------------------------------------------------------------------------
 
 STREAMS = {"S1": (1.3, 2.0), "S2": (3.7, 1.0), "S3": (6.1, 2.0), "S4": (8.8, 1.0)}
@@ -232,6 +288,7 @@ def honesty(_data: Path) -> list[Figure]:
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment("AL-1", "interpolation, shaken at 550 deg/s RMS", interpolation),
     Experiment("AL-2", "interpolation, real board", board, ("broad_excerpts",)),
+    Experiment("AL-2e", "one period ahead at 95 Hz, real board", ahead, ("broad_excerpts",)),
     Experiment("AL-3", "added latency, four IMUs at 100 Hz, shaken", latency),
     Experiment("AL-4", "what calls itself synced, bytes to frames", honesty),
 )
