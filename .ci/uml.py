@@ -33,6 +33,7 @@ NO_AVX = {
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX,-AVX2,-AVX512F,-AVX512VL,-AVX512BW,"
     "-AVX_Fast_Unaligned_Load",
     "OPENBLAS_CORETYPE": "Nehalem",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3,X86_V4,AVX512_ICL,AVX512_SPR",
 }
 """For every program of a guest that keeps SSE registers only (see ``hide_xstate``)."""
 

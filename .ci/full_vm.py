@@ -1,0 +1,117 @@
+#!/usr/bin/env python3
+"""Run the service as it is installed: the Debian package in a virtual machine with real systemd.
+
+    .ci/full_vm.py [--deb FILE] [--image FILE] [--time-limit S] [--out DIR] [-- PYTEST ARGUMENTS]
+
+Boots Debian (``vm_image.py``) under user-mode-linux, installs the package, brings up a real vcan
+and a real mosquitto with TLS and passwords, and runs ``tests/vm_service`` inside. Each run writes
+to a disk of its own that is thrown away.
+
+Exit status as of ``light_vm.py``: that of pytest; 1 if a test was skipped or none ran; 90 if the
+guest never got as far; 124 at the time limit; 2 if the machine cannot be started at all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import uml
+import vm_image
+from uml import say
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+TESTS = CHECKOUT / "tests" / "vm_service"
+UNUSED = (
+    "e2scrub_reap.service", "systemd-networkd-wait-online.service", "systemd-logind.service",
+    "systemd-binfmt.service", "dev-hugepages.mount", "sys-kernel-config.mount",
+    "sys-fs-fuse-connections.mount", "modprobe@configfs.service", "modprobe@dm_mod.service",
+    "modprobe@drm.service", "modprobe@efi_pstore.service", "modprobe@fuse.service",
+    "modprobe@loop.service", "apt-daily.timer", "apt-daily-upgrade.timer",
+)  # fmt: skip
+"""Units of Debian that the tests do not need; masking them saves a second and a half of boot."""
+START = (
+    "echo {no_result} > /proc/exitcode; mount -t hostfs none /mnt -o {share} "
+    "&& sh /mnt/vm_service/guest.sh > /mnt/guest.log 2>&1; echo $? > /proc/exitcode"
+)
+
+
+def main() -> int:
+    """Make what is missing, boot, judge."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--deb", type=Path, help="the package (default: built now)")
+    parser.add_argument("--image", type=Path, help="the disk (default: this week's, see vm_image)")
+    parser.add_argument("--time-limit", type=float, default=300.0, help="seconds, whole run")
+    parser.add_argument("--memory", default="768M", help="memory of the guest")
+    parser.add_argument("--out", type=Path, help="folder for logs and junit.xml")
+    parser.add_argument("tests", nargs="*", help="pytest arguments for tests/vm_service")
+    given = parser.parse_args()
+    absent = uml.missing(uml.UML)
+    if absent:
+        say("linux.uml not found: apt install user-mode-linux")
+        return uml.CANNOT_START
+    with tempfile.TemporaryDirectory(prefix="full-vm-") as scratch:
+        work = Path(scratch)
+        try:
+            disk = given.image or vm_image.image()
+        except vm_image.CannotMake as error:
+            say(str(error))
+            return uml.CANNOT_START
+        share = (given.out or work / "share").resolve()
+        fill(share, given.deb or build_deb(work), given.tests)
+        return run(work, disk.resolve(), share, given.memory, given.time_limit)
+
+
+def build_deb(work: Path, *extra: str) -> Path:
+    """Return the package of this checkout."""
+    say("building the package")
+    words = [sys.executable, str(CHECKOUT / "packaging" / "deb.py"), "--out", str(work), *extra]
+    done = subprocess.run(words, text=True, capture_output=True, check=False)  # noqa: S603 - ours
+    if done.returncode:
+        sys.exit(done.stdout + done.stderr)
+    return Path(done.stdout.strip().splitlines()[-1])
+
+
+def fill(share: Path, deb: Path, tests: list[str]) -> None:
+    """Put into the folder that the guest sees what it needs, and nothing of an earlier run."""
+    share.mkdir(parents=True, exist_ok=True)
+    for leftover in ("junit.xml", "pytest.log", "guest.log", "journal.txt", "console.log"):
+        (share / leftover).unlink(missing_ok=True)
+    shutil.rmtree(share / "vm_service", ignore_errors=True)
+    shutil.copytree(TESTS, share / "vm_service", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copyfile(deb, share / "jointfitd.deb")
+    (share / "pytest.args").write_text("".join(f"{word}\n" for word in tests))
+
+
+def run(work: Path, disk: Path, share: Path, memory: str, limit_s: float) -> int:
+    """Boot and return the judgement."""
+    service = START.format(no_result=uml.NO_RESULT, share=share)
+    guest = uml.NO_AVX if uml.has_amx() else {}
+    command = [
+        uml.UML, f"mem={memory}", f"uml_dir={work}", f"ubd0={work}/cow,{disk}", "root=/dev/ubda",
+        "rootfstype=ext4", "rw", *uml.CONSOLE, "systemd.show_status=0",
+        *(f"systemd.mask={unit}" for unit in UNUSED),
+        *(f"{name}={value}" for name, value in guest.items()),  # for PID 1
+        *(f"systemd.setenv={name}={value}" for name, value in guest.items()),  # for all others
+        f"systemd.run=\"/bin/sh -c '{service}'\"",  # the quotes must reach the kernel
+        "systemd.run_success_action=poweroff", "systemd.run_failure_action=poweroff",
+    ]  # fmt: skip
+    began = time.monotonic()
+    with (share / "console.log").open("wb") as console:
+        code = uml.boot(command, limit_s, console)
+    say(f"the machine ended with {code} after {time.monotonic() - began:.1f} s")
+    verdict = uml.judge(code, share / "junit.xml")
+    if verdict:
+        for name in ("guest.log", "pytest.log"):
+            if (share / name).is_file():
+                print((share / name).read_text(errors="replace")[-12000:])
+    return verdict
+
+
+if __name__ == "__main__":
+    sys.exit(main())

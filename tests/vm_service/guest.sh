@@ -1,0 +1,47 @@
+#!/bin/sh
+# Inside the virtual machine, as root: bring up buses, broker and package, run the tests, leave what they said.
+set -e
+cd /mnt
+mount -t hostfs none /lib/modules -o /usr/lib/uml/modules
+modprobe -a vcan can-raw
+
+# A bus: vcan for the hardware, brought up by the network file that the package ships.
+printf '[NetDev]\nName=can0\nKind=vcan\n' > /etc/systemd/network/80-can0.netdev
+dpkg -i jointfitd.deb
+cp /usr/share/jointfitd/networkd/80-jointfit-can0.network /etc/systemd/network/
+
+# A broker as docs/security.md sets it up: TLS with a CA of our own, passwords, the shipped rights.
+certs=/etc/mosquitto/certs
+openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj "/CN=test CA" -keyout $certs/ca.key -out $certs/ca.crt 2>/dev/null
+openssl req -newkey rsa:2048 -nodes -subj "/CN=localhost" -keyout $certs/broker.key -out $certs/broker.csr 2>/dev/null
+printf 'subjectAltName=DNS:localhost,IP:127.0.0.1\n' > $certs/broker.ext
+openssl x509 -req -in $certs/broker.csr -CA $certs/ca.crt -CAkey $certs/ca.key -CAcreateserial -days 2 \
+    -extfile $certs/broker.ext -out $certs/broker.crt 2>/dev/null
+cp /usr/share/jointfitd/mosquitto/jointfitd.conf /etc/mosquitto/conf.d/
+cp /usr/share/jointfitd/mosquitto/jointfitd.acl /etc/mosquitto/
+: > /etc/mosquitto/jointfitd.passwd
+for who in jointfitd:s3cret viewer:look operator:ask; do
+    mosquitto_passwd -b /etc/mosquitto/jointfitd.passwd "${who%%:*}" "${who##*:}"
+done
+chown -R mosquitto $certs /etc/mosquitto/jointfitd.*
+chmod 600 $certs/*.key
+install -d -m 700 /etc/credstore
+printf s3cret > /etc/credstore/jointfitd.mqtt-password
+chmod 600 /etc/credstore/jointfitd.mqtt-password
+
+# Virtual sensors: two on real ptys, two on can0, cameras on loopback.
+mkfifo /run/sim.commands
+cat > /run/systemd/system/jointfit-sim.service <<'UNIT'
+[Service]
+ExecStart=/bin/sh -c 'exec 3<>/run/sim.commands; exec jointfit-sim play --directory /run/jointfit-sim --can socketcan:can0 --perfect --seed 1 --static-s 3 --mqtt-host localhost --mqtt-base jointfit/vm --programme walk:600 <&3'
+RuntimeDirectory=jointfit-sim
+UNIT
+
+systemctl daemon-reload
+systemctl start systemd-networkd mosquitto jointfit-sim
+set +e
+xargs -d '\n' -a pytest.args python3 -m pytest -v -ra -p no:cacheprovider --color=no --basetemp=/tmp/pytest \
+    --junitxml=/mnt/junit.xml --durations=8 -c /dev/null --rootdir=/mnt/vm_service /mnt/vm_service > /mnt/pytest.log 2>&1
+result=$?
+journalctl -b -o short-monotonic > /mnt/journal.txt
+exit $result

@@ -1,0 +1,97 @@
+"""What the tests of the installed service use: systemctl, the journal, mosquitto's own clients."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+UNIT = "jointfitd.service"
+RIG = Path("/etc/jointfitd/rig.toml")
+SIM = Path("/run/jointfit-sim")
+BASE = "jointfit/vm"
+CA = "/etc/mosquitto/certs/ca.crt"
+TLS = f'[mqtt.tls]\nca = "{CA}"\n'
+
+
+def run(*words: str, check: bool = True) -> str:
+    """Return what a command prints."""
+    done = subprocess.run(words, text=True, capture_output=True, check=False)
+    assert not check or done.returncode == 0, f"{' '.join(words)}: {done.stdout}{done.stderr}"
+    return done.stdout.strip()
+
+
+def show(name: str, unit: str = UNIT) -> str:
+    """Return a property of a unit."""
+    return run("systemctl", "show", "-P", name, unit)
+
+
+def eventually(claim: Callable[[], object], what: str, seconds: float = 20.0) -> Any:
+    """Return the first true answer of `claim`; fail with `what` when time is up."""
+    end = time.monotonic() + seconds
+    while not (answer := claim()):
+        assert time.monotonic() < end, f"not within {seconds:g} s: {what}; {show('StatusText')}"
+        time.sleep(0.1)
+    return answer
+
+
+def journal(since: str, unit: str = UNIT) -> str:
+    """Return what the unit logged since a cursor (see ``cursor``)."""
+    return run("journalctl", "-b", "-o", "cat", "-u", unit, f"--after-cursor={since}")
+
+
+def cursor() -> str:
+    """Return the journal's end."""
+    last = run("journalctl", "-b", "-n", "0", "--show-cursor")
+    return last.rpartition("-- cursor: ")[2].strip()
+
+
+def messages(topic: str, count: int = 1, seconds: float = 10.0) -> list[Any]:
+    """Return that many messages below the base, as the viewer gets them over TLS."""
+    text = run(
+        "mosquitto_sub", "-h", "localhost", "-p", "8883", "--cafile", CA, "-V", "mqttv5",
+        "-u", "viewer", "-P", "look", "-t", f"{BASE}/{topic}", "-C", str(count),
+        "-W", str(round(seconds)), check=False,
+    )  # fmt: skip
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def ask(command: str, user: str = "operator", password: str = "ask", **arguments: object) -> None:
+    """Send a request as a user of the broker."""
+    run(
+        "mosquitto_pub", "-h", "localhost", "-p", "8883", "--cafile", CA, "-V", "mqttv5",
+        "-u", user, "-P", password, "-t", f"{BASE}/bridge/request/{command}", "-q", "1",
+        "-m", json.dumps(arguments),
+    )  # fmt: skip
+
+
+def write_rig(change: Callable[[str], str] = lambda text: text) -> None:
+    """Install the simulator's rig, with TLS and a user, and what `change` makes of it."""
+    text = (SIM / "rig.toml").read_text()
+    text = text.replace(
+        'host = "localhost"\nport = 1883', 'host = "localhost"\nusername = "jointfitd"'
+    )
+    assert 'username = "jointfitd"' in text
+    RIG.write_text(change(text + "\n" + TLS))
+    RIG.chmod(0o644)
+
+
+def give_ports() -> None:
+    """Let the unit's group open the virtual serial ports, as udev does for real ones."""
+    for link in SIM.glob("tty*"):
+        with contextlib.suppress(FileNotFoundError):
+            os.chown(link, 0, 20)  # dialout
+            link.chmod(0o660)
+
+
+def sim(command: str) -> None:
+    """Tell the simulator something."""
+    with open("/run/sim.commands", "w") as fifo:  # noqa: PTH123 - a fifo
+        fifo.write(f"{command}\n")

@@ -1,0 +1,74 @@
+"""What the unit keeps its program from, tried by a probe that runs under the very same unit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from machine import SIM, UNIT, cursor, eventually, give_ports, journal, run
+
+PROBE = "jointfit-probe.service"
+UNIT_FILE = Path("/usr/lib/systemd/system") / UNIT
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, int]:
+    """What the probe met: errno of each attempt."""
+    program = Path("/usr/local/lib/jointfit-probe.py")
+    shutil.copyfile(Path(__file__).with_name("probe.py"), program)
+    program.chmod(0o644)
+    text = UNIT_FILE.read_text()
+    start = next(line for line in text.splitlines() if line.startswith("ExecStart="))
+    port = SIM / "ttyS1"
+    eventually((SIM / "rig.toml").is_file, "the simulator is ready")
+    give_ports()
+    text = text.replace(start, f"ExecStart=/usr/bin/python3 {program} {port.resolve()}")
+    (Path("/run/systemd/system") / PROBE).write_text(text)
+    run("systemctl", "daemon-reload")
+    since = cursor()
+    run("systemctl", "start", PROBE)
+    lines = journal(since, PROBE).splitlines()
+    run("systemctl", "stop", PROBE)
+    line = next(line for line in lines if line.startswith("PROBE "))
+    answer: dict[str, int] = json.loads(line.removeprefix("PROBE "))
+    return answer
+
+
+FORBIDDEN = (
+    "write /usr", "write /etc", "write /etc/jointfitd", "write /var/lib", "write /opt",
+    "read /home", "read /root", "open /dev/kmsg", "open /dev/net/tun", "open a disk",
+    "raw socket", "packet socket", "netlink socket", "own namespace", "mount", "host name",
+    "clock", "ptrace", "code that can be written", "new capability", "setuid",
+)  # fmt: skip
+NEEDED = ("may write its state", "may open its port", "may speak CAN", "may speak UDP")
+
+
+@pytest.mark.parametrize("what", FORBIDDEN)
+def test_it_is_refused(found: dict[str, int], what: str) -> None:
+    assert found[what] != 0
+
+
+@pytest.mark.parametrize("what", NEEDED)
+def test_what_it_needs_works(found: dict[str, int], what: str) -> None:
+    assert found[what] == 0
+
+
+def test_every_attempt_is_judged(found: dict[str, int]) -> None:
+    assert set(found) == {*FORBIDDEN, *NEEDED}
+
+
+def test_root_outside_the_unit_is_not_refused() -> None:
+    # the control: an errno above means the unit, not the machine
+    assert Path("/root").is_dir()
+    probe = Path("/usr/probe")
+    probe.write_text("x")
+    probe.unlink()
+
+
+def test_the_exposure_is_low() -> None:
+    said = run("systemd-analyze", "security", "--no-pager", UNIT).splitlines()[-1]
+    exposure = float(said.partition("level for")[2].partition(":")[2].split()[0])
+    assert exposure <= 1.4

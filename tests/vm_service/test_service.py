@@ -1,0 +1,206 @@
+"""The installed service under real systemd: start, angles, faults, reload, upgrade, removal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from machine import (
+    RIG,
+    SIM,
+    UNIT,
+    ask,
+    cursor,
+    eventually,
+    give_ports,
+    journal,
+    messages,
+    run,
+    show,
+    sim,
+    write_rig,
+)
+
+DEB = "/mnt/jointfitd.deb"
+
+pytestmark = pytest.mark.usefixtures("machine")
+
+
+def online() -> bool:
+    return messages("bridge/state", seconds=2) == [{"state": "online"}]
+
+
+def test_installing_gives_a_rig_to_edit_and_starts_nothing() -> None:
+    assert run("dpkg", "-s", "jointfitd").splitlines()[1] == "Status: install ok installed"
+    assert Path("/usr/share/jointfitd/examples/knee.toml").is_file()
+    assert run("systemctl", "is-enabled", UNIT, check=False) == "disabled"
+    assert run("jointfitd", "--version").startswith("jointfitd ")
+    assert "is right" in run("jointfit", "check", "/usr/share/jointfitd/examples/knee.toml")
+
+
+def test_angles_arrive_over_tls_from_two_serial_ports_and_two_on_a_bus(service: int) -> None:
+    eventually(lambda: "4 of 4 IMUs" in show("StatusText"), "all four stream")
+    sim("play stand")
+    ask("calibrate", phase="static", transaction="1")
+    eventually(
+        lambda: messages("calibration", seconds=2)[0].get("version"), "a static pose is stored", 60
+    )
+    pose = messages("pose", seconds=10)[0]
+    assert pose["mode"] in {"imu", "imu+mocap"}
+    assert isinstance(pose["joints"]["knee"]["flexion_deg"], float)
+    assert sorted(pose["segments"]["thigh"]["used"]) == ["S1", "S2"]
+    assert sorted(pose["segments"]["shank"]["used"]) == ["S3", "S4"]
+
+
+def test_the_status_line_counts_what_is_there(service: int) -> None:
+    eventually(lambda: "4 of 4 IMUs" in show("StatusText"), "all four are counted")
+
+
+def test_a_start_is_ready_at_once_and_a_stop_takes_less_than_three_seconds(since: str) -> None:
+    began = time.monotonic()
+    run("systemctl", "start", UNIT)
+    assert time.monotonic() - began < 6.0  # Python alone takes two in here
+    eventually(online, "online")
+    began = time.monotonic()
+    run("systemctl", "stop", UNIT)
+    assert time.monotonic() - began < 3.0
+    assert show("Result") == "success"
+    assert messages("bridge/state", seconds=2) == [{"state": "offline"}]
+
+
+def test_a_hung_daemon_is_killed_by_the_watchdog_and_starts_again(service: int, since: str) -> None:
+    os.kill(service, signal.SIGSTOP)
+    eventually(lambda: int(show("MainPID")) not in {0, service}, "a new process", 40)
+    assert "watchdog" in journal(since).lower()
+    eventually(lambda: show("ActiveState") == "active", "active again")
+
+
+def test_kill_9_costs_a_restart_and_nothing_else(service: int) -> None:
+    os.kill(service, signal.SIGKILL)
+    eventually(lambda: int(show("MainPID")) not in {0, service}, "a new process")
+    eventually(lambda: messages("pose", seconds=3), "poses again")
+
+
+def test_a_reload_keeps_the_process_and_a_bad_file_changes_nothing(
+    service: int, since: str
+) -> None:
+    write_rig(lambda text: text.replace("output_rate_hz = 100", "output_rate_hz = 50"))
+    run("systemctl", "reload", UNIT)
+    eventually(lambda: "reload" in journal(since), "the reload is told")
+    write_rig(lambda text: text.replace('segment = "thigh"', 'segment = "thing"', 1))
+    before = cursor()
+    run("systemctl", "reload", UNIT)
+    eventually(lambda: "thing" in journal(before), "the fault is named")
+    assert int(show("MainPID")) == service
+    assert show("ActiveState") == "active"
+    assert messages("pose", seconds=5)
+
+
+def test_a_missing_credential_is_told_and_the_sensors_go_on(since: str) -> None:
+    credential = Path("/etc/credstore/jointfitd.mqtt-password")
+    hidden = credential.with_suffix(".away")
+    credential.rename(hidden)
+    try:
+        run("systemctl", "start", UNIT)
+        eventually(lambda: "password" in journal(since).lower(), "the journal says what is missing")
+        assert show("ActiveState") == "active"
+    finally:
+        hidden.rename(credential)
+
+
+def test_without_a_broker_it_starts_and_publishes_when_one_comes(since: str) -> None:
+    run("systemctl", "stop", "mosquitto")
+    run("systemctl", "start", UNIT)
+    eventually(lambda: "broker" in show("StatusText"), "the status says so")
+    run("systemctl", "start", "mosquitto")
+    eventually(online, "online")
+
+
+def test_a_bus_that_comes_later_is_taken(since: str) -> None:
+    run("ip", "link", "del", "can0")
+    try:
+        run("systemctl", "start", UNIT)
+        eventually(lambda: "2 of 4 IMUs" in show("StatusText"), "two without the bus")
+    finally:
+        run("systemctl", "restart", "systemd-networkd")
+        eventually(lambda: Path("/sys/class/net/can0").exists(), "can0 is back")
+        run("systemctl", "restart", "jointfit-sim")
+        eventually((SIM / "rig.toml").is_file, "the simulator is back")
+        time.sleep(1)
+        give_ports()
+    eventually(lambda: "4 of 4 IMUs" in show("StatusText"), "all four", 30)
+
+
+def test_a_wrong_rig_is_told_and_not_tried_again(since: str) -> None:
+    write_rig(lambda text: text.replace("output_rate_hz = 100", 'output_rate_hz = "fast"'))
+    run("systemctl", "start", UNIT, check=False)
+    eventually(lambda: show("ActiveState") == "failed", "failed")
+    time.sleep(3)
+    assert show("ExecMainStatus") == "2"
+    assert show("NRestarts") == "0"
+    assert "output_rate_hz" in journal(since)
+
+
+def test_a_rig_on_its_own_instance_runs_beside_the_first(service: int) -> None:
+    other = RIG.with_name("second.toml")
+    other.write_text(RIG.read_text().replace("jointfit/vm", "jointfit/vm2"))
+    other.chmod(0o644)
+    unit = "jointfitd@second.service"
+    try:
+        run("systemctl", "start", unit)
+        assert show("ActiveState", unit) == "active"
+        assert Path("/var/lib/private/jointfitd-second").is_dir()
+        assert int(show("MainPID")) == service
+    finally:
+        run("systemctl", "stop", unit)
+        other.unlink()
+
+
+def test_an_upgrade_restarts_the_service_and_keeps_the_rig(service: int) -> None:
+    before = RIG.read_text()
+    run("dpkg", "-i", DEB)
+    eventually(lambda: int(show("MainPID")) not in {0, service}, "the new version runs")
+    assert RIG.read_text() == before
+    eventually(online, "online")
+
+
+def test_no_secret_is_seen_from_outside(service: int, since: str) -> None:
+    eventually(online, "online")
+    shown = "".join(
+        (
+            Path(f"/proc/{service}/cmdline").read_text(),
+            Path(f"/proc/{service}/environ").read_text(),
+            journal(since),
+            run(
+                "mosquitto_sub", "-h", "localhost", "-p", "8883", "--cafile",
+                "/etc/mosquitto/certs/ca.crt", "-u", "viewer", "-P", "look", "-t", "jointfit/#",
+                "--retained-only", "-W", "2", "-v", check=False,
+            ),
+        )
+    )  # fmt: skip
+    assert "s3cret" not in shown
+
+
+def test_a_viewer_cannot_ask(service: int) -> None:
+    eventually(online, "online")
+    ask("calibrate", user="viewer", password="look", phase="static", transaction="x")
+    time.sleep(2)
+    assert messages("calibration", seconds=2)[0]["phase"] != "static"
+
+
+def test_purging_leaves_nothing_and_removing_keeps_the_rig(service: int) -> None:
+    run("dpkg", "-r", "jointfitd")
+    assert RIG.is_file()
+    assert not Path("/usr/lib/jointfitd").exists()
+    run("dpkg", "-P", "jointfitd")
+    left = [
+        path for path in ("/etc/jointfitd", "/var/lib/private/jointfitd") if Path(path).exists()
+    ]
+    run("dpkg", "-i", DEB)
+    run("systemctl", "daemon-reload")
+    assert left == []
+    assert RIG.is_file()
