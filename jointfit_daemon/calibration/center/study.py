@@ -25,6 +25,7 @@ from jointfit_daemon.calibration.center.bounds import uniform_arc_rms
 from jointfit_daemon.calibration.center.circle import fit_circles
 from jointfit_daemon.calibration.center.error_prediction import equal_step_error
 from jointfit_daemon.calibration.center.grid import Grid, grid_center
+from jointfit_daemon.calibration.center.moments import GATE
 from jointfit_daemon.calibration.center.study_oriented import oriented_centers
 from jointfit_daemon.calibration.center.three_frames import three_frame_center
 
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-USABLE = 6.0
-"""T from which a circle answers; below it refuses."""
 CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
 """Both maps of a correlation are cut off there, m; None: as they are."""
 PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
@@ -154,7 +153,7 @@ def _all_frames(
     angles = arc[:, None] * np.linspace(0.0, 1.0, setup.frames)
     many = _noisy(rng, radius, noise, angles, setup.frames_repeats)
     circles = fit_circles(many)
-    accepted = circles.valid & (circles.conditioning >= USABLE)
+    accepted = circles.valid & (circles.conditioning >= GATE)
     drawn = rng.normal(0.0, setup.orientation_noise, many.shape[:-1])
     aided = oriented_centers(many, angles[:, None] + drawn)
     least = [

@@ -1,7 +1,7 @@
 r"""The orientation-aided center for many runs at once, as the numerical experiment needs it.
 
 Law: the cost function, the start and the guard are those of ``oriented``; only the arithmetic is
-arranged for thousands of short movements, all with the same number of frames.
+arranged for thousands of short movements, all with the same number of frames and turning evenly.
 """
 
 from __future__ import annotations
@@ -12,25 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.circle import Circles, fit_circles
+from jointfit_daemon.calibration.center.moments import GATE
+from jointfit_daemon.calibration.center.oriented import AngleNoise
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-SLOW = float(np.deg2rad(1.5))
-"""Standard deviation of the angle's slow error, rad, and how long it lasts, s."""
-SLOW_S = 1.0
-WHITE = float(np.deg2rad(1.0))
-GAIN = 0.02
-"""Standard deviation of the share by which angles are too large or too small."""
+_TOLD = AngleNoise()
 _STEPS = 12
 _LEAST_NOISE_M = 1e-6
-_INCONSISTENT = 13.8
-"""χ² with two degrees of freedom at 0.1 %."""
-_FLOOR = 0.25
 _STUCK = 1e3
 """Damping at which a run is at its end."""
-_USABLE = 6.0
-"""T of a circle worth comparing with."""
 
 
 class _Weights(NamedTuple):
@@ -94,9 +86,12 @@ def _linear_start(z: Complex, theta: Array) -> Array:
 def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
     n = theta.shape[-1]
     apart = interval * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    values, U = np.linalg.eigh(SLOW**2 * np.exp(-apart / SLOW_S) + WHITE**2 * np.eye(n))
+    slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
+    values, U = np.linalg.eigh(slow + _TOLD.white**2 * np.eye(n))
     d = 1.0 / (values + relative_noise[:, None] ** 2)
-    g = GAIN * (theta - theta.mean(axis=-1, keepdims=True))
+    # the scale's part without the noise of the angles: here they grow evenly from frame to frame
+    even = np.arange(n) - 0.5 * (n - 1)
+    g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
     h = ((g @ U) * d) @ U.T
     return _Weights(U, d, h / np.sqrt(1.0 + (g * h).sum(axis=-1, keepdims=True)))
 
@@ -165,13 +160,15 @@ def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
 
 
 def _guarded(center: Array, H: Array, circles: Circles) -> Array:
-    """Return the circle's center where it is good and the aided one contradicts it."""
+    """Hold aided centers near what the path alone says: ``oriented.guarded`` of many runs."""
     C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
-    good = circles.valid & (circles.conditioning >= _USABLE) & (circles.noise > _LEAST_NOISE_M)
-    of_circle = np.where(good[:, None, None], circles.covariance, np.eye(2))
-    values, axes = np.linalg.eigh(of_circle - C)
-    least = _FLOOR * np.einsum("rij,rik,rkj->rj", axes, of_circle, axes)
-    gap = np.where(good[:, None], center - circles.center, 0.0)
-    along = np.einsum("rij,ri->rj", axes, gap)
-    contradicts = (along**2 / np.maximum(values, least)).sum(axis=-1) > _INCONSISTENT
-    return np.asarray(np.where((good & contradicts)[:, None], circles.center, center))
+    held = circles.valid & (circles.noise > _LEAST_NOISE_M)
+    of_circle = np.where(held[:, None, None], circles.covariance, np.eye(2))
+    spread, axes = np.linalg.eigh(of_circle)
+    apart = np.einsum("rai,rab,rbi->ri", axes, of_circle - C, axes)
+    apart = np.maximum(apart, 0.25 * spread)
+    delta = np.where(held[:, None], center - circles.center, 0.0)
+    s = np.sqrt((np.einsum("rai,ra->ri", axes, delta) ** 2 / apart).sum(axis=-1))
+    reach = 0.7 * (1.0 + 0.5 * (GATE / np.maximum(circles.conditioning, 1e-3)) ** 2)
+    kept = np.minimum(1.0, reach / np.maximum(s, 1e-12))
+    return np.asarray(np.where(held[:, None], center - (1.0 - kept)[:, None] * delta, center))

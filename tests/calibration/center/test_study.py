@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jointfit_daemon.calibration.center.oriented import oriented_estimate
 from jointfit_daemon.calibration.center.study import (
     PairMaps,
     StudySetup,
@@ -104,3 +105,15 @@ def test_exact_points_and_angles_give_the_exact_center() -> None:
     points = center + 0.3 * np.stack((np.cos(turned), np.sin(turned)), axis=-1)
     found = oriented_centers(points, angles)
     np.testing.assert_allclose(found, center[:, 0], atol=1e-6)
+
+
+def test_many_runs_at_once_are_the_estimator_of_one_movement() -> None:
+    rng = np.random.default_rng(6)
+    angles = np.linspace(0.0, 0.7, 80)
+    points = 0.3 * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    points = points + rng.normal(0.0, 0.001, (12, 80, 2))
+    measured = angles + rng.normal(0.0, 0.02, (12, 80))
+    together = oriented_centers(points, measured, 0.02)
+    for i in range(12):
+        alone = oriented_estimate(points[i], measured[i], 0.02)
+        np.testing.assert_allclose(together[i], alone.center, atol=0.05 * alone.sd)
