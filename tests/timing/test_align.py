@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from itertools import pairwise
 from math import cos, sin
-from typing import TYPE_CHECKING
+from random import Random
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
@@ -341,3 +344,70 @@ def test_whatever_comes_in_frames_are_in_order_and_samples_accounted(
         last = frame.t_ns
     a.close()
     assert all(assert_accounted(a, name)["pending"] == 0 for name in "ABC")
+
+
+# --- streams as devices send them -----------------------------------------------------------------
+
+streams = st.fixed_dictionaries(
+    {
+        "period": st.sampled_from([2_500_000, 5 * MS, 8_333_333, 10 * MS, 16_666_667, 40 * MS]),
+        "phase": st.integers(0, 40 * MS),
+        "delay": st.integers(0, 30 * MS),
+        "jitter": st.integers(0, 12 * MS),
+        "gap": st.tuples(st.integers(0, 900), st.integers(0, 400)),  # begin and length, ms
+        "restart": st.integers(0, 2_000),  # ms; beyond a second: none
+        "every_twice": st.integers(3, 50),
+        "every_lost": st.integers(3, 50),
+    }
+)
+
+
+def sent(name: str, given_by: dict[str, Any], dice: Random) -> list[tuple[int, str, int, int]]:
+    """Return arrival, stream, stamp and epoch of a second of samples of one device."""
+    found = []
+    begin, length = given_by["gap"]
+    for k in range(1_000 * MS // given_by["period"]):
+        t = T0 + given_by["phase"] + k * given_by["period"]
+        since = (t - T0) // MS
+        if begin <= since < begin + length or k % given_by["every_lost"] == 1:
+            continue
+        epoch = int(since >= given_by["restart"])
+        arrival = t + given_by["delay"] + dice.randrange(given_by["jitter"] + 1)
+        times = 2 if k % given_by["every_twice"] == 0 else 1
+        found += [(arrival, name, t, epoch)] * times
+    return found
+
+
+@given(
+    st.lists(streams, min_size=1, max_size=4),
+    st.sampled_from(["smooth", "fast"]),
+    st.sampled_from([4 * MS, 10 * MS, 25 * MS]),
+    st.integers(0, 2**32),
+)
+def test_every_sample_of_any_device_gets_one_verdict_and_frames_are_right(
+    given_by: list[dict[str, Any]], mode: str, period: int, seed: int
+) -> None:
+    named, dice = dict(zip("ABCD", given_by, strict=False)), Random(seed)
+    a = aligner(period, mode, **{name: one["period"] for name, one in named.items()})
+    pushes = sorted(push for name, one in named.items() for push in sent(name, one, dice))
+    frames: list[AlignedFrame] = []
+    early = Counter[str]()
+    for arrival, name, t, epoch in pushes:
+        while (deadline := a.next_deadline_ns) is not None and deadline < arrival:
+            frames += a.advance(deadline)
+        verdict = a.push(name, t, arrival, turned(t), epoch=epoch)
+        early[name] += verdict is not None
+        frames += a.advance(arrival)
+        assert a.counts(name)["pending"] <= 512
+    a.close()
+    came = Counter(name for _, name, _, _ in pushes)
+    for name in named:
+        counts = assert_accounted(a, name)
+        assert counts["received"] == came[name]
+        assert counts["pending"] == 0
+        assert early[name] <= counts["late"] + counts["duplicate"] + counts["dropped"]
+    assert all(one.t_ns < other.t_ns for one, other in pairwise(frames))
+    assert all(one.completed_ns <= other.completed_ns for one, other in pairwise(frames))
+    for frame in frames:  # a constant turn is met exactly, between samples and beyond
+        for q in frame.orientations.values():
+            assert q == pytest.approx(turned(frame.t_ns), abs=1e-9)
