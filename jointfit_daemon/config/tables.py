@@ -23,8 +23,8 @@ class RigTable(Settings):
     output_rate_hz: float = Field(100.0, gt=0, le=1000, description="limb states per second, Hz")
     align_mode: Literal["smooth", "fast"] = Field(
         "smooth",
-        description="`smooth` interpolates every sensor to the instant of the frame; "
-        "`fast` takes the newest samples, a sample period earlier",
+        description="`smooth` waits for samples on both sides of an instant and interpolates; "
+        "`fast` is a sample period earlier and extrapolates by that at most",
     )
 
 
