@@ -6,6 +6,7 @@ import pytest
 
 from bench.experiment import DATA, Experiment
 from bench.joint_center_rows import a_planar, a_planar_oriented
+from bench.planar_runs import runs_on, share_covered
 
 EXPERIMENTS = (*a_planar.EXPERIMENTS, *a_planar_oriented.EXPERIMENTS)
 
@@ -18,3 +19,12 @@ def test_every_figure_of_a_planar_center_keeps_its_goal(experiment: Experiment) 
     figures = experiment.run(DATA)
     assert figures
     assert [figure for figure in figures if not figure.kept] == []
+
+
+@pytest.mark.parametrize(
+    ("n", "arc", "noise"),
+    [(100, 19, 0.002), (100, 90, 0.002), (30, 30, 0.002), (15, 45, 0.002), (60, 90, 0.02)],
+)
+def test_published_ellipses_hold_the_truth_19_times_in_20(n: int, arc: float, noise: float) -> None:
+    found = runs_on(n, arc, noise, runs=4000, correlated=True)
+    assert 0.93 <= share_covered(found, n) <= 0.97
