@@ -138,7 +138,9 @@ class LiveCenters:
         """
         if self.joints:
             k = self._turn = (self._turn + 1) % len(self.joints)
-            self._told[self.joints[k]] = self._judged(k, self._spheres[k].estimate())
+            with np.errstate(all="ignore"):  # of markers that stand still little is left but zeros
+                found = self._spheres[k].estimate()
+            self._told[self.joints[k]] = self._judged(k, found)
         fits = {joint: fit for joint, (_, fit) in self._told.items() if fit is not None}
         settled = settle_unseen(self._chain, fits)
         order = self._chain.joints

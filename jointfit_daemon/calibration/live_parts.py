@@ -106,11 +106,10 @@ class LiveParts:
         wrong = ok & (gap.sum(axis=1) / count > MAX_FIT_RMS_M**2)
         self.placed = ok & ~wrong
         self._good += self.placed
-        if wrong.any():
-            y[wrong] = np.nan
-            rows = np.flatnonzero(wrong)
-            self._bad[rows] += 1
-            self._blamed[rows, gap[rows].argmax(axis=1)] += 1
+        for i in np.flatnonzero(wrong).tolist():
+            self._bad[i] += 1
+            self._blamed[i, _out_of_place(self._template[i], y[i], seen[i])] += 1
+            y[i] = np.nan
 
     def _read(self, layout: MocapLayout) -> None:
         """Find the columns of a new layout; what it lacks is not seen."""
@@ -189,3 +188,10 @@ class LiveParts:
                 absent,
             )
         return told
+
+
+def _out_of_place(template: Array, y: Array, seen: Mask) -> int:
+    """Return the marker whose distances to the others changed most: a rigid fit would share it."""
+    known = np.where(seen[:, None], y, 0.0)
+    now, then = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, template))
+    return int((np.abs(now - then) * np.outer(seen, seen)).sum(axis=1).argmax())

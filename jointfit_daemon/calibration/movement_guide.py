@@ -24,10 +24,14 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.live_parts import PartFigures
     from jointfit_daemon.calibration.markers import Cluster
-    from jointfit_daemon.calibration.trial import CalibrationSettings, OpticalTrack
+    from jointfit_daemon.calibration.trial import (
+        CalibrationSettings,
+        CalibrationTrial,
+        OpticalTrack,
+    )
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
-MIN_BENDS = 15
+MIN_BENDS = 12
 """Steps and squats that a joint between two sensors must have done: half a minute of both."""
 MIN_SEEN = 0.5
 """The fit refuses a body part that was seen in a smaller share of the frames."""
@@ -62,17 +66,18 @@ class MovementGuide:
         What is calibrated.
     settings : CalibrationSettings
         Target and markers.
-    standing : OpticalTrack or None
-        The static pose as the cameras saw it; None: only the sensors tell.
+    standing : CalibrationTrial or None
+        The static pose; without cameras in it only the sensors tell.
     """
 
     def __init__(
-        self, chain: Chain, settings: CalibrationSettings, standing: OpticalTrack | None
+        self, chain: Chain, settings: CalibrationSettings, standing: CalibrationTrial | None
     ) -> None:
         self._chain, self._target = chain, settings.center_target_m
-        clusters, self._faults = _clusters(chain, settings, standing)
+        optical = None if standing is None else standing.optical
+        clusters, self._faults = _clusters(chain, settings, optical)
         self._centers = LiveCenters(chain, clusters)
-        self._movement = MovementProgress(chain)
+        self._movement = MovementProgress(chain, _last_said(standing))
 
     def add_mocap(self, frame: MocapFrame) -> None:
         """Take one camera frame."""
@@ -136,6 +141,13 @@ class MovementGuide:
         }
 
 
+def _last_said(standing: CalibrationTrial | None) -> dict[str, Quaternion]:
+    """Return the last orientation of each sensor that a still trial holds."""
+    said = {} if standing is None else standing.sensors
+    last = {s: track.q_world_sensor[-1].tolist() for s, track in said.items() if len(track.t_ns)}
+    return {sensor: (w, x, y, z) for sensor, (w, x, y, z) in last.items()}
+
+
 def _clusters(
     chain: Chain, settings: CalibrationSettings, standing: OpticalTrack | None
 ) -> tuple[dict[str, Cluster], list[str]]:
@@ -175,7 +187,7 @@ def _wanted(one: LiveCenter, target: float) -> str | None:
     if one.frames == 0:
         return "its markers were not seen yet: move so that the cameras see both sides of it"
     if one.center is None or one.unseen > 1:
-        return f"it has hardly moved: {words.bend}"
+        return f"not moved far enough yet: {words.bend}"
     if one.unseen == 1 and not words.hinge:
         return f"no circumduction, it moved about one axis only: {words.sideways}"
     noise = _noise(one)

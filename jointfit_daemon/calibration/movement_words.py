@@ -17,7 +17,8 @@ class JointWords(NamedTuple):
     sideways: str
     """How to move it about a second axis."""
     hinge: bool = False
-    """It has one axis by nature: where the center lies along it comes from the static pose."""
+    """It moves about one axis by nature, or hardly about others: where the center lies along it
+    comes from the static pose, and nobody is asked to show it."""
     arc: float = radians(40.0)
     """Least arc of a joint between two sensors, rad: what the regression must have seen."""
 
@@ -25,11 +26,15 @@ class JointWords(NamedTuple):
 _GENERAL = JointWords("bend and stretch it as far as it goes", "circle it")
 _WORDS = {
     "hip": JointWords("squat, and swing the leg forward and back", "swing the leg sideways"),
-    "knee": JointWords("squat, sit down and stand up", "", hinge=True, arc=radians(60.0)),
-    "ankle": JointWords("lift the foot and bend it up and down", "circle the foot"),
+    "knee": JointWords(
+        "squat, sit down and stand up", "turn the foot in and out", hinge=True, arc=radians(60.0)
+    ),
+    "ankle": JointWords("lift the foot and bend it up and down", "circle the foot", hinge=True),
     "shoulder": JointWords("swing the arm forward and back", "swing the arm sideways"),
-    "elbow": JointWords("bend and stretch the arm", "", hinge=True, arc=radians(60.0)),
-    "wrist": JointWords("bend the hand up and down", "circle the hand"),
+    "elbow": JointWords(
+        "bend and stretch the arm", "turn the palm up and down", hinge=True, arc=radians(60.0)
+    ),
+    "wrist": JointWords("bend the hand up and down", "circle the hand", hinge=True),
 }
 
 

@@ -25,7 +25,7 @@ CORRELATION_S = 0.5
 """Skin motion keeps its value about this long, so a second is worth two samples."""
 
 BENT_RAD, STRAIGHT_RAD = math.radians(30.0), math.radians(15.0)
-"""A joint bent when it turned further than the first from where it was at the beginning, and came
+"""A joint bent when it turned further than the first from where it was in the static pose, and came
 back when it is nearer than the second: what one step or one squat does to a knee."""
 
 
@@ -63,6 +63,9 @@ class MovementProgress:
     """
 
     chain: Chain
+    standing: Mapping[str, Quaternion] = field(default_factory=dict)
+    """Orientation of each sensor in the static pose, from which bends are counted; of one that is
+    not in it, the first that is looked at."""
     _seen: dict[tuple[str, str, str], _Reach] = field(default_factory=dict)
     """By joint and the two sensors looked at: each pair has a mount, so a zero, of its own."""
 
@@ -74,9 +77,11 @@ class MovementProgress:
             a = next((sensor for sensor in above if sensor in latest), None)
             b = next((sensor for sensor in below if sensor in latest), None)
             if a is not None and b is not None:
-                proximal, distal = np.asarray(latest[a]), np.asarray(latest[b])
-                q = rotation.multiply(rotation.conjugate(proximal), distal)
-                self._seen.setdefault((joint, a, b), _Reach(q)).take(q)
+                reach = self._seen.get((joint, a, b))
+                if reach is None:
+                    zero = self.standing if {a, b} <= self.standing.keys() else latest
+                    reach = self._seen[joint, a, b] = _Reach(_between(zero[a], zero[b]))
+                reach.take(_between(latest[a], latest[b]))
 
     def arcs(self) -> dict[str, float]:
         """Return the largest arc each inner joint went through so far, rad."""
@@ -96,6 +101,10 @@ class MovementProgress:
         """Return the expected RMS error of each inner joint centre, m; None while it is useless."""
         looks = max(1.0, elapsed_s / CORRELATION_S)
         return {joint: _predicted(arc, looks) for joint, arc in self.arcs().items()}
+
+
+def _between(proximal: Quaternion, distal: Quaternion) -> np.ndarray:
+    return rotation.multiply(rotation.conjugate(np.asarray(proximal)), np.asarray(distal))
 
 
 def _predicted(arc: float, looks: float) -> float | None:

@@ -217,8 +217,7 @@ class CalibrationSession:
     def _begin(self, t_ns: int, name: str, wanted_s: float) -> list[Output]:
         guide, settings = None, self._settings
         if name == "functional":
-            standing = None if self._static is None else self._static.optical
-            guide = MovementGuide(self._chain, settings, standing)
+            guide = MovementGuide(self._chain, settings, self._static)
         wanted_s = min(wanted_s, LONGEST_S)
         least_s = settings.functional_min_s
         self._phase = Phase(name, self._chain, t_ns, wanted_s, guide=guide, least_s=least_s)

@@ -62,13 +62,10 @@ def calibrate(
     Exit code 1: a phase was refused or given up; 3: the result is worse than what is stored, which
     stays (--force takes it).
     """
-    import orjson
-
     from jointfit_daemon.config import ConfigError, load_rig
     from jointfit_daemon.outputs.mqtt import BrokerLost
     from jointfit_daemon.outputs.mqtt_client import NoAnswer
     from jointfit_daemon.tools.calibration_guide import PhaseAborted, RequestRefused
-    from jointfit_daemon.tools.calibration_report import report
 
     wrong = [name for name in phase or () if name not in (*ORDER, "abort")]
     if wrong:
@@ -87,6 +84,15 @@ def calibrate(
     except (BrokerLost, NoAnswer, PhaseAborted, RequestRefused) as fault:
         typer.echo(f"jointfit calibrate: {fault}", err=True)
         raise typer.Exit(1) from None
+    _tell(status, json=json)
+
+
+def _tell(status: Mapping[str, Any], *, json: bool) -> None:
+    """Print the last status; end with `NOT_TAKEN` if its result was not."""
+    import orjson
+
+    from jointfit_daemon.tools.calibration_report import report
+
     if json:
         typer.echo(orjson.dumps(status))
     else:

@@ -62,3 +62,11 @@ def test_a_chain_of_any_length_has_its_inner_joints(segments: int) -> None:
     progress = MovementProgress(chain)
     progress.look({f"S{i}": UPRIGHT for i in range(segments)})
     assert list(progress.arcs()) == [f"J{i}" for i in range(1, segments)]
+
+
+def test_bends_are_counted_from_the_static_pose_wherever_the_movement_begins() -> None:
+    progress = MovementProgress(CHAIN, {"S1": UPRIGHT, "S3": UPRIGHT})
+    for _ in range(4):
+        for degrees in (60, 20, 40, 5):  # 20 is not straight: 60, 20, 40 is one bend
+            progress.look({"S1": UPRIGHT, "S3": about_x(degrees)})
+    assert progress.bends() == {"knee": 4}

@@ -8,7 +8,7 @@ import pytest
 
 from jointfit_daemon.tools import calibration_guide
 from jointfit_daemon.tools.calibration_guide import CalibrationWatch, PhaseAborted
-from jointfit_daemon.tools.calibration_report import report
+from jointfit_daemon.tools.calibration_report import movement_lines, report
 
 
 def watch(*phases: str) -> CalibrationWatch:
@@ -87,3 +87,21 @@ def test_the_report_names_errors_centers_and_a_missing_align_phase() -> None:
 
 def test_nothing_known_is_nothing_told() -> None:
     assert report({}) == []
+
+
+def test_a_movement_is_told_a_joint_a_line_and_what_is_unknown_is_said() -> None:
+    hip = {"met": True, "source": "markers", "predicted_error_mm": 16.66, "noise_error_mm": 2.11,
+           "arc_deg": 64.2}  # fmt: skip
+    knee = {"met": False, "source": "sensors", "predicted_error_mm": None, "bends": 3}
+    assert movement_lines({"joints": {"hip": hip, "knee": knee}}) == [
+        "✔ hip: center ± 16.7 mm with skin, 2.1 mm by noise, 64° seen",
+        "… knee: center unknown, bent 3×, by sensors",
+    ]
+    assert movement_lines({}) == []
+
+
+def test_figures_follow_the_progress_they_came_with() -> None:
+    told: list[object] = []
+    one = CalibrationWatch(lambda *said: told.append(said), told.append)
+    one.on_progress({"phase": "functional", "progress": 0.5, "text": "on", "data": {"joints": {}}})
+    assert told == [("functional", 0.5, "on"), {"joints": {}}]

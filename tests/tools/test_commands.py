@@ -70,3 +70,17 @@ def test_an_unknown_phase_is_refused_before_anything_is_sent() -> None:
     result = run(app, ["calibrate", str(EXAMPLE), "--phase", "dance"])
     assert result.exit_code == 2
     assert "functional" in result.stderr
+
+
+@pytest.mark.parametrize(("kept", "code"), [("knee: flexion error 5 deg, was 2", 3), (None, 0)])
+def test_a_result_that_is_not_taken_ends_with_3_and_the_reason(
+    monkeypatch: pytest.MonkeyPatch, kept: str | None, code: int
+) -> None:
+    async def led(*_: object, **__: object) -> dict[str, object]:
+        return {"text": "told", "kept": kept, "quality": {}}
+
+    monkeypatch.setattr("jointfit_daemon.tools.calibrate._lead", led)
+    result = run(app, ["calibrate", str(EXAMPLE), "--yes"])
+    assert result.exit_code == code
+    assert "told" in result.stdout
+    assert (kept or "") in result.stderr
