@@ -22,6 +22,7 @@ from jointfit_daemon.calibration.center.sphere import (
     gamage_lasenby,
     halvorsen,
 )
+from jointfit_daemon.calibration.center.sphere_directions import Limits
 from jointfit_daemon.calibration.center.sphere_verdict import refusal
 
 if TYPE_CHECKING:
@@ -120,7 +121,9 @@ def _bodies(movement: Movement) -> tuple[BodyPoses, BodyPoses]:
 
 def _stream(movement: Movement) -> CenterEstimate:
     points = _points(movement)
-    stream = RunningSphere(points.shape[1], dimension=points.shape[2], near=movement.near)
+    limits = Limits(min_direction=movement.least_turn)
+    k, d = points.shape[1:]
+    stream = RunningSphere(k, dimension=d, near=movement.near, limits=limits)
     for number, frame in enumerate(points, 1):
         stream.feed(frame)
         if number % _ASK_EVERY == 0:
@@ -149,21 +152,21 @@ _ALL = (
         "linear sphere fit; biased on short arcs",
         ("points",),
         False,
-        lambda m: gamage_lasenby(_points(m)),
+        lambda m: gamage_lasenby(_points(m), m.least_turn),
     ),
     Method(
         "halvorsen",
         "linear sphere fit, bias taken out",
         ("points",),
         False,
-        lambda m: halvorsen(_points(m)),
+        lambda m: halvorsen(_points(m), m.least_turn),
     ),
     Method(
         "sphere",
         "geometric sphere fit of all markers, robust; tells a hinge from a ball joint",
         ("points",),
         False,
-        lambda m: fit_sphere(_points(m), SphereOptions(start=m.near)),
+        lambda m: fit_sphere(_points(m), SphereOptions(start=m.near, min_direction=m.least_turn)),
     ),
     Method(
         "running_sphere",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.calibration.center import sphere_directions as directions
 from jointfit_daemon.calibration.center.geometric import geometric_estimate
 from jointfit_daemon.calibration.center.grid import Grid, grid_center
 from jointfit_daemon.calibration.center.oriented import oriented_estimate
@@ -131,7 +132,8 @@ def in_plane(
             return run(points, movement)
         axis = movement.axis
         if axis is None:
-            shown = fit_running(points)
+            turn = directions.Limits(min_direction=movement.least_turn)
+            shown = fit_running(points, limits=turn)
             if shown.axis is None:
                 return refusal(name, 3, shown.frames, shown.refused or OFF_AXIS)
             axis = shown.axis

@@ -87,10 +87,11 @@ def planar_noise(points: Array, parent: Array, noise: float) -> Array:
 def relative(points: Array, parent: Array, center: Array) -> Array:
     r"""Return the shape of each marker's noise for `RunningSphere`: its radial part is one.
 
-    .. math:: S_j = \overline{Σ_x} / \overline{\hat r^T Σ_x \hat r}
+    .. math:: S_j = Σ_c / \overline{\hat r_j^T Σ_c \hat r_j}, \qquad
+              Σ_c = \left(1 + \tfrac1m\right) I + [λ_c]_× G^{-1} [λ_c]_×^T
 
-    The noise found along the radius says nothing of the noise across it, which is larger where the
-    center is near the parent's markers; taking too little of it out leaves a bias.
+    with the lever arm of the center, not of the marker: a turn of the parent's frame carries
+    markers and center alike, and the distance between them feels only how the center is moved.
 
     Parameters
     ----------
@@ -104,17 +105,14 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     Returns
     -------
     ndarray, shape (k, d, d)
-        Identity for a marker never seen.
+        The common shape for a marker never seen.
     """
-    seen: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=-1))
-    d = points.shape[-1]
-    v = np.where(seen[..., None], points, center + 1.0)
-    S = (spatial_noise if d == 3 else planar_noise)(v, parent, 1.0)
-    spoke = v - center
+    seen = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.float64)
+    S = (spatial_noise if len(center) == 3 else planar_noise)(center, parent, 1.0)
+    spoke = np.where(seen[..., None] > 0.0, points, center + 1.0) - center
     spoke = spoke / np.maximum(np.linalg.norm(spoke, axis=-1, keepdims=True), 1e-9)
-    radial = np.einsum("tja,tjab,tjb->tj", spoke, S, spoke)
-    count = np.maximum(seen.sum(axis=0), 1)
-    mean = (seen[..., None, None] * S).sum(axis=0) / count[:, None, None]
-    along = (seen * radial).sum(axis=0) / count
-    found = mean / np.maximum(along, 1e-300)[:, None, None]
-    return np.where((seen.sum(axis=0) > 0)[:, None, None], found, np.eye(d))
+    radial = np.einsum("tja,ab,tjb->tj", spoke, S, spoke)
+    total = seen.sum(axis=0)
+    along = (seen * radial).sum(axis=0) / np.maximum(total, 1.0)
+    along = np.where(total > 0.0, along, np.trace(S) / len(center))
+    return np.asarray(S / np.maximum(along, 1e-300)[:, None, None])

@@ -185,7 +185,7 @@ class RunningSphere:
         # the center's own uncertainty excuses a marker that goes where it never was
         way = np.where(near[:, None], phi[:, 1:-1] - expected.mean, 0.0)
         excused = np.einsum("ja,jab,jb->j", way, expected.unsure, way)
-        scale = np.sqrt(expected.noise**2 + excused)
+        scale = np.sqrt(expected.noise**2 + np.maximum(excused, 0.0))
         residual = np.where(near, residual, 0.0)
         w = w * np.minimum(1.0, OUTLIER * scale / np.maximum(residual, 1e-300))
         off = near & (residual > np.maximum(OFF * scale, OFF_M))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from jointfit_daemon.calibration.center.score import (
     FEW,
     HINGE_RATIO,
+    MIN_TURN_RAD,
     solve_two_sided,
     two_sided_estimate,
 )
@@ -58,7 +59,7 @@ def fit_axis(
     found = solve_two_sided(parent, child, hinge=True, robust=robust)
     if found is None:
         return refusal("sara", 3, 0, FEW)
-    if found.ratio >= HINGE_RATIO:
+    if found.ratio >= HINGE_RATIO and found.turn >= MIN_TURN_RAD:
         return refusal(
             "sara",
             3,

@@ -87,7 +87,7 @@ class SphereFit:
         return np.asarray(np.linalg.svd(self.basis)[0][:, self.basis.shape[1] :].T)
 
 
-def gamage_lasenby(points: Array) -> CenterEstimate:
+def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     r"""Solve for the center in which the spread of squared distances is least.
 
     .. math:: 2 \sum_j \left(\overline{vv^T} - \bar v \bar v^T\right) m
@@ -99,11 +99,13 @@ def gamage_lasenby(points: Array) -> CenterEstimate:
     ----------
     points : ndarray, shape (n, k, 3)
         Markers of the child in the parent's coordinates, m; NaN where not seen.
+    min_direction : float
+        RMS turning, rad, below which a direction is not seen: then refused.
     """
-    return _linear(points, "gamage_lasenby", 0)
+    return _linear(points, "gamage_lasenby", 0, min_direction)
 
 
-def halvorsen(points: Array) -> CenterEstimate:
+def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     r"""Take the bias out of `gamage_lasenby` by the noise found, twenty times over.
 
     .. math:: A m = b - 2 σ^2 \sum_j (\bar v_j - m), \qquad
@@ -111,7 +113,7 @@ def halvorsen(points: Array) -> CenterEstimate:
 
     Halvorsen 2003. Parameters as in `gamage_lasenby`.
     """
-    return _linear(points, "halvorsen", _HALVORSEN_STEPS)
+    return _linear(points, "halvorsen", _HALVORSEN_STEPS, min_direction)
 
 
 FLAT = (
@@ -124,7 +126,7 @@ def _few(frames: int) -> str:
     return f"{frames} usable frames, at least {MIN_FRAMES} are needed: keep the markers in view"
 
 
-def _linear(points: Array, method: str, steps: int) -> CenterEstimate:
+def _linear(points: Array, method: str, steps: int, min_direction: float) -> CenterEstimate:
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     enough = seen.sum(axis=0) >= MIN_FRAMES
     frames = int(np.count_nonzero(seen[:, enough].any(axis=1)))
@@ -141,7 +143,7 @@ def _linear(points: Array, method: str, steps: int) -> CenterEstimate:
         e, _ = _residual(points[:, enough], m, seen[:, enough].astype(np.float64))
         noise2 = float(np.nansum(e * e)) / max(free, 1)
         m = np.linalg.solve(A, b - noise2 * (paths.mean - m).sum(axis=0))
-    options = SphereOptions(huber=np.inf)
+    options = SphereOptions(huber=np.inf, min_direction=min_direction)
     w = seen[:, enough].astype(np.float64)
     fit = _at(points[:, enough], m, w, np.eye(3))
     scale = float(np.sqrt((fit.residuals**2).sum() / w.sum()))
@@ -150,7 +152,7 @@ def _linear(points: Array, method: str, steps: int) -> CenterEstimate:
         return refusal(method, 3, frames, FLAT)
     found = judge_sphere(fit, method, frames, Limits(), options)
     radii = np.full(len(enough), np.nan)
-    radii[enough] = found.radii
+    radii[enough] = found.radii if len(found.radii) else np.nan
     flags = found.flags if steps else (*found.flags, "biased_on_short_arcs")
     return replace(found, radii=radii, flags=flags) if len(found.radii) else found
 
@@ -190,8 +192,8 @@ def fit_sphere(
     fit = solve_sphere(points[:, enough], options)
     found = judge_sphere(fit, "sphere", frames, limits, options)
     radii = np.full(len(enough), np.nan)
-    radii[enough] = found.radii
-    return replace(found, radii=radii) if len(found.radii) else found
+    radii[enough] = found.radii if len(found.radii) else np.nan
+    return replace(found, radii=radii)
 
 
 def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
@@ -292,7 +294,8 @@ def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions
     left = spread - noise * across
     chance = np.array([7.0, 0.0, 0.0]) * noise * np.sqrt(2.0 / total) * across
     sharp = MIN_CONDITIONING**2 * noise / total
-    keep = left > np.maximum(np.maximum(options.min_direction**2, chance), sharp)
+    third = np.array([options.min_direction**2, 0.0, 0.0])
+    keep = left > np.maximum(np.maximum(third, chance), sharp)
     return np.asarray(axes[:, keep])
 
 

@@ -120,6 +120,7 @@ def common_center(paths: Paths) -> Spheres | None:
 def _shrunk(ratio: Array, n: Array) -> Array:
     """Return how noisy markers are relative to each other, as far as chance does not explain it."""
     ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
+    ratio = np.clip(ratio, 0.0, 1e6)
     chance = 4.0 * 2.0 / np.maximum(n, 1.0)
     excess = (ratio - 1.0) ** 2
     trust = np.maximum(0.0, 1.0 - chance / np.maximum(excess, 1e-300))

@@ -28,6 +28,8 @@ MIN_CONDITIONING = 6.0
 MIN_SIGNIFICANCE = 7.0
 """Standard deviations by which the turning along a third direction must exceed what noise turns:
 many frames of noise along a hinge's axis would pass for a well-conditioned center."""
+FILLED = 0.1
+"""Share of the movement's variance from which residuals are no noise about an arc."""
 _STILL_M = 1e-6
 _PERSISTENT = 0.99
 _CHI2 = (3.841, 5.991, 7.815)  # 95 % of one, two, three squares
@@ -38,8 +40,9 @@ class Limits:
     """When a center is not to be used."""
 
     min_direction: float = 0.0
-    """RMS turning of the markers along a direction, rad, below which it is not seen whatever the
-    noise: 3° on skin, which moves more than a marker's noise."""
+    """RMS turning of the markers along the third direction, rad, below which the joint is taken for
+    a hinge whatever the noise: 3° on skin; more than the turns that noise gives the parent's frame,
+    which look like the joint's own."""
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)
     """Least and largest distance of the markers from the center, m."""
@@ -86,27 +89,39 @@ def observe(sums: SphereSums, paths: Paths, basis: Array, limits: Limits) -> See
         clear = spread[0] > max(
             (basis.shape[1] == 3) * MIN_SIGNIFICANCE * floor * np.sqrt(2.0 / total),
             MIN_CONDITIONING**2 * found.noise2 / float(np.median(found.radii2)),
-            limits.min_direction**2 * total,
+            (basis.shape[1] == 3) * limits.min_direction**2 * total,
             0.0,
         )
         if clear:
-            return _spread(sums, basis, flat, found)
+            return None if _filled(flat, found) else _spread(sums, basis, flat, found)
         basis = basis @ axes[:, 1:]
     return None
+
+
+def _filled(paths: Paths, found: Spheres) -> bool:
+    """Tell whether paths fill an area as wide as it is long: a small movement seen face on.
+
+    Its center lies before or behind it, too far for the bend to show; a circle in it is chance.
+    """
+    wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", paths.n / paths.n.sum(), paths.C))[-1]
+    noise2 = found.noise2 * float(np.median(found.relative))
+    return bool(noise2 > FILLED * wide)
 
 
 def _spread(sums: SphereSums, basis: Array, paths: Paths, found: Spheres) -> Seen:
     r"""Return the covariance by the sandwich of what the residuals really have in common.
 
     .. math:: \mathrm{Cov} = B^{-1} \Big[ \sum_{jl} \frac{n_{jl}\, \overline{e_j e_l}\;
-              \overline{u_j u_l^T}}{s_j s_l} \Big] B^{-1} \cdot \frac{1+\rho}{1-\rho}
+              \overline{u_j u_l^T}}{s_j s_l} \Big] B^{-1} \cdot \frac{1+\rho\rho_u}{1-\rho\rho_u}
 
-    e the radial residuals, u the directions, s the relative noise, ρ the lag-one correlation; times
+    e the radial residuals, u the directions, s the relative noise, ρ and ρ_u their
+    lag-one correlations (noise that lasts hurts only where the movement lasts, too); times
     what turns the normal quantile into Hotelling's for the degrees of freedom at hand.
     """
     k, rank = paths.mean.shape
     total = float(paths.n.sum())
     together, rho = _residuals(sums, basis, paths, found)
+    both = rho * _smoothness(sums, paths, found)
     weights = np.maximum(sums.weights, 1e-300)
     pairs = np.maximum(sums.M[:, -1, :, -1], 0.0)
     X = np.einsum("ap,jalb,bq->jlpq", basis, sums.M[:, 1:-1, :, 1:-1], basis)
@@ -118,13 +133,37 @@ def _spread(sums: SphereSums, basis: Array, paths: Paths, found: Spheres) -> See
     meat = np.einsum("jl,jlpq->pq", joint * together / np.outer(scale, scale), X)
     bread = np.linalg.inv(found.information)
     dof = max(total * (1.0 - rho) / (1.0 + rho) - k - rank, 2.0)
-    widened = (1.0 + rho) / (1.0 - rho) * total / max(total - k - rank, 1.0)
+    # a fit takes more out of noise that lasts
+    own = total * (1.0 - both) / (1.0 + both)
+    widened = total / max(own - k - rank, 1.0)
     widened *= 1.0 + (_CHI2[rank - 1] - rank + 2.0) / (2.0 * dof)
     bound2 = found.noise2 * float(np.trace(bread))
-    spread = bread @ meat @ bread * widened
+    spread = _no_better(bread @ meat @ bread, np.asarray(found.noise2 * bread)) * widened
     path = np.einsum("j,jab->ab", paths.n / found.relative, paths.C)
     tilt = found.noise2 * np.linalg.inv(path)  # of a plane through the paths
-    return Seen(basis, paths, found, spread, tilt, np.diagonal(together), bound2, rho)
+    return Seen(
+        basis, paths, found, spread, tilt, np.maximum(np.diagonal(together), 0.0), bound2, rho
+    )
+
+
+def _no_better(spread: Array, white: Array) -> Array:
+    """Return `spread` no smaller in any direction than a quarter of what white noise gives.
+
+    Few frames may show correlations between markers that are chance and would cancel all noise.
+    """
+    L = np.linalg.cholesky((white + white.T) / 2.0)
+    inner = np.linalg.solve(L, np.linalg.solve(L, spread).T)
+    values, axes = np.linalg.eigh((inner + inner.T) / 2.0)
+    T = L @ axes
+    return np.asarray((T * np.maximum(values, 0.25)) @ T.T)
+
+
+def _smoothness(sums: SphereSums, paths: Paths, found: Spheres) -> float:
+    """Return the correlation of the markers' directions from one frame to the next, 0 to 1."""
+    w = paths.n / (found.radii2 * found.relative)
+    after = np.einsum("jaa->j", sums.L[:, 1:-1, 1:-1]) / np.maximum(sums.L[:, -1, -1], 1e-300)
+    own = np.einsum("jaja->j", sums.M[:, 1:-1, :, 1:-1]) / np.maximum(sums.weights, 1e-300)
+    return float(np.clip((w @ after) / max(float(w @ own), 1e-300), 0.0, 1.0))
 
 
 def _residuals(sums: SphereSums, basis: Array, paths: Paths, found: Spheres) -> tuple[Array, float]:

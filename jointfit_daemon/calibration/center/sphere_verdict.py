@@ -37,7 +37,7 @@ LOUD = 9.0
 """Variance of a marker over that of the others from which it is named."""
 PERSISTENT = 0.5
 """Correlation of residuals from frame to frame from which it is flagged."""
-STRAIGHT = "the markers moved on what may be a straight line: bend the joint at least 30° each way"
+STRAIGHT = "the markers' paths show no bend: move the joint further, at least 30° each way"
 STILL = "the markers stood still in the parent: move the joint, at least 30° each way"
 
 

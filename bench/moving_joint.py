@@ -1,0 +1,105 @@
+"""Joints that move as the rows say: true paths, noisy markers, frames fitted to them.
+
+Law: the center is the origin of the parent; all randomness comes from the generator given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration.center.movement import BodyPoses
+from jointfit_daemon.calibration.markers import rigid_fit
+from jointfit_daemon.kinematics import rotation
+
+Array = NDArray[np.float64]
+
+CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])
+"""m, shape (4, 3)."""
+PARENT = np.array([[0.1, 0.1, 0.05], [-0.1, 0.1, 0.04], [0.1, -0.08, 0.06], [-0.1, -0.08, 0.1]])
+TEMPLATE_ERROR_M = 0.0003
+RADII = (0.30, 0.35, 0.20, 0.28)
+OFFSETS = (0.0, 0.25, -0.3, 0.6)
+CHI2_95 = {2: 5.991, 3: 7.815}
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What cameras see of one run."""
+
+    points: Array
+    """Child's markers in the parent's fitted frame, m, shape (n, k, 3)."""
+    parent: BodyPoses
+    child: BodyPoses
+
+
+def ball_turns(rng: np.random.Generator, rom_deg: float, n: int = 200) -> Array:
+    """Return rotations in all directions, (n, 3, 3)."""
+    h = np.radians(rom_deg) / 2
+    a, phi = h * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    vectors = np.stack((a * np.cos(phi), a * np.sin(phi), rng.uniform(-h, h, n)), axis=1)
+    return np.asarray(rotation.to_matrix(rotation.exp(vectors)))
+
+
+def hinge_turns(rom_deg: float, n: int = 200, axis: int = 2) -> Array:
+    """Return rotations about one axis, (n, 3, 3)."""
+    angle = np.linspace(-0.5, 0.5, n) * np.radians(rom_deg)
+    return np.asarray(rotation.to_matrix(rotation.exp(angle[:, None] * np.eye(3)[axis])))
+
+
+def star_turns(rom_deg: float, n: int) -> Array:
+    """Return a smooth movement through all directions, (n, 3, 3)."""
+    s = np.linspace(0.0, 2.0 * np.pi, n)
+    vectors = np.stack((np.sin(3 * s), np.sin(4 * s + 0.7), np.sin(5 * s + 1.3)), axis=1)
+    return np.asarray(rotation.to_matrix(rotation.exp(np.radians(rom_deg) / 2 * vectors)))
+
+
+def carried(turns: Array, markers: Array = CHILD) -> Array:
+    """Return the true paths of markers, m, shape (n, k, 3)."""
+    return np.asarray(np.einsum("nij,kj->nki", turns, markers))
+
+
+def fan(arc_deg: float, n: int = 100) -> Array:
+    """Return four markers' paths in a plane, at different angles round the joint, (n, 4, 2)."""
+    theta = np.linspace(0.0, np.radians(arc_deg), n)[:, None] + np.array(OFFSETS)
+    return np.asarray(np.array(RADII)[:, None] * np.stack((np.cos(theta), np.sin(theta)), axis=-1))
+
+
+def watched(
+    rng: np.random.Generator,
+    turns: Array,
+    *,
+    markers: Array = CHILD,
+    noise: float = 1e-3,
+    template_error: float = 0.0,
+    frame: Array = PARENT,
+) -> Seen:
+    """Let the parent move, too, and both be seen by noisy markers."""
+    n = len(turns)
+    moved = rotation.to_matrix(rotation.exp(rng.normal(0, 0.1, (n, 3))))
+    t = rng.normal(0, 0.05, (n, 3))
+    above = np.einsum("nij,kj->nki", moved, frame) + t[:, None]
+    below = np.einsum("nij,nkj->nki", moved, carried(turns, markers)) + t[:, None]
+    above += rng.normal(0, noise, above.shape)
+    below += rng.normal(0, noise, below.shape)
+    parent = BodyPoses(*rigid_fit(frame, above)[:2])
+    template = markers + rng.normal(0, template_error, markers.shape)
+    child = BodyPoses(*rigid_fit(template, below)[:2])
+    return Seen(parent.to_body(below), parent, child)
+
+
+def sphere_bound(paths: Array, noise: float) -> float:
+    """Return the least mean square error of a center from these true paths, m²."""
+    u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
+    u = u - u.mean(axis=0)
+    return float(np.trace(np.linalg.inv(np.einsum("tja,tjb->ab", u, u)))) * noise**2
+
+
+def covers(error: Array, covariance: Array, unseen: Array) -> bool:
+    """Tell whether the 95 % ellipse, in the directions seen, holds the truth."""
+    d = len(error)
+    across = np.linalg.svd(unseen)[2][len(unseen) :] if len(unseen) else np.eye(d)
+    e, spread = across @ error, across @ covariance @ across.T
+    return bool(e @ np.linalg.solve(spread, e) < CHI2_95[len(e)])
