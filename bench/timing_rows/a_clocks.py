@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Delays = Callable[[np.random.Generator, int], NDArray[np.float64]]
+    Figures = Callable[[], list[Figure]]
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD = 10 * MS
@@ -125,6 +126,7 @@ def passive(
 def jitter(_: Path, runs: int = 60) -> list[Figure]:
     """T2: passive clocks under ordinary jitter."""
     figures: list[Figure] = []
+    skews = np.zeros(0)
     for delays, seconds, goals in (
         (exponential, 10.0, (0.0015, 0.004)),
         (spiky, 10.0, (0.0015, 0.005)),

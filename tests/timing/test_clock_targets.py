@@ -1,0 +1,41 @@
+"""The rows of bench/timing.py that clocks must keep, with fewer runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bench.timing_rows import a_clocks
+
+if TYPE_CHECKING:
+    from bench.experiment import Figure
+
+NOWHERE = Path()
+SLACK = 1.5
+"""Of a few runs the 99th percentile is the worst, and the root mean square scatters."""
+
+
+def kept(figure: Figure) -> bool:
+    """Tell whether a figure of fewer runs is what the goal of more runs makes likely."""
+    return figure.value <= SLACK * figure.goal
+
+
+@pytest.mark.parametrize(
+    "figures",
+    [
+        pytest.param(lambda: a_clocks.echoes(NOWHERE, runs=30), id="T1"),
+        pytest.param(lambda: a_clocks.jitter(NOWHERE, runs=6), id="T2"),
+        pytest.param(lambda: a_clocks.timer(NOWHERE, runs=12), id="T3"),
+        pytest.param(lambda: a_clocks.wraps_and_restarts(NOWHERE), id="T5"),
+    ],
+)
+def test_clocks_keep_their_targets(figures: a_clocks.Figures) -> None:
+    missed = [figure for figure in figures() if not kept(figure)]
+    assert missed == []
+
+
+def test_an_update_costs_microseconds() -> None:
+    (figure,) = a_clocks.cost(NOWHERE)
+    assert figure.value <= 5 * figure.goal  # a busy machine of any kind; the bench says how many
