@@ -6,6 +6,7 @@ arranged for thousands of short movements, all with the same number of frames an
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -83,11 +84,18 @@ def _linear_start(z: Complex, theta: Array) -> Array:
     return np.stack((c.real, c.imag, np.abs(w), np.angle(w)), axis=-1)
 
 
-def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
-    n = theta.shape[-1]
+@cache
+def _wandering(n: int, interval: float) -> tuple[Array, Array]:
+    """Return eigenvalues and -vectors of the angles' covariance, the scale's part left out."""
     apart = interval * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
     values, U = np.linalg.eigh(slow + _TOLD.white**2 * np.eye(n))
+    return values, U
+
+
+def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
+    n = theta.shape[-1]
+    values, U = _wandering(n, interval)
     d = 1.0 / (values + relative_noise[:, None] ** 2)
     # the scale's part without the noise of the angles: here they grow evenly from frame to frame
     even = np.arange(n) - 0.5 * (n - 1)
