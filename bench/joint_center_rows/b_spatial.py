@@ -49,6 +49,10 @@ NOISE = 1e-3
 """Of every coordinate, m."""
 
 
+AT_20, AT_45 = (2.15, 2.15, 2.28, 3.26, inf), (0.85, 0.85, 0.91, 1.00, inf)
+"""Measured by others for these methods, mm; the last is not one to use."""
+
+
 def rms(errors: list[Array]) -> float:
     return float(np.sqrt(np.mean([e @ e for e in errors])))
 
@@ -71,31 +75,24 @@ def four_markers(_: Path) -> list[Figure]:
     ]
 
 
-def ball_joint(_: Path) -> list[Figure]:
+def ball_joint(rom: float, goals: tuple[float, ...]) -> list[Figure]:
     """C-10: 1 mm on all markers of both bodies, 400 runs."""
-    figures = []
-    goals = {20: (2.15, 2.28, 3.26, inf), 45: (0.85, 0.91, 1.00, inf)}
-    for rom, (sphere, linear, score, kasa) in goals.items():
-        rng = np.random.default_rng(10)
-        errors: dict[str, list[Array]] = {}
-        for _run in range(400):
-            turns = ball_turns(rng, rom)
-            seen = watched(rng, turns, template_error=TEMPLATE_ERROR_M)
-            plain = fit_sphere(seen.points, SphereOptions(huber=inf))
-            for name, found in (
-                ("sphere", plain),
-                ("running sphere", fit_running(seen.points)),
-                ("Halvorsen", halvorsen(seen.points)),
-                ("SCoRE", fit_score(seen.parent, seen.child, robust=False)),
-                ("Gamage-Lasenby", gamage_lasenby(seen.points)),
-            ):
-                errors.setdefault(name, []).append(found.center)
-        wanted = (sphere, sphere, linear, score, kasa)
-        figures += [
-            Figure(f"{name} at {rom}°", MM * rms(found), 1.15 * goal, unit="mm")
-            for (name, found), goal in zip(errors.items(), wanted, strict=True)
-        ]
-    return figures
+    rng = np.random.default_rng(10)
+    errors: dict[str, list[Array]] = {}
+    for _run in range(400):
+        seen = watched(rng, ball_turns(rng, rom), template_error=TEMPLATE_ERROR_M)
+        for name, found in (
+            ("sphere", fit_sphere(seen.points, SphereOptions(huber=inf))),
+            ("running sphere", fit_running(seen.points)),
+            ("Halvorsen", halvorsen(seen.points)),
+            ("SCoRE", fit_score(seen.parent, seen.child, robust=False)),
+            ("Gamage-Lasenby", gamage_lasenby(seen.points)),
+        ):
+            errors.setdefault(name, []).append(found.center)
+    return [
+        Figure(name, MM * rms(found), 1.15 * goal, unit="mm")
+        for (name, found), goal in zip(errors.items(), goals, strict=True)
+    ]
 
 
 def hinge_axis(_: Path) -> list[Figure]:
@@ -220,9 +217,12 @@ def coverage(runs: int) -> list[Figure]:
 
 EXPERIMENTS = (
     Experiment("C-7", "four markers round a joint, 20° arc", four_markers),
-    Experiment("C-10", "ball joint, both bodies noisy, RMS error", ball_joint),
+    Experiment("C-10", "ball joint 20°, both bodies noisy, RMS", lambda _: ball_joint(20.0, AT_20)),
+    Experiment(
+        "C-10b", "ball joint 45°, both bodies noisy, RMS", lambda _: ball_joint(45.0, AT_45)
+    ),
     Experiment("C-11", "SARA at 45°", hinge_axis),
     Experiment("C-12", "noise of the parent's frame against Monte-Carlo", parent_covariance),
-    Experiment("C-10c", "streaming sphere: bound and 95 % ellipse", lambda _: coverage(150)),
+    Experiment("C-10c", "streaming sphere: bound and 95 % ellipse", lambda _: coverage(100)),
     Experiment("C-10C", "the same, 4000 runs", lambda _: coverage(4000), long=True),
 )
