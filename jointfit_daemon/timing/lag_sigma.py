@@ -4,10 +4,11 @@ Law: pure; judges a finished fit, changes nothing. Residuals of low-passed rates
 over the filter's memory, and where the two bodies or the two systems disagree (skin, lens, gyro
 scale) over whole movements. So the variance is taken at several scales and the largest one counts:
 
-* Newey and West (1987), residuals correlated over the filter's memory;
 * the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each stretch of the window,
-  stretches of one filter memory and of its doubles while at least five remain. It needs no model
-  of the residuals, and a stretch that everything rests on betrays itself.
+  with at most 32 stretches, none shorter than the filter's memory, and with half as many
+  again and again while five remain. It needs no model of the residuals, and a stretch that
+  everything rests on betrays itself;
+* Newey and West (1987), residuals correlated over the shortest of these stretches.
 
 Each is widened by :math:`\nu/(\nu-2)`, the variance of Student's t, where :math:`\nu + 1 =
 (\sum h)^2/\sum h^2` counts the stretches that carry the information h about the lag: one tap in a
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 RIDGE = 1e-9
 """Relative, on the rotation: motion about one axis leaves it open about that axis."""
 LEAST_BLOCKS = 5
+MOST_BLOCKS = 32
+"""More would be shorter than they need be: noise of orientations is a rate that swings back, and
+stretches too short to see it do so are overrated."""
 _LEAST_FREEDOM = 2.0
 """Below, a variance estimated from so few has no mean."""
 _TINY = 1e-12
@@ -64,11 +68,13 @@ def lag_sigma(columns: Columns, t_s: Floats, memory_s: float) -> float:
     information = columns.weight * np.sum(own**2, axis=1)
     if information.sum() <= _TINY:
         return float("inf")
+    block = np.floor((t_s - t_s[0]) / memory_s).astype(np.int64)
+    while np.unique(block).size > MOST_BLOCKS:
+        block, memory_s = block // 2, 2.0 * memory_s
     score = columns.weight * np.sum(own * columns.residual, axis=1)
     period = float(np.median(np.diff(t_s)))
     blind = _newey_west(score, max(1, round(memory_s / period))) / information.sum() ** 2
     variances: list[float] = []
-    block = np.floor((t_s - t_s[0]) / memory_s).astype(np.int64)
     table = np.concatenate((normal.reshape(-1, 49), gradient, information[:, None]), axis=1)
     while True:
         first = np.flatnonzero(np.diff(block, prepend=-1))
