@@ -84,6 +84,10 @@ class Scene:
         self, knobs: Knobs, subject: Subject, options: SceneOptions, *, now_ns: int
     ) -> None:
         self._options, self._subject = options, subject
+        known = (*subject.sensors, OPTICAL)
+        for name in options.clocks:
+            if name not in known:
+                raise BadCommand(f"no clock {name!r}; there are: {', '.join(known)}")
         options.directory.mkdir(parents=True, exist_ok=True)
         self._hardware = wire_up(
             knobs,
@@ -101,7 +105,7 @@ class Scene:
         ticker = Ticker(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
         self._tickers = {n: s.ticker for n, s in self._hardware.streams.items()} | {OPTICAL: ticker}
         for name, fault in options.clocks.items():
-            self._ticker(name).ask(fault, now_ns)
+            self._tickers[name].ask(fault, now_ns)
         for stream in self._hardware.streams.values():
             stream.told = told
         self._server: NatNetServer | None = None
@@ -243,11 +247,6 @@ class Scene:
 
     def _play(self, name: str) -> None:
         self._player.play(name)
-
-    def _ticker(self, name: str) -> Ticker:
-        if name not in self._tickers:
-            raise BadCommand(f"no clock {name!r}; there are: {', '.join(self._tickers)}")
-        return self._tickers[name]
 
     def _reboot(self, name: str) -> None:
         if name == OPTICAL:

@@ -1,0 +1,71 @@
+"""A scene whose clocks are asked for, whose script reboots devices, and which tells the truth."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import orjson
+import pytest
+
+from jointfit_simulators.clocks import NS, ClockFault, Ticker
+from jointfit_simulators.programme import parse_programme
+from jointfit_simulators.sample_log import SampleLog
+from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
+from jointfit_simulators.settings import Knobs
+from jointfit_simulators.wearer import Wearer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOW = 10**13
+
+
+def test_a_clock_runs_as_it_is_asked_to() -> None:
+    ticker = Ticker(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
+    ticker.ask(ClockFault.parse("50,3600"), NOW)
+    assert ticker.device_ns(NOW) == pytest.approx(3600 * NS * (1 + 50e-6), abs=1)
+    hour_later = ticker.device_ns(NOW + 3600 * NS) - ticker.device_ns(NOW)
+    assert hour_later == pytest.approx(3600 * NS + 3600 * 50_000, abs=2)
+    ticker.reboot(NOW + NS)
+    assert ticker.device_ns(NOW + 2 * NS) == pytest.approx(NS, abs=60_000)
+
+
+def test_a_skew_alone_leaves_the_start_to_the_dice() -> None:
+    ticker = Ticker(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
+    boot_ns = ticker.clock.boot_ns
+    ticker.ask(ClockFault.parse("-20"), NOW)
+    assert ticker.clock.boot_ns == boot_ns
+    assert ticker.clock.skew == pytest.approx(-20e-6)
+
+
+def test_the_log_tells_device_number_and_instant(tmp_path: Path) -> None:
+    log = SampleLog(tmp_path / "samples.jsonl")
+    log.add("S1", 65535, NOW)
+    log.close()
+    (line,) = (tmp_path / "samples.jsonl").read_bytes().splitlines()
+    assert orjson.loads(line) == {"id": "S1", "number": 65535, "host_ns": NOW}
+
+
+def scene(folder: Path, **options: Any) -> Scene:
+    knobs = Knobs()
+    wearer = Wearer(knobs, parse_programme("stand"), motion_files={})
+    return Scene(knobs, wearer, SceneOptions(folder, **options), now_ns=NOW)
+
+
+def test_clocks_that_are_not_there_cannot_be_asked(tmp_path: Path) -> None:
+    with pytest.raises(BadCommand, match=r"S9.*there are: S1"):
+        scene(tmp_path, clocks={"S9": ClockFault(1.0)})
+
+
+async def test_a_script_is_obeyed_in_time_and_its_faults_are_told(tmp_path: Path) -> None:
+    script = ((0.0, "reboot S9"), (0.0, "mocap restart"), (0.1, "quit"))
+    said: list[dict[str, object]] = []
+    async with asyncio.timeout(10):
+        await scene(tmp_path, script=script, sync_line=True).run(said.append)
+    assert [line for line in said if "error" in line] == [
+        {"error": "no sensor 'S9'; there are: S1, S2, S3, S4"}
+    ]
+    text = (tmp_path / "rig.toml").read_text(encoding="utf-8")
+    assert text.count("trigger_indication") == 2
+    assert text.count("sync_line = 0") == 1
