@@ -53,13 +53,14 @@ def _title(found: Judged) -> str:
     lines = [found.joint.name]
     for method in METHODS:
         e = found.estimates[method]
-        told = "refused" if e.refused else f"told {_MM * e.sd:.0f}"
+        told = "refused" if e.refused else f"told ±{_MM * e.sd:.0f}"
+        told = "place along the axis unknown" if len(e.unseen) else told
         if not np.isfinite(e.center).all():
             lines.append(f"{method}: refused")
             continue
         lines.append(
             f"{method}: {_MM * found.off(method):.0f} mm from the model,"
-            f" {_MM * found.off_axis(method):.0f} across; {told}"
+            f" {_MM * found.off_axis(method):.0f} across;\n{told}"
         )
     return "\n".join(lines)
 
