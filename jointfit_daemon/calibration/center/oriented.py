@@ -133,7 +133,10 @@ def oriented_estimate(
         return replace(alone, method=METHOD)
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
     Sigma = (noise or AngleNoise()).covariance(times, _smooth(x, theta))
-    aided = _solve(x, theta, sigma, Sigma, near)
+    try:
+        aided = _solve(x, theta, sigma, Sigma, near)
+    except np.linalg.LinAlgError:  # no information in some direction at all
+        aided = None
     if aided is None and alone.refused is None:
         return replace(_path_alone(x, allowed), flags=("orientation_inconsistent",))
     if aided is None:
@@ -215,7 +218,8 @@ def _path_noise(x: Array) -> float:
     # no arc to speak of: across the straight line that the path then is, or a flat parabola
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
-    return float(np.std(across - np.polyval(np.polyfit(along, across, 2), along)))
+    terms = np.column_stack((np.ones(len(x)), along, along**2))
+    return float(np.std(across - terms @ np.linalg.lstsq(terms, across, rcond=None)[0]))
 
 
 def _solve(
