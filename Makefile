@@ -38,8 +38,9 @@ types: $(STAMP)  ## mypy, strict
 imports: $(STAMP)  ## who may import whom
 	@$(BIN)/lint-imports
 
-bench: $(STAMP)  ## measure speed and accuracy; fails where a floor is missed
+bench: $(STAMP)  ## measure speed, accuracy and timing; fails where a floor is missed
 	@$(BIN)/python bench/accuracy.py
+	@$(BIN)/python bench/timing.py
 	@$(BIN)/python bench/joint_center.py
 	@$(BIN)/python bench/speed.py $(ARGS)
 
