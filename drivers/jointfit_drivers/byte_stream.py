@@ -2,7 +2,7 @@
 
 Law: this is the only module that knows pyserial, and nothing of pyserial leaves it: whatever goes
 wrong becomes ``DeviceLost`` (may heal) or ``DeviceMisconfigured`` (cannot). Bytes are stamped with
-the monotonic clock before anything else happens to them, for a tty has no kernel stamp. No device
+the monotonic clock as soon as they are read, before anything else happens to them, for a tty has no kernel stamp. No device
 and no protocol is named here.
 """
 
@@ -201,9 +201,11 @@ class SerialPort:
         loop, fd = asyncio.get_running_loop(), self._fd
 
         def readable() -> None:
-            t_ns = time.monotonic_ns()  # first of all: a tty has no kernel stamp
             try:
                 data = self._read(fd)
+                # A tty has no kernel stamp. Not before the read: bytes that come while this process
+                # is held up between the two would be stamped early, and no clock forgives that.
+                t_ns = time.monotonic_ns()
                 if data is not None:
                     take(Chunk(t_ns, data))
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
