@@ -77,10 +77,10 @@ def as_json(results: Sequence[dict[str, Any]]) -> str:
             "figures": [
                 {
                     "name": figure.name,
-                    "value": figure.value,
+                    "value": float(figure.value),
                     "unit": figure.unit,
                     "goal": figure.goal_text,
-                    "kept": figure.kept,
+                    "kept": bool(figure.kept),
                 }
                 for figure in result["figures"]
             ],

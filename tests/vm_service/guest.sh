@@ -33,7 +33,7 @@ chmod 600 /etc/credstore/jointfitd.mqtt-password
 mkfifo /run/sim.commands
 cat > /run/systemd/system/jointfit-sim.service <<'UNIT'
 [Service]
-ExecStart=/bin/sh -c 'exec 3<>/run/sim.commands; exec jointfit-sim play --directory /run/jointfit-sim --can socketcan:can0 --perfect --seed 1 --static-s 3 --mqtt-host localhost --mqtt-base jointfit/vm --programme walk:600 <&3'
+ExecStart=/bin/sh -c 'exec 3<>/run/sim.commands; exec jointfit-sim play --directory /run/jointfit-sim --can socketcan:can0 --perfect --seed 1 --rate 50 --set mocap_hz=50 --output-rate-hz 50 --static-s 3 --mqtt-host localhost --mqtt-base jointfit/vm --programme walk:600 <&3'
 RuntimeDirectory=jointfit-sim
 UNIT
 

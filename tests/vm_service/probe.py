@@ -49,8 +49,8 @@ found = {
     "write /etc/jointfitd": write("/etc/jointfitd/probe"),
     "write /var/lib": write("/var/lib/probe"),
     "write /opt": write("/opt/probe"),
-    "read /home": tried(lambda: os.listdir("/home")),  # noqa: PTH208
-    "read /root": tried(lambda: os.listdir("/root")),  # noqa: PTH208
+    "read /home": tried(lambda: list(Path("/home").iterdir())),
+    "read /root": tried(lambda: list(Path("/root").iterdir())),
     "open /dev/kmsg": tried(lambda: os.open("/dev/kmsg", os.O_RDONLY)),
     "open /dev/net/tun": tried(lambda: os.open("/dev/net/tun", os.O_RDWR)),
     "open a disk": tried(lambda: os.open("/dev/ubda", os.O_RDONLY)),
