@@ -2,8 +2,8 @@
 
 Law: this is the only module that knows pyserial, and nothing of pyserial leaves it: whatever goes
 wrong becomes ``DeviceLost`` (may heal) or ``DeviceMisconfigured`` (cannot). Bytes are stamped with
-the monotonic clock as soon as they are read, before anything else happens to them, for a tty has no kernel stamp. No device
-and no protocol is named here.
+the monotonic clock as soon as they are read, before anything else happens to them, for a tty has no
+kernel stamp. No device and no protocol is named here.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class KernelStamps:
     ) -> None:
         self._wall = WallClock(monotonic_ns, unix_ns)
         self._bit_ns = _NS / bitrate
-        self._now = 0
+        self._monotonic_ns = monotonic_ns
 
     @property
     def unusable(self) -> int:
@@ -46,14 +46,14 @@ class KernelStamps:
 
     def pair(self) -> int:
         """Read both clocks; return the monotonic one, ns."""
-        self._now = self._wall.pair()
-        return self._now
+        return self._wall.pair()
 
     def start_ns(self, unix_s: float, size: int, extended: bool) -> int:
         """Return the start of a frame of `size` bytes that the kernel stamped `unix_s`.
 
-        Never after the last ``pair``. A stamp that lies more than 2 s before it, or after it by
-        more than a millisecond, whatever the offset, is replaced by the last ``pair``.
+        Never after now. A stamp that lies more than 2 s before it, or after it by more than a
+        millisecond, whatever the offset, is replaced by now.
         """
-        end = self._wall.monotonic(round(unix_s * _NS), self._now)
+        # now, not at the wake-up: what came while this process was held up must not seem early
+        end = self._wall.monotonic(round(unix_s * _NS), self._monotonic_ns())
         return end - round(frame_bits(size, extended) * self._bit_ns)
