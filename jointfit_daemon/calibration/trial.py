@@ -60,7 +60,7 @@ class CalibrationSettings:
     align_s: float = 30.0
     functional_s: float = 60.0
     """The movement ends by then at the latest."""
-    functional_min_s: float = 20.0
+    functional_min_s: float = 45.0
     """And not before, however good the joint centers are: the regression wants its share."""
     center_target_m: float = 0.003
     """Noise part of every joint center's predicted error at which the movement is enough, m."""

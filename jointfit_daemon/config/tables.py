@@ -68,7 +68,7 @@ class CalibrationTable(Settings):
         60.0, gt=0, le=600, description="greatest length of the movement phase, s"
     )
     functional_min_s: float = Field(
-        20.0,
+        45.0,
         ge=0,
         le=600,
         description="least length of the movement phase, s; it ends itself when every joint "
