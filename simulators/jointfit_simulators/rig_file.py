@@ -26,7 +26,7 @@ class RigOptions:
     store: str = "demo"
     align_s: float = 30.0
     static_s: float = 5.0
-    functional_s: float = 30.0
+    functional_s: float = 60.0
 
 
 def rig_toml(
