@@ -1,0 +1,115 @@
+"""The order of a chain as arrays: who moves whom, in which column, on which level.
+
+Law: computed once for a model, then only read; nothing here depends on an instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+
+Index = NDArray[np.intp]
+
+LEVI: NDArray[np.float64] = np.zeros((3, 9))
+"""``(v @ LEVI).reshape(3, 3)`` is the matrix of the cross product with v."""
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    LEVI[_i, 3 * _k + _j], LEVI[_i, 3 * _j + _k] = 1.0, -1.0
+LEVI.setflags(write=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What every computation on a chain needs; S segments, nq degrees of freedom."""
+
+    nq: int
+    levels: tuple[tuple[Index, Index], ...]
+    """Segments with a parent, those of equal depth together, and their parents."""
+    free: Index
+    """Free segments."""
+    center_in_parent: Array
+    """m, shape (S, 3); zero for free segments."""
+    center: Array
+    """m, shape (S, 3); zero for free segments."""
+    segment_of: Index
+    """Segment of each degree of freedom, shape (nq,)."""
+    axes: Array
+    """Axis of each turn in segment axes, zero for shifts; shape (nq, 3)."""
+    turns_about: Array
+    """The point (x, y, z, 1) in segment axes that a turn leaves in place; shape (nq, 4)."""
+    shifts: Index
+    """Columns that shift a free segment."""
+    shift_twists: Array
+    """Their twists, shape (len(shifts), 6)."""
+    spread: Array
+    """Takes a step to the rotation vectors of all segments: shape (nq, 3 S)."""
+    below: Array
+    """1 where segment j is i or moves with it, shape (S, S)."""
+    moves: Array
+    """1 where a degree of freedom moves a segment, shape (S, nq)."""
+
+
+def layout_of(model: ChainModel) -> Layout:
+    """Return the layout of a model; the model keeps it."""
+    kept = model.__dict__.get("_layout")
+    if not isinstance(kept, Layout):
+        kept = _layout(model)
+        model.__dict__["_layout"] = kept  # beside its cached properties, as frozen as they are
+    return kept
+
+
+def _layout(model: ChainModel) -> Layout:
+    joints = [s.joint for s in model.segments]
+    parents = model.parents.tolist()
+    is_free = np.array([j.kind == "free" for j in joints])
+    columns = [(i, k) for i, c in enumerate(model.columns) for k in range(c.stop - c.start)]
+    axes = np.zeros((len(columns), 3))
+    for row, (i, k) in enumerate(columns):
+        if k < 3:
+            axes[row] = joints[i].axis if joints[i].kind == "hinge" else np.eye(3)[k]
+    segment_of = np.array([i for i, _ in columns], dtype=np.intp)
+    shifts = np.array([row for row, (_, k) in enumerate(columns) if k > 2], dtype=np.intp)
+    center = np.where(is_free[:, None], 0.0, [j.center for j in joints])
+    below = _below(parents)
+    spread = np.zeros((len(columns), len(parents), 3))
+    spread[np.arange(len(columns)), segment_of] = axes
+    about = center[segment_of]
+    return Layout(
+        nq=len(columns),
+        levels=_levels(parents),
+        free=np.flatnonzero(is_free),
+        center_in_parent=np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints]),
+        center=center,
+        segment_of=segment_of,
+        axes=axes,
+        turns_about=np.concatenate((about, np.ones((len(columns), 1))), axis=1),
+        shifts=shifts,
+        shift_twists=np.tile(np.eye(6)[3:], (len(shifts) // 3, 1)),
+        spread=spread.reshape(len(columns), -1),
+        below=below,
+        moves=below.T[:, segment_of],
+    )
+
+
+def _below(parents: list[int]) -> Array:
+    below = np.eye(len(parents))
+    for i in reversed(range(len(parents))):
+        if parents[i] >= 0:
+            below[parents[i]] = np.maximum(below[parents[i]], below[i])
+    return below
+
+
+def _levels(parents: list[int]) -> tuple[tuple[Index, Index], ...]:
+    depth: list[int] = []
+    for parent in parents:
+        depth.append(0 if parent < 0 else depth[parent] + 1)
+    return tuple(
+        (np.array(level, dtype=np.intp), np.array([parents[i] for i in level], dtype=np.intp))
+        for d in range(1, max(depth) + 1)
+        if (level := [i for i, at in enumerate(depth) if at == d])
+    )

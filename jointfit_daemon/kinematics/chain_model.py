@@ -1,0 +1,245 @@
+r"""A tree of rigid segments on joints, with the markers that ride on them.
+
+Law: frozen data. Segments stand parents first. A segment's pose follows from its parent's by
+
+.. math:: R_i = R_p A_i, \qquad t_i = t_p + R_p\, c_p - R_i\, c_i
+
+where :math:`A_i` is all the joint may change: anything (``ball``), :math:`A_{rest}\exp(a\theta)`
+(``hinge``), anything and the origin, too (``free``). Axes and centers are metres in segment axes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.model import Quaternion, Vector
+
+Array = NDArray[np.float64]
+JointKind = Literal["free", "ball", "hinge"]
+DEGREES_OF_FREEDOM: dict[JointKind, int] = {"free": 6, "ball": 3, "hinge": 1}
+_ORIGIN: Vector = (0.0, 0.0, 0.0)
+_UNIT_TOLERANCE = 1e-6
+
+
+class ImpossibleModel(ValueError):  # noqa: N818 - named for what happened
+    """Segments, joints and markers that make no chain; the message lists all reasons."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """What joins a segment to its parent."""
+
+    kind: JointKind = "free"
+    center_in_parent: Vector = _ORIGIN
+    """Joint center in the parent's axes (the world's without a parent), m; unused when free."""
+    center: Vector = _ORIGIN
+    """The same point in the segment's own axes, m; unused when free."""
+    axis: Vector = (1.0, 0.0, 0.0)
+    """Unit axis of a hinge, own axes; positive turns are right-handed about it."""
+    rest: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """q_parent_segment of a hinge at angle zero; of a ball, where a search without data begins."""
+    limits: tuple[float, float] | None = None
+    """Lowest and highest angle of a hinge, rad; None: free to turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """One rigid body of the tree."""
+
+    name: str
+    parent: str | None = None
+    """None: the world."""
+    joint: Joint = Joint()
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A point fixed to a segment."""
+
+    name: str
+    segment: str
+    position: Vector
+    """In segment axes, m."""
+    weight: float = 1.0
+    """Of its squared error; 0 leaves it out."""
+    locked: tuple[bool, bool, bool] = (False, False, False)
+    """Coordinates, segment axes, that a refinement must not move."""
+
+
+@dataclass(frozen=True)
+class ChainModel:
+    """Segments, parents first, and markers; no slots, its arrays are computed once, when asked.
+
+    Raises
+    ------
+    ImpossibleModel
+        Doubled names, unknown parents or segments, parents after children, a free joint below a
+        parent, axes or rests that are no unit, limits the wrong way round, values not finite.
+    """
+
+    segments: tuple[Segment, ...]
+    markers: tuple[Marker, ...]
+    name: str = "chain"
+
+    def __post_init__(self) -> None:
+        wrong = [*_wrong_segments(self.segments), *_wrong_markers(self.segments, self.markers)]
+        if wrong:
+            raise ImpossibleModel(f"{self.name}: {'; '.join(wrong)}")
+
+    @cached_property
+    def nq(self) -> int:
+        """Degrees of freedom."""
+        return sum(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)
+
+    @cached_property
+    def segment_names(self) -> tuple[str, ...]:
+        """Names in the order of every array over segments."""
+        return tuple(s.name for s in self.segments)
+
+    @cached_property
+    def marker_names(self) -> tuple[str, ...]:
+        """Names in the order of every array over markers."""
+        return tuple(m.name for m in self.markers)
+
+    @cached_property
+    def parents(self) -> NDArray[np.intp]:
+        """Index of each segment's parent, -1 for the world; shape (S,)."""
+        index = {name: i for i, name in enumerate(self.segment_names)} | {None: -1}
+        return np.array([index[s.parent] for s in self.segments], dtype=np.intp)
+
+    @cached_property
+    def marker_segments(self) -> NDArray[np.intp]:
+        """Index of each marker's segment; shape (M,)."""
+        index = {name: i for i, name in enumerate(self.segment_names)}
+        return np.array([index[m.segment] for m in self.markers], dtype=np.intp)
+
+    @cached_property
+    def positions(self) -> Array:
+        """Markers in their segments' axes, m; shape (M, 3)."""
+        return np.array([m.position for m in self.markers], dtype=np.float64).reshape(-1, 3)
+
+    @cached_property
+    def weights(self) -> Array:
+        """Shape (M,)."""
+        return np.array([m.weight for m in self.markers], dtype=np.float64)
+
+    @cached_property
+    def locked(self) -> NDArray[np.bool_]:
+        """Coordinates a refinement must not move; shape (M, 3)."""
+        return np.array([m.locked for m in self.markers], dtype=np.bool_).reshape(-1, 3)
+
+    @cached_property
+    def columns(self) -> tuple[slice, ...]:
+        """Degrees of freedom of each segment: of a free one three turns, then three shifts."""
+        ends = np.cumsum([0, *(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)]).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    def with_markers(self, positions: ArrayLike) -> ChainModel:
+        """Return the model with its markers elsewhere: segment axes, m, shape (M, 3)."""
+        new = np.asarray(positions, dtype=np.float64).reshape(len(self.markers), 3).tolist()
+        moved = (
+            replace(m, position=(x, y, z)) for m, (x, y, z) in zip(self.markers, new, strict=True)
+        )
+        return replace(self, markers=tuple(moved))
+
+    def with_locks(self, locked: Mapping[str, tuple[bool, bool, bool]]) -> ChainModel:
+        """Return the model with the locks of some markers set anew, by marker name."""
+        return replace(
+            self,
+            markers=tuple(
+                replace(m, locked=locked[m.name]) if m.name in locked else m for m in self.markers
+            ),
+        )
+
+    def scaled(self, factors: Mapping[str, ArrayLike]) -> ChainModel:
+        """Return the model with segments stretched: one factor or one per axis, by segment name.
+
+        All that is fixed to a segment goes along: its markers, its own joint center and those of
+        its children.
+        """
+        unknown = set(factors) - set(self.segment_names)
+        if unknown:
+            raise ImpossibleModel(f"{self.name}: no segments {', '.join(sorted(unknown))}")
+
+        def stretch(segment: str | None, point: Vector) -> Vector:
+            x, y, z = (np.asarray(point) * np.asarray(factors.get(segment or "", 1.0))).tolist()
+            return (x, y, z)
+
+        def joint(s: Segment) -> Joint:
+            j = s.joint
+            return replace(
+                j,
+                center_in_parent=stretch(s.parent, j.center_in_parent),
+                center=stretch(s.name, j.center),
+            )
+
+        return replace(
+            self,
+            segments=tuple(replace(s, joint=joint(s)) for s in self.segments),
+            markers=tuple(
+                replace(m, position=stretch(m.segment, m.position)) for m in self.markers
+            ),
+        )
+
+
+def _doubled(what: str, names: Sequence[str]) -> list[str]:
+    return [f"{what} {name!r} twice" for name, n in Counter(names).items() if n > 1]
+
+
+def _wrong_segments(segments: tuple[Segment, ...]) -> list[str]:
+    names = [s.name for s in segments]
+    wrong = _doubled("segment", names) if names else ["no segments"]
+    for i, s in enumerate(segments):
+        if s.parent is not None and s.parent not in names[:i]:
+            known = "after it" if s.parent in names else "unknown"
+            wrong.append(f"segment {s.name!r}: its parent {s.parent!r} is {known}")
+        wrong += [f"segment {s.name!r}: {reason}" for reason in _wrong_joint(s)]
+    return wrong
+
+
+def _wrong_joint(s: Segment) -> list[str]:
+    j, wrong = s.joint, []
+    if j.kind not in DEGREES_OF_FREEDOM:
+        wrong.append(f"joint {j.kind!r}, expected one of {', '.join(DEGREES_OF_FREEDOM)}")
+    if j.kind == "free" and s.parent is not None:
+        wrong.append("a free joint has no parent")
+    if not np.isfinite([*j.center_in_parent, *j.center, *j.axis, *j.rest]).all():
+        wrong.append("its joint is not finite")
+    for what, values in (("axis", j.axis), ("rest", j.rest)):
+        if abs(float(np.linalg.norm(values)) - 1.0) > _UNIT_TOLERANCE:
+            wrong.append(f"{what} {values} is not of length 1")
+    if j.limits is not None and not j.limits[0] < j.limits[1]:
+        wrong.append(f"limits {j.limits} leave no angle")
+    return wrong
+
+
+def _wrong_markers(segments: tuple[Segment, ...], markers: tuple[Marker, ...]) -> list[str]:
+    names = {s.name for s in segments}
+    wrong = _doubled("marker", [m.name for m in markers])
+    for m in markers:
+        if m.segment not in names:
+            wrong.append(f"marker {m.name!r}: no segment {m.segment!r}")
+        if not np.isfinite(m.position).all():
+            wrong.append(f"marker {m.name!r}: position {m.position} is not finite")
+        if not 0.0 <= m.weight < float("inf"):
+            wrong.append(f"marker {m.name!r}: weight {m.weight}")
+    return wrong
+
+
+def rest_rotations(model: ChainModel) -> Array:
+    """Return every joint's rest as matrices R_parent_segment, shape (S, 3, 3)."""
+    return rotation.to_matrix(np.array([s.joint.rest for s in model.segments]))

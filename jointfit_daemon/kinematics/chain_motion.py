@@ -1,0 +1,166 @@
+r"""A chain at its instants: poses of segments, markers in the world, their Jacobian, steps.
+
+Law: everything has the instants first, shape (T, ...). A step moves a state on its manifold,
+
+.. math:: A_i \leftarrow A_i \exp(\delta_i), \qquad t_{root} \leftarrow t_{root} + \delta_t
+
+with :math:`\delta` in the columns `ChainModel.columns`: turns in the segment's own axes, rad, then
+for a free segment the shift of its origin in the world, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.chain_layout import LEVI, Layout, layout_of
+from jointfit_daemon.kinematics.chain_model import Array, ChainModel, rest_rotations
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class ChainState:
+    """Joint positions of a chain at T instants."""
+
+    rotations: Array
+    """A_i = R_parent_segment (R_world_segment without a parent), shape (T, S, 3, 3)."""
+    origins: Array
+    """World origins of the free segments, in their order, m, shape (T, F, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def take(self, instants: NDArray[np.intp] | NDArray[np.bool_] | slice) -> ChainState:
+        """Return the state at some instants."""
+        return ChainState(self.rotations[instants], self.origins[instants])
+
+
+def rest_state(model: ChainModel, count: int = 1) -> ChainState:
+    """Return the chain at rest, free origins in the world's, at `count` instants."""
+    free = sum(s.joint.kind == "free" for s in model.segments)
+    rest = np.broadcast_to(rest_rotations(model), (count, len(model.segments), 3, 3))
+    return ChainState(rest.copy(), np.zeros((count, free, 3)))
+
+
+def segment_poses(model: ChainModel, state: ChainState) -> tuple[Array, Array]:
+    """Return R_world_segment, shape (T, S, 3, 3), and world origins, m, shape (T, S, 3)."""
+    world = transforms(layout_of(model), state.rotations, state.origins)
+    return world[..., :3, :3], world[..., :3, 3]
+
+
+def transforms(layout: Layout, rotations: Array, origins: Array) -> Array:
+    """Return each segment's transform to the world, shape (T, S, 4, 4), one level at a time."""
+    local = np.empty((*rotations.shape[:2], 4, 4))
+    local[..., :3, :3] = rotations
+    local[..., :3, 3] = layout.center_in_parent - (rotations @ layout.center[:, :, None])[..., 0]
+    local[:, layout.free, :3, 3] = origins
+    local[..., 3, :] = (0.0, 0.0, 0.0, 1.0)
+    for level, parents in layout.levels:
+        local[:, level] = local[:, parents] @ local[:, level]
+    return local
+
+
+def marker_positions(model: ChainModel, state: ChainState) -> Array:
+    """Return the markers in the world, m, shape (T, M, 3)."""
+    R, t = segment_poses(model, state)
+    s = model.marker_segments
+    placed: Array = (R[:, s] @ model.positions[:, :, None])[..., 0] + t[:, s]
+    return placed
+
+
+def twists(layout: Layout, world: Array) -> Array:
+    r"""Return what each degree of freedom does to points: shape (T, nq, 6).
+
+    A point x moves by :math:`\alpha\times x + \beta`; the row is :math:`(\alpha, \beta)`. For a
+    turn about the world axis :math:`\alpha` through C it is :math:`\beta = C \times \alpha`.
+    """
+    found = np.empty((len(world), layout.nq, 6))
+    placed = world[:, layout.segment_of]
+    alpha = (placed[..., :3, :3] @ layout.axes[:, :, None])[..., 0]
+    centers = (placed @ layout.turns_about[:, :, None])[..., :3, :]
+    found[..., :3] = alpha
+    found[..., 3:] = (skew(centers[..., 0]) @ alpha[..., None])[..., 0]
+    found[:, layout.shifts] = layout.shift_twists
+    return found
+
+
+def skew(v: Array) -> Array:
+    """Return cross-product matrices, shape (..., 3, 3); one product, for hot paths."""
+    return (v @ LEVI).reshape(*v.shape[:-1], 3, 3)
+
+
+def jacobian(model: ChainModel, state: ChainState) -> Array:
+    r"""Return d(marker)/d(step), shape (T, M, 3, nq).
+
+    .. math:: \partial x_m/\partial q_k = \alpha_k \times (x_m - C_k)
+
+    for the turns of all joints between the world and the marker's segment, the identity for the
+    shifts of its root, zero else.
+    """
+    layout = layout_of(model)
+    world = transforms(layout, state.rotations, state.origins)
+    s = model.marker_segments
+    x = (world[:, s, :3, :3] @ model.positions[:, :, None])[..., 0] + world[:, s, :3, 3]
+    motion = twists(layout, world)
+    # alpha x X + beta as one product: [skew(alpha), beta] times (X, 1)
+    maps = np.empty((len(world), layout.nq, 3, 4))
+    maps[..., :3] = skew(motion[..., :3])
+    maps[..., 3] = motion[..., 3:]
+    points = np.concatenate((x, np.ones_like(x[..., :1])), axis=-1)
+    moved = maps.reshape(len(world), -1, 4) @ np.swapaxes(points, -1, -2)
+    J = moved.reshape(len(world), layout.nq, 3, len(s)).transpose(0, 3, 2, 1)
+    return J * layout.moves[s][:, None, :]
+
+
+def apply_step(model: ChainModel, state: ChainState, delta: Array) -> ChainState:
+    """Return the state moved by `delta`, rad and m, shape (T, nq)."""
+    layout = layout_of(model)
+    return ChainState(
+        turned(layout, state.rotations, delta),
+        state.origins + delta[:, layout.shifts].reshape(len(delta), -1, 3),
+    )
+
+
+def turned(layout: Layout, rotations: Array, delta: Array) -> Array:
+    """Return A exp(delta) for all joints: rotations (T, S, 3, 3), delta (T, nq)."""
+    vectors = (delta @ layout.spread).reshape(*rotations.shape[:2], 3)
+    return rotations @ exp_matrix(vectors)
+
+
+def exp_matrix(r: Array) -> Array:
+    """Return rotation matrices of rotation vectors, rad: I + sin(x)/x K + (1 - cos x)/x^2 K^2."""
+    K = skew(r)
+    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", r, r))[..., None, None]
+    sinc = np.sinc(half / np.pi)
+    turn = (np.cos(half) * sinc) * K + (0.5 * sinc * sinc) * (K @ K)
+    turn[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    return np.asarray(turn)
+
+
+def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
+    """Return the step, shape (T, nq), that `apply_step` needs to go from a to b.
+
+    For turns it is log(A_a^T A_b), of a hinge the part about its axis: joint-angle differences.
+    """
+    layout = layout_of(model)
+    between = rotation.from_matrix(np.swapaxes(a.rotations, -1, -2) @ b.rotations)
+    vectors = rotation.log(between).reshape(len(between), -1)
+    step: Array = vectors @ layout.spread.T
+    step[:, layout.shifts] = (b.origins - a.origins).reshape(len(step), -1)
+    return step
+
+
+def hinge_angles(model: ChainModel, state: ChainState) -> dict[str, Array]:
+    """Return the angle of every hinge from its rest, rad, by segment name, shape (T,) each."""
+    rest = rest_state(model, len(state))
+    step = step_between(model, ChainState(rest.rotations, state.origins), state)
+    return {
+        s.name: step[:, columns.start]
+        for s, columns in zip(model.segments, model.columns, strict=True)
+        if s.joint.kind == "hinge"
+    }
