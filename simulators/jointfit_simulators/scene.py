@@ -84,10 +84,7 @@ class Scene:
         self, knobs: Knobs, subject: Subject, options: SceneOptions, *, now_ns: int
     ) -> None:
         self._options, self._subject = options, subject
-        known = (*subject.sensors, OPTICAL)
-        for name in options.clocks:
-            if name not in known:
-                raise BadCommand(f"no clock {name!r}; there are: {', '.join(known)}")
+        _check_clocks(options.clocks, (*subject.sensors, OPTICAL))
         options.directory.mkdir(parents=True, exist_ok=True)
         self._hardware = wire_up(
             knobs,
@@ -300,6 +297,12 @@ class Scene:
             "refused": {n: s.refused for n, s in streams.items()},
             "unheard": {n: s.unheard for n, s in streams.items()},
         }
+
+
+def _check_clocks(asked: Mapping[str, ClockFault], known: tuple[str, ...]) -> None:
+    for name in asked:
+        if name not in known:
+            raise BadCommand(f"no clock {name!r}; there are: {', '.join(known)}")
 
 
 def _on(word: str) -> bool:
