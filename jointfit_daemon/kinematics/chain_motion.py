@@ -58,7 +58,7 @@ def transforms(layout: Layout, rotations: Array, origins: Array) -> Array:
     local = np.empty((*rotations.shape[:2], 4, 4))
     local[..., :3, :3] = rotations
     local[..., :3, 3] = layout.center_in_parent - (rotations @ layout.center[:, :, None])[..., 0]
-    local[:, layout.free, :3, 3] = origins
+    local[..., :3, 3][:, layout.free] = origins
     local[..., 3, :] = (0.0, 0.0, 0.0, 1.0)
     for level, parents in layout.levels:
         local[:, level] = local[:, parents] @ local[:, level]
@@ -105,7 +105,7 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
     layout = layout_of(model)
     world = transforms(layout, state.rotations, state.origins)
     s = model.marker_segments
-    x = (world[:, s, :3, :3] @ model.positions[:, :, None])[..., 0] + world[:, s, :3, 3]
+    x = (world[:, s, :3, :3] @ model.positions[:, :, None])[..., 0] + world[..., :3, 3][:, s]
     motion = twists(layout, world)
     # alpha x X + beta as one product: [skew(alpha), beta] times (X, 1)
     maps = np.empty((len(world), layout.nq, 3, 4))

@@ -35,7 +35,7 @@ class IkOptions:
     reweightings: int = 2
     """Rounds of new robust weights."""
     hold_m2: float = 1e-4
-    """Weight, m^2/rad^2, of each joint's turn since the instant before, where markers leave any open."""
+    """Weight, m^2/rad^2, of a joint's turn since the instant before, if markers leave one open."""
     limit_m2: float = 0.0
     """Weight, m^2/rad^2, of a hinge's excess over its limits; 0: limits are not looked at."""
 
