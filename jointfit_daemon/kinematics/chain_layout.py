@@ -52,6 +52,11 @@ class Layout:
     """1 where segment j is i or moves with it, shape (S, S)."""
     moves: Array
     """1 where a degree of freedom moves a segment, shape (S, nq)."""
+    lower: Array
+    """1 where the column's segment is the row's or before it on its way to the world, and the
+    column is not after the row; shape (nq, nq)."""
+    strictly_lower: Array
+    """The same without the diagonal."""
 
 
 def layout_of(model: ChainModel) -> Layout:
@@ -79,6 +84,7 @@ def _layout(model: ChainModel) -> Layout:
     spread = np.zeros((len(columns), len(parents), 3))
     spread[np.arange(len(columns)), segment_of] = axes
     about = center[segment_of]
+    lower = np.tril(below[np.ix_(segment_of, segment_of)].T)
     return Layout(
         nq=len(columns),
         levels=_levels(parents),
@@ -93,6 +99,8 @@ def _layout(model: ChainModel) -> Layout:
         spread=spread.reshape(len(columns), -1),
         below=below,
         moves=below.T[:, segment_of],
+        lower=lower,
+        strictly_lower=np.tril(lower, -1),
     )
 
 

@@ -5,7 +5,8 @@ Law: at every instant
 .. math:: q_t = \arg\min_q \sum_m w_{tm} |x_m(q) - y_{tm}|^2
 
 by Levenberg and Marquardt, all instants at once, each with its own damping. A marker that is NaN
-weighs nothing. What the markers leave open is told, and held to the instant before.
+weighs nothing. An instant whose markers leave something open is told, and in a second pass, one
+instant after the other, begins at and is held to the instant before it.
 """
 
 from __future__ import annotations
@@ -15,11 +16,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.kinematics.chain_motion import ChainState
+from jointfit_daemon.kinematics.chain_start import start_from_markers
+from jointfit_daemon.kinematics.marker_equations import fit, normal_equations, slots_of
+from jointfit_daemon.kinematics.pose_search import Band, Problem, limits_of, search
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
-    from jointfit_daemon.kinematics.chain_motion import ChainState
+
+CHUNK = 128
+"""Instants searched together: their arrays stay in the processor's cache."""
+OPEN_M2 = 4e-4
+"""Information on a degree of freedom, m^2/rad^2, below which the markers leave it open: 2 cm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +99,148 @@ def solve_frames(
     ValueError
         Shapes that do not belong together, negative weights.
     """
-    raise NotImplementedError
+    options = options or IkOptions()
+    measured, seen = checked_markers(model, markers)
+    w = checked_weights(model, weights, seen)
+    if start is not None and len(start) != len(measured):
+        raise ValueError(f"start has {len(start)} instants, the markers {len(measured)}")
+    slots = slots_of(model)
+    problem = Problem(
+        model,
+        slots.filled_vectors(measured),
+        slots.filled(w),
+        tolerance=options.tolerance,
+        iterations=options.iterations,
+        huber_m=options.huber_m,
+        reweightings=options.reweightings,
+        bands=limits_of(model, options.limit_m2),
+    )
+    if start is None:
+        start, guessed = start_from_markers(model, problem.measured, problem.weights)
+    else:
+        guessed = np.zeros(len(measured), dtype=np.bool_)
+    solution = _Solution.of(problem, start)
+    for first in range(0, len(measured), CHUNK):
+        solution.solve(np.arange(first, min(first + CHUNK, len(measured))))
+    is_open = solution.is_open()
+    solution.follow(guessed | is_open, is_open, options.hold_m2 * problem.typical_weight)
+    return solution.result(seen, is_open)
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """What is being found, instant by instant; its arrays are written in place."""
+
+    problem: Problem
+    rotations: Array
+    origins: Array
+    weights: Array
+    converged: NDArray[np.bool_]
+    iterations: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, problem: Problem, start: ChainState) -> _Solution:
+        count = len(start)
+        return cls(
+            problem,
+            start.rotations.copy(),
+            start.origins.copy(),
+            problem.weights.copy(),
+            np.zeros(count, dtype=np.bool_),
+            np.zeros(count, dtype=np.intp),
+        )
+
+    def solve(self, instants: NDArray[np.intp], hold: Band | None = None) -> None:
+        """Search at some instants from where they are."""
+        part = self.problem.take(instants, hold)
+        found = search(part, ChainState(self.rotations[instants], self.origins[instants]))
+        self.rotations[instants] = found.state.rotations
+        self.origins[instants] = found.state.origins
+        self.weights[instants] = found.weights
+        self.converged[instants] = found.converged
+        self.iterations[instants] += found.iterations
+
+    def is_open(self) -> NDArray[np.bool_]:
+        """Return at which instants the markers leave a degree of freedom open.
+
+        That is where a pivot of the normal matrix is small, each being what the markers say about
+        one degree of freedom when those after it are free to follow.
+        """
+        slots = slots_of(self.problem.model)
+        at = fit(slots, self.rotations, self.origins, self.problem.measured, self.weights)
+        return open_instants(normal_equations(slots, at)[0] / self.problem.typical_weight)
+
+    def follow(
+        self, doubtful: NDArray[np.bool_], is_open: NDArray[np.bool_], hold_m2: float
+    ) -> None:
+        """Search doubtful instants once more, each from the one before it (or after, at first).
+
+        Runs of doubtful instants do not touch each other, so their first ones are searched
+        together, then their second ones, and so on.
+        """
+        for instants, before in _waves(doubtful):
+            self.rotations[instants] = self.rotations[before]
+            self.origins[instants] = self.origins[before]
+            held: Array = hold_m2 * is_open[instants].astype(np.float64)
+            hold = Band.holding(self.problem.model, self.rotations[before], held)
+            self.solve(instants, hold)
+
+    def result(self, seen: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> IkResult:
+        slots = slots_of(self.problem.model)
+        at = fit(slots, self.rotations, self.origins, self.problem.measured, self.weights)
+        residuals = slots.taken(at.errors)
+        residuals[~seen] = np.nan
+        return IkResult(
+            ChainState(self.rotations, self.origins),
+            at.world[..., :3, :3],
+            at.world[..., :3, 3],
+            residuals,
+            self.weights.reshape(len(seen), -1)[:, slots.places],
+            self.converged,
+            is_open,
+            self.iterations,
+        )
+
+
+def open_instants(H: Array) -> NDArray[np.bool_]:
+    """Return where normal matrices, shape (T, nq, nq), leave a degree of freedom open."""
+    ridge = 1e-9 * np.eye(H.shape[-1])
+    pivots = np.diagonal(np.linalg.cholesky(H + ridge), axis1=-2, axis2=-1)
+    return np.asarray((pivots**2 < OPEN_M2).any(axis=-1))
+
+
+def _waves(doubtful: NDArray[np.bool_]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Return instants to be searched together and the solved ones they follow."""
+    good = np.flatnonzero(~doubtful)
+    bad = np.flatnonzero(doubtful)
+    if not good.size:
+        return [(bad[i : i + 1], bad[i - 1 : i]) for i in range(1, len(bad))]
+    last = np.searchsorted(good, bad) - 1
+    leading = last < 0
+    distance = np.where(leading, good[0] - bad, bad - good[last])
+    before = np.where(leading, bad + 1, bad - 1)
+    return [(bad[at], before[at]) for d in np.unique(distance) if (at := distance == d).any()]
+
+
+def checked_markers(model: ChainModel, markers: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Return measured markers with zeros for NaN, and which of them are there, shape (T, M)."""
+    measured = np.asarray(markers, dtype=np.float64)
+    if measured.ndim != 3 or measured.shape[1:] != (len(model.markers), 3):
+        raise ValueError(
+            f"markers have shape {measured.shape}, expected (instants, {len(model.markers)}, 3)"
+        )
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=-1))
+    return np.where(seen[..., None], measured, 0.0), seen
+
+
+def checked_weights(model: ChainModel, weights: ArrayLike | None, seen: NDArray[np.bool_]) -> Array:
+    """Return weights, shape (T, M), zero where nothing was measured."""
+    w = model.weights if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape not in {seen.shape, seen.shape[1:]}:
+        raise ValueError(f"weights have shape {w.shape}, expected {seen.shape[1:]} or {seen.shape}")
+    if not (np.isfinite(w) & (w >= 0.0)).all():
+        raise ValueError("weights must be finite and not negative")
+    return np.where(seen, w, 0.0)
 
 
 def tracking_error(residuals: Array) -> float:
