@@ -66,7 +66,7 @@ def gait2354(data: Path) -> ModelTrial:
         folder = Path(shutil.copytree(source, Path(name) / "gait"))
         for path in (folder, *folder.iterdir()):
             path.chmod(0o755)
-        with chdir(folder), _quiet():
+        with chdir(folder), quiet():
             opensim.Logger.setLevelString("off")
             opensim.InverseKinematicsTool("subject01_Setup_IK.xml").run()
             motion = next(path for path in folder.glob("*.mot") if "ik" in path.name.lower())
@@ -76,7 +76,7 @@ def gait2354(data: Path) -> ModelTrial:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep the descriptor of standard output from what C++ prints: tables go there."""
     sys.stdout.flush()
     kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)

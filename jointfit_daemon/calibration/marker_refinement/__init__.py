@@ -1,0 +1,1 @@
+"""Where markers are on their segments, learned from movements, and what that is worth."""

@@ -1,0 +1,51 @@
+r"""Anderson acceleration of a fixed-point iteration, to be taken only where it helps.
+
+Law: this proposes, the caller disposes. Without a safeguard it was seen to raise tracking errors.
+
+.. math::
+
+    f_k = g(p_k) - p_k, \quad \gamma = \arg\min |f_k - \Delta F \gamma|, \quad
+    p = g(p_k) - \Delta G \gamma
+
+with the differences of the last iterations as columns. Source: Anderson, J. ACM 12 (1965), 547;
+Walker and Ni, SIAM J. Numer. Anal. 49 (2011), 1715.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+DEPTH = 4
+_RANK = 1e-8
+
+
+class Anderson:
+    """The last few iterates and their images."""
+
+    def __init__(self, depth: int = DEPTH) -> None:
+        self._depth = depth
+        self._images: list[Array] = []
+        self._changes: list[Array] = []
+
+    def propose(self, at: Array, image: Array) -> Array | None:
+        """Return the next point to try after g(at) = image; None without a history."""
+        self._images = [*self._images[-self._depth :], image]
+        self._changes = [*self._changes[-self._depth :], image - at]
+        if len(self._images) == 1:
+            return None
+        dG = np.diff(np.array(self._images), axis=0).T
+        dF = np.diff(np.array(self._changes), axis=0).T
+        gamma = np.linalg.lstsq(dF, self._changes[-1], rcond=_RANK)[0]
+        return np.asarray(image - dG @ gamma)
+
+    def forget(self) -> None:
+        """Start over: the last proposal was no good."""
+        self._images.clear()
+        self._changes.clear()

@@ -1,0 +1,84 @@
+r"""What every refinement minimizes: tracking errors of all frames, and distance from the start.
+
+Law: with the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weights w,
+
+.. math::
+
+    F(q, p) = \sum_{tm} w_{tm}\, \rho(|e_{tm}|)
+              + \tfrac12 \lambda \sum_m n_m\, |p_m - p^0_m|^2, \qquad n_m = \sum_t w_{tm}
+
+where :math:`\rho(r) = r^2/2`, beyond c Huber's :math:`c (r - c/2)`. The prior grows with the frames
+in which a marker was seen, so thinning frames does not change what it means. Poses q are free in
+every frame, positions p are the same in all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One refinement to be done; no slots, what follows from it is computed once.
+
+    The chain gives names, nominal positions and joints; measured positions beyond it are missing.
+    """
+
+    model: ChainModel
+    targets: Array
+    """Measured markers in the order of the model's, world, m, shape (T, M, 3); NaN: missing."""
+    weights: Array
+    """Of squared errors, shape (T, M); 0 where missing."""
+    free: NDArray[np.bool_]
+    """Coordinates that may move, shape (M, 3)."""
+    prior: float
+    """lambda."""
+    huber_m: float | None
+    """c, m; None: plain squares."""
+
+    @cached_property
+    def seen(self) -> Array:
+        """Measured markers with zeros for missing ones, shape (T, M, 3)."""
+        return np.nan_to_num(self.targets)
+
+    @cached_property
+    def counts(self) -> Array:
+        """n_m, shape (M,)."""
+        return np.asarray(self.weights.sum(axis=0))
+
+    @cached_property
+    def pull(self) -> Array:
+        """Weight of the prior on every coordinate, shape (M, 3); none on what cannot move."""
+        return self.prior * self.counts[:, None] * self.free
+
+    def robust(self, distances: Array) -> Array:
+        """Return the weights of squared errors at these distances, shape (T, M)."""
+        if self.huber_m is None:
+            return self.weights
+        beyond = np.maximum(distances, self.huber_m)
+        return self.weights * (self.huber_m / beyond)
+
+    def cost(self, distances: Array, positions: Array) -> float:
+        """Return F from the distances |e|, m, shape (T, M)."""
+        loss = 0.5 * distances**2
+        if self.huber_m is not None:
+            c = self.huber_m
+            loss = np.where(distances > c, c * (distances - 0.5 * c), loss)
+        away = positions - self.model.positions
+        return float((self.weights * loss).sum() + 0.5 * (self.pull * away**2).sum())
+
+
+def rms(distances: Array, present: NDArray[np.bool_]) -> float:
+    """Return the root of the mean square over what is present, m; NaN if nothing is."""
+    seen = distances[present]
+    return float(np.sqrt(np.mean(seen**2))) if seen.size else float("nan")

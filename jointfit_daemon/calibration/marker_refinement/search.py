@@ -1,0 +1,118 @@
+r"""The published refinement: one marker coordinate after the other, judged by inverse kinematics.
+
+Law: the search knows nothing but the tracking error of a set of marker positions, so it runs on any
+model whatever: ours, or another program's. Every unlocked coordinate has a step of its own::
+
+    while any step is at or above the threshold:
+        for every marker, for x, y, z whose step is:
+            go on in + while the error falls; if it never did, go on in - while it falls
+            if neither way helped: halve the step
+
+Source: Price, LaPrè, Johnson, Umberger and Sup, Int J Numer Method Biomed Eng 36 (2020) e3283,
+doi 10.1002/cnm.3283. The paper does not state the first step, the threshold, the order, nor what
+counts as a decrease; they are settings here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SearchSettings:
+    """What the paper leaves open."""
+
+    first_step_m: float = 0.008
+    """Step of every coordinate at the start, m."""
+    threshold_m: float = 0.002
+    """A coordinate is done when its step is below this, m."""
+    least_gain_m: float = 1e-7
+    """The error must fall by more than this for a step to count, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResult:
+    """Where the search ended."""
+
+    positions: Array
+    """On their segments, m, shape (M, 3)."""
+    errors: tuple[float, ...]
+    """RMS tracking error at the start and after every accepted step, m."""
+    runs: int
+    """Times inverse kinematics was run."""
+
+
+def search(
+    tracking_error: Callable[[Array], float],
+    start: Array,
+    free: NDArray[np.bool_],
+    settings: SearchSettings = SearchSettings(),
+    progress: Callable[[float, float], None] | None = None,
+) -> SearchResult:
+    """Refine marker positions coordinate by coordinate.
+
+    Parameters
+    ----------
+    tracking_error
+        RMS distance between measured and model markers after inverse kinematics, m; it may keep the
+        last pose of the frames to start from.
+    start
+        Positions on their segments, m, shape (M, 3).
+    free
+        False where a coordinate is locked, shape (M, 3).
+    progress
+        Told the largest step left and the error, both m, after every pass.
+    """
+    walk = _Walk(tracking_error, start)
+    steps = np.where(free, settings.first_step_m, 0.0)
+    while (steps >= settings.threshold_m).any():
+        for marker, axis in np.argwhere(steps >= settings.threshold_m):
+            if not walk.along(marker, axis, steps[marker, axis], settings.least_gain_m):
+                steps[marker, axis] /= 2.0
+        if progress is not None:
+            progress(float(steps.max()), walk.errors[-1])
+    return SearchResult(walk.positions, tuple(walk.errors), walk.runs)
+
+
+class _Walk:
+    """Marker positions on their way, and what they cost."""
+
+    def __init__(self, tracking_error: Callable[[Array], float], start: Array) -> None:
+        self._tracking_error = tracking_error
+        self.positions = np.array(start, dtype=np.float64)
+        self.runs = 0
+        self.errors = [self._measure(self.positions)]
+
+    def _measure(self, positions: Array) -> float:
+        self.runs += 1
+        return self._tracking_error(positions)
+
+    def along(self, marker: int, axis: int, step: float, least_gain: float) -> bool:
+        """Go in one direction while that helps, else in the other; tell whether either did."""
+        for signed in (step, -step):
+            moved = False
+            while self._try(marker, axis, signed, least_gain):
+                moved = True
+            if moved:
+                return True
+        return False
+
+    def _try(self, marker: int, axis: int, signed: float, least_gain: float) -> bool:
+        trial = self.positions.copy()
+        trial[marker, axis] += signed
+        error = self._measure(trial)
+        if error < self.errors[-1] - least_gain:
+            self.positions = trial
+            self.errors.append(error)
+            return True
+        return False
