@@ -71,6 +71,10 @@ class ImuSample(NamedTuple):
     rate: Vector | None = None
     """Angular rate at the instant of the orientation, in the same sensor frame, rad/s; None where
     none came. A mean since the sample before is no such rate: leave it out."""
+    acceleration: Vector | None = None
+    """Specific force, sensor axes, m/s^2 (+9.81 upwards at rest); None where none came."""
+    magnetic: Vector | None = None
+    """Magnetic field, sensor axes, in the device's own unit; None where none came."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 from jointfit_drivers.byte_stream import SerialPort
 from jointfit_drivers.xbus_events import XbusEvents
 from jointfit_drivers.xbus_handshake import Handshake
+from jointfit_drivers.xbus_raw import XbusRaw
 from jointfit_drivers.xbus_settings import XbusSettings
 from jointfit_drivers.xbus_sync import wires
 
@@ -35,7 +36,10 @@ class XbusImu:
         """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
         settings = self._settings
         baud = settings.baud if settings.transport == "uart" else None
-        return XbusEvents(baud, settings.rate_hz, wires(settings.sync or ()))
+        raw = None
+        if settings.orientation == "gateway":
+            raw = XbusRaw(settings.rate_hz, magnetometer=settings.magnetometer)
+        return XbusEvents(baud, settings.rate_hz, wires(settings.sync or ()), raw)
 
     async def run(self, emit: Emit) -> None:
         """Open the port, bring the device to measure, read until cancelled.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.xbus_continuity import Continuity
+from jointfit_drivers.xbus_raw import RAW, Message
 from jointfit_drivers.xbus_sync import describe
 from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item, Trigger, decode_item, split, world_of
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_drivers.xbus_raw import XbusRaw
     from jointfit_protocols.corrupt import Corrupt as WireCorrupt
+    from jointfit_protocols.mtdata2 import Value
 
 _BITS = 10  # of one byte on the line, 8N1
 _SILENCE_FLOOR_NS = 250_000_000
@@ -44,12 +47,20 @@ class XbusEvents:
         Nominal rate, used until the stream has shown its own.
     wires
         Items that tell of edges, and the wire of the rig that each is about.
+    raw
+        Makes orientations of raw readings; None: the device sends them.
     """
 
     def __init__(
-        self, baud: int | None, rate_hz: float, wires: Mapping[int, int] | None = None
+        self,
+        baud: int | None,
+        rate_hz: float,
+        wires: Mapping[int, int] | None = None,
+        raw: XbusRaw | None = None,
     ) -> None:
         self._wires = wires or {}
+        self._raw = raw
+        self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
         self._xbus = XbusDecoder()
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
@@ -110,22 +121,32 @@ class XbusEvents:
         return self._arrival_ns
 
     def _measurement(self, message: XbusMessage) -> list[Decoded]:
-        """Return the sample of an MTData2, after what its counter and time say."""
+        """Return what an MTData2 holds, or what is wrong with it."""
         items = split(message.data)
         if items is None:
             return [self._refuse(message, "MTData2 items do not fill the message")]
-        values, world_id = {}, 0
+        values: dict[int, Value] = {}
+        world_id = 0
         for data_id, raw in items:
             kind = data_id & 0xFFF0
-            if kind in _WANTED or kind in self._wires:
-                values[kind] = decode_item(data_id, raw)
-                if values[kind] is None:
+            if kind in self._wanted:
+                value = decode_item(data_id, raw)
+                if value is None:
                     return [self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
+                values[kind] = value
                 world_id = data_id if kind == _QUATERNION else world_id
+        return self._said(message, values, world_id)
+
+    def _said(
+        self, message: XbusMessage, values: Mapping[int, Value], world_id: int
+    ) -> list[Decoded]:
+        """Return the sample of the items of an MTData2, after what its counter and time say."""
         counter = cast("int | None", values.get(_COUNTER))
         if counter is not None:
             self._continuity.message(counter)
         pulses = self._pulses(message, values) if self._wires else []
+        if self._raw is not None:
+            return pulses + self._felt(message, values, self._raw)
         native = cast("Quaternion | None", values.get(_QUATERNION))
         if native is None:
             return pulses
@@ -140,6 +161,23 @@ class XbusEvents:
             out.append(ImuSample(self._arrived(message), q, native, ticks, counter, status))
         return out if self._warned else out + self._judged()
 
+    def _felt(
+        self, message: XbusMessage, values: Mapping[int, object], raw: XbusRaw
+    ) -> list[Decoded]:
+        """Return what raw readings give; nothing for a message without, as of a receiver."""
+        ticks = cast("int | None", values.get(_TIME))
+        if ticks is None or not raw.is_complete(values):
+            return []
+        self._measuring = True
+        out = self._continued(ticks)
+        counter = cast("int | None", values.get(_COUNTER))
+        status = cast("int | None", values.get(_STATUS_WORD))
+        said = Message(self._arrived(message), ticks, counter, status)
+        found = raw.samples(said, values, self.tick_clock.modulus or setup.WRAP_32_BIT)
+        if found is None:
+            return [*out, self._refuse(message, "raw readings that no sensor gives")]
+        return out + found
+
     def _pulses(self, message: XbusMessage, values: Mapping[int, object]) -> list[Decoded]:
         """Return the edges that a message tells of."""
         found = [(wire, values.get(item)) for item, wire in self._wires.items()]
@@ -153,11 +191,16 @@ class XbusEvents:
         """Return a gap or a restart, if there was one."""
         step = self._continuity.orientation(ticks)
         if step.restarted:
-            self._gate.forget()
+            self._forget_orientation()
             return [DeviceEvent("restart", f"its clock began anew at {ticks} ticks")]
         if step.lost:
             return [DeviceEvent("gap", f"{step.lost} messages lost", {"lost": step.lost})]
         return []
+
+    def _forget_orientation(self) -> None:
+        self._gate.forget()
+        if self._raw is not None:
+            self._raw.forget()
 
     def _judged(self) -> list[Decoded]:
         """Return one warning where hardly any quaternion has norm 1."""
@@ -191,7 +234,7 @@ class XbusEvents:
     def _woke(self) -> list[Decoded]:
         """Return a restart if the device had been measuring: it lost power, or was reset."""
         self._continuity.forget()
-        self._gate.forget()
+        self._forget_orientation()
         if not self._measuring:
             return []
         self._measuring = False

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NoReturn
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
 from jointfit_drivers import xbus_sync
 from jointfit_drivers.xbus_conversation import Conversation
+from jointfit_drivers.xbus_needs import ORIENTATION, message_bytes, needs_of
 from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item, real_id
 from jointfit_protocols.xbus import MessageId, XbusMessage
@@ -20,7 +21,9 @@ from jointfit_protocols.xbus import MessageId, XbusMessage
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
     from jointfit_drivers.byte_stream import SerialPort
+    from jointfit_drivers.xbus_needs import Need
     from jointfit_drivers.xbus_settings import XbusSettings
+    from jointfit_protocols.orientation import World
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +31,6 @@ _OTHER_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 
 """Factory settings and common choices first."""
 _LISTEN_S = 0.15  # an acknowledgement takes 10 ms at 9600 baud, a sample at 10 Hz 100 ms
 _RESETS, _RESET_WAIT_S = 50, 0.1  # 5 s: a stuck MTi-G-700 answered 1.8 s after its reset
-_SMALLEST_BYTES = 36  # counter, time and quaternion in one message
 _BITS = 10  # of one byte on the line, 8N1
 _FRAMES = (0, 1)  # of the alignment rotations: sensor, local
 _NO_SYNC = bytes(12)  # an entry that is off: a request without data would only ask
@@ -58,6 +60,7 @@ class Handshake:
         self._who = f"{settings.id} ({settings.port})"
         self._product_code = ""
         self._triggers = tuple(map(Item, xbus_sync.wires(settings.sync or ())))
+        self._needs = needs_of(settings)
 
     async def ensure_measuring(self) -> None:
         """Return when the device measures as the settings ask.
@@ -81,7 +84,7 @@ class Handshake:
 
     def _refuse_too_much_for_the_line(self) -> None:
         settings = self._settings
-        needs = settings.rate_hz * _SMALLEST_BYTES * _BITS
+        needs = settings.rate_hz * message_bytes(self._needs) * _BITS
         if needs > settings.baud:
             raise DeviceMisconfigured(
                 f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
@@ -120,24 +123,29 @@ class Handshake:
         rate = int(self._settings.rate_hz)
         reply = await self._answer(MessageId.OUTPUT_CONFIGURATION)
         found = _outputs_of(reply)
-        faults = differences(found, rate, self._triggers)
+        faults = differences(found, rate, self._triggers, self._needs)
         if not faults:
             return
-        self._refuse_to_write(faults, _rate_hint(found))
+        self._refuse_to_write(faults, _rate_hint(found, self._needs))
         log.warning("%s: writing its output configuration: %s", self._who, "; ".join(faults))
         wanted = (
             (Item.PACKET_COUNTER, setup.MAX_RATE),
             (Item.SAMPLE_TIME_FINE, setup.MAX_RATE),
             (Item.STATUS_WORD, setup.MAX_RATE),
-            (real_id(Item.QUATERNION, world=self._settings.world), rate),
+            *((real_id(need.items[0], world=self._world(need)), rate) for need in self._needs),
             *((item, setup.MAX_RATE) for item in self._triggers),
         )
         reply = await self._answer(MessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(wanted))
-        self._refuse_error(reply, f"refuses quaternions at {rate} Hz")
-        left = differences(_outputs_of(reply), rate, self._triggers)
+        asked = ", ".join(need.many for need in self._needs)
+        self._refuse_error(reply, f"refuses {asked} at {rate} Hz")
+        left = differences(_outputs_of(reply), rate, self._triggers, self._needs)
         if left:
-            hint = _rate_hint(_outputs_of(reply))
+            hint = _rate_hint(_outputs_of(reply), self._needs)
             raise DeviceMisconfigured(f"{self._who}: cannot do as asked: {'; '.join(left)}{hint}")
+
+    def _world(self, need: Need) -> World:
+        """Return the world an item is asked in: raw readings are in the sensor's own axes."""
+        return self._settings.world if need.items[0] == Item.QUATERNION else "ENU"
 
     def _refuse_to_write(self, faults: list[str], hint: str = "") -> None:
         """Say what would have to be written, unless it may be."""
@@ -232,12 +240,15 @@ class Handshake:
 
 
 def differences(
-    found: tuple[setup.Output, ...], rate: int, triggers: tuple[Item, ...] = ()
+    found: tuple[setup.Output, ...],
+    rate: int,
+    triggers: tuple[Item, ...] = (),
+    needs: tuple[Need, ...] = ORIENTATION,
 ) -> list[str]:
     """Return in words what an output configuration lacks; empty if it will do.
 
-    It will do with a counter, a fine time, a quaternion at `rate` Hz and the items that tell of
-    edges (`triggers`); precision, world and further items do not matter, for the decoder
+    It will do with a counter, a fine time, what `needs` says at `rate` Hz and the items that tell
+    of edges (`triggers`); precision, world and further items do not matter, for the decoder
     understands them all.
     """
     faults = []
@@ -248,10 +259,12 @@ def differences(
     faults += [
         f"it does not tell of edges (0x{item:04X})" for item in triggers if item not in kinds
     ]
-    if Item.QUATERNION not in kinds:
-        faults.append("it sends no quaternion (0x2010)")
-    elif kinds[Item.QUATERNION] != rate:
-        faults.append(f"it sends quaternions at {_hz(kinds[Item.QUATERNION])}, not {rate} Hz")
+    for need in needs:
+        sent = [kinds[item] for item in need.items if item in kinds]
+        if not sent:
+            faults.append(f"it sends no {need.one} (0x{need.items[0]:04X})")
+        elif rate not in sent:
+            faults.append(f"it sends {need.many} at {_hz(sent[0])}, not {rate} Hz")
     return faults
 
 
@@ -263,10 +276,10 @@ def _hz(rate: int) -> str:
     return "its maximum rate" if rate in {0, setup.MAX_RATE} else f"{rate} Hz"
 
 
-def _rate_hint(found: tuple[setup.Output, ...]) -> str:
+def _rate_hint(found: tuple[setup.Output, ...], needs: tuple[Need, ...]) -> str:
     """Offer the rate the device has, where that alone would do."""
-    rates = {output.rate for output in found if output.data_id & 0xFFF0 == Item.QUATERNION}
+    rates = {output.rate for output in found if output.data_id & 0xFFF0 in needs[0].items}
     rate = next(iter(rates), 0)
-    if rate in {0, setup.MAX_RATE} or differences(found, rate):
+    if rate in {0, setup.MAX_RATE} or differences(found, rate, (), needs):
         return ""
     return f" (or set rate_hz = {rate})"

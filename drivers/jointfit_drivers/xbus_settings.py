@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from jointfit_daemon.driver import ImuSettings
+from jointfit_drivers import gateway_orientation
 from jointfit_drivers.xbus_sync import XbusSyncSettings  # noqa: TC001 - pydantic reads it
 
 MAX_RATE_HZ = 400
@@ -37,6 +38,16 @@ class XbusSettings(ImuSettings):
         description="what its sync lines do, all of them; written only where they differ and "
         "`persist` allows it. Left out: they stay as they are",
     )
+    orientation: Literal["device", "gateway"] = Field(
+        "device",
+        description="who computes it: the `device`, or the `gateway` from raw rates of turn and "
+        "accelerations (needs the extra `vqf`); one answer for all IMUs of a rig is best",
+    )
+    magnetometer: bool = Field(
+        False,
+        description='with `orientation = "gateway"`: heading by magnetometer, which the device '
+        "must then send at `rate_hz`, too; left out it drifts freely. The same for all IMUs",
+    )
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"
     )
@@ -48,3 +59,19 @@ class XbusSettings(ImuSettings):
         if rate_hz != int(rate_hz) or rate_hz > MAX_RATE_HZ:
             raise ValueError(f"whole Hz up to {MAX_RATE_HZ}, found {rate_hz:g}")
         return rate_hz
+
+    @field_validator("orientation")
+    @classmethod
+    def _filter_that_is_installed(cls, orientation: str) -> str:
+        """Refuse before anything opens what would fail at the first sample."""
+        if orientation == "gateway" and not gateway_orientation.is_installed():
+            raise ValueError(gateway_orientation.PACKAGE_MISSING)
+        return orientation
+
+    @field_validator("magnetometer")
+    @classmethod
+    def _magnetometer_of_a_filter(cls, magnetometer: bool, info: ValidationInfo) -> bool:
+        """Refuse a magnetometer that nobody would read."""
+        if magnetometer and info.data.get("orientation") == "device":
+            raise ValueError('needs orientation = "gateway": a device uses its own as it is set')
+        return magnetometer

@@ -134,7 +134,7 @@ _TRIGGER = struct.Struct(">BBIH")
 _TRIGGERS = {int(Item.TRIGGER_IN1), int(Item.TRIGGER_IN2)}
 _GNSS_PVT_BYTES = 94
 _ITEM_HEAD = 3
-_FOUR_FLOATS = struct.Struct(">4f")
+_FLOATS = tuple(struct.Struct(f">{count}f") for count in range(10))
 
 
 def world_of(data_id: int) -> World | None:
@@ -164,9 +164,7 @@ def decode_reals(data_id: int, raw: bytes, count: int) -> Reals | None:
     if len(raw) != count * _BYTES[precision]:
         return None
     if precision == Precision.FLOAT32:
-        if count == 4:  # noqa: PLR2004 - the quaternion: the path every sample takes
-            return _FOUR_FLOATS.unpack(raw)
-        return struct.unpack(f">{count}f", raw)
+        return _FLOATS[count].unpack(raw)  # the path every sample takes
     if precision == Precision.FLOAT64:
         return struct.unpack(f">{count}d", raw)
     if precision == Precision.FIXED_12_20:

@@ -20,6 +20,7 @@ from jointfit_protocols.mtdata2 import Item
 from jointfit_protocols.orientation import native_of
 from jointfit_protocols.xbus import MASTER, MessageId, XbusDecoder, XbusMessage, encode
 from jointfit_protocols.xbus_sync import IN1
+from jointfit_simulators.felt import Felt
 from jointfit_simulators.imu_device import clean_wire
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xbus_sync_lines import SyncLines
@@ -41,6 +42,7 @@ _FOREIGN_EVERY = 12  # messages: a GNSS receiver at 4 Hz beside orientations at 
 _BITS = 10  # of one byte on the line, 8N1
 _PARAMETER = b"\x21"
 _INVALID = b"\x04"
+_MEASURED = (Item.QUATERNION, Item.RATE_OF_TURN, Item.DELTA_Q)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,7 @@ class XbusDevice:
         self._line = PtyLine(link)
         self._noise = wire_noise
         self._sync = SyncLines(options.sync)
+        self._felt = Felt()
         self._decoder = XbusDecoder()
         self._outputs = tuple(setup.Output(*output) for output in options.outputs)
         self._alignment = dict.fromkeys((0, 1), options.alignment)
@@ -129,7 +132,7 @@ class XbusDevice:
     def rate_hz(self) -> float:
         """Quaternions per second, as configured; 0 if none are."""
         for data_id, rate in self._outputs:
-            if data_id & 0xFFF0 == Item.QUATERNION:
+            if data_id & 0xFFF0 in _MEASURED:
                 return float(FILTER_RATE_HZ if rate in {0, setup.MAX_RATE} else rate)
         return 0.0
 
@@ -153,6 +156,7 @@ class XbusDevice:
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now, if it measures; ``ImuDevice.push`` says the rest."""
         self._last_ns = device_ns
+        self._felt.moved(device_ns, q_world_sensor)
         if not self._measuring:
             return
         if self._options.gnss and self._messages % _FOREIGN_EVERY == _FOREIGN_EVERY - 1:
@@ -335,14 +339,17 @@ class XbusDevice:
         self, counter: int, ticks: int, q: Quaternion | None, edges: Mapping[int, Trigger]
     ) -> bytes:
         """Return the data of one MTData2."""
-        return mtdata2.encode_items(
-            (data_id, value)
+        felt = self._felt
+        said = (
+            (data_id, edges.get(data_id, _value(data_id, counter, ticks, q, felt)))
             for data_id, _ in self._outputs
-            if (value := edges.get(data_id, _value(data_id, counter, ticks, q))) is not None
         )
+        return mtdata2.encode_items((item, value) for item, value in said if value is not None)
 
 
-def _value(data_id: int, counter: int, ticks: int, q: Quaternion | None) -> Value | None:
+def _value(
+    data_id: int, counter: int, ticks: int, q: Quaternion | None, felt: Felt
+) -> Value | None:
     """Return what an item of a message holds; None if the message does without it."""
     simple: dict[int, Value] = {
         Item.PACKET_COUNTER: counter,
@@ -356,7 +363,9 @@ def _value(data_id: int, counter: int, ticks: int, q: Quaternion | None) -> Valu
     world, count = mtdata2.world_of(data_id), mtdata2.reals_in(data_id)
     if q is None or world is None or count is None:
         return None
-    return native_of(q, world) if data_id & 0xFFF0 == Item.QUATERNION else (0.0,) * count
+    if data_id & 0xFFF0 == Item.QUATERNION:
+        return native_of(q, world)
+    return felt.value(data_id & 0xFFF0) or (0.0,) * count
 
 
 def _can_do(output: setup.Output) -> bool:

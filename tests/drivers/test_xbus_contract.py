@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from typing_extensions import override
 
 from jointfit_drivers.xbus import XbusImu
 from jointfit_drivers.xbus_settings import XbusSettings
+from jointfit_protocols.mtdata2 import Item
+from jointfit_protocols.xbus_messages import MAX_RATE
+from jointfit_simulators.contract_scene import orientation
 from jointfit_simulators.driver_contract import DriverContract
+from jointfit_simulators.felt import Felt
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
 
@@ -63,3 +69,34 @@ class TestXbusThatStreamsFromTheStart(TestXbus):
     def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
         options = XbusDeviceOptions(measures_at_once=True, config_delay_s=0.05, gnss=True)
         return XbusDevice(folder / "imu", options=options, wire_noise=wire_noise)
+
+
+RAW_OUTPUTS = (
+    (Item.PACKET_COUNTER, MAX_RATE),
+    (Item.SAMPLE_TIME_FINE, MAX_RATE),
+    (Item.STATUS_WORD, MAX_RATE),
+    (Item.RATE_OF_TURN, 100),
+    (Item.ACCELERATION, 100),
+)
+
+
+@pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
+class TestXbusThatOnlyFeels(TestXbus):
+    """Raw readings on the wire, orientation on the gateway."""
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
+        options = XbusDeviceOptions(outputs=RAW_OUTPUTS)
+        return XbusDevice(folder / "imu", options=options, wire_noise=wire_noise)
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        return XbusImu(settings(folder, orientation="gateway"))
+
+    @override
+    def matches(self, number: int, measurement: Any) -> bool:
+        """By what it felt: the orientation remembers all that came before."""
+        felt = Felt()
+        felt.moved(0, orientation(number))
+        force = felt.value(Item.ACCELERATION)
+        return bool(measurement.acceleration == pytest.approx(force, abs=0.01))

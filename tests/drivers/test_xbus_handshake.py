@@ -13,6 +13,7 @@ from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusImu
 from jointfit_drivers.xbus_handshake import differences
+from jointfit_drivers.xbus_needs import needs_of
 from jointfit_drivers.xbus_settings import XbusSettings
 from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item, Precision, real_id
@@ -144,6 +145,38 @@ async def test_a_difference_is_written_once_with_permission(tmp_path: Path) -> N
     assert device.rate_hz == 100.0
     assert (0x2014, 100) in device.outputs
     assert (Item.STATUS_WORD, 0xFFFF) in device.outputs
+
+
+async def test_raw_outputs_are_written_once_where_the_gateway_computes_the_orientation(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("vqf")
+    device = XbusDevice(tmp_path / "imu")
+    asked = {"orientation": "gateway", "magnetometer": True}
+    async with powered(device, feeding=True):
+        said = await refusal(make(tmp_path, **asked), DeviceMisconfigured)
+        await chunks_of(make(tmp_path, persist=True, **asked))
+        await chunks_of(make(tmp_path, **asked))
+    for part in ("no rate of turn (0x8020)", "no acceleration (0x4020)", "no magnetic field"):
+        assert part in said
+    assert device.flash_writes == 1
+    assert {(Item.RATE_OF_TURN, 100), (Item.ACCELERATION, 100), (Item.MAGNETIC_FIELD, 100)} <= set(
+        device.outputs
+    )
+    assert Item.QUATERNION not in dict(device.outputs)
+
+
+def test_increments_will_do_where_the_device_sends_them_already() -> None:
+    sent = ((0x1020, 0xFFFF), (0x1060, 0xFFFF), (0x8032, 100), (0x4012, 100))
+    found = tuple(setup.Output(*output) for output in sent)
+    asked = XbusSettings(
+        id="S1", segment="thigh", driver="xbus", port="p", orientation="gateway"
+    )  # fmt: skip
+    assert differences(found, 100, (), needs_of(asked)) == []
+    assert differences(found, 50, (), needs_of(asked)) == [
+        "it sends rates of turn at 100 Hz, not 50 Hz",
+        "it sends accelerations at 100 Hz, not 50 Hz",
+    ]
 
 
 async def test_a_rate_the_device_rounds_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,97 @@
+r"""What a sensor that turns in place feels: angular rate, gravity and the earth's magnetic field.
+
+Law: from two successive orientations, exact for the interval between them, without noise:
+
+.. math:: \omega = \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
+    m = R_k^{T} (0, \cos\delta, -\sin\delta)
+
+The device is told where it points, not where it is: specific force is gravity alone, as if it only
+turned.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, radians, sin, sqrt
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.mtdata2 import Item
+
+if TYPE_CHECKING:
+    from jointfit_simulators.imu_device import Quaternion
+
+GRAVITY = 9.81
+"""m/s^2."""
+DIP_RAD = radians(65.0)
+"""Of the magnetic field below the horizon; its size is 1, its heading north."""
+_TINY = 1e-12
+
+Vector = tuple[float, float, float]
+
+
+class Felt:
+    """Follows one sensor."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, Quaternion] | None = None
+        self._turn: Vector = (0.0, 0.0, 0.0)
+        self._step_s = 0.0
+        self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    def moved(self, device_ns: int, q_world_sensor: Quaternion) -> None:
+        """Take the orientation at the next instant."""
+        if self._last is not None:
+            at_ns, before = self._last
+            self._turn = _between(before, q_world_sensor)
+            self._step_s = (device_ns - at_ns) * 1e-9
+        self._last, self._q = (device_ns, q_world_sensor), q_world_sensor
+
+    def value(self, item: int) -> tuple[float, ...] | None:
+        """Return what an item says of the last interval; None for items that are not felt."""
+        x, y, z = self._turn
+        step_s = self._step_s
+        if item == Item.RATE_OF_TURN:
+            return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
+        if item == Item.DELTA_Q:
+            angle = sqrt(x * x + y * y + z * z)
+            scale = sin(angle / 2.0) / angle if angle > _TINY else 0.5
+            return (cos(angle / 2.0), scale * x, scale * y, scale * z)
+        if item == Item.ACCELERATION:
+            return _in_sensor(self._q, (0.0, 0.0, GRAVITY))
+        if item == Item.DELTA_V:
+            x, y, z = _in_sensor(self._q, (0.0, 0.0, GRAVITY))
+            return (x * step_s, y * step_s, z * step_s)
+        if item == Item.MAGNETIC_FIELD:
+            return _in_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
+        return None
+
+
+def _between(before: Quaternion, after: Quaternion) -> Vector:
+    """Return log(before* after), rad."""
+    a, b, c, d = before
+    w, x, y, z = after
+    v = (
+        a * x - b * w - c * z + d * y,
+        a * y + b * z - c * w - d * x,
+        a * z - b * y + c * x - d * w,
+    )
+    real = a * w + b * x + c * y + d * z
+    if real < 0.0:
+        real, v = -real, (-v[0], -v[1], -v[2])
+    length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    scale = 2.0 * atan2(length, real) / length if length > _TINY else 2.0
+    return (scale * v[0], scale * v[1], scale * v[2])
+
+
+def _in_sensor(q: Quaternion, v: Vector) -> Vector:
+    """Return a world vector in the axes of the sensor."""
+    w, x, y, z = q[0], -q[1], -q[2], -q[3]
+    tx, ty, tz = (
+        2.0 * (y * v[2] - z * v[1]),
+        2.0 * (z * v[0] - x * v[2]),
+        2.0 * (x * v[1] - y * v[0]),
+    )
+    return (
+        v[0] + w * tx + y * tz - z * ty,
+        v[1] + w * ty + z * tx - x * tz,
+        v[2] + w * tz + x * ty - y * tx,
+    )
