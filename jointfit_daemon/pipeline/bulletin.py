@@ -1,4 +1,4 @@
-"""Turns what wires do into notices, at most one in ten seconds for each kind and device.
+"""Turns what wires and clocks do into notices, at most one in ten seconds for each kind and device.
 
 Law: nothing is lost by the limit: what is held back is summed into the next notice.
 """
@@ -6,21 +6,25 @@ Law: nothing is lost by the limit: what is held back is summed into the next not
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.model import Corrupt, DeviceEvent
 from jointfit_daemon.pipeline.events import Notice
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 QUIET_NS = 10_000_000_000
-"""Every drop-out is counted in health; a line each ten seconds and kind is enough for a log."""
+"""Every drop-out and every epoch is counted in health; a line each ten seconds, kind and device is
+enough for a log."""
 
 Level = Literal["info", "warning", "error"]
 _LEVELS: dict[str, Level] = {
     "warning": "warning",
     "error": "error",
-    "restart": "warning",
-    "clock": "warning",
 }
+_OF_CLOCKS = frozenset({"restart", "clock"})
 
 
 @dataclass(slots=True)
@@ -29,26 +33,28 @@ class _Held:
     count: int = 0
     amount: int = 0
     text: str = ""
+    data: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class Bulletin:
-    """Collects corruption and gaps; passes everything else on at once."""
+    """Collects corruption, gaps, jumps of clocks; passes on everything else at once."""
 
     _held: dict[tuple[str, str], _Held] = field(default_factory=dict)
 
     def add(self, now_ns: int, source: str, item: Corrupt | DeviceEvent) -> list[Notice]:
         """Take one happening; return what may be told already."""
         if isinstance(item, Corrupt):
-            return self._hold(now_ns, source, "corrupt", item.discarded, item.reason)
+            return self._hold(now_ns, (source, "corrupt"), item.discarded, item.reason)
         if item.kind == "gap":
             lost = item.data.get("lost", 1)
             return self._hold(
-                now_ns, source, "gap", lost if isinstance(lost, int) else 1, item.text
+                now_ns, (source, "gap"), lost if isinstance(lost, int) else 1, item.text
             )
-        kind = "clock" if item.kind in {"restart", "clock"} else "device"
+        if item.kind in _OF_CLOCKS:
+            return self._hold(now_ns, (source, item.kind), 1, item.text, item.data)
         level: Level = _LEVELS.get(item.kind, "info")
-        return [Notice(now_ns, kind, source, item.text, level, dict(item.data))]
+        return [Notice(now_ns, "device", source, item.text, level, dict(item.data))]
 
     def due(self, now_ns: int) -> list[Notice]:
         """Return the held-back notices whose quiet time is over."""
@@ -60,17 +66,25 @@ class Bulletin:
             if held.count and now_ns - held.told_ns >= QUIET_NS
         ]
 
-    def _hold(self, now_ns: int, source: str, kind: str, amount: int, text: str) -> list[Notice]:
-        key = (source, kind)
+    def _hold(
+        self,
+        now_ns: int,
+        key: tuple[str, str],
+        amount: int,
+        text: str,
+        data: Mapping[str, object] = MappingProxyType({}),
+    ) -> list[Notice]:
         held = self._held.setdefault(key, _Held(told_ns=now_ns - QUIET_NS))
         held.count += 1
         held.amount += amount
-        held.text = text
+        held.text, held.data = text, data
         return [_notice(now_ns, key, held)] if now_ns - held.told_ns >= QUIET_NS else []
 
 
 def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
     source, kind = key
+    if kind in _OF_CLOCKS:
+        return _of_clock(now_ns, source, held)
     if kind == "gap":
         text = f"{held.amount} sample{'s' if held.amount > 1 else ''} lost on the way"
         data: dict[str, object] = {"gaps": held.count, "lost": held.amount}
@@ -79,3 +93,13 @@ def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
         data = {"runs": held.count, "discarded_bytes": held.amount}
     held.told_ns, held.count, held.amount = now_ns, 0, 0
     return Notice(now_ns, "wire", source, text, "warning", data)
+
+
+def _of_clock(now_ns: int, source: str, held: _Held) -> Notice:
+    """Return the last of what was held back, and how often there was something of its kind."""
+    text, data = held.text, dict(held.data)
+    if held.count > 1:
+        text = f"{text} (the last of {held.count} such events)"
+        data["events"] = held.count
+    held.told_ns, held.count, held.amount = now_ns, 0, 0
+    return Notice(now_ns, "clock", source, text, "warning", data)

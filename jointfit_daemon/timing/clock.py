@@ -25,7 +25,7 @@ from jointfit_daemon.timing.device_time import ArrivalTime, CounterTime, TickTim
 from jointfit_daemon.timing.direct import PulseTie, declared
 from jointfit_daemon.timing.echo_clock import STALE_NS, EchoFit
 from jointfit_daemon.timing.envelope import CRYSTAL, NOMINAL_RATE, Envelope
-from jointfit_daemon.timing.lateness import LATE_NS, Lateness
+from jointfit_daemon.timing.lateness import LATE_NS, Plausibility
 from jointfit_daemon.timing.stamps import STEP_NS, Stamp, StampLine
 
 if TYPE_CHECKING:
@@ -63,8 +63,8 @@ class DeviceClock:
     """
 
     __slots__ = (
-        "_absent", "_arrival_ns", "_direct", "_echo", "_envelope", "_kind",
-        "_lateness", "_line", "_looked", "_period_ns", "_reader", "_refused", "_state_direct",
+        "_absent", "_arrival_ns", "_direct", "_doubts", "_echo", "_envelope", "_kind",
+        "_line", "_looked", "_period_ns", "_reader", "_refused", "_state_direct",
         "_synced", "_tick_clock", "_unix_offset_ns", "_warned", "epoch", "jitter_ns", "latency_ns",
         "latency_sd_ns", "minute", "news", "sigma_ns",
     )  # fmt: skip
@@ -97,7 +97,7 @@ class DeviceClock:
         self._direct: Direct | None = None
         self._refused = self._state_direct = self._synced = False
         self._line.last_u = None
-        self._lateness = Lateness()
+        self._doubts = Plausibility()
 
     # --- what is known -----------------------------------------------------------------------
 
@@ -253,6 +253,8 @@ class DeviceClock:
         if u is None or news is not None:
             self._begin(news)
             u = self._afresh(ticks, counter, arrival_ns, tick_clock)
+        elif self._doubts.doubtful:
+            return self._by_arrival(arrival_ns)
         last_u = self._line.last_u
         if last_u is not None and u <= last_u:
             return self._past(u, last_u)
@@ -305,26 +307,23 @@ class DeviceClock:
     # --- what does not fit -------------------------------------------------------------------
 
     def _impossible(self, u: int, arrival_ns: int) -> ClockNews | None:
-        """Say what contradicts the fit: a sample that came before its time, or that stays late."""
-        last_u = self._line.last_u
+        """Say what contradicts the fit: samples that came before their time, or that stay late."""
+        last_u, doubts = self._line.last_u, self._doubts
         if last_u is None or u <= last_u:
             return None
-        echo = self._echo
+        echo, envelope = self._echo, self._envelope
         if echo is not None and echo.settled:
-            early = echo.host_ns(u) - arrival_ns
-            return clock_news.too_early(early) if early > STEP_NS else None
-        envelope = self._envelope
+            return doubts.feed(min(arrival_ns - echo.host_ns(u), 0), 0.0, arrival_ns)
         excess = envelope.residual(u, arrival_ns - u)
-        if excess < -STEP_NS:
-            if envelope.settled:
-                return clock_news.too_early(-excess)
+        if -STEP_NS <= excess < LATE_NS:
+            doubts.on_time()
+            return None
+        if envelope.settled:
+            return doubts.feed(excess, envelope.sigma_ns(u), arrival_ns)
+        if excess < 0.0:
             # What came before was merely late, by seconds perhaps (stale bytes): no use for a fit.
             self._envelope = Envelope(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
-            return None
-        if excess < LATE_NS or not envelope.settled:
-            self._lateness.on_time()
-            return None
-        return self._lateness.feed(excess, envelope.sigma_ns(u), arrival_ns)
+        return None
 
     # --- stamps ------------------------------------------------------------------------------
 
@@ -338,6 +337,7 @@ class DeviceClock:
         t, step = self._line.stamp(u, target, skew, slew=self._synced)
         if step:
             self.epoch += 1
+            self._synced = False
             self.news.append(clock_news.moved(step))
         # a stamp held back by those before it has yet to catch up with what is known by now
         self._synced = settled = settled and (self._synced or t - target < CAUGHT_UP_NS)

@@ -27,6 +27,8 @@ YOUNG_NS = 10_000_000_000
 """Until this span every bucket is worth a refit; later one in two seconds is."""
 SETTLED_NS = 2_000_000_000
 SETTLED_POINTS = 10
+TRUSTED_NS = 2_000_000.0
+"""Standard deviation below which the line is taken for settled; scattered delays leave it above."""
 FLOOR_NS = 10_000.0
 """No envelope is believed better than this."""
 CRYSTAL = 50e-6
@@ -119,14 +121,15 @@ class Envelope:
         while points and points[0][0] < oldest:
             points.popleft()
         self._span = u - points[0][0] if points else 0
-        self.settled = len(points) >= SETTLED_POINTS and self._span >= SETTLED_NS
+        enough = len(points) >= SETTLED_POINTS and self._span >= SETTLED_NS
         self._sealed += 1
         if not points:  # a silence of a whole window: the slope is still a good guess
             self._prior, self._prior_sd = self.skew, CRYSTAL / 10
             self._c, self._ref = float(y), u
             self._variance = (inf, 0.0, self._prior_sd**2)
-        elif self._span < YOUNG_NS or self._sealed % _OLD_REFIT_BUCKETS == 0:
+        elif self._span < YOUNG_NS or not self.settled or self._sealed % _OLD_REFIT_BUCKETS == 0:
             self._refit(u)
+        self.settled = enough and (self.settled or self.sigma_ns(u) <= TRUSTED_NS)
         self._best, self._best_key = (u, y), y - self.skew * (u - self._ref)
         self._bucket_end = u + BUCKET_NS
 

@@ -26,8 +26,11 @@ Point = tuple[int, int]
 
 _SUPPORTS = 2  # points that every edge rests on
 _FINEST_NS = 1_000.0  # no cloud of points is taken to define its lower edge better
+_JAM_NS = 25_000_000.0  # higher up a starved host or a full queue was at work, and no jitter
+_LEAST = 5  # points that are not, to tell jitter by
 _TAIL = 14.0  # of the logarithm of the likelihood
 _PRIOR_TAIL = 6.0
+_WILDEST = 5e-3  # no clock's slope is beyond this
 _STEPS = 20
 _PASSES = 3
 
@@ -82,8 +85,11 @@ def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd
     hull = lower_hull(points)
     mean_u = sum(at for at, _ in points) / len(points)
     (ua, ya), (ub, yb) = straddling_edge(hull, mean_u)
-    edge = (yb - ya) / (ub - ua)
-    scale = _edge_scale([y - ya - edge * (at - ua) for at, y in points])
+    most = max(_PRIOR_TAIL * prior_sd, _WILDEST)  # else a burst read at once, y = A - u, is an edge
+    edge = min(max((yb - ya) / (ub - ua), prior - most), prior + most)
+    heights = [y - ya - edge * (at - ua) for at, y in points]
+    least_height = min(heights)
+    scale = _edge_scale([height - least_height for height in heights])
     rows = [(float(at - ref), float(y - ya)) for at, y in hull]
     middle, least = mean_u - ref, (hull[-1][0] - hull[0][0]) / 100
     low = edge - _TAIL * scale / max(mean_u - ua, least)
@@ -97,6 +103,9 @@ def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd
 
 def _edge_scale(rests: list[float]) -> float:
     """Return 1/G, ns, from the heights of all points above the edge."""
+    low = [rest for rest in rests if rest < _JAM_NS]
+    if len(low) >= _LEAST:
+        rests = low
     rests.sort()
     # Half of the points lie within log(2) mean heights. The two that the edge rests on say nothing,
     # and a third is the price of not knowing the mean height beforehand.

@@ -1,4 +1,4 @@
-"""Notices about wires come at most once a second, and nothing is lost by that."""
+"""Notices about wires and clocks come at most once in ten seconds, and nothing is lost by that."""
 
 from __future__ import annotations
 
@@ -41,3 +41,24 @@ def test_a_restarted_clock_is_told_at_once_as_a_warning() -> None:
         "warning",
         "device time fell by 3 s",
     )
+
+
+def test_a_clock_that_jumps_again_and_again_is_one_line_in_ten_seconds_with_a_count() -> None:
+    bulletin, told = Bulletin(), []
+    for number in range(40):
+        now = number * QUIET_NS // 20
+        told += bulletin.due(now)
+        told += bulletin.add(now, "S1", DeviceEvent("clock", f"jump {number}", {"jump_ms": number}))
+    told += bulletin.due(2 * QUIET_NS)
+    assert [(n.text, n.data) for n in told] == [
+        ("jump 0", {"jump_ms": 0}),
+        ("jump 19 (the last of 19 such events)", {"jump_ms": 19, "events": 19}),
+        ("jump 39 (the last of 20 such events)", {"jump_ms": 39, "events": 20}),
+    ]
+
+
+def test_a_reboot_is_not_hidden_by_jumps_of_the_clock_nor_by_another_device() -> None:
+    bulletin = Bulletin()
+    kinds = [("S1", "clock"), ("S1", "restart"), ("S2", "clock"), ("S2", "restart")]
+    told = [bulletin.add(1, source, DeviceEvent(kind, "anew")) for source, kind in kinds]
+    assert [len(notices) for notices in told] == [1, 1, 1, 1]

@@ -1,0 +1,126 @@
+"""A starved host reads late and in bursts: late data, never a clock that restarted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from jointfit_daemon.model import TickClock
+from jointfit_daemon.timing.clock import DeviceClock
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.timing.clock import Stamp
+
+MS, S = 1_000_000, 1_000_000_000
+PERIOD = 10 * MS
+START = 7_000 * S
+OWN = TickClock(1000, 1 << 32)
+SETTLING_S = 8.0
+"""Of a clock that is starved from its first sample on: three times that of one that is not."""
+
+
+def read_late(
+    stalls_s: Sequence[tuple[float, float]], seconds: float, begin_s: float
+) -> NDArray[np.int64]:
+    """Return arrivals of a steady device at a host that works and stalls by turns."""
+    rng = np.random.default_rng(1)
+    n = int(seconds * S / PERIOD)
+    due = START + np.arange(n) * PERIOD + rng.exponential(3e5, n).astype(np.int64)
+    at = START + round(begin_s * S)
+    while at < due[-1]:
+        for work_s, stall_s in stalls_s:
+            asleep = at + round(work_s * S)
+            at = asleep + round(stall_s * S)
+            late = (due >= asleep) & (due < at)
+            due[late] = at + 2_000 * np.arange(np.count_nonzero(late))
+    return np.maximum.accumulate(due)
+
+
+def stamped(arrivals: NDArray[np.int64]) -> tuple[DeviceClock, list[tuple[int, Stamp]]]:
+    """Return the clock of a device 20 ppm fast, and true instant and stamp of every sample."""
+    clock, out = DeviceClock(PERIOD), []
+    for k, arrival in enumerate(arrivals.tolist()):
+        ticks = (k * PERIOD * 1_000_020 // 1_000_000 + 60 * S) // 1000 % (1 << 32)
+        stamp = clock.feed_sample(ticks, k % 65536, arrival, OWN)
+        out.append((START + k * PERIOD, stamp))
+    return clock, out
+
+
+stalls = st.lists(
+    st.tuples(st.floats(0.005, 0.5), st.floats(0.2, 2.0)), min_size=1, max_size=5
+)  # fmt: skip
+
+
+@settings(max_examples=15, deadline=None)
+@given(stalls, st.sampled_from([0.0, 6.0]))
+@example([(0.01, 2.0)], 6.0)
+def test_stalls_and_bursts_are_late_data_and_no_restart(
+    stalls_s: list[tuple[float, float]], begin_s: float
+) -> None:
+    clock, out = stamped(read_late(stalls_s, 40.0, begin_s))
+    assert clock.epoch == 0
+    assert not clock.news
+    assert all(abs(stamp.t_ns - true) < MS for true, stamp in out if stamp.synced)
+    if begin_s:
+        assert all(stamp.synced for _, stamp in out[500:])
+
+
+def test_a_clock_settles_on_a_starved_host() -> None:
+    """A tenth of a second of work, then 0.3 to 1.5 s of none, from the first sample on."""
+    _, out = stamped(read_late([(0.1, 0.3), (0.1, 1.5), (0.1, 0.7)], 20.0, 0.0))
+    assert all(stamp.synced for _, stamp in out[int(SETTLING_S * S / PERIOD) :])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_jam_of_changing_length_moves_nothing(seed: int) -> None:
+    """Ten seconds in which nothing is on time: the queue grows and shrinks, the clock goes on."""
+    rng = np.random.default_rng(seed)
+    arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
+    steps = np.abs(np.cumsum(rng.normal(0.0, 25.0 * MS, 1000)))
+    arrivals[1000:2000] += (60 * MS + steps).astype(np.int64)
+    clock, out = stamped(np.maximum.accumulate(arrivals))
+    assert not clock.news
+    assert all(abs(stamp.t_ns - true) < MS for true, stamp in out[300:])
+
+
+def test_a_burst_from_before_the_start_settles_nothing() -> None:
+    """Three seconds from a full buffer, read at once: one arrival, and no line through it."""
+    arrivals = read_late([(100.0, 0.0)], 12.0, 0.0)
+    arrivals[:300] = START + 3 * S + 2_000 * np.arange(300)
+    clock, out = stamped(np.maximum.accumulate(arrivals))
+    assert not any(stamp.synced for _, stamp in out[:400])
+    assert not clock.news
+    assert all(abs(stamp.t_ns - true) < MS for true, stamp in out if stamp.synced)
+    assert clock.settled
+
+
+def test_one_wrong_stamp_of_arrival_is_no_restart() -> None:
+    """A single sample that seems to come before it was taken is not stamped synced, that is all."""
+    arrivals = read_late([(100.0, 0.0)], 12.0, 0.0)
+    arrivals[800] -= 400 * MS
+    clock, out = stamped(arrivals)
+    assert clock.epoch == 0
+    assert [number for number, (_, stamp) in enumerate(out[300:], 300) if not stamp.synced] == [800]
+    stamps = [stamp.t_ns for _, stamp in out]
+    assert np.all(np.diff(stamps) > 0)
+
+
+def test_a_backward_step_of_the_estimate_is_told_once_and_waited_for() -> None:
+    """Fast samples after minutes of a full queue: one news, unsynced until stamps fit again."""
+    arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
+    arrivals[:1500] += 300 * MS
+    clock, out = stamped(arrivals)
+    assert [news.kind for news in clock.news] == ["clock"]
+    stamps = [stamp.t_ns for _, stamp in out]
+    assert np.all(np.diff(stamps) > 0)
+    assert clock.epoch == 1
+    assert all(abs(stamp.t_ns - true) < MS for true, stamp in out[1500:] if stamp.synced)
+    assert clock.settled
