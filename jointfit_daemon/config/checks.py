@@ -178,6 +178,25 @@ def can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
                 yield Fault(f"imu[{source.id}].ids.{message}", text)
 
 
+def headings(sources: Sequence[Source]) -> str | None:
+    """Say what is wrong with IMUs of which some find north on the gateway and others drift.
+
+    A fault it is not: who wants it may have it. Of a device that computes its own orientation it
+    is not known which it is.
+    """
+    drifts: dict[bool, list[str]] = {True: [], False: []}
+    for source in sources:
+        if getattr(source.settings, "orientation", None) == "gateway":
+            drifts[not getattr(source.settings, "magnetometer", False)].append(source.id)
+    if not drifts[True] or not drifts[False]:
+        return None
+    return (
+        f"heading by magnetometer on {', '.join(drifts[False])}, but not on "
+        f"{', '.join(drifts[True])}: it drifts there, and joint rotation with it; "
+        "set `magnetometer` alike on all"
+    )
+
+
 def _numbers(ids: object) -> Iterator[tuple[str, int]]:
     """Yield message names and identifiers of an ``ids`` table, be it a model or a dict.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
+from jointfit_daemon.config.checks import headings
 from jointfit_daemon.fusion import LimbFuser, OpticalOrigin
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline.bulletin import Bulletin
@@ -149,6 +150,8 @@ class Core:
             self._replace_aligner(rig)
         self._session = session
         self._use_calibration()
+        if (doubt := headings(rig.sources)) is not None:
+            outputs.append(Notice(event.t_ns, "device", rig.name, doubt, "warning"))
         text = "stored calibration loaded" if event.calibration else "no calibration stored yet"
         return [*outputs, session.status(event.t_ns, text)]
 

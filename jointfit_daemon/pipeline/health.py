@@ -34,7 +34,7 @@ def health_of(
         verdicts = counted[name]
         if state.source.kind == "mocap":
             verdicts = _mocap(state, verdicts)
-        devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state)}
+        devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state), **_filter(state)}
     return {
         "devices": devices,
         "calibration": {"phase": session.phase, "version": session.version},
@@ -86,6 +86,12 @@ def _clock(state: SourceState) -> dict[str, object]:
         else {"p50": _us(delays.p50_ns), "p99": _us(delays.p99_ns), "max": _us(delays.max_ns)},
         "rate_hz": None if rate is None else round(rate, 2),
     }
+
+
+def _filter(state: SourceState) -> dict[str, object]:
+    """Return rest and bias of an orientation filter on the gateway, as its decoder told them."""
+    told = state.info.get("orientation_filter")
+    return {} if told is None else {"orientation_filter": told}
 
 
 def _us(value_ns: float | None) -> float | None:

@@ -42,6 +42,7 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from jointfit_daemon.config.checks import headings
     from jointfit_daemon.driver import driver_names
 
     table = Table(title=f"{config}: rig {rig.name!r} is right", title_justify="left")
@@ -56,4 +57,6 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
             f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
             f"{rig.calibration_store!r} by {rig.calibration.method}"
         )
+        if (doubt := headings(rig.sources)) is not None:
+            console.print(f"[yellow]warning:[/] {doubt}")
         console.print(f"drivers installed: {', '.join(driver_names())}")
