@@ -28,12 +28,14 @@ class Layout:
     """What every computation on a chain needs; S segments, nq degrees of freedom."""
 
     nq: int
-    levels: tuple[tuple[Index, Index], ...]
+    levels: tuple[tuple[Index | slice, Index | slice], ...]
     """Segments with a parent, those of equal depth together, and their parents."""
-    free: Index
+    free: Index | slice
     """Free segments."""
-    center_in_parent: Array
-    """m, shape (S, 3); zero for free segments."""
+    corners: Array
+    """Transforms to the parent but for rotations and own centers, shape (S, 4, 4)."""
+    has_own_centers: bool
+    """Some joint center is not the origin of its segment."""
     center: Array
     """m, shape (S, 3); zero for free segments."""
     segment_of: Index
@@ -81,6 +83,8 @@ def _layout(model: ChainModel) -> Layout:
     shifts = np.array([row for row, (_, k) in enumerate(columns) if k > 2], dtype=np.intp)
     center = np.where(is_free[:, None], 0.0, [j.center for j in joints])
     below = _below(parents)
+    corners = np.tile(np.eye(4), (len(joints), 1, 1))
+    corners[:, :3, 3] = np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints])
     spread = np.zeros((len(columns), len(parents), 3))
     spread[np.arange(len(columns)), segment_of] = axes
     about = center[segment_of]
@@ -88,8 +92,9 @@ def _layout(model: ChainModel) -> Layout:
     return Layout(
         nq=len(columns),
         levels=_levels(parents),
-        free=np.flatnonzero(is_free),
-        center_in_parent=np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints]),
+        free=_index(np.flatnonzero(is_free).tolist()),
+        corners=corners,
+        has_own_centers=bool(center.any()),
         center=center,
         segment_of=segment_of,
         axes=axes,
@@ -112,12 +117,20 @@ def _below(parents: list[int]) -> Array:
     return below
 
 
-def _levels(parents: list[int]) -> tuple[tuple[Index, Index], ...]:
+def _levels(parents: list[int]) -> tuple[tuple[Index | slice, Index | slice], ...]:
     depth: list[int] = []
     for parent in parents:
         depth.append(0 if parent < 0 else depth[parent] + 1)
     return tuple(
-        (np.array(level, dtype=np.intp), np.array([parents[i] for i in level], dtype=np.intp))
+        (_index(level), _index([parents[i] for i in level]))
         for d in range(1, max(depth) + 1)
         if (level := [i for i, at in enumerate(depth) if at == d])
     )
+
+
+def _index(items: list[int]) -> Index | slice:
+    """Return evenly spaced items as a slice, which costs no copy."""
+    step = items[1] - items[0] if len(items) > 1 else 1
+    if items and step > 0 and items == list(range(items[0], items[-1] + 1, step)):
+        return slice(items[0], items[-1] + 1, step)
+    return np.array(items, dtype=np.intp)

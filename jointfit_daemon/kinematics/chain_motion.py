@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+_TINY = 1e-30  # rad^2: keeps sin(x)/x from 0/0, far below rounding
+_EYE = np.eye(3)
+
+
 @dataclass(frozen=True, slots=True)
 class ChainState:
     """Joint positions of a chain at T instants."""
@@ -56,10 +60,11 @@ def segment_poses(model: ChainModel, state: ChainState) -> tuple[Array, Array]:
 def transforms(layout: Layout, rotations: Array, origins: Array) -> Array:
     """Return each segment's transform to the world, shape (T, S, 4, 4), one level at a time."""
     local = np.empty((*rotations.shape[:2], 4, 4))
+    local[:] = layout.corners
     local[..., :3, :3] = rotations
-    local[..., :3, 3] = layout.center_in_parent - (rotations @ layout.center[:, :, None])[..., 0]
+    if layout.has_own_centers:
+        local[..., :3, 3] -= (rotations @ layout.center[:, :, None])[..., 0]
     local[..., :3, 3][:, layout.free] = origins
-    local[..., 3, :] = (0.0, 0.0, 0.0, 1.0)
     for level, parents in layout.levels:
         local[:, level] = local[:, parents] @ local[:, level]
     return local
@@ -135,10 +140,10 @@ def turned(layout: Layout, rotations: Array, delta: Array) -> Array:
 def exp_matrix(r: Array) -> Array:
     """Return rotation matrices of rotation vectors, rad: I + sin(x)/x K + (1 - cos x)/x^2 K^2."""
     K = skew(r)
-    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", r, r))[..., None, None]
-    sinc = np.sinc(half / np.pi)
-    turn = (np.cos(half) * sinc) * K + (0.5 * sinc * sinc) * (K @ K)
-    turn[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    angle = np.sqrt(np.einsum("...i,...i->...", r, r) + _TINY)[..., None, None]
+    half = np.sin(0.5 * angle) / angle
+    turn = (np.sin(angle) / angle) * K + (2.0 * half * half) * (K @ K)
+    turn += _EYE
     return np.asarray(turn)
 
 

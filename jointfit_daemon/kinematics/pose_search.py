@@ -49,7 +49,7 @@ class Band:
     def holding(cls, model: ChainModel, reference: Array, weights: Array) -> Band:
         """Return a band that holds all joints but free ones to `reference`; weights (T,)."""
         layout = layout_of(model)
-        joint = ~np.isin(layout.segment_of, layout.free)
+        joint = np.array([s.joint.kind != "free" for s in model.segments])[layout.segment_of]
         zero = np.zeros(layout.nq)
         return cls(reference, weights[:, None] * joint, zero, zero)
 

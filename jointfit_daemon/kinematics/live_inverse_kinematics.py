@@ -1,0 +1,232 @@
+r"""Inverse kinematics one instant at a time, with the covariance of each pose.
+
+Law: an instant begins where the last one ended and takes a few safeguarded Gauss-Newton steps; if
+its markers are then still far off, it begins anew from the markers alone. The covariance of a pose,
+in the columns of a step, is
+
+.. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
+
+with :math:`\sigma` the error of a marker per axis, given or learnt from the residuals. What the
+markers leave open is held to the last instant, and :math:`\Sigma` is wide there, never infinite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import lapack
+
+from jointfit_daemon.kinematics.chain_motion import ChainState, rest_state, turned
+from jointfit_daemon.kinematics.inverse_kinematics import OPEN_M2, IkOptions, solve_frames
+from jointfit_daemon.kinematics.marker_equations import Fit, fit, normal_equations, slots_of
+from jointfit_daemon.kinematics.pose_search import Band
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+
+_TRIES = 6
+_DAMPING = 1e-2
+_RIDGE = 1e-9
+_FORGETTING = 0.02
+_FIRST_SD_M = 0.003
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """How to follow; the defaults are for markers on skin at 100 Hz."""
+
+    steps: int = 2
+    """Steps an instant; two are within a thousandth of the least error at 100 Hz."""
+    huber_m: float | None = None
+    """Errors beyond weigh as c/|e|, m; None: plain least squares."""
+    hold_m2: float = 1e-4
+    """Weight, m^2/rad^2, that holds all turns to the last instant where markers leave one open."""
+    marker_sd_m: float | None = None
+    """Error of a marker per axis, m; None: learnt from the residuals of the last 50 instants."""
+    lost_m: float = 0.06
+    """Tracking error, m, above which an instant begins anew from the markers alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class LivePose:
+    """The chain at one instant."""
+
+    state: ChainState
+    """Of length one."""
+    rotations: Array
+    """R_world_segment, shape (S, 3, 3)."""
+    origins: Array
+    """World, m, shape (S, 3)."""
+    residuals: Array
+    """Marker of the model minus measured, m, shape (M, 3); NaN where missing."""
+    covariance: Array
+    """Of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
+    underdetermined: bool
+    """The markers left something open, which was held to the last instant."""
+    restarted: bool
+    """Did not begin where the last instant ended."""
+
+
+class LiveInverseKinematics:
+    """Follows a chain through its markers.
+
+    Parameters
+    ----------
+    model
+        The chain.
+    options
+        `LiveOptions()` if None.
+    """
+
+    def __init__(self, model: ChainModel, options: LiveOptions | None = None) -> None:
+        self._model = model
+        self._options = options or LiveOptions()
+        self._slots = slots_of(model)
+        self._state: ChainState | None = None
+        self._variance = (self._options.marker_sd_m or _FIRST_SD_M) ** 2
+        self._everywhere = np.ones(model.nq)
+
+    def feed(self, markers: ArrayLike) -> LivePose:
+        """Return the pose of the next instant.
+
+        Parameters
+        ----------
+        markers : array_like, shape (M, 3)
+            Measured, in the order of the model's, world, m; NaN where missing.
+
+        Raises
+        ------
+        ValueError
+            Another shape.
+        """
+        given = np.asarray(markers, dtype=np.float64)
+        if given.shape != (len(self._model.markers), 3):
+            raise ValueError(
+                f"markers have shape {given.shape}, expected ({len(self._model.markers)}, 3)"
+            )
+        seen: NDArray[np.bool_] = np.asarray(np.isfinite(given).all(axis=-1))
+        measured = self._slots.filled_vectors(np.where(seen[:, None], given, 0.0)[None])
+        weights = self._slots.filled((self._model.weights * seen)[None])
+        restarted = self._state is None
+        state = self._anew(given) if self._state is None else self._state
+        if seen.any():
+            step = self._follow(state, measured, weights)
+            if not restarted and self._is_lost(step):
+                again = self._follow(self._anew(given), measured, weights)
+                restarted = again.cost < step.cost
+                step = again if restarted else step
+        else:
+            at = fit(self._slots, state.rotations, state.origins, measured, weights)
+            step = _Step(state, at, np.eye(self._model.nq), 0.0, is_open=True)
+        self._state = _straightened(step.state)
+        return self._pose(step, seen, restarted=restarted)
+
+    def _anew(self, given: Array) -> ChainState:
+        if not np.isfinite(given).any():
+            return rest_state(self._model)
+        options = IkOptions(iterations=15, huber_m=self._options.huber_m)
+        return solve_frames(self._model, given[None], options=options).state
+
+    def _is_lost(self, step: _Step) -> bool:
+        weights = float(step.at.weighted[..., 3, :].sum())
+        return step.cost > weights * self._options.lost_m**2
+
+    def _follow(self, state: ChainState, measured: Array, weights: Array) -> _Step:
+        """Take the steps of one instant from `state`."""
+        reference = state.rotations
+        at = fit(self._slots, state.rotations, state.origins, measured, weights)
+        for _ in range(self._options.steps):
+            w = self._robust(at, weights)
+            if w is not weights:
+                at = fit(self._slots, state.rotations, state.origins, measured, w)
+            state, at = self._one_step(state, at, reference, measured, w)
+        H, _, is_open = self._equations(state, at, reference)
+        return _Step(state, at, H, float(at.cost[0]), is_open=is_open)
+
+    def _robust(self, at: Fit, weights: Array) -> Array:
+        if self._options.huber_m is None:
+            return weights
+        errors = at.errors
+        size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
+        return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
+
+    def _equations(self, state: ChainState, at: Fit, reference: Array) -> tuple[Array, Array, bool]:
+        """Return normal matrix and gradient, held to `reference` if the markers leave one open."""
+        H, g = normal_equations(self._slots, at)
+        H, g = H[0], g[0]
+        H.flat[:: len(g) + 1] += _RIDGE
+        factor, failed = lapack.dpotrf(H, lower=1, clean=0)
+        pivots = factor.flat[:: len(g) + 1]
+        is_open = bool(failed) or bool((pivots * pivots < OPEN_M2).any())
+        if is_open:
+            hold = Band(reference, self._options.hold_m2 * self._everywhere[None], _ZERO, _ZERO)
+            g = g + hold.weights[0] * hold.excess(self._slots.layout, state.rotations)[0]
+            H.flat[:: len(g) + 1] += self._options.hold_m2
+        return H, g, is_open
+
+    def _one_step(
+        self, state: ChainState, at: Fit, reference: Array, measured: Array, weights: Array
+    ) -> tuple[ChainState, Fit]:
+        H, g, is_open = self._equations(state, at, reference)
+        layout, damping, cost = self._slots.layout, 0.0, at.cost[0]
+        for _ in range(_TRIES):
+            damped = H if damping == 0.0 else H + damping * np.diag(H.diagonal())
+            _, delta, failed = lapack.dposv(damped, -g, lower=1)
+            if not failed:
+                step = delta[None]
+                onward = ChainState(
+                    turned(layout, state.rotations, step),
+                    state.origins + step[:, layout.shifts].reshape(1, -1, 3),
+                )
+                there = fit(self._slots, onward.rotations, onward.origins, measured, weights)
+                if there.cost[0] <= cost or (is_open and there.cost[0] <= 1.01 * cost):
+                    return onward, there
+            damping = max(_DAMPING, 10.0 * damping)
+        return state, at
+
+    def _pose(self, step: _Step, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
+        residuals = self._slots.taken(step.at.errors)[0]
+        residuals[~seen] = np.nan
+        self._learn(step.cost, int(seen.sum()))
+        half, _ = lapack.dpotrf(step.H, lower=1, clean=1)
+        covariance, _ = lapack.dpotri(half, lower=1)
+        covariance *= self._variance
+        covariance += np.tril(covariance, -1).T
+        return LivePose(
+            step.state,
+            step.at.world[0, :, :3, :3],
+            step.at.world[0, :, :3, 3],
+            residuals,
+            covariance,
+            step.is_open,
+            restarted,
+        )
+
+    def _learn(self, cost: float, seen: int) -> None:
+        freedom = 3 * seen - self._model.nq
+        if self._options.marker_sd_m is None and freedom > 0:
+            self._variance += _FORGETTING * (cost / freedom - self._variance)
+
+
+_ZERO = np.zeros(1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """Where an instant ended."""
+
+    state: ChainState
+    at: Fit
+    H: Array
+    cost: float
+    is_open: bool
+
+
+def _straightened(state: ChainState) -> ChainState:
+    """Return the state with what rounding bent taken out: one Newton step to A^T A = 1."""
+    A = state.rotations
+    return ChainState(1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)), state.origins)
