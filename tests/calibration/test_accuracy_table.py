@@ -20,6 +20,7 @@ def test_every_figure_keeps_its_goal(experiment: Experiment) -> None:
     assert [figure for figure in figures if not figure.kept] == []
 
 
+@pytest.mark.timeout(120)
 def test_the_demos_person_is_measured_to_three_degrees() -> None:
     errors = {method: found[0] for method, found in people((1,)).items()}
     assert errors["anchored"].knee <= 3.0
