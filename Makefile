@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-vm lint types imports bench docs lock clean
+.PHONY: help demo test test-vm lint types imports bench docs wheel deb sbom audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
@@ -25,8 +25,9 @@ demo: $(STAMP)  ## the main job on simulated hardware, with an embedded broker
 test: $(STAMP)  ## all tests that this machine can run; what is skipped says why
 	@$(BIN)/python -m pytest $(ARGS)
 
-test-vm: $(STAMP)  ## the SocketCAN tests on a real vcan, in a light virtual machine where the kernel has none
-	@$(BIN)/python .ci/light_vm.py $(ARGS)
+test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; the .deb under real systemd, with broker and faults
+	@$(BIN)/python .ci/light_vm.py
+	@$(BIN)/python .ci/full_vm.py $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format
 	@$(BIN)/ruff check .
@@ -46,6 +47,18 @@ bench: $(STAMP)  ## measure speed, accuracy and timing; fails where a floor is m
 
 docs: $(STAMP)  ## the documentation as a site, warnings are errors
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir build/site
+
+wheel: $(STAMP)  ## wheel and sdist in build/packages: reproducible, checked, installed in empty environments
+	@$(BIN)/python .ci/check_wheel.py build/packages
+
+deb: $(STAMP)  ## the Debian package in build/packages; for a Raspberry Pi: ARGS="--arch arm64"
+	@$(BIN)/python packaging/deb.py $(ARGS)
+
+sbom: $(STAMP)  ## what the package carries, as CycloneDX JSON in build/packages
+	@$(BIN)/python packaging/sbom.py $(ARGS)
+
+audit: $(STAMP)  ## ask the Python vulnerability service about requirements.lock
+	@$(BIN)/python .ci/audit.py
 
 lock: $(STAMP)  ## write requirements.lock anew from what is installed now
 	@$(BIN)/python .ci/lock.py > requirements.lock.new && mv requirements.lock.new requirements.lock || { rm -f requirements.lock.new; exit 1; }

@@ -5,6 +5,7 @@ Law: faults are collected, never raised one by one.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _SHOWN = 60  # characters of a value worth repeating
 _NO_VALUE = object()
+_SECRET = re.compile(r"passw|passphrase|secret|token|api_?key|private_?key|request_?key")
+"""Names of keys whose values must not be told in a message."""
 
 
 def nearest(word: object, known: Iterable[str]) -> str | None:
@@ -78,6 +81,13 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
     owner = _model_at(model, loc[:-1])
     fields = owner.model_fields if owner is not None else {}
     match detail["type"]:
+        case "extra_forbidden" if _SECRET.search(str(loc[-1]).lower()):
+            files = [name for name in fields if name.endswith("_file")]
+            instead = f" and name it: {' or '.join(files)}" if files else ""
+            return Fault(
+                path,
+                f"no place for a secret: others may read rig.toml. Put it into a file{instead}",
+            )
         case "extra_forbidden":
             known = f"no such key; known here: {', '.join(fields)}"
             return Fault(path, known, detail["input"], nearest(loc[-1], fields))

@@ -90,7 +90,7 @@ def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
 def _anchor_files(table: dict[str, Any], folder: Path) -> None:
     mqtt = table.get("mqtt")
     if isinstance(mqtt, dict):
-        _anchor(mqtt, ("password_file",), folder)
+        _anchor(mqtt, ("password_file", "request_key_file"), folder)
         _anchor(mqtt.get("tls"), ("ca", "cert", "key"), folder)
 
 

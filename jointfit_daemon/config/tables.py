@@ -6,9 +6,10 @@ Law: unknown keys are refused, every field says what it is and in which unit; th
 
 from __future__ import annotations
 
+import ipaddress
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from jointfit_daemon.calibration.trial import Method  # noqa: TC001 - pydantic reads it at run time
 from jointfit_daemon.driver import Settings
@@ -86,12 +87,31 @@ class CalibrationTable(Settings):
     )
 
 
+def is_this_host(host: str) -> bool:
+    """Return whether `host` is the loopback of this machine, by name or address."""
+    if host == "localhost" or host.endswith(".localhost"):  # RFC 6761
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 class TlsSettings(Settings):
     """``[mqtt.tls]``: files in PEM; relative names start at the folder of rig.toml."""
 
     ca: str | None = Field(None, description="certificates to trust; default: the system's")
     cert: str | None = Field(None, description="own certificate, for brokers that ask for one")
-    key: str | None = Field(None, description="private key of `cert`")
+    key: str | None = Field(
+        None, description="private key of `cert`; default: it is in the same file"
+    )
+
+    @field_validator("key")
+    @classmethod
+    def _has_its_certificate(cls, key: str | None, info: ValidationInfo) -> str | None:
+        if key is not None and info.data.get("cert") is None:
+            raise ValueError("a key without its certificate: set cert, too")
+        return key
 
 
 class MqttSettings(Settings):
@@ -107,12 +127,41 @@ class MqttSettings(Settings):
         "jointfitd.mqtt-password",
     )
     tls: TlsSettings | None = Field(None, description="talk TLS to the broker")
+    insecure: bool = Field(
+        False,
+        validate_default=True,
+        description="`true`: no TLS to a broker on another machine; who is on the way reads and "
+        "writes all",
+    )
+    request_key_file: str | None = Field(
+        None,
+        description="file that holds the key which requests must be signed with; a systemd "
+        "credential of the same name is taken first. Default: the broker decides who may ask",
+    )
     version: Literal["5", "3.1.1"] = Field(
         "5", description="MQTT version; never changed silently: an old broker needs `3.1.1`"
     )
     pose_ui_hz: float = Field(10.0, gt=0, le=30, description="rate of the topic pose/ui, Hz")
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
     health_s: float = Field(10.0, gt=0, le=60, description="time between two bridge/health, s")
+
+    @field_validator("insecure")
+    @classmethod
+    def _is_protected(cls, insecure: bool, info: ValidationInfo) -> bool:
+        if not {"host", "tls"} <= info.data.keys():
+            return insecure  # wrong themselves, and told
+        host: str = info.data["host"]
+        if not (insecure or info.data["tls"] is not None or is_this_host(host)):
+            raise ValueError(
+                f"broker {host!r} is on another machine and [mqtt.tls] is missing: add it (with ca "
+                "for a broker of your own), or allow plain MQTT with insecure = true"
+            )
+        return insecure
+
+    @property
+    def is_local(self) -> bool:
+        """Whether what we say to the broker stays on this machine."""
+        return is_this_host(self.host)
 
     @property
     def tcp_port(self) -> int:

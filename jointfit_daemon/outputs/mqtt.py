@@ -9,11 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import socket
-import ssl
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import aiomqtt
@@ -21,13 +18,14 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from jointfit_daemon.outputs.mqtt_secrets import password_of
+from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context, tls_remedy
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
     from types import TracebackType
 
     from jointfit_daemon.config import MqttSettings
-
-log = logging.getLogger(__name__)
 
 PAYLOAD_VERSION = 1
 """Raised when a key is removed or renamed or changes its unit or meaning."""
@@ -39,7 +37,6 @@ _Properties: Any = (
     Properties  # its constructor is not annotated, its attributes are made at run time
 )
 
-CREDENTIAL = "jointfitd.mqtt-password"
 _INCOMING = 64  # requests are rare; a flood of them must not grow
 _REFUSED = 0x80  # MQTT reason codes from here on are refusals
 
@@ -123,6 +120,7 @@ class MqttConnection:
         self._will, self._farewell = will, farewell
         self._modern = settings.version == "5"
         self._cached: dict[int | None, Any] = {}
+        self._troubles = _Troubles()
 
     async def __aenter__(self) -> Self:
         self._client = self._new_client()
@@ -212,9 +210,9 @@ class MqttConnection:
     def _new_client(self) -> _Client:
         settings, will = self._settings, self._will
         try:
-            context = _tls_context(settings)
-        except OSError as error:  # ssl.SSLError too
-            raise BrokerLost(f"{self._place()}: [mqtt.tls]: {error}") from error
+            context = None if settings.tls is None else tls_context(settings.tls)
+        except TlsFault as fault:
+            raise BrokerLost(f"{self._place()}: [mqtt.tls]: {fault}") from fault
         version = aiomqtt.ProtocolVersion.V5 if self._modern else aiomqtt.ProtocolVersion.V311
         return _Client(
             settings.host,
@@ -232,12 +230,16 @@ class MqttConnection:
             max_queued_incoming_messages=_INCOMING,
             socket_options=_SOCKET_OPTIONS,
             tls_context=context,
+            logger=self._troubles,
         )
 
     def _place(self) -> str:
         return f"broker {self._settings.host}:{self._settings.tcp_port}"
 
     def _hint(self, error: Exception) -> str:
+        met = self._troubles.last or error.__cause__ or error.__context__
+        if remedy := tls_remedy(met, self._settings):
+            return remedy
         if self._modern and "timed out" in str(error):
             return (
                 " (no answer to MQTT 5; if this broker is older or keeps MQTT 5 on another port, "
@@ -261,6 +263,26 @@ class MqttConnection:
         if plain:
             self._cached[message.expiry_s] = made
         return made
+
+
+class _Troubles(logging.Logger):
+    """Takes what paho would log, and keeps the last exception of a socket.
+
+    A broker that does not accept our certificate says so after the handshake (TLS 1.3), where paho
+    logs the alert and aiomqtt only sees that time passes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("mqtt", logging.ERROR)
+        self.last: OSError | None = None
+
+    def handle(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
+        """Keep the exception of `record`, if it has one."""
+        for value in record.args if isinstance(record.args, tuple) else ():
+            if isinstance(value, OSError):
+                self.last = value
+        if record.exc_info:  # a callback of ours failed: a bug
+            logging.getLogger(__name__).handle(record)
 
 
 class _Client(aiomqtt.Client):
@@ -287,30 +309,6 @@ class _Client(aiomqtt.Client):
             sock.close()
             return
         super()._on_socket_open(client, userdata, sock)
-
-
-def password_of(settings: MqttSettings) -> str | None:
-    """Return the password in the file that rig.toml or systemd names; None if there is none."""
-    path = settings.password_file
-    if path is None and (folder := os.environ.get("CREDENTIALS_DIRECTORY")) is not None:
-        path = f"{folder}/{CREDENTIAL}"
-    if path is None:
-        return None
-    try:
-        return Path(path).read_text(encoding="utf-8").rstrip("\r\n") or None
-    except OSError as error:
-        log.debug("mqtt: no password: %s", error)
-        return None
-
-
-def _tls_context(settings: MqttSettings) -> ssl.SSLContext | None:
-    tls = settings.tls
-    if tls is None:
-        return None
-    context = ssl.create_default_context(cafile=tls.ca)
-    if tls.cert is not None:
-        context.load_cert_chain(tls.cert, tls.key)
-    return context
 
 
 class LoopNoise:

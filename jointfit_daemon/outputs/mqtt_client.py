@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 import orjson
 
 from jointfit_daemon.outputs.mqtt import BrokerLost, Incoming, MqttConnection, Outgoing
+from jointfit_daemon.outputs.mqtt_secrets import NoKey, request_key_of
+from jointfit_daemon.outputs.mqtt_signature import signed
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -46,6 +48,7 @@ class MqttClient:
         self.base = settings.base
         self.dropped = 0
         """Messages that came faster than they were read."""
+        self._settings = settings
         self._connection = MqttConnection(settings)
         self._unread: deque[Incoming] = deque()
         self._arrived = asyncio.Event()
@@ -88,17 +91,19 @@ class MqttClient:
     ) -> dict[str, Any]:
         """Send a request and return its answer: ``status``, ``data`` and, on refusal, ``error``.
 
+        It is signed if the rig names a key.
+
         Raises
         ------
         NoAnswer
-            Nobody answered within `timeout_s`.
+            Nobody answered within `timeout_s`, or the key to sign with cannot be read.
         """
         transaction = uuid.uuid4().hex
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
         self._waiting[transaction] = answer
-        payload = orjson.dumps({**arguments, "transaction": transaction})
         topic = f"{self.base}/bridge/request/{command}"
         try:
+            payload = self._payload(topic, {**arguments, "transaction": transaction})
             if self._lost is not None:
                 raise self._lost
             await self._connection.publish(Outgoing(topic, payload, 1, expiry_s=_EXPIRY_S))
@@ -110,6 +115,13 @@ class MqttClient:
         finally:
             del self._waiting[transaction]
             answer.cancel()
+
+    def _payload(self, topic: str, request: dict[str, object]) -> bytes:
+        try:
+            key = request_key_of(self._settings)
+        except NoKey as missing:
+            raise NoAnswer(f"cannot sign the request: {missing}") from missing
+        return orjson.dumps(request if key is None else signed(key, topic, request))
 
     async def _read(self) -> None:
         try:

@@ -16,9 +16,9 @@ from jointfit_daemon.outputs.mqtt import (
     Incoming,
     MqttConnection,
     Outgoing,
-    password_of,
     stop_if_cancelled,
 )
+from jointfit_daemon.outputs.mqtt_secrets import exposures, password_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,6 +71,8 @@ class MqttPublisher:
 
     async def run(self) -> None:
         """Connect, serve, and begin again, until cancelled."""
+        for exposure in exposures(self._settings):
+            log.warning("mqtt: %s", exposure)
         if self._settings.username is not None and password_of(self._settings) is None:
             log.warning(
                 "mqtt: user %s has no password file: trying without", self._settings.username

@@ -46,6 +46,7 @@ from jointfit_daemon.supervisor.fits import FitRunner
 from jointfit_daemon.supervisor.heart import Heart
 from jointfit_daemon.supervisor.last_resort import leave_within
 from jointfit_daemon.supervisor.process import ProcessWatch
+from jointfit_daemon.supervisor.request_guard import RequestGuard
 from jointfit_daemon.supervisor.requests import reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
 from jointfit_daemon.supervisor.storing import StoreRunner
@@ -108,6 +109,12 @@ class Daemon:
         self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
         self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
         self._reporter = Reporter(rig, self._outbox)
+        self._take_request_key(rig)
+
+    def _take_request_key(self, rig: Rig) -> None:
+        self._guard = RequestGuard(rig.mqtt)
+        if self._guard.fault:
+            log.error("mqtt: all requests are refused: %s", self._guard.fault)
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
         """Leave the old broker in order; the new one gets all that was retained."""
@@ -207,7 +214,7 @@ class Daemon:
 
     def _asked(self, message: Incoming) -> None:
         """Take one request from the broker: answered once, by the core or for it."""
-        request = request_of(message)
+        request = request_of(message, self._guard)
         self._asking = message
         try:
             if isinstance(request, Reply):
@@ -291,6 +298,8 @@ class Daemon:
         self._reporter.configure(rig)  # clears what is gone, before anything is carried over
         if before.mqtt != rig.mqtt:
             await self._move_to_broker(before, rig)
+        else:
+            self._take_request_key(rig)  # the file may hold a new one
         self._online &= {source.id for source in rig.sources}
         await self._stores.settle()  # else the store would not have what is in force
         self._configure(rig)

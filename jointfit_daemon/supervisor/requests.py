@@ -12,11 +12,13 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jointfit_daemon.config.faults import Fault, faults_of, nearest
+from jointfit_daemon.outputs.mqtt_signature import NotSigned
 from jointfit_daemon.outputs.publisher import command_of
 from jointfit_daemon.pipeline.events import Reply, Request
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import Incoming
+    from jointfit_daemon.supervisor.request_guard import RequestGuard
 
 LONGEST_BYTES = 16 * 1024  # a request is a line of JSON
 _NOT_IN_TOPICS = ("#", "+", "\0")
@@ -45,12 +47,25 @@ class CalibrateArguments(_Arguments):
 COMMANDS: dict[str, type[_Arguments]] = {"calibrate": CalibrateArguments}
 
 
-def request_of(message: Incoming) -> Request | Reply:
-    """Return the request in `message`, or the reply that says all that is wrong with it."""
+def request_of(message: Incoming, guard: RequestGuard | None = None) -> Request | Reply:
+    """Return the request in `message`, or the reply that says all that is wrong with it.
+
+    Parameters
+    ----------
+    message
+        As it came.
+    guard
+        Judges who may ask, before anything else is looked at; None: the broker did.
+    """
     command = command_of(message)
     table, fault = _table(message.payload)
-    given = table.get("transaction")
-    transaction = given if isinstance(given, str) else ""
+    if guard is not None and fault is None:
+        try:
+            table = guard.check(message.topic, table)
+        except NotSigned as refused:
+            fault = Fault("signature", str(refused))
+            return _refusal(command, _transaction(table), [fault])
+    transaction = _transaction(table)
     model = COMMANDS.get(command)
     if model is None:
         known = f"no such request; known: {', '.join(COMMANDS)}"
@@ -63,6 +78,11 @@ def request_of(message: Incoming) -> Request | Reply:
         return _refusal(command, transaction, faults_of(error, model, command))
     values = arguments.model_dump(exclude={"transaction"}, exclude_none=True)
     return Request(time.monotonic_ns(), command, transaction, values)
+
+
+def _transaction(table: dict[str, Any]) -> str:
+    given = table.get("transaction")
+    return given if isinstance(given, str) else ""
 
 
 def _table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:

@@ -1,0 +1,81 @@
+"""Signatures on requests. Law: pure; both sides use this file, and a shell can do the same.
+
+A signed request has three more keys::
+
+    t_us        UNIX time of signing, microseconds
+    nonce       16 to 64 letters, digits and dashes, new for every request
+    signature   HMAC-SHA256, in hexadecimal, of topic, newline, and canonical text
+
+The canonical text is the JSON of the request without ``signature``: keys sorted, no blanks, UTF-8
+unescaped, as ``jq -cS`` prints it. The topic is whole, so that a request signed for one rig or
+command is none for another.
+
+Source: RFC 2104 (HMAC), FIPS 180-4 (SHA-256).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import time
+from typing import TYPE_CHECKING, Any
+
+import orjson
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+FRESH_US = 30_000_000
+"""A signature is good for this long, and may come from a clock that is ahead by as much."""
+SIGNING_KEYS = ("nonce", "signature", "t_us")
+_NONCE = re.compile(r"[A-Za-z0-9-]{16,64}")
+
+
+class NotSigned(Exception):  # noqa: N818 - named for what happened
+    """The request is not signed as it must be; the message says what is wrong with it."""
+
+
+def canonical(topic: str, request: Mapping[str, Any]) -> bytes:
+    """Return the bytes that are signed."""
+    table = {name: value for name, value in request.items() if name != "signature"}
+    return topic.encode() + b"\n" + orjson.dumps(table, option=orjson.OPT_SORT_KEYS)
+
+
+def signature_of(key: bytes, topic: str, request: Mapping[str, Any]) -> str:
+    """Return the signature of `request` as it has to be sent on `topic`."""
+    return hmac.new(key, canonical(topic, request), hashlib.sha256).hexdigest()
+
+
+def signed(key: bytes, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `request`, stamped with the present time and signed."""
+    stamped = {**request, "t_us": time.time_ns() // 1000, "nonce": secrets.token_hex(16)}
+    return stamped | {"signature": signature_of(key, topic, stamped)}
+
+
+def verify(key: bytes, topic: str, request: Mapping[str, Any], now_us: int) -> tuple[str, int]:
+    """Return nonce and time of a request that `key` signed for `topic` just now.
+
+    Raises
+    ------
+    NotSigned
+        A key is missing or no such thing, the signature is another, or it is too old or too new.
+    """
+    if missing := [name for name in SIGNING_KEYS if name not in request]:
+        raise NotSigned(f"this rig takes signed requests only: {', '.join(missing)} missing")
+    nonce, signature, t_us = (request[name] for name in SIGNING_KEYS)
+    if not isinstance(nonce, str) or not _NONCE.fullmatch(nonce):
+        raise NotSigned("nonce: expected 16 to 64 letters, digits or dashes")
+    if not isinstance(t_us, int) or isinstance(t_us, bool):
+        raise NotSigned("t_us: expected UNIX time in whole microseconds")
+    right = signature_of(key, topic, request).encode()
+    if not hmac.compare_digest(str(signature).encode(errors="replace"), right):
+        raise NotSigned("signature: made with another key, for another topic, or of other content")
+    if abs(off_us := now_us - t_us) > FRESH_US:
+        where = "old" if off_us > 0 else "ahead"
+        raise NotSigned(
+            f"t_us: {abs(off_us) / 1e6:.0f} s {where}, at most {FRESH_US // 1_000_000} s are "
+            "allowed: sign it anew, and compare the clocks of both machines"
+        )
+    return nonce, t_us
