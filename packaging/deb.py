@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out dist]`.
+"""Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
 Law: what goes in is decided by ``requirements.lock`` and the commit, never by the machine it is
 built on; the same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels
@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import compileall
+import gzip
+import hashlib
 import os
 import py_compile
 import shutil
@@ -20,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
+from email.utils import formatdate
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,6 +38,7 @@ COMMANDS = {
     "jointfit": "jointfit_daemon.tools.__main__",
     "jointfit-sim": "jointfit_simulators.__main__",
 }
+MAINTAINER = "The jointfitd authors <jointfitd@users.noreply.github.com>"
 EXTRAS = "demo,c3d"
 """Pure Python, or with wheels for both architectures."""
 LAUNCHER = """\
@@ -56,8 +60,7 @@ SYSTEM_FILES = {
     "systemd/mosquitto/jointfitd.conf": "usr/share/jointfitd/mosquitto",
     "systemd/mosquitto/jointfitd.acl": "usr/share/jointfitd/mosquitto",
     "examples/knee.toml": "usr/share/jointfitd/examples",
-    "LICENSE": "usr/share/doc/jointfitd",
-    "CHANGELOG.md": "usr/share/doc/jointfitd",
+    "requirements.lock": "usr/share/doc/jointfitd",
 }
 
 
@@ -65,7 +68,7 @@ def main() -> int:
     """Build one package and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--arch", choices=sorted(PLATFORMS), default="amd64")
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", metavar="DIR")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "packages", metavar="DIR")
     parser.add_argument("--version", help="as in the control file (default: that of the project)")
     options = parser.parse_args()
     version = options.version or f"{_project_version()}-1+py{PYTHON.replace('.', '')}"
@@ -74,6 +77,7 @@ def main() -> int:
         tree = Path(scratch) / "tree"
         _install_python(tree, Path(scratch), options.arch, epoch)
         _install_files(tree)
+        _install_documents(tree, version, int(epoch))
         _write_control(tree, version, options.arch)
         _settle(tree, int(epoch))
         options.out.mkdir(parents=True, exist_ok=True)
@@ -163,6 +167,28 @@ def _install_files(tree: Path) -> None:
         launcher.chmod(0o755)
 
 
+def _install_documents(tree: Path, version: str, epoch: int) -> None:
+    """Install manual pages, licence and changelogs where Debian's policy wants them."""
+    documents, manuals = tree / "usr/share/doc/jointfitd", tree / "usr/share/man/man1"
+    manuals.mkdir(parents=True)
+    for page in sorted((DEBIAN.parent / "man").glob("*.1")):
+        _compress(manuals / f"{page.name}.gz", page.read_bytes())
+    terms = (ROOT / "LICENSE").read_text(encoding="utf-8").partition("\n\n")[2]
+    indented = "".join(f" {line or '.'}\n" for line in terms.rstrip().splitlines())
+    text = (DEBIAN / "copyright").read_text(encoding="utf-8").rstrip("\n")
+    (documents / "copyright").write_text(f"{text}\n{indented}", encoding="utf-8")
+    _compress(documents / "changelog.gz", (ROOT / "CHANGELOG.md").read_bytes())
+    entry = (
+        f"jointfitd ({version}) stable; urgency=medium\n\n  * See changelog.gz.\n\n"
+        f" -- {MAINTAINER}  {formatdate(epoch)}\n"
+    )
+    _compress(documents / "changelog.Debian.gz", entry.encode())
+
+
+def _compress(path: Path, content: bytes) -> None:
+    path.write_bytes(gzip.compress(content, 9, mtime=0))
+
+
 def _write_control(tree: Path, version: str, architecture: str) -> None:
     size = sum(path.lstat().st_size for path in tree.rglob("*") if not path.is_dir())
     control = tree / "DEBIAN"
@@ -172,12 +198,23 @@ def _write_control(tree: Path, version: str, architecture: str) -> None:
     (control / "control").write_text(
         text.format(
             version=version, architecture=architecture, kilobytes=size // 1024,
-            python=PYTHON, next_python=f"{major}.{int(minor) + 1}",
+            maintainer=MAINTAINER, python=PYTHON, next_python=f"{major}.{int(minor) + 1}",
         )
     )  # fmt: skip
+    (control / "md5sums").write_text(_md5sums(tree), encoding="utf-8")
     for name in ("postinst", "prerm", "postrm"):
         shutil.copyfile(DEBIAN / name, control / name)
         (control / name).chmod(0o755)
+
+
+def _md5sums(tree: Path) -> str:
+    """Return what `dpkg --verify` compares the installed files with."""
+    files = [path for path in sorted(tree.rglob("*")) if path.is_file() and not path.is_symlink()]
+    return "".join(
+        f"{hashlib.md5(path.read_bytes()).hexdigest()}  {name}\n"  # noqa: S324 - dpkg's format
+        for path in files
+        if not (name := path.relative_to(tree).as_posix()).startswith("DEBIAN/")
+    )
 
 
 def _settle(tree: Path, epoch: int) -> None:
