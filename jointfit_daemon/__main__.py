@@ -75,8 +75,11 @@ class _JournalFormatter(logging.Formatter):
 
 
 def _start_logging(level: str) -> None:
+    from jointfit_daemon.outputs.log_limit import LimitedHandler
+
     faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
-    handler = logging.StreamHandler(sys.stderr)
+    asked_for_all = level == "debug"
+    handler = (logging.StreamHandler if asked_for_all else LimitedHandler)(sys.stderr)
     if "JOURNAL_STREAM" in os.environ or "INVOCATION_ID" in os.environ:
         handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
     else:

@@ -7,6 +7,8 @@ import logging
 import threading
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.outputs.log_limit import Allowance
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -27,7 +29,7 @@ class LogTopic(logging.Handler):
         self._tell = tell
         self._loop = asyncio.get_running_loop()
         self._thread = threading.get_ident()
-        self._allowed, self._at = RATE_HZ, self._loop.time()
+        self._allowance = Allowance(RATE_HZ, RATE_HZ, self._loop.time())
         self._suppressed = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
@@ -39,12 +41,8 @@ class LogTopic(logging.Handler):
             self._loop.call_soon_threadsafe(self._take, *line)
 
     def _take(self, level: str, name: str, text: str) -> None:
-        now = self._loop.time()
-        self._allowed = min(RATE_HZ, self._allowed + RATE_HZ * (now - self._at))
-        self._at = now
-        if self._allowed < 1:
+        if not self._allowance.take(self._loop.time()):
             self._suppressed += 1
             return
-        self._allowed -= 1
         suppressed, self._suppressed = self._suppressed, 0
         self._tell(level, name, text, suppressed)
