@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+
 from hypothesis import given
 from hypothesis import strategies as st
 
