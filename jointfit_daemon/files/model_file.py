@@ -41,8 +41,8 @@ def read_model(path: Path) -> ChainModel:
     Malformed
         Broken, keys that are not known, values of the wrong kind, segments that make no chain.
     """
-    text = path.read_text(encoding="utf-8")
     try:
+        text = path.read_text(encoding="utf-8")
         data: Any = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except ValueError as error:
         raise Malformed(f"{path}: {error}") from error
@@ -126,6 +126,8 @@ def _wrong(data: Any) -> list[str]:
     if not isinstance(data, dict):
         return ["expected a table with name, segment and marker"]
     wrong = _unknown("model", "the model", data)
+    if not isinstance(data.get("name", ""), str):
+        wrong.append(f"the model: name must be text, is {data['name']!r}")
     for what in ("segment", "marker"):
         rows = data.get(what, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
