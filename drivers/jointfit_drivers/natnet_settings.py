@@ -32,7 +32,8 @@ class NatNetSettings(MocapSettings):
         10.0,
         ge=0,
         le=1000,
-        description="from exposure to transmission, for cameras without exposure stamp (USB), ms",
+        description="from exposure to transmission, for cameras without exposure stamp (USB) "
+        "or on PTP, ms",
     )
     time: Literal["server", "ptp", "utc"] = Field(
         "server",
@@ -52,3 +53,11 @@ class NatNetSettings(MocapSettings):
             return None
         major, minor = self.bitstream.split(".")
         return int(major), int(minor)
+
+    @property
+    def usual_delay_ms(self) -> tuple[float, float] | None:
+        """From exposure to arrival, mean and sd, where frames are stamped by PTP; else the usual.
+
+        Cameras and server take their time, and no echo tells of it then.
+        """
+        return None if self.time == "server" else (self.latency_ms, self.latency_ms / 2)

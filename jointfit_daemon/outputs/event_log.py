@@ -31,6 +31,7 @@ from jointfit_daemon.pipeline.events import (
     SourceClosed,
     SourceOpened,
     Tick,
+    UnixOffset,
 )
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def encode_event(event: Event) -> bytes:
     return orjson.dumps(_described(event), _exact, orjson.OPT_SERIALIZE_NUMPY)
 
 
-def _described(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return a kind
+def _described(event: Event) -> dict[str, Any]:  # noqa: C901, PLR0911 - one return a kind
     match event:
         case Tick(t_ns):
             return {"e": "tick", "t_ns": t_ns}
@@ -88,6 +89,8 @@ def _described(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return a 
             return {"e": "job", "t_ns": t_ns, "job": job, "result": result, "error": error}
         case CalibrationStored(t_ns, version):
             return {"e": "stored", "t_ns": t_ns, "version": version}
+        case UnixOffset(t_ns, offset_ns):
+            return {"e": "unix", "t_ns": t_ns, "offset_ns": offset_ns}
     raise TypeError(f"no such event: {event!r}")
 
 
@@ -123,6 +126,7 @@ _KINDS: dict[str, Any] = {
     "request": Request,
     "job": JobFinished,
     "stored": CalibrationStored,
+    "unix": UnixOffset,
 }
 
 

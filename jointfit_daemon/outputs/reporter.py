@@ -6,7 +6,6 @@ The topics, their rates and their retained flags are the contract of docs/mqtt.m
 from __future__ import annotations
 
 import hashlib
-import logging
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.outbox import Outbox
     from jointfit_daemon.pipeline.events import Output
-
-log = logging.getLogger(__name__)
 
 _NS_PER_S = 1_000_000_000
 
@@ -105,7 +102,7 @@ class Reporter:
                 pass
 
     def _limb_state(self, state: LimbState) -> None:
-        offset_ns, now_ns = self._offset_ns(), time.monotonic_ns()
+        offset_ns, now_ns = self._clock.offset_ns(), time.monotonic_ns()
         pose = encode_pose(state, offset_ns, now_ns)
         self._outbox.stream(self._pose_topic, pose)
         if self._pose_ui.due(state.t_ns):
@@ -154,21 +151,8 @@ class Reporter:
         said = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
         self._outbox.stream(f"{self._base}/bridge/log", self._stamped(said, time.monotonic_ns()))
 
-    def _offset_ns(self) -> int:
-        """Return UNIX minus monotonic time; tell of a step first."""
-        offset_ns, step_ns = self._clock.offset_ns(), self._clock.take_step_ns()
-        if step_ns:
-            step_s = step_ns / _NS_PER_S
-            text = f"UNIX time was set back by {-step_s:.3f} s"
-            if step_s > 0:  # in suspend CLOCK_MONOTONIC stands still
-                text = f"UNIX time was set forward by {step_s:.3f} s, or the host slept so long"
-            log.warning("%s", text)
-            now_ns = time.monotonic_ns()
-            self.event(Notice(now_ns, "clock", "host", text, "warning", {"step_s": step_s}))
-        return offset_ns
-
     def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
-        stamp = {} if t_ns is None else {"t_us": (t_ns + self._offset_ns()) // 1000}
+        stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}
         return encode({"v": PAYLOAD_VERSION} | stamp | dict(data))
 
 

@@ -1,4 +1,4 @@
-"""UNIX time of monotonic stamps. Law: follows the system's clock, and tells when it was set.
+"""UNIX time of monotonic stamps. Law: follows the system's clock, and knows when it was set.
 
 Both clocks run at the same rate, however NTP slews them, so their offset changes only when somebody
 steps UNIX time. CLOCK_MONOTONIC also stands still while the host is suspended; that is a step, too.
@@ -7,46 +7,59 @@ steps UNIX time. CLOCK_MONOTONIC also stands still while the host is suspended; 
 from __future__ import annotations
 
 import time
+from typing import NamedTuple
 
-STEP_NS = 2_000_000
-"""A change of the offset by more than this is a step, and not a busy moment between two reads."""
+STEP_NS = 50_000
+"""A change of the offset by more than this, and by more than the looks may err, is a step."""
 _LOOKS = 5
 _NS_PER_S = 1_000_000_000
+
+
+class _Look(NamedTuple):
+    """One comparison of both clocks."""
+
+    width_ns: int
+    """How long it took: twice what it may err by."""
+    offset_ns: int
 
 
 class UnixClock:
     """The offset from CLOCK_MONOTONIC to UNIX time, measured at most once a second.
 
-    Between measurements stamps keep their spacing; a step of the system's clock is followed
-    within a second.
+    Between steps stamps keep their spacing; a step of the system's clock is followed within a
+    second.
     """
 
     def __init__(self) -> None:
-        self._offset_ns: int | None = None
+        self._look: _Look | None = None
         self._until_ns = -1
-        self._step_ns = 0
+        self._told_ns: int | None = None
 
     def offset_ns(self) -> int:
         """Return what to add to a monotonic stamp to get UNIX time."""
-        now_ns, before_ns = time.monotonic_ns(), self._offset_ns
-        if before_ns is not None and now_ns < self._until_ns:
-            return before_ns
+        now_ns, before = time.monotonic_ns(), self._look
+        if before is not None and now_ns < self._until_ns:
+            return before.offset_ns
         self._until_ns = now_ns + _NS_PER_S
-        offset_ns = min(_look() for _ in range(_LOOKS))[1]
-        if before_ns is not None and abs(offset_ns - before_ns) > STEP_NS:
-            self._step_ns += offset_ns - before_ns
-        self._offset_ns = offset_ns
+        look = min(_looked() for _ in range(_LOOKS))
+        if before is not None:
+            slack_ns = STEP_NS + (look.width_ns + before.width_ns) // 2
+            if abs(look.offset_ns - before.offset_ns) <= slack_ns:
+                return before.offset_ns
+        self._look = look
+        return look.offset_ns
+
+    def news_ns(self) -> int | None:
+        """Return the offset if it is another than this has told before; mostly None."""
+        offset_ns = self.offset_ns()
+        if offset_ns == self._told_ns:
+            return None
+        self._told_ns = offset_ns
         return offset_ns
 
-    def take_step_ns(self) -> int:
-        """Return by how much UNIX time was set forward since this was last asked; mostly 0."""
-        step_ns, self._step_ns = self._step_ns, 0
-        return step_ns
 
-
-def _look() -> tuple[int, int]:
-    """Return how long the look took, and the offset in its middle, ns."""
+def _looked() -> _Look:
     before_ns = time.monotonic_ns()
     unix_ns = time.time_ns()
     after_ns = time.monotonic_ns()
-    return after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2
+    return _Look(after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2)

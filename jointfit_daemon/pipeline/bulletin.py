@@ -19,6 +19,9 @@ QUIET_NS = 10_000_000_000
 """Every drop-out and every epoch is counted in health; a line each ten seconds, kind and device is
 enough for a log."""
 
+STEP_NS = 2_000_000
+"""UNIX time set by less is followed and not told of."""
+
 Level = Literal["info", "warning", "error"]
 _LEVELS: dict[str, Level] = {
     "warning": "warning",
@@ -103,3 +106,14 @@ def _of_clock(now_ns: int, source: str, held: _Held) -> Notice:
         data["events"] = held.count
     held.told_ns, held.count, held.amount = now_ns, 0, 0
     return Notice(now_ns, "clock", source, text, "warning", data)
+
+
+def unix_time_set(now_ns: int, step_ns: int) -> list[Notice]:
+    """Return what to tell when UNIX time of this host was set forward by `step_ns`."""
+    if abs(step_ns) < STEP_NS:
+        return []
+    step_s = step_ns / 1e9
+    text = f"UNIX time was set back by {-step_s:.3f} s"
+    if step_s > 0:  # in suspend CLOCK_MONOTONIC stands still
+        text = f"UNIX time was set forward by {step_s:.3f} s, or the host slept so long"
+    return [Notice(now_ns, "clock", "host", text, "warning", {"step_s": step_s})]

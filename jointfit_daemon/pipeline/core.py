@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from jointfit_daemon.config.checks import headings
 from jointfit_daemon.fusion import LimbFuser, OpticalOrigin
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
-from jointfit_daemon.pipeline.bulletin import Bulletin
+from jointfit_daemon.pipeline.bulletin import Bulletin, unix_time_set
 from jointfit_daemon.pipeline.events import (
     CalibrationStored,
     ChunkArrived,
@@ -25,6 +25,7 @@ from jointfit_daemon.pipeline.events import (
     SourceClosed,
     SourceOpened,
     Tick,
+    UnixOffset,
 )
 from jointfit_daemon.pipeline.health import health_of
 from jointfit_daemon.pipeline.lag_watch import LagWatch
@@ -61,6 +62,7 @@ class Core:
         self._rig: Rig | None = None
         self._sources: dict[str, SourceState] = {}
         self._lines = SyncLines()
+        self._unix_offset_ns: int | None = None
         self._now_ns = 0
         self._seq = 0
         self._verdicts: dict[str, dict[str, int]] = {}
@@ -87,6 +89,8 @@ class Core:
         self._now_ns = max(self._now_ns, event.t_ns)
         if isinstance(event, Tick):
             return self._advance()
+        if isinstance(event, UnixOffset):
+            return [*self._unix_time(event), *self._advance()]
         return [*self._state_change(event), *self._advance()]
 
     def _state_change(self, event: Event) -> list[Output]:
@@ -138,6 +142,7 @@ class Core:
             s.id: kept.get(s.id) or SourceState.of(s, self._sources.get(s.id), self._lines)
             for s in rig.sources
         }
+        self._tell_unix_offset()
         if all(source.kind != "mocap" for source in rig.sources):
             self._mocap_used = self._mocap_idle = 0
         outputs: list[Output] = []
@@ -177,6 +182,17 @@ class Core:
             self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
 
     # --- sources -----------------------------------------------------------------------------
+
+    def _unix_time(self, event: UnixOffset) -> list[Notice]:
+        before_ns, self._unix_offset_ns = self._unix_offset_ns, event.offset_ns
+        self._tell_unix_offset()
+        step_ns = 0 if before_ns is None else event.offset_ns - before_ns
+        return unix_time_set(event.t_ns, step_ns) if step_ns else []
+
+    def _tell_unix_offset(self) -> None:
+        if self._unix_offset_ns is not None:
+            for state in self._sources.values():
+                state.clock.feed_unix_offset(self._unix_offset_ns)
 
     def _opened(self, event: SourceOpened) -> list[Output]:
         state = self._sources.get(event.source)

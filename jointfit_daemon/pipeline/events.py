@@ -94,6 +94,17 @@ class CalibrationStored:
     version: int
 
 
+@dataclass(frozen=True, slots=True)
+class UnixOffset:
+    """UNIX time minus CLOCK_MONOTONIC: at the start, and whenever it is another.
+
+    They run at the same rate, so another one means that UNIX time was set, or that the host slept.
+    """
+
+    t_ns: int
+    offset_ns: int
+
+
 Event = (
     Configured
     | SourceOpened
@@ -103,6 +114,7 @@ Event = (
     | Request
     | JobFinished
     | CalibrationStored
+    | UnixOffset
 )
 
 # --- out --------------------------------------------------------------------------------------

@@ -29,9 +29,11 @@ class LatencyPrior(NamedTuple):
 def latency_prior(source: Source) -> LatencyPrior:
     """Return the prior of a source: as set, as its driver says, or by its transport.
 
-    A driver may have a class attribute ``least_delay_ms``: mean and standard deviation, ms.
+    A driver may have a class attribute ``least_delay_ms``, or its settings a property
+    ``usual_delay_ms`` where it depends on them: mean and standard deviation, ms.
     """
-    asked = getattr(source.settings, "least_delay_ms", None)
+    settings = source.settings
+    asked = getattr(settings, "least_delay_ms", None) or getattr(settings, "usual_delay_ms", None)
     told = getattr(source.driver_class, "least_delay_ms", None)
     mean, sd = asked or told or _of_transport(source)
     return LatencyPrior(round(mean * _NS_PER_MS), round(sd * _NS_PER_MS))

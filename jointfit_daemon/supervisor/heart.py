@@ -11,7 +11,8 @@ import time
 from typing import TYPE_CHECKING, Protocol
 
 from jointfit_daemon.model import LimbState
-from jointfit_daemon.pipeline.events import Tick
+from jointfit_daemon.outputs.unix_clock import UnixClock
+from jointfit_daemon.pipeline.events import Tick, UnixOffset
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,6 +62,7 @@ class Heart:
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_ns = 0
+        self._unix_clock = UnixClock()
 
     def feed(self, event: Event) -> None:
         """Give one event to the core and hand out what it says."""
@@ -94,6 +96,7 @@ class Heart:
         deadline_ns = self.core.next_deadline_ns
         due = deadline_ns is not None and now_ns >= deadline_ns
         try:
+            self._tell_unix_time()
             if due or now_ns >= self._fed_ns + HEARTBEAT_NS:
                 self.feed(Tick(now_ns))
             else:
@@ -102,8 +105,15 @@ class Heart:
             if not self._failed.done():
                 self._failed.set_exception(error)
 
+    def _tell_unix_time(self) -> None:
+        """Tell the core what UNIX time is, at first and whenever it was set."""
+        offset_ns = self._unix_clock.news_ns()
+        if offset_ns is not None:
+            self.feed(UnixOffset(time.monotonic_ns(), offset_ns))
+
     async def run(self) -> None:
         """Keep time until cancelled; raise what the core raised on a Tick."""
+        self._tell_unix_time()
         self._arm()
         try:
             await self._failed

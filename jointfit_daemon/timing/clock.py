@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.timing import clock_news
 from jointfit_daemon.timing.delays import LastMinute
 from jointfit_daemon.timing.device_time import ArrivalTime, CounterTime, TickTime
-from jointfit_daemon.timing.direct import PulseTie, declared
+from jointfit_daemon.timing.direct import MARGIN_NS, PulseTie, declared, possible
 from jointfit_daemon.timing.echo_clock import STALE_NS, EchoFit
 from jointfit_daemon.timing.envelope import CRYSTAL, NOMINAL_RATE, Envelope
 from jointfit_daemon.timing.lateness import LATE_NS, Plausibility
@@ -40,8 +40,6 @@ __all__ = ["DeviceClock", "Stamp"]
 ABSENT_LIMIT = 100
 """Samples in a row without the time they used to carry, before the clock does without it."""
 CAUGHT_UP_NS = 50_000
-MARGIN_NS = 3_000_000
-"""How far beyond its prior the smallest delay may be before a direct time is doubted."""
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
 _JITTER_GAIN = 0.01
@@ -81,12 +79,11 @@ class DeviceClock:
         self.news: deque[ClockNews] = deque(maxlen=16)
         """What is to be published; whoever does takes it out."""
         self._unix_offset_ns: int | None = None
-        self._warned = False
         self._period_ns = period_ns
         self._line = StampLine(period_ns)
         self._arrival_ns = 0
         self._tick_clock: TickClock | None = None
-        self._kind, self._absent, self._looked = _ARRIVAL, 0, 0
+        self._kind, self._absent, self._looked, self._warned = _ARRIVAL, 0, 0, False
         self._forget()
 
     def _forget(self) -> None:
@@ -173,7 +170,7 @@ class DeviceClock:
     def _begin(self, news: ClockNews | None) -> None:
         if self._line.last_u is not None or self._echo is not None:
             self.epoch += 1
-            if news is not None:
+            if news is not None and (self._synced or news is not clock_news.ANOTHER_WAY):
                 self.news.append(news)
         self._forget()
 
@@ -266,7 +263,7 @@ class DeviceClock:
         reader = self._reader
         if not isinstance(reader, TickTime) or tick_clock != self._tick_clock:
             if reader is not None:
-                self._begin(clock_news.said("it tells time in another way now"))
+                self._begin(clock_news.ANOTHER_WAY)
             self._tick_clock, self._kind = tick_clock, _TICKS
             self._reader = reader = TickTime(tick_clock)
             self._direct = declared(tick_clock, self._unix_offset_ns)
@@ -290,7 +287,7 @@ class DeviceClock:
             self._absent += 1
             if kind < self._kind and self._absent < ABSENT_LIMIT:
                 return None
-            self._begin(clock_news.said("it tells time in another way now"))
+            self._begin(clock_news.ANOTHER_WAY)
         self._kind, self._absent = kind, 0
         self._envelope = Envelope(NOMINAL_RATE)
         make = ArrivalTime if kind == _ARRIVAL else CounterTime
@@ -368,6 +365,9 @@ class DeviceClock:
             return estimate
         target = direct.host_ns(u)
         estimated, _, settled, sigma, delay = estimate
+        if not settled and not possible(target, self._arrival_ns):
+            self._state_direct = False  # no more than a suspicion, until the estimate can tell
+            return estimate
         slack = MARGIN_NS + _PRIOR_SIGMAS * (sigma + self.latency_sd_ns) + (self.bound_ns or 0.0)
         if settled and abs(target - estimated) > slack:
             self.news.append(clock_news.contradicted(target, estimated))

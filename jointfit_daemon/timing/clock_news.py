@@ -71,6 +71,9 @@ def said(text: str) -> ClockNews:
     return ClockNews("clock", text, {})
 
 
+ANOTHER_WAY = said("it tells time in another way now")
+
+
 def contradicted(direct_ns: int, estimate_ns: int) -> ClockNews:
     """Explain why a direct time is not used."""
     off = (direct_ns - estimate_ns) / _MS

@@ -27,6 +27,10 @@ TIE_SKEW_SD = 100e-6
 TIE_STALE_NS = 20_000_000_000
 KNOWN_SD_NS = 10_000.0
 """What a clock that is declared to be the host's is believed to."""
+MARGIN_NS = 3_000_000
+"""How far beyond its prior the smallest delay may be before a direct time is doubted."""
+LATEST_NS = 2_000_000_000
+"""Nothing live comes later than this."""
 
 _LEAST_PAIRS = 5
 _CAPACITY = 120
@@ -184,3 +188,8 @@ def declared(clock: TickClock, unix_offset_ns: int | None) -> KnownOffset | None
     if clock.scale == "unix" and unix_offset_ns is not None:
         return KnownOffset(-unix_offset_ns)
     return None
+
+
+def possible(t_ns: int, arrival_ns: int) -> bool:
+    """Tell whether something taken at `t_ns` may have arrived at `arrival_ns`, ns."""
+    return -MARGIN_NS <= arrival_ns - t_ns <= LATEST_NS

@@ -82,6 +82,8 @@ def _parser() -> argparse.ArgumentParser:
                       help="a command and its time, from the beginning of the run")  # fmt: skip
     play.add_argument("--sync-line", action="store_true",
                       help="a wire from the cameras' sync output to every UART sensor")  # fmt: skip
+    play.add_argument("--ptp", action="store_true",
+                      help="cameras on PTP: frames have precision timestamps")  # fmt: skip
     play.add_argument("--sample-log", action="store_true",
                       help="write samples.jsonl: when each sample was truly taken")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
@@ -164,6 +166,7 @@ async def _play(options: argparse.Namespace) -> None:
         clocks={name: ClockFault.parse(text) for name, text in _pairs(options.clock)},
         script=tuple((float(at_s), command) for at_s, command in _pairs(options.at)),
         sync_line=options.sync_line,
+        ptp=options.ptp,
         sample_log=options.sample_log,
     )
     subject = _subject(options, knobs)

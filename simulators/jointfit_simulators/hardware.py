@@ -6,7 +6,8 @@ adapter on a pty, or on a bus of python-can); the optical system is a NatNet ser
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.mtdata2 import Item
@@ -14,6 +15,7 @@ from jointfit_protocols.xbus_messages import SyncSetting
 from jointfit_protocols.xbus_sync import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.can_wire import CanWire, PythonCanWire, SlcanAdapter
+from jointfit_simulators.clocks import NS
 from jointfit_simulators.line_noise import line_noise
 from jointfit_simulators.natnet_options import NatNetServerOptions
 from jointfit_simulators.natnet_server import NatNetServer
@@ -23,7 +25,7 @@ from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from jointfit_simulators.clocks import Ticker
@@ -33,6 +35,7 @@ WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
 """Which sensor speaks what, unless asked otherwise."""
 BUS = "can0"
 _FREE_RUNNING = 0xFFFF
+_TAI_MINUS_UTC_S = 37
 _EVERY = 12  # exposures an edge that is told: ten a second at 120 Hz
 _SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _EVERY - 1),)
 _SYNC_TOML = (
@@ -166,7 +169,12 @@ def _imu_table(knobs: Knobs, name: str, segment: str, driver: str, where: list[s
 
 
 def optical_server(
-    knobs: Knobs, clusters: Mapping[str, tuple[str, ...]], bodies: Sequence[str], ticker: Ticker
+    knobs: Knobs,
+    clusters: Mapping[str, tuple[str, ...]],
+    bodies: Sequence[str],
+    ticker: Ticker,
+    *,
+    ptp: bool = False,
 ) -> NatNetServer:
     """Return a NatNet server whose project has a body for every cluster of markers.
 
@@ -180,6 +188,8 @@ def optical_server(
         Rigid bodies that are tracked; those without markers come last.
     ticker
         Whose clock is the server's.
+    ptp
+        Cameras and host are on PTP: frames carry precision timestamps.
     """
     owned = {part.capitalize(): names for part, names in clusters.items()}
     owned |= {body: () for body in bodies if body not in owned}
@@ -189,11 +199,20 @@ def optical_server(
     options = NatNetServerOptions(
         bodies=staged, rate_hz=knobs.mocap_hz, device_ns=ticker.device_ns, seed=knobs.seed
     )
+    if ptp:
+        options = replace(options, bitstream=(4, 1), precision_ns=_ptp_time())
     return NatNetServer(options)
+
+
+def _ptp_time() -> Callable[[int], int]:
+    """Return the PTP time (TAI) of a host instant: what the host's own clock says now, from now."""
+    ahead_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
+    return lambda host_ns: host_ns + ahead_ns
 
 
 def mocap_table(server: NatNetServer, *, sync_line: bool = False) -> str:
     """Return the first lines of ``[mocap]`` for that server, its sync output wired or not."""
     wired = "\nsync_line = 0" if sync_line else ""
+    wired += '\ntime = "ptp"' if server.options.precision_ns is not None else ""
     where = f'server = "127.0.0.1"\ncommand_port = {server.command_port}'
     return f'[mocap]\ndriver = "natnet"\n{where}\nup_axis = "{server.options.up_axis}"{wired}'

@@ -39,6 +39,8 @@ class NatNetServerOptions:
     """Server clock, ns, at a host CLOCK_MONOTONIC instant: offset and skew live here."""
     received_after_ns: int = 4_600_000
     """From exposure to the stamp `received`; `transmit` is the true time of sending."""
+    precision_ns: Callable[[int], int] | None = None
+    """PTP time, ns, of cameras on PTP at a host CLOCK_MONOTONIC instant; None: they are not."""
     exposure_stamps: bool = True
     """False: USB cameras, exposure is 0."""
     hiding: Hiding = "missing"

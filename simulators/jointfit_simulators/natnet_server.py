@@ -171,6 +171,9 @@ class NatNetServer:
         """
         stamps = self._stamps(exposure_host_ns)
         frame = self._stage.frame(stamps, markers, bodies)
+        if self.options.precision_ns is not None:
+            told = divmod(self.options.precision_ns(exposure_host_ns), _NS)
+            frame = frame._replace(precision=told)
         self.number += 1
         self._model_changed = max(0, self._model_changed - 1)
         if self.options.transport == "multicast":

@@ -57,6 +57,8 @@ class SceneOptions:
     """Commands and when to obey them, s from the beginning of the run."""
     sync_line: bool = False
     """A wire from the cameras' sync output to the first sync input of every UART sensor."""
+    ptp: bool = False
+    """Cameras and host are on PTP."""
     sample_log: bool = False
     """Tell the true instant of every sample sent."""
 
@@ -107,7 +109,9 @@ class Scene:
             stream.told = told
         self._server: NatNetServer | None = None
         if options.mocap:
-            self._server = optical_server(knobs, subject.clusters, cameras.bodies, ticker)
+            self._server = optical_server(
+                knobs, subject.clusters, cameras.bodies, ticker, ptp=options.ptp
+            )
         self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
         self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))

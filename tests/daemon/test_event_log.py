@@ -32,6 +32,7 @@ from jointfit_daemon.pipeline.events import (
     SourceClosed,
     SourceOpened,
     Tick,
+    UnixOffset,
 )
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ events = st.one_of(
     st.builds(Request, instants, words, words, tables),
     st.builds(JobFinished, instants, st.integers(0, 99), st.none() | tables, st.none() | words),
     st.builds(CalibrationStored, instants, st.integers(1, 99)),
+    st.builds(UnixOffset, instants, st.integers(-(2**62), 2**62)),
 )
 angles = st.floats(allow_nan=False, allow_infinity=False)
 states = st.builds(

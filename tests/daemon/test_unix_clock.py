@@ -1,7 +1,8 @@
-"""UNIX time set while the daemon runs: followed, told once, and frames keep their order."""
+"""UNIX time set while the daemon runs: followed, told to the core, and frames keep their order."""
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import time
 from typing import TYPE_CHECKING, Any
@@ -14,9 +15,13 @@ from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.outbox import Outbox
 from jointfit_daemon.outputs.reporter import Reporter
 from jointfit_daemon.outputs.unix_clock import UnixClock
+from jointfit_daemon.pipeline.events import UnixOffset
+from jointfit_daemon.supervisor.heart import Heart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from jointfit_daemon.pipeline.events import Event, Output
 
 S, MS = 1_000_000_000, 1_000_000
 BEGIN_UNIX_NS = 1_795_250_000 * S
@@ -53,25 +58,26 @@ def test_the_unix_clock_keeps_the_spacing_of_stamps(host: Host) -> None:
     assert before == pytest.approx(BEGIN_UNIX_NS - 5_000 * S, abs=1_000)
 
 
-@pytest.mark.parametrize("step_s", [3_600.0, -3_600.0, 0.01, -0.01])
+@pytest.mark.parametrize("step_s", [3_600.0, -3_600.0, 0.01, -0.01, 0.0002])
 def test_a_step_is_followed_within_a_second_and_told_once(host: Host, step_s: float) -> None:
     clock = UnixClock()
     before = clock.offset_ns()
     host.offset_ns += round(step_s * S)
     host.now_ns += S
     assert clock.offset_ns() - before == pytest.approx(step_s * S, abs=1_000)
-    assert clock.take_step_ns() == pytest.approx(step_s * S, abs=1_000)
-    assert clock.take_step_ns() == 0
+    assert clock.news_ns() == pytest.approx(before + step_s * S, abs=1_000)
+    assert clock.news_ns() is None
 
 
 def test_a_busy_machine_is_no_step(host: Host) -> None:
     waits = iter([100, 20 * MS, 100, 100, 30 * MS] * 100)
     host.wait_ns = lambda: next(waits)
     clock = UnixClock()
+    told = []
     for _ in range(5):
-        clock.offset_ns()
+        told.append(clock.news_ns())
         host.now_ns += S
-    assert clock.take_step_ns() == 0
+    assert told[1:] == [None] * 4
 
 
 async def sent(outbox: Outbox) -> dict[str, list[Any]]:
@@ -85,22 +91,17 @@ async def sent(outbox: Outbox) -> dict[str, list[Any]]:
     return found
 
 
-async def test_poses_across_a_step_back_keep_their_order_and_the_step_is_an_event(
-    table: dict[str, Any], host: Host, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_poses_across_a_step_back_keep_their_order(table: dict[str, Any], host: Host) -> None:
     outbox = Outbox("b/bridge/state")
     reporter = Reporter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox)
     poses: list[dict[str, Any]] = []
-    events: list[dict[str, Any]] = []
     for number in range(400):
         if number == 200:
             host.offset_ns -= 3_600 * S
         host.now_ns += 10 * MS
         t_ns = host.now_ns - 5 * MS
         reporter.handle(LimbState(number, t_ns, t_ns, "imu", "locked", (), (), ()))
-        found = await sent(outbox)
-        poses += found.get("pose", [])
-        events += found.get("bridge/event", [])
+        poses += (await sent(outbox)).get("pose", [])
     steps = [b["t_us"] - a["t_us"] for a, b in itertools.pairwise(poses)]
     assert sum(step < 0 for step in steps) == 1
     assert sum(step for step in steps if step < 0) == pytest.approx(-3_600e6, abs=20_000)
@@ -108,8 +109,38 @@ async def test_poses_across_a_step_back_keep_their_order_and_the_step_is_an_even
     assert min(mono) > 9_900
     assert max(mono) < 10_100
     assert all(pose["age_ms"] < 6 for pose in poses)
-    (event,) = events
-    assert (event["kind"], event["id"], event["level"]) == ("clock", "host", "warning")
-    assert event["text"] == "UNIX time was set back by 3600.000 s"
-    assert event["data"] == {"step_s": pytest.approx(-3600.0, abs=1e-5)}
-    assert caplog.text.count("set back") == 1
+
+
+class Listening:
+    """A core that only hears."""
+
+    def __init__(self) -> None:
+        self.heard: list[Event] = []
+        self.next_deadline_ns = None
+
+    def feed(self, event: Event) -> list[Output]:
+        self.heard.append(event)
+        return []
+
+    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the shape of a core
+        return {}
+
+
+async def test_the_core_hears_of_unix_time_before_anything_else_and_again_when_it_was_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Through the real heart; the host's clock is set a second after the start."""
+    set_ns = 0
+    true_unix_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: true_unix_ns() + set_ns)
+    core = Listening()
+    beating = asyncio.create_task(Heart(core, lambda _: None).run(), name="heart")
+    await asyncio.sleep(0.3)
+    set_ns = -3_600 * S
+    await asyncio.sleep(1.5)
+    beating.cancel()
+    await asyncio.wait([beating])
+    assert isinstance(core.heard[0], UnixOffset)
+    told = [event.offset_ns for event in core.heard if isinstance(event, UnixOffset)]
+    assert len(told) == 2
+    assert told[1] - told[0] == pytest.approx(-3_600 * S, abs=MS)

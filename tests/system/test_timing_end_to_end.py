@@ -19,6 +19,8 @@ pytestmark = pytest.mark.system
 MOST_ERROR_NS = 500_000
 MOST_TIED_ERROR_NS = 250_000
 """Ticks of 100 us, 20 us of jitter on each stamp, and the camera clock's own error."""
+MOST_PTP_ERROR_NS = 50_000
+"""Both processes read the same clocks, each once; a microsecond where nothing else runs."""
 
 
 @pytest.mark.timeout(90)
@@ -45,10 +47,23 @@ async def test_a_wired_sync_line_takes_even_the_delay_out(
     tmp_path: Path, mosquitto: MosquittoBroker
 ) -> None:
     """Stamps of a tied clock are right without anybody knowing what the transport takes."""
-    found = await live(tmp_path, mosquitto.port, (), rest_s=7.0, more=("--sync-line",))
+    found = await live(tmp_path, mosquitto.port, (), rest_s=9.0, more=("--sync-line",))
     assert found.replayed
     for source in ("S1", "S3"):
         errors = found.errors_ns(source, "direct")
         assert len(errors) > 500, source
         # before, the stamps slew to their new place: 2 ms at 500 ppm take 4 s
         assert max(map(abs, errors[-100:])) <= MOST_TIED_ERROR_NS, source
+
+
+@pytest.mark.timeout(90)
+async def test_cameras_on_ptp_need_no_echo_and_no_settling(
+    tmp_path: Path, mosquitto: MosquittoBroker
+) -> None:
+    """The daemon knows its own UNIX time, and that is what cameras on PTP stamp frames with."""
+    found = await live(tmp_path, mosquitto.port, (), rest_s=3.0, more=("--ptp",))
+    assert found.replayed
+    errors = found.errors_ns(OPTICAL, "direct")
+    assert len(errors) > 500
+    assert max(map(abs, errors)) <= MOST_PTP_ERROR_NS
+    assert len(found.errors_ns(OPTICAL)) == len(errors)  # it was never told in another way
