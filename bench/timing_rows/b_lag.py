@@ -19,6 +19,7 @@ from jointfit_daemon.timing.lag_tracker import LagTracker
 from jointfit_daemon.timing.rates import rates_from_gyro, rates_from_orientations
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -29,6 +30,9 @@ MS = 1e6
 HALF_FRAME_MS = 1e3 / 240
 FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 MARGIN_S = 0.3
+FAST_SD_MS = {2.0: 0.054, 5.0: 0.025, 10.0: 0.02, 30.0: 0.02}
+SLOW_SD_MS = {2.0: 0.307, 5.0: 0.21, 10.0: 0.14, 30.0: 0.14}
+"""Standard deviations wanted, by the length of the window, s."""
 
 
 class Recording(NamedTuple):
@@ -123,7 +127,7 @@ def windows(
 
 
 def excerpts(
-    name: str, sd_goal_ms: float, constant: tuple[float, float], data: Path
+    name: str, sd_goals_ms: Mapping[float, float], constant: tuple[float, float], data: Path
 ) -> list[Figure]:
     recording = excerpt(data, name)
     imu = rates_from_gyro(recording.t_ns, recording.gyro, 0)
@@ -138,7 +142,7 @@ def excerpts(
         used = [one for found in tries for one in found if one.used]
         lags = np.array([one.lag_ms for one in used])
         sigmas = np.array([one.sigma_ms for one in used])
-        goal = sd_goal_ms if length_s >= 10.0 else free
+        goal = sd_goals_ms[length_s]
         label = f"{length_s:g} s windows"
         figures += [
             Figure(f"{label}, sd", float(lags.std()), goal, unit="ms"),
@@ -317,10 +321,10 @@ EXPERIMENTS = (
     Experiment("T8", "drift of the lag over two minutes", drift),
     Experiment("T10-lag", "cost of the lag", cost, EXCERPTS),
     Experiment(
-        "LAG-fast", "lag, fast excerpt", partial(excerpts, FAST, 0.02, (4.17, 0.05)), EXCERPTS
+        "LAG-fast", "lag, fast excerpt", partial(excerpts, FAST, FAST_SD_MS, (4.17, 0.05)), EXCERPTS
     ),
     Experiment(
-        "LAG-slow", "lag, slow excerpt", partial(excerpts, SLOW, 0.14, (4.05, 0.2)), EXCERPTS
+        "LAG-slow", "lag, slow excerpt", partial(excerpts, SLOW, SLOW_SD_MS, (4.05, 0.2)), EXCERPTS
     ),
     Experiment("LAG-honest", "lag: windows of whole recordings", honest, WHOLE, NEED, long=True),
     Experiment("LAG-quat", "lag of orientations against the gyro's", quaternion_input, EXCERPTS),

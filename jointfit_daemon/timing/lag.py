@@ -62,14 +62,14 @@ class LagSettings:
     span_s: float = 0.15
     """Largest lag searched for, s. 3 s at first contact if a clock is not mapped."""
     step_s: float = 0.004
-    cutoff_hz: float = 12.0
+    cutoff_hz: float = 10.0
     """Low-pass on both rates; at most 0.4 of the lower sample rate."""
     bridge_s: float = BRIDGE_S
     min_rate: float = radians(30.0)
     """RMS angular rate of the reference, rad/s."""
     min_acceleration: float = radians(300.0)
     """RMS angular acceleration of the reference, rad/s²."""
-    max_sigma_ns: float = 500_000.0
+    max_sigma_ns: float = 700_000.0
     """Well above what ordinary motion gives: a gate near it would choose windows by their luck."""
     min_r2: float = 0.98
     """Right data on one rigid body reach 0.998; skin-mounted sensors deserve less."""
@@ -194,7 +194,7 @@ def estimate_in_steps(
     fits: list[LagFit] = []
     for start in coarse:
         yield
-        found = yield from fit_lag(imu, ref, start, cutoff)
+        found = yield from fit_lag(imu, ref, start)
         fits += [] if found is None else [found]
     if not fits:
         return replace(seen, refused=NO_OVERLAP)

@@ -12,25 +12,28 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.timing.lag_sigma import RIDGE, Columns, lag_sigma
-from jointfit_daemon.timing.rates import Interpolant
+from jointfit_daemon.timing.rates import KERNEL_HALF_S, Interpolant
 
 if TYPE_CHECKING:
     from collections.abc import Generator
 
     from jointfit_daemon.timing.rates import Floats, Rates
 
-HUBER = 1.5
-"""Times sigma, on the norm of three, whose median is 1.538: optics err in bursts, so half of the
-residuals are weighed down."""
+HUBERS = (1.5, 2.4, np.inf)
+"""Times sigma, on the norm of three, whose median is 1.538. Optics err in bursts, and then low is
+best; where errors grow with the motion instead, the largest come with what tells most."""
+CHOICES = 6
+"""Iterations that choose among them, by the least variance of the lag; then the choice stands."""
 MEDIAN_NORM = 1.538
 """Median norm of a standard normal vector of three."""
 STEP_S = 0.020
 ITERATIONS = 30
-DONE_S = 1e-7
+DONE_S = 1e-6
 """A step this small, twice in a row, ends the search. The rotation is not asked: about a single
 axis of motion it may turn for ever without a word to the lag."""
 LEAST_PAIRS = 16
 
+_FIRST_HUBER = 2.4
 _TINY = 1e-12
 
 
@@ -47,6 +50,7 @@ class LagFit:
     r2: float
     residual_rms: float
     mean_weight: float
+    """Of the usual Huber weights, clipped at 2.4, whichever were used."""
     pairs: int
     converged: bool
 
@@ -68,14 +72,15 @@ class _Linear(NamedTuple):
     """Of tau, shape (n, 3)."""
     omega: Floats
     t_s: Floats
+    give: Floats
+    """See ``Columns``."""
 
 
-def fit_lag(
-    imu: Rates, ref: Rates, start_s: float, cutoff_hz: float
-) -> Generator[None, None, LagFit | None]:
+def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, LagFit | None]:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
-    Gauss-Newton on all seven unknowns with Huber weights on |r|. The faster track is interpolated
+    Gauss-Newton on all seven unknowns with Huber weights on |r|, clipped where the residuals
+    themselves say that it pays. The faster track is interpolated
     at the instants of the slower one. The standard deviation is that of ``lag_sigma``.
 
     Parameters
@@ -84,8 +89,6 @@ def fit_lag(
         Filtered alike.
     start_s : float
         Coarse lag, s.
-    cutoff_hz : float
-        Of the filter: it sets how far residuals are correlated.
 
     Yields
     ------
@@ -104,31 +107,37 @@ def fit_lag(
     if state is None:
         return None
     converged, before = False, float("inf")
-    for _ in range(ITERATIONS):
-        linear = _linearize(cubic, slow, state)
+    clip: float | None = None
+    for iteration in range(ITERATIONS):
+        linear = _linearize(cubic, slow, state, clip)
         if linear is None:
             return None
+        if iteration < CHOICES:
+            clip = _best_clip(linear)
         state, moved = _step(linear, state)
         if max(moved, before) < DONE_S:
             converged = True
             break
         before = moved
         yield
-    linear = _linearize(cubic, slow, state)
+    linear = _linearize(cubic, slow, state, clip)
     if linear is None:
         return None
     yield
     rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
     whole = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
-    square = float(np.sum(linear.r**2))
+    norm = np.linalg.norm(linear.r, axis=1)
+    square = float(norm @ norm)
     return LagFit(
         tau_s=-state.tau if swapped else state.tau,
-        sigma_s=lag_sigma(Columns(whole, linear.r, linear.w), linear.t_s, 2.0 / cutoff_hz),
+        sigma_s=lag_sigma(
+            Columns(whole, linear.r, linear.w, linear.give), linear.t_s, 2.0 * KERNEL_HALF_S
+        ),
         rotation=rot,
         bias=bias,
         r2=1.0 - square / max(float(np.sum(linear.omega**2)), _TINY),
         residual_rms=float(np.sqrt(square / linear.r.size)),
-        mean_weight=float(linear.w.mean()),
+        mean_weight=float(_clipped(norm, _FIRST_HUBER * _scale(norm)).mean()),
         pairs=len(linear.r),
         converged=converged,
     )
@@ -145,7 +154,9 @@ def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
     return _State(tau, u @ vt, np.zeros(3))
 
 
-def _linearize(cubic: Interpolant, slow: Rates, state: _State) -> _Linear | None:
+def _linearize(
+    cubic: Interpolant, slow: Rates, state: _State, clip: float | None
+) -> _Linear | None:
     g, slope, ok = cubic(slow.t_s + state.tau)
     if ok.sum() < LEAST_PAIRS:
         return None
@@ -153,12 +164,38 @@ def _linearize(cubic: Interpolant, slow: Rates, state: _State) -> _Linear | None
     turned = omega @ state.rot.T
     r = g[ok] - state.bias - turned
     norm = np.linalg.norm(r, axis=1)
-    limit = HUBER * np.median(norm) / MEDIAN_NORM
-    weight = np.where(norm <= limit, 1.0, limit / np.maximum(norm, _TINY))
+    weight = _clipped(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
     jac = np.concatenate(
-        (rotation.skew(turned), np.broadcast_to(-np.eye(3), (*norm.shape, 3, 3))), axis=2
+        (rotation.skew(turned), np.broadcast_to(-np.eye(3), (*weight.shape, 3, 3))), axis=2
     )
-    return _Linear(r, weight, jac, slope[ok], omega, slow.t_s[ok])
+    give = (weight < 1.0).astype(np.float64)
+    return _Linear(r, weight, jac, slope[ok], omega, slow.t_s[ok], give)
+
+
+def _scale(norm: Floats) -> float:
+    """Return sigma per axis of residuals so long, robust."""
+    return max(float(np.median(norm)), _TINY) / MEDIAN_NORM
+
+
+def _clipped(norm: Floats, clip: float) -> Floats:
+    """Return Huber's weights."""
+    return np.minimum(1.0, clip / np.maximum(norm, _TINY))
+
+
+def _best_clip(linear: _Linear) -> float:
+    r"""Return the clip, rad/s, of the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
+
+    h is what a row may tell of the lag. Residuals are taken as they come, each for its own: that
+    they are correlated is the same for all clips.
+    """
+    norm, tells = np.linalg.norm(linear.r, axis=1), np.sum(linear.jtau**2, axis=1)
+
+    def variance(clip: float) -> float:
+        weight = _clipped(norm, clip)
+        curve = weight * np.where(weight < 1.0, 2.0 / 3.0, 1.0)
+        return float(tells @ (weight * norm) ** 2) / float(tells @ curve + _TINY) ** 2
+
+    return min((huber * _scale(norm) for huber in HUBERS), key=variance)
 
 
 def _step(linear: _Linear, state: _State) -> tuple[_State, float]:

@@ -2,17 +2,20 @@ r"""How far a fitted lag may be off: a standard deviation that trusts nothing ab
 
 Law: pure; judges a finished fit, changes nothing. Residuals of low-passed rates are correlated
 over the filter's memory, and where the two bodies or the two systems disagree (skin, lens, gyro
-scale) over whole movements. So the variance is taken at several scales and the largest one counts:
+scale) over whole movements. So the variance is taken in several ways and the largest one counts:
 
 * the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each stretch of the window,
-  with at most 32 stretches, none shorter than the filter's memory, and with half as many
+  with at most 20 stretches, none shorter than the filter's memory, and with half as many
   again and again while five remain. It needs no model of the residuals, and a stretch that
   everything rests on betrays itself;
 * Newey and West (1987), residuals correlated over the shortest of these stretches.
 
-Each is widened by :math:`\nu/(\nu-2)`, the variance of Student's t, where :math:`\nu + 1 =
-(\sum h)^2/\sum h^2` counts the stretches that carry the information h about the lag: one tap in a
-window of rest leaves none, and the answer is infinite.
+A variance from few stretches is itself a guess. :math:`\nu + 1 = (\sum h)^2/\sum h^2` counts the
+stretches that carry the information h about the lag, and the finest scale is widened by the
+quantile of Student's t with :math:`\nu` degrees of freedom over the normal one as rare, so that no
+more windows are far off than the normal distribution lets be. Coarser scales only look for what
+lasts, and are widened by :math:`\nu/(\nu-2)`, the variance of t. One tap in a window of rest leaves
+nothing to count, and the answer is infinite.
 """
 
 from __future__ import annotations
@@ -22,14 +25,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from jointfit_daemon.timing.rates import Floats
 
 RIDGE = 1e-9
 """Relative, on the rotation: motion about one axis leaves it open about that axis."""
 LEAST_BLOCKS = 5
-MOST_BLOCKS = 32
+MOST_BLOCKS = 20
 """More would be shorter than they need be: noise of orientations is a rate that swings back, and
 stretches too short to see it do so are overrated."""
+SIGMAS = 2.8
+"""Where the tails are made equal."""
 _LEAST_FREEDOM = 2.0
 """Below, a variance estimated from so few has no mean."""
 _TINY = 1e-12
@@ -44,6 +51,9 @@ class Columns(NamedTuple):
     """Shape (n, 3)."""
     weight: Floats
     """Shape (n,)."""
+    give: Floats
+    """``-d log(weight) / d log |residual|``, shape (n,): 0 where the weight stays 1, 1 where Huber
+    clips. A clipped residual no longer holds the lag along itself, only across."""
 
 
 def lag_sigma(columns: Columns, t_s: Floats, memory_s: float) -> float:
@@ -58,24 +68,37 @@ def lag_sigma(columns: Columns, t_s: Floats, memory_s: float) -> float:
     memory_s : float
         How long the filter makes residuals remember, s.
     """
-    weighted = columns.jacobian * columns.weight[:, None, None]
-    normal = np.einsum("nij,nik->njk", weighted, columns.jacobian)
-    gradient = np.einsum("nij,ni->nj", weighted, columns.residual)
+    normal, gradient = _curvature(columns)
     whole = normal.sum(axis=0)
     whole[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(whole[:3, :3]), _TINY)
-    share = np.linalg.solve(whole[:6, :6], whole[:6, 6])
-    own = columns.jacobian[:, :, 6] - columns.jacobian[:, :, :6] @ share
-    information = columns.weight * np.sum(own**2, axis=1)
+    share = np.append(-np.linalg.solve(whole[:6, :6], whole[:6, 6]), 1.0)
+    own = columns.jacobian @ share
+    information = np.einsum("i,nij,j->n", share, normal, share)
     if information.sum() <= _TINY:
         return float("inf")
     block = np.floor((t_s - t_s[0]) / memory_s).astype(np.int64)
+    period, memory = float(np.median(np.diff(t_s))), memory_s
     while np.unique(block).size > MOST_BLOCKS:
-        block, memory_s = block // 2, 2.0 * memory_s
+        block, memory = block // 2, 2.0 * memory
     score = columns.weight * np.sum(own * columns.residual, axis=1)
-    period = float(np.median(np.diff(t_s)))
-    blind = _newey_west(score, max(1, round(memory_s / period))) / information.sum() ** 2
-    variances: list[float] = []
+    free = _newey_west(score, max(1, round(memory / period)))
     table = np.concatenate((normal.reshape(-1, 49), gradient, information[:, None]), axis=1)
+    return _widest(table, block, whole, free / information.sum() ** 2)
+
+
+def _curvature(columns: Columns) -> tuple[Floats, Floats]:
+    """Return each row's share of the normal matrix, (n, 7, 7), and of the gradient, (n, 7)."""
+    jacobian, residual, weight, give = columns
+    weighted = jacobian * weight[:, None, None]
+    gradient = np.einsum("nij,ni->nj", weighted, residual)
+    along = gradient / np.maximum(weight * np.linalg.norm(residual, axis=1), _TINY)[:, None]
+    normal = np.einsum("nij,nik->njk", weighted, jacobian)
+    return normal - np.einsum("n,nj,nk->njk", weight * give, along, along), gradient
+
+
+def _widest(table: Floats, block: NDArray[np.int64], whole: Floats, free: float) -> float:
+    """Return the largest standard deviation of all scales; `free` is that of no scale, squared."""
+    variances: list[float] = []
     while True:
         first = np.flatnonzero(np.diff(block, prepend=-1))
         if variances and first.size < LEAST_BLOCKS:
@@ -83,11 +106,19 @@ def lag_sigma(columns: Columns, t_s: Floats, memory_s: float) -> float:
         table, block = np.add.reduceat(table, first, axis=0), block[first] // 2
         freedom = float(table[:, -1].sum() ** 2 / np.sum(table[:, -1] ** 2)) - 1.0
         if freedom > _LEAST_FREEDOM:
-            variance = max(blind, _jackknife(table, whole))
-            variances.append(variance * freedom / (freedom - _LEAST_FREEDOM))
-            blind = 0.0  # its scale was the first
+            variance = _jackknife(table, whole)
+            variances.append(variance if variances else max(variance, free) * _rarity(freedom) ** 2)
         elif not variances:
             return float("inf")
+
+
+def _rarity(freedom: float) -> float:
+    """Return Student's quantile that is as rare as `SIGMAS` of a normal one, over `SIGMAS`.
+
+    Wallace's approximation (1959), good to a percent from three degrees of freedom on.
+    """
+    normal = SIGMAS * (8.0 * freedom + 3.0) / (8.0 * freedom + 1.0)
+    return float(np.sqrt(freedom * np.expm1(normal**2 / freedom))) / SIGMAS
 
 
 def _newey_west(score: Floats, lags: int) -> float:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-KERNEL_HALF_S = 0.125
+KERNEL_HALF_S = 0.08
 """Half the length of the low-pass; what a run of rates loses at either end."""
 GAP = 1.5
 """Nominal periods between two poses from which on something is missing."""
