@@ -6,6 +6,7 @@ Law: the center is the origin of the parent; all randomness comes from the gener
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from jointfit_daemon.calibration.center.movement import BodyPoses
 from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.center.result import CenterEstimate
 
 Array = NDArray[np.float64]
 
@@ -97,9 +101,10 @@ def sphere_bound(paths: Array, noise: float) -> float:
     return float(np.trace(np.linalg.inv(np.einsum("tja,tjb->ab", u, u)))) * noise**2
 
 
-def covers(error: Array, covariance: Array, unseen: Array) -> bool:
-    """Tell whether the 95 % ellipse, in the directions seen, holds the truth."""
-    d = len(error)
-    across = np.linalg.svd(unseen)[2][len(unseen) :] if len(unseen) else np.eye(d)
-    e, spread = across @ error, across @ covariance @ across.T
-    return bool(e @ np.linalg.solve(spread, e) < CHI2_95[len(e)])
+def covers(found: CenterEstimate) -> bool:
+    """Tell whether the 95 % ellipse told, in the directions seen, holds the origin."""
+    d = len(found.center)
+    across = np.linalg.svd(found.unseen)[2][len(found.unseen) :] if len(found.unseen) else np.eye(d)
+    e, spread = across @ found.center, across @ found.covariance @ across.T
+    size = CHI2_95[len(e)] if found.within95 is None else found.within95
+    return bool(e @ np.linalg.solve(spread, e) < size)

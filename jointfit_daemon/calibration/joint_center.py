@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jointfit_daemon.calibration.center.sphere import (
+from jointfit_daemon.calibration.center.sphere_directions import Limits
+from jointfit_daemon.calibration.center.sphere_solve import (
     SphereOptions,
     judge_sphere,
     solve_sphere,
 )
-from jointfit_daemon.calibration.center.sphere_directions import Limits
 from jointfit_daemon.calibration.center.sphere_verdict import objection
 from jointfit_daemon.calibration.markers import visible
 

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 _MM = 1000.0
 _FLAGS = {
     "orientation_inconsistent": "the angles contradict the circle, which was used instead",
-    "residuals_persist": "residuals go with posture, as skin does: frames are not independent",
+    "residuals_persist": "residuals last from frame to frame: frames are not independent",
+    "residuals_repeat": "residuals go with posture, as skin does: counted as seen once, however"
+    " long the trial",
     "hinge": "the joint turned about one axis: the center's place along it is not shown",
 }
 _WINDOW_HEAD = (

@@ -85,7 +85,8 @@ class Answer:
         """Return the semi-axes of the 95 % ellipsoid, m, longest first; inf where unseen."""
         unseen = len(self.estimate.unseen)
         variances = np.linalg.eigvalsh(self.estimate.covariance)[unseen:]
-        scale = CHI2_95[max(1, len(variances))]
+        told = self.estimate.within95
+        scale = CHI2_95[max(1, len(variances))] if told is None else told
         seen = np.sqrt(scale * np.maximum(variances[::-1], 0.0))
         return np.concatenate((np.full(unseen, np.inf), seen))
 
@@ -121,12 +122,13 @@ def reduce(
             f"--parent: the first three, {', '.join(parent[:MIN_MARKERS])}, lie on a line: put"
             " another one among the first three"
         )
-    poses, rms = _poses(template @ _own_axes(template), seen)
+    template = template @ _own_axes(template)
+    poses, rms = _poses(template, seen)
     other = None
     if len(markers) >= MIN_MARKERS and visible(child).all(axis=1).any():
         shape = np.nanmedian(child - np.nanmean(child, axis=1, keepdims=True), axis=0)
         other = None if is_line(shape) else _poses(moving_template(child), child)[0]
-    movement = Movement(poses.to_body(child), poses, other, interval=interval)
+    movement = Movement(poses.to_body(child), poses, other, template, interval=interval)
     return Reduced(movement, rms, poses, np.eye(3))
 
 
@@ -258,5 +260,6 @@ def _cut(movement: Movement, part: slice) -> Movement:
         None if movement.points is None else movement.points[part],
         bodies(movement.parent),
         bodies(movement.child),
+        movement.parent_markers,
         interval=movement.interval,
     )

@@ -16,13 +16,9 @@ from jointfit_daemon.calibration.center.movement import Movement
 from jointfit_daemon.calibration.center.running_sphere import RunningSphere
 from jointfit_daemon.calibration.center.sara import fit_axis
 from jointfit_daemon.calibration.center.score import fit_score
-from jointfit_daemon.calibration.center.sphere import (
-    SphereOptions,
-    fit_sphere,
-    gamage_lasenby,
-    halvorsen,
-)
+from jointfit_daemon.calibration.center.sphere import fit_sphere, gamage_lasenby, halvorsen
 from jointfit_daemon.calibration.center.sphere_directions import Limits
+from jointfit_daemon.calibration.center.sphere_solve import SphereOptions
 from jointfit_daemon.calibration.center.sphere_verdict import refusal
 
 if TYPE_CHECKING:
@@ -166,7 +162,12 @@ _ALL = (
         "geometric sphere fit of all markers, robust; tells a hinge from a ball joint",
         ("points",),
         False,
-        lambda m: fit_sphere(_points(m), SphereOptions(start=m.near, min_direction=m.least_turn)),
+        lambda m: fit_sphere(
+            _points(m),
+            SphereOptions(start=m.near),
+            Limits(min_direction=m.least_turn),
+            m.parent_markers,
+        ),
     ),
     Method(
         "running_sphere",

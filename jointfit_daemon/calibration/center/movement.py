@@ -47,6 +47,9 @@ class Movement:
     plane."""
     parent: BodyPoses | None = None
     child: BodyPoses | None = None
+    parent_markers: Array | None = None
+    """The parent's own markers in its coordinates, m, shape (m, 3): what their noise does to the
+    points is then told from the points' own."""
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
     inertial sensors: for ``oriented``."""

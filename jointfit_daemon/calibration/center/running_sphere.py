@@ -6,19 +6,20 @@ frames at once with the same weights.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jointfit_daemon.calibration.center.sphere_sums import SphereSums, centered, sum_up
+from jointfit_daemon.calibration.center.sphere_directions import Limits
+from jointfit_daemon.calibration.center.sphere_sums import LAGS, SphereSums, centered, sum_up
 from jointfit_daemon.calibration.center.sphere_verdict import center_and_spheres, center_of
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.center.result import CenterEstimate
     from jointfit_daemon.calibration.center.sphere_algebra import Spheres
-    from jointfit_daemon.calibration.center.sphere_directions import Limits
 
 Array = NDArray[np.float64]
 
@@ -65,7 +66,8 @@ class RunningSphere:
         Weigh down markers that leave the sphere found so far, as skin and swapped names do, and
         begin anew with one that stays away. Works from the last `estimate`.
     limits : Limits, optional
-        When to refuse.
+        When to refuse. If None, residuals that last are not counted as going with posture: live,
+        skin is added by who asks, see ``skin`` (give ``Limits()`` to have it counted).
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, see ``parent_noise``.
 
@@ -92,15 +94,16 @@ class RunningSphere:
                 "marker, forgetting above 0 and at most 1, in a plane or in space"
             )
         e = dimension + 2
-        self._near, self._robust, self._limits, self._shape = near, robust, limits, shape
+        self._near, self._robust, self._shape = near, robust, shape
+        self._limits = limits or Limits(posture=False)
         self._forgetting = forgetting
         self._origin = np.full((markers, dimension), np.nan)
         self._M = np.zeros((markers * e, markers * e))
-        self._L = np.zeros((markers, e, e))
+        self._L = np.zeros((len(LAGS), markers, e, e))
         self._squares = np.zeros(markers)
         self._phi = np.zeros((markers, e))
         self._phi[:, -1] = 1.0
-        self._last = np.zeros((markers, e))
+        self._past = deque((np.zeros((markers, e)) for _ in range(LAGS[-1])), maxlen=LAGS[-1])
         self._frames = 0
         self._placed = False
         self._expected: _Expected | None = None
@@ -132,9 +135,10 @@ class RunningSphere:
             self._L *= self._forgetting
             self._squares *= self._forgetting**2
         self._M += flat[:, None] * flat
-        self._L += phi[:, :, None] * self._last[:, None, :]
+        for g, lag in enumerate(LAGS):
+            self._L[g] += phi[:, :, None] * self._past[-lag][:, None, :]
         self._squares += 1.0 if w is None else w * w
-        self._last = phi.copy()
+        self._past.append(phi.copy())
         self._frames += 1 if w is None else int(w.any())
 
     def sums(self) -> SphereSums:
@@ -199,7 +203,9 @@ class RunningSphere:
             M = self._M.reshape(k, e, k, e)
             M[j] = 0.0
             M[:, :, j] = 0.0
-            self._L[j] = self._last[j] = 0.0
+            self._L[:, j] = 0.0
+            for past in self._past:
+                past[j] = 0.0
             self._squares[j] = 0.0
             self._off[j] = 0
             self._origin[j] = np.nan
@@ -250,4 +256,5 @@ def fit_running(
     near, limits, shape
         As for `RunningSphere`.
     """
+    limits = limits or Limits(posture=False)
     return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.result import CenterEstimate
-from jointfit_daemon.calibration.center.sphere_verdict import arc_of, refusal
+from jointfit_daemon.calibration.center.sphere_directions import Limits, of_posture, within95
+from jointfit_daemon.calibration.center.sphere_sums import LAGS
+from jointfit_daemon.calibration.center.sphere_verdict import arc_of, objection, refusal
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
@@ -29,6 +31,9 @@ all directions 0.85 and more)."""
 MIN_FRAMES = 15
 MIN_TURN_RAD = 0.02
 """RMS turning about the second axis of the movement below which nothing was turned."""
+LEVER_M = 0.24
+"""Stands for the radius in T, since poses do not say where markers are: a center has to be known to
+40 mm."""
 HUBER = 1.5
 _PASSES = 10
 _LEAST_M = 1e-9
@@ -56,6 +61,8 @@ class TwoSided:
     """What is left between the two sides, m, shape (n, 3)."""
     covariance: Array
     """Of parent and child point for white noise, m², shape (6, 6), zero along the axis."""
+    skin: Array
+    """What goes with posture adds to it, m², shape (6, 6)."""
     persistence: float
     """Correlation of the gaps from one frame to the next, 0 to 0.99."""
     frames: int
@@ -101,7 +108,8 @@ def solve_two_sided(
         w = again
     c, gaps, s, Vt, rank = _solve(N, rhs, w, hinge)
     noise2 = max(float((w[:, None] * gaps**2).sum()) / max(3.0 * n - rank, 1.0), _LEAST_M**2)
-    C = noise2 * (Vt[:rank].T / np.maximum(s[:rank], 1e-12) ** 2) @ Vt[:rank]
+    inverse = (Vt[:rank].T / np.maximum(s[:rank], 1e-12) ** 2) @ Vt[:rank]
+    skin2 = noise2 * float(w.sum()) * of_posture(_correlation(gaps, LAGS[1]), n)
     return TwoSided(
         parent_point=c[:3],
         child_point=c[3:],
@@ -111,7 +119,8 @@ def solve_two_sided(
         ratio=float(s[5] / max(s[4], 1e-300)),
         turn=float(s[4]) / sqrt(float(w.sum())),
         gaps=gaps,
-        covariance=C,
+        covariance=noise2 * inverse,
+        skin=skin2 * inverse,
         persistence=_persistence(gaps),
         frames=n,
     )
@@ -131,11 +140,13 @@ def _solve(
 
 
 def _persistence(gaps: Array) -> float:
-    power = float((gaps**2).mean())
-    if power < 1e-18:
-        return 0.0
-    rho = float((gaps[1:] * gaps[:-1]).mean()) / power
+    rho = _correlation(gaps, LAGS[0])
     return min(rho, 0.99) if rho > 2.0 / sqrt(gaps.size) else 0.0
+
+
+def _correlation(gaps: Array, lag: int) -> float:
+    power = float((gaps**2).mean())
+    return float((gaps[lag:] * gaps[:-lag]).mean()) / power if power > _LEAST_M**2 else 0.0
 
 
 def fit_score(
@@ -180,17 +191,19 @@ def two_sided_estimate(
             "the child did not turn against the parent: move the joint, at least 30° each way",
         )
     a = found.parent_axis
-    center, C = found.parent_point, found.covariance[:3, :3]
+    rho = found.persistence
+    # noise that lasts leaves fewer frames; what goes with posture, one
+    total = found.covariance * (1.0 + rho) / (1.0 - rho) + found.skin
+    center, C = found.parent_point, total[:3, :3]
     hinge = found.hinge
     unseen = a[None] if hinge else np.zeros((0, 3))
     if hinge:
         P = np.eye(3) - np.outer(a, a)
         along = 0.0 if near is None else float(a @ (near - center))
         center, C = center + along * a, P @ C @ P
-    rho = found.persistence
-    C = C * (1.0 + rho) / (1.0 - rho)
     noise = sqrt(float((found.gaps**2).mean()))
     arc = _arc(parent, child)
+    conditioning = LEVER_M / sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 1e-18))
     return CenterEstimate(
         method=method,
         center=center,
@@ -200,13 +213,14 @@ def two_sided_estimate(
         radii=np.array([float(np.linalg.norm(found.child_point))]),
         arc=arc,
         bound=inf if hinge else sqrt(float(np.trace(found.covariance[:3, :3]))),
-        conditioning=float(np.linalg.norm(found.child_point))
-        / sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 1e-18)),
+        conditioning=conditioning,
         frames=found.frames,
         effective_frames=found.frames * (1.0 - rho) / (1.0 + rho),
         unseen=unseen,
         axis=a if hinge else None,
         flags=("hinge",) if hinge else (),
+        within95=within95(2 if hinge else 3, 3.0 * found.frames * (1 - rho) / (1 + rho) - 6.0),
+        refused=objection(arc, LEVER_M, conditioning, Limits()),
     )
 
 

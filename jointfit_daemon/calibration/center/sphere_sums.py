@@ -4,7 +4,7 @@ Law: for every marker φ = (|p|², p, 1), p its place from a fixed point near it
 spheres about one center are functions of
 
 .. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
-          L_j = \sum_t \sqrt{w_{tj} w_{t-1,j}}\, φ_{tj} φ_{t-1,j}^T
+          L_{gj} = \sum_t \sqrt{w_{tj} w_{t-g,j}}\, φ_{tj} φ_{t-g,j}^T, \quad g \in \{1, 4\}
 
 M holds the residuals' variances and what markers have in common (noise of the parent's frame), L
 how long they persist. Forgetting multiplies both. A marker that is not seen adds nothing.
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+LAGS = (1, 4)
+"""Frames apart: neighbours, and far enough for noise that halves itself each frame to be gone."""
+
 
 @dataclass(frozen=True, slots=True)
 class SphereSums:
@@ -29,7 +32,7 @@ class SphereSums:
     M: Array
     """Shape (k, e, k, e)."""
     L: Array
-    """Shape (k, e, e)."""
+    """One for each of `LAGS`, shape (2, k, e, e)."""
     squares: Array
     """Σ w², shape (k,)."""
     frames: int
@@ -50,7 +53,7 @@ class SphereSums:
         """Return the sums of some markers, given as a mask."""
         pick = np.flatnonzero(markers)
         M = self.M[pick][:, :, pick]
-        return SphereSums(self.origin[pick], M, self.L[pick], self.squares[pick], self.frames)
+        return SphereSums(self.origin[pick], M, self.L[:, pick], self.squares[pick], self.frames)
 
 
 def raised(points: Array, origin: Array) -> Array:
@@ -78,7 +81,7 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     n, k, e = phi.shape
     flat = phi.reshape(n, k * e)
     M = (flat.T @ flat).reshape(k, e, k, e)
-    L = np.einsum("tja,tjb->jab", phi[1:], phi[:-1])
+    L = np.stack([np.einsum("tja,tjb->jab", phi[g:], phi[:-g]) for g in LAGS])
     return SphereSums(origin, M, L, (w * w).sum(axis=0), int(np.count_nonzero(seen.any(axis=1))))
 
 
@@ -96,7 +99,7 @@ def about(sums: SphereSums, by: Array) -> SphereSums:
     """Return the same sums about fixed points moved by `by`, m, shape (k, d)."""
     T = shift(by)
     M = np.einsum("jab,jblc,ldc->jald", T, sums.M, T)
-    L = np.einsum("jab,jbc,jdc->jad", T, sums.L, T)
+    L = np.einsum("jab,gjbc,jdc->gjad", T, sums.L, T)
     return SphereSums(sums.origin + by, M, L, sums.squares, sums.frames)
 
 

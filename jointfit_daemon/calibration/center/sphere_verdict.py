@@ -82,7 +82,7 @@ def center_and_spheres(
     shape: Array | None = None,
     limits: Limits | None = None,
 ) -> tuple[CenterEstimate, Spheres | None]:
-    """Return `center_of` and the spheres of the markers used, None where there are none."""
+    """Return `center_of` and the markers' spheres; None where they are about no such center."""
     limits = limits or Limits()
     d = sums.origin.shape[1]
     usable = sums.counts >= MIN_FRAMES
@@ -100,7 +100,8 @@ def center_and_spheres(
     found = _answer(sums, paths, seen, near, limits)
     radii = np.full(len(usable), np.nan)
     radii[usable] = found.radii
-    return replace(found, method=method, radii=radii), seen.found
+    whole = seen.shown.shape[0] == seen.shown.shape[1]
+    return replace(found, method=method, radii=radii), seen.found if whole else None
 
 
 def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
@@ -125,36 +126,48 @@ def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
 def _answer(
     sums: SphereSums, paths: Paths, seen: Seen, near: Array | None, limits: Limits
 ) -> CenterEstimate:
-    basis, d = seen.basis, len(seen.basis)
+    basis, found = seen.basis @ seen.shown, seen.found
     middle = np.average(paths.mean, axis=0, weights=paths.n)
     unseen = np.asarray(np.linalg.svd(basis)[0][:, basis.shape[1] :].T)
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
-    center, spread = drawn_in(seen, middle @ basis)
-    lean = float(((unseen @ (stay - middle)) ** 2).sum())
-    C = basis @ (spread + lean * seen.tilt) @ basis.T
-    radii = np.sqrt(seen.found.radii2)
+    center, spread = drawn_in(seen, middle @ seen.basis)
+    fitted = seen.basis @ center
+    hidden = unseen @ seen.basis @ seen.basis.T  # in the fit, but not in the answer
+    lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
+    spread = seen.shown.T @ spread @ seen.shown
+    C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
+    radii, arc = _round(seen)
     radius = float(np.median(radii))
     conditioning = radius / float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 1e-300)))
-    resultant = np.linalg.norm(seen.found.center - seen.paths.mean, axis=1) / radii
-    arc = arc_of(float(resultant.min()))
-    relative = seen.found.relative
+    relative, rho = found.relative, seen.left.persistence
+    residual2 = np.maximum(np.diagonal(seen.left.together), 0.0)
     return CenterEstimate(
         method="",
-        center=basis @ center + unseen.T @ (unseen @ stay),
+        center=basis @ (basis.T @ fitted) + unseen.T @ (unseen @ stay),
         covariance=(C + C.T) / 2.0,
-        noise=float(np.sqrt(seen.found.noise2 * np.median(relative))),
-        residual=float(np.sqrt(np.average(seen.residual2, weights=paths.n))),
+        noise=float(np.sqrt(found.noise2 * np.median(relative))),
+        residual=float(np.sqrt(np.average(residual2, weights=paths.n))),
         radii=radii,
         arc=arc,
         bound=float(np.sqrt(seen.bound2)) if len(unseen) == 0 else inf,
         conditioning=conditioning,
         frames=sums.frames,
-        effective_frames=float(paths.n.mean()) * (1 - seen.persistence) / (1 + seen.persistence),
+        effective_frames=float(paths.n.mean()) * (1 - rho) / (1 + rho),
         unseen=unseen,
-        axis=unseen[0] if len(unseen) == 1 and d == 3 else None,
+        axis=unseen[0] if len(unseen) == 1 and len(basis) == 3 else None,
         flags=_flags(seen, len(unseen)),
+        within95=seen.within95,
         refused=objection(arc, radius, conditioning, limits),
     )
+
+
+def _round(seen: Seen) -> tuple[Array, float]:
+    """Return the radii, m, and the arc, rad, about what is shown of the center."""
+    away = seen.found.center - seen.paths.mean
+    inside = away @ seen.shown
+    aside2 = np.maximum((away**2).sum(axis=1) - (inside**2).sum(axis=1), 0.0)
+    radii = np.sqrt(np.maximum(seen.found.radii2 - aside2, 1e-8))
+    return radii, arc_of(float((np.linalg.norm(inside, axis=1) / radii).min()))
 
 
 def drawn_in(seen: Seen, middle: Array) -> tuple[Array, Array]:
@@ -178,8 +191,10 @@ def arc_of(resultant: float) -> float:
 
 def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
     flags = ["hinge"] if unseen else []
-    if seen.persistence > PERSISTENT:
+    if seen.left.persistence > PERSISTENT:
         flags.append("residuals_persist")
+    if seen.left.posture > 0.0:
+        flags.append("residuals_repeat")
     loud = np.flatnonzero(seen.found.relative > LOUD * np.median(seen.found.relative))
     return (*flags, *(f"noisy_marker:{j}" for j in loud))
 

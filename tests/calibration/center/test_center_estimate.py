@@ -152,5 +152,5 @@ def test_the_batch_spheres_ellipse_covers(arc: float) -> None:
         paths = carried(ball_turns(rng, arc))
         found = estimate_center(paths + rng.normal(0, 1e-3, paths.shape), "sphere")
         assert found.refused is None
-        held += covers(found.center, found.covariance, found.unseen)
+        held += covers(found)
     assert held >= 70

@@ -33,7 +33,7 @@ def test_score_is_exact_without_noise_and_honest_with_it() -> None:
         seen = watched(rng, ball_turns(rng, 45))
         found = fit_score(seen.parent, seen.child)
         assert found.refused is None
-        held += covers(found.center, found.covariance, found.unseen)
+        held += covers(found)
     assert held >= 48
 
 
