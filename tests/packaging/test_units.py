@@ -1,0 +1,108 @@
+"""The files for systemd and udev: what they promise, and that the promises are documented."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jointfit_daemon.__main__ import EXIT_USAGE
+from jointfit_daemon.outputs.mqtt_secrets import CREDENTIAL
+from jointfit_daemon.supervisor.daemon import STOP_S
+
+ROOT = Path(__file__).resolve().parents[2]
+SYSTEMD = ROOT / "systemd"
+ONE, MANY = SYSTEMD / "jointfitd.service", SYSTEMD / "jointfitd@.service"
+GUIDE = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
+
+
+def directives(unit: Path) -> list[tuple[str, str]]:
+    """Return the settings of a unit in order, without comments."""
+    lines = [line for line in unit.read_text().splitlines() if re.match(r"[A-Za-z]+=", line)]
+    return [(name, value) for name, _, value in (line.partition("=") for line in lines)]
+
+
+def setting(name: str) -> str:
+    found = [value for key, value in directives(ONE) if key == name]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_both_units_differ_only_where_the_instance_is_named() -> None:
+    one, many = directives(ONE), directives(MANY)
+    assert [name for name, _ in one] == [name for name, _ in many]
+    different = {a[0] for a, b in zip(one, many, strict=True) if a != b}
+    assert different == {
+        "Description", "ExecStart", "StateDirectory", "RuntimeDirectory", "LogsDirectory",
+        "LoadCredential",
+    }  # fmt: skip
+    assert all("%i" in b[1] for a, b in zip(one, many, strict=True) if a != b)
+
+
+def test_a_wrong_rig_is_not_tried_again_and_all_else_is() -> None:
+    assert setting("Restart") == "always"
+    assert setting("RestartPreventExitStatus") == str(EXIT_USAGE)
+    assert setting("StartLimitIntervalSec") == "0"
+    assert "ExecStartPre" not in dict(directives(ONE))  # its exit status would restart for ever
+
+
+def test_the_shipped_times_are_the_documented_ones() -> None:
+    assert setting("Type") == "notify"
+    assert setting("RestartSec") == "2"
+    assert "| restart | 2 s after any end but exit code 2, for ever |" in GUIDE
+    assert setting("WatchdogSec") == "10"
+    assert "| watchdog | 10 s (`WatchdogSec=`)" in GUIDE
+    assert setting("TimeoutStopSec") == "15"
+    assert f"After {STOP_S:g} s it leaves whatever hangs; systemd would kill it after 15 s" in GUIDE
+    assert setting("MemoryMax") == "512M"
+    assert "at most 512 MB" in GUIDE
+
+
+def test_the_service_gets_the_credentials_that_the_daemon_looks_for() -> None:
+    named = {value.partition(":")[0] for key, value in directives(ONE) if key == "LoadCredential"}
+    assert named == {CREDENTIAL, "jointfitd.request-key"}
+    assert all(f"/etc/credstore/{name}" in GUIDE for name in named)
+
+
+def test_units_are_read_without_complaint_and_little_is_exposed() -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd is not installed (Debian: apt install systemd)")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "check_unit.py")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+
+
+def test_serial_ports_are_named_by_serial_number_never_by_vendor_alone() -> None:
+    rules = [
+        line
+        for line in (SYSTEMD / "70-jointfitd.rules").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
+    named = [line for line in rules if "SYMLINK" in line]
+    assert named
+    for line in named:
+        assert 'ENV{ID_SERIAL_SHORT}=="?*"' in line
+        assert 'GROUP="dialout"' in line
+        assert 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line
+    assert any('ATTR{latency_timer}="1"' in line for line in rules)
+
+
+def test_the_bus_does_not_hold_up_the_boot_nor_ask_for_what_adapters_lack() -> None:
+    text = (SYSTEMD / "80-jointfit-can0.network").read_text()
+    active = [line for line in text.splitlines() if not line.startswith("#")]
+    assert "RequiredForOnline=no" in active
+    assert "BitRate=1M" in active
+    assert not any(line.startswith("RestartSec") for line in active)
+
+
+def test_the_broker_example_has_tls_rights_and_no_guests() -> None:
+    lines = (SYSTEMD / "mosquitto" / "jointfitd.conf").read_text().splitlines()
+    for wanted in ("allow_anonymous false", "tls_version tlsv1.2", "listener 1883 127.0.0.1"):
+        assert wanted in lines
+    assert "A broker of your own" in (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
