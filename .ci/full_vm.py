@@ -14,6 +14,7 @@ guest never got as far; 124 at the time limit; 2 if the machine cannot be starte
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import subprocess
 import sys
@@ -85,7 +86,28 @@ def fill(share: Path, deb: Path, tests: list[str]) -> None:
     shutil.rmtree(share / "vm_service", ignore_errors=True)
     shutil.copytree(TESTS, share / "vm_service", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copyfile(deb, share / "jointfitd.deb")
+    make_newer(deb, share / "newer.deb")
     (share / "pytest.args").write_text("".join(f"{word}\n" for word in tests))
+
+
+def make_newer(deb: Path, newer: Path) -> None:
+    """Write the same package with a higher version: what an upgrade installs."""
+    with tempfile.TemporaryDirectory(prefix="newer-deb-") as scratch:
+        tree = Path(scratch) / "tree"
+        subprocess.run(["dpkg-deb", "-R", str(deb), str(tree)], check=True)  # noqa: S603, S607 - Debian's
+        control = tree / "DEBIAN" / "control"
+        text = control.read_text(encoding="utf-8")
+        control.write_text(re.sub(r"(?m)^(Version: .*)$", r"\1.1", text), encoding="utf-8")
+        words = [
+            "dpkg-deb",
+            "--root-owner-group",
+            "-Zzstd",
+            "-z1",
+            "--build",
+            str(tree),
+            str(newer),
+        ]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - as above
 
 
 def run(work: Path, disk: Path, share: Path, memory: str, limit_s: float) -> int:

@@ -135,10 +135,24 @@ def stop(machine: subprocess.Popen[bytes]) -> int:
         try:
             os.killpg(machine.pid, signal.SIGKILL)
         except (ProcessLookupError, PermissionError):
-            return 0
+            break
         time.sleep(0.05)
-    say(f"process group {machine.pid} does not die")
+    if left := members(machine.pid):
+        sys.exit(f"processes of the machine are left: {left}")
     return 0
+
+
+def members(group: int) -> list[int]:
+    """Return the processes of a process group that are not yet gone (zombies are)."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, of_group = path.read_text().rpartition(")")[2].split()[:3]
+        except (OSError, ValueError):  # it went away just now
+            continue
+        if int(of_group) == group and state != "Z":
+            found.append(int(path.parent.name))
+    return found
 
 
 def exit_status(code: int) -> int:

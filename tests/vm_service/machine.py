@@ -72,6 +72,19 @@ def ask(command: str, user: str = "operator", password: str = "ask", **arguments
     )  # fmt: skip
 
 
+def answer(command: str, text: str = "", **arguments: object) -> dict[str, Any]:
+    """Return the daemon's answer to a request of the operator: `text`, or JSON of `arguments`."""
+    found: dict[str, Any] = json.loads(
+        run(
+            "mosquitto_rr", "-h", "localhost", "-p", "8883", "--cafile", CA, "-V", "mqttv5",
+            "-u", "operator", "-P", "ask", "-t", f"{BASE}/bridge/request/{command}", "-q", "1",
+            "-e", f"{BASE}/bridge/response/{command}", "-W", "20",
+            "-m", text or json.dumps(arguments),
+        )
+    )  # fmt: skip
+    return found
+
+
 def write_rig(change: Callable[[str], str] = lambda text: text) -> None:
     """Install the simulator's rig, with TLS and a user, and what `change` makes of it."""
     text = (SIM / "rig.toml").read_text()
