@@ -40,10 +40,9 @@ class Layout:
     """m, shape (S, 3); zero for free segments."""
     segment_of: Index
     """Segment of each degree of freedom, shape (nq,)."""
-    axes: Array
-    """Axis of each turn in segment axes, zero for shifts; shape (nq, 3)."""
-    turns_about: Array
-    """The point (x, y, z, 1) in segment axes that a turn leaves in place; shape (nq, 4)."""
+    turns: Array
+    """Axis (x, y, z, 0) of each turn, and a point (x, y, z, 1) it leaves in place, in segment axes;
+    no axis for shifts. Shape (nq, 4, 2)."""
     shifts: Index
     """Columns that shift a free segment."""
     shift_twists: Array
@@ -87,7 +86,8 @@ def _layout(model: ChainModel) -> Layout:
     corners[:, :3, 3] = np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints])
     spread = np.zeros((len(columns), len(parents), 3))
     spread[np.arange(len(columns)), segment_of] = axes
-    about = center[segment_of]
+    turns = np.zeros((len(columns), 4, 2))
+    turns[:, :3, 0], turns[:, :3, 1], turns[:, 3, 1] = axes, center[segment_of], 1.0
     lower = np.tril(below[np.ix_(segment_of, segment_of)].T)
     return Layout(
         nq=len(columns),
@@ -97,8 +97,7 @@ def _layout(model: ChainModel) -> Layout:
         has_own_centers=bool(center.any()),
         center=center,
         segment_of=segment_of,
-        axes=axes,
-        turns_about=np.concatenate((about, np.ones((len(columns), 1))), axis=1),
+        turns=turns,
         shifts=shifts,
         shift_twists=np.tile(np.eye(6)[3:], (len(shifts) // 3, 1)),
         spread=spread.reshape(len(columns), -1),

@@ -85,11 +85,9 @@ def twists(layout: Layout, world: Array) -> Array:
     turn about the world axis :math:`\alpha` through C it is :math:`\beta = C \times \alpha`.
     """
     found = np.empty((len(world), layout.nq, 6))
-    placed = world[:, layout.segment_of]
-    alpha = (placed[..., :3, :3] @ layout.axes[:, :, None])[..., 0]
-    centers = (placed @ layout.turns_about[:, :, None])[..., :3, :]
-    found[..., :3] = alpha
-    found[..., 3:] = (skew(centers[..., 0]) @ alpha[..., None])[..., 0]
+    turns = world[:, layout.segment_of, :3] @ layout.turns
+    found[..., :3] = turns[..., 0]
+    found[..., 3:] = (skew(turns[..., 1]) @ turns[..., :1])[..., 0]
     found[:, layout.shifts] = layout.shift_twists
     return found
 

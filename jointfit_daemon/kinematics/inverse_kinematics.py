@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
 
-CHUNK = 128
-"""Instants searched together: their arrays stay in the processor's cache."""
+_TOGETHER = 4096
+"""Degrees of freedom searched together: their arrays stay in the processor's cache."""
 OPEN_M2 = 4e-4
 """Information on a degree of freedom, m^2/rad^2, below which the markers leave it open: 2 cm."""
 
@@ -120,8 +120,9 @@ def solve_frames(
     else:
         guessed = np.zeros(len(measured), dtype=np.bool_)
     solution = _Solution.of(problem, start)
-    for first in range(0, len(measured), CHUNK):
-        solution.solve(np.arange(first, min(first + CHUNK, len(measured))))
+    size = max(_TOGETHER // model.nq, 1)
+    for first in range(0, len(measured), size):
+        solution.solve(np.arange(first, min(first + size, len(measured))))
     is_open = solution.is_open()
     solution.follow(guessed | is_open, is_open, options.hold_m2 * problem.typical_weight)
     return solution.result(seen, is_open)

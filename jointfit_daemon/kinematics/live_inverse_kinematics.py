@@ -13,14 +13,14 @@ markers leave open is held to the last instant, and :math:`\Sigma` is wide there
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
 
 from jointfit_daemon.kinematics.chain_motion import ChainState, rest_state, turned
 from jointfit_daemon.kinematics.inverse_kinematics import OPEN_M2, IkOptions, solve_frames
-from jointfit_daemon.kinematics.marker_equations import Fit, fit, normal_equations, slots_of
+from jointfit_daemon.kinematics.marker_equations import Fit, fit, lower_equations, slots_of
 from jointfit_daemon.kinematics.pose_search import Band
 
 if TYPE_CHECKING:
@@ -31,8 +31,12 @@ if TYPE_CHECKING:
 _TRIES = 6
 _DAMPING = 1e-2
 _RIDGE = 1e-9
+_ROUNDING = 1e-9
+_OPEN_SLACK = 1e-2  # the hold may cost the markers a little
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
+_STRAIGHTEN = 32
+"""Instants after which what rounding bent is taken out of the rotations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ class LiveOptions:
     """How to follow; the defaults are for markers on skin at 100 Hz."""
 
     steps: int = 2
-    """Steps an instant; two are within a thousandth of the least error at 100 Hz."""
+    """Steps an instant, at least one; two are within a thousandth of the least error at 100 Hz."""
     huber_m: float | None = None
     """Errors beyond weigh as c/|e|, m; None: plain least squares."""
     hold_m2: float = 1e-4
@@ -88,7 +92,9 @@ class LiveInverseKinematics:
         self._slots = slots_of(model)
         self._state: ChainState | None = None
         self._variance = (self._options.marker_sd_m or _FIRST_SD_M) ** 2
-        self._everywhere = np.ones(model.nq)
+        weighing = model.weights[model.weights > 0.0]
+        self._typical = float(np.median(weighing)) if weighing.size else 1.0
+        self._fed = 0
 
     def feed(self, markers: ArrayLike) -> LivePose:
         """Return the pose of the next instant.
@@ -122,7 +128,8 @@ class LiveInverseKinematics:
         else:
             at = fit(self._slots, state.rotations, state.origins, measured, weights)
             step = _Step(state, at, np.eye(self._model.nq), 0.0, is_open=True)
-        self._state = _straightened(step.state)
+        self._fed += 1
+        self._state = step.state if self._fed % _STRAIGHTEN else _straightened(step.state)
         return self._pose(step, seen, restarted=restarted)
 
     def _anew(self, given: Array) -> ChainState:
@@ -136,16 +143,22 @@ class LiveInverseKinematics:
         return step.cost > weights * self._options.lost_m**2
 
     def _follow(self, state: ChainState, measured: Array, weights: Array) -> _Step:
-        """Take the steps of one instant from `state`."""
+        """Take the steps of one instant from `state`.
+
+        The normal matrix that goes with the result is that of the last step's beginning: it differs
+        by the turn of that step, which is far below what a covariance is good for.
+        """
         reference = state.rotations
         at = fit(self._slots, state.rotations, state.origins, measured, weights)
-        for _ in range(self._options.steps):
+        equations = self._equations(state, at, reference)
+        for taken in range(self._options.steps):
             w = self._robust(at, weights)
             if w is not weights:
                 at = fit(self._slots, state.rotations, state.origins, measured, w)
-            state, at = self._one_step(state, at, reference, measured, w)
-        H, _, is_open = self._equations(state, at, reference)
-        return _Step(state, at, H, float(at.cost[0]), is_open=is_open)
+            if taken or w is not weights:
+                equations = self._equations(state, at, reference)
+            state, at = self._one_step(state, at, equations, measured, w)
+        return _Step(state, at, equations.factor, float(at.cost[0]), is_open=equations.is_open)
 
     def _robust(self, at: Fit, weights: Array) -> Array:
         if self._options.huber_m is None:
@@ -154,48 +167,49 @@ class LiveInverseKinematics:
         size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
         return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
 
-    def _equations(self, state: ChainState, at: Fit, reference: Array) -> tuple[Array, Array, bool]:
+    def _equations(self, state: ChainState, at: Fit, reference: Array) -> _Equations:
         """Return normal matrix and gradient, held to `reference` if the markers leave one open."""
-        H, g = normal_equations(self._slots, at)
-        H, g = H[0], g[0]
-        H.flat[:: len(g) + 1] += _RIDGE
-        factor, failed = lapack.dpotrf(H, lower=1, clean=0)
-        pivots = factor.flat[:: len(g) + 1]
-        is_open = bool(failed) or bool((pivots * pivots < OPEN_M2).any())
+        lower, gradient = lower_equations(self._slots, at)
+        H, g = lower[0], gradient[0]
+        diagonal = H.ravel()[:: len(g) + 1]
+        diagonal += _RIDGE
+        factor, failed = lapack.dpotrf(H, lower=1)
+        pivots = factor.diagonal()
+        is_open = failed != 0 or float(pivots.min()) ** 2 < OPEN_M2 * self._typical
         if is_open:
-            hold = Band(reference, self._options.hold_m2 * self._everywhere[None], _ZERO, _ZERO)
-            g = g + hold.weights[0] * hold.excess(self._slots.layout, state.rotations)[0]
-            H.flat[:: len(g) + 1] += self._options.hold_m2
-        return H, g, is_open
+            weight = self._options.hold_m2 * self._typical
+            hold = Band(reference, np.full((1, len(g)), weight), _ZERO, _ZERO)
+            g = g + weight * hold.excess(self._slots.layout, state.rotations)[0]
+            diagonal += weight
+            factor, _ = lapack.dpotrf(H, lower=1)
+        return _Equations(H, g, factor, is_open)
 
     def _one_step(
-        self, state: ChainState, at: Fit, reference: Array, measured: Array, weights: Array
+        self, state: ChainState, at: Fit, equations: _Equations, measured: Array, weights: Array
     ) -> tuple[ChainState, Fit]:
-        H, g, is_open = self._equations(state, at, reference)
-        layout, damping, cost = self._slots.layout, 0.0, at.cost[0]
+        layout, factor, damping = self._slots.layout, equations.factor, 0.0
+        most = float(at.cost[0]) * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
         for _ in range(_TRIES):
-            damped = H if damping == 0.0 else H + damping * np.diag(H.diagonal())
-            _, delta, failed = lapack.dposv(damped, -g, lower=1)
-            if not failed:
-                step = delta[None]
-                onward = ChainState(
-                    turned(layout, state.rotations, step),
-                    state.origins + step[:, layout.shifts].reshape(1, -1, 3),
-                )
-                there = fit(self._slots, onward.rotations, onward.origins, measured, weights)
-                if there.cost[0] <= cost or (is_open and there.cost[0] <= 1.01 * cost):
-                    return onward, there
+            step = lapack.dpotrs(factor, -equations.g, lower=1)[0][None]
+            onward = ChainState(
+                turned(layout, state.rotations, step),
+                state.origins + step[:, layout.shifts].reshape(1, -1, 3),
+            )
+            there = fit(self._slots, onward.rotations, onward.origins, measured, weights)
+            if there.cost[0] <= most:
+                return onward, there
             damping = max(_DAMPING, 10.0 * damping)
+            damped = equations.H + damping * np.diag(equations.H.diagonal())
+            factor, _ = lapack.dpotrf(damped, lower=1)
         return state, at
 
     def _pose(self, step: _Step, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
         residuals = self._slots.taken(step.at.errors)[0]
         residuals[~seen] = np.nan
         self._learn(step.cost, int(seen.sum()))
-        half, _ = lapack.dpotrf(step.H, lower=1, clean=1)
-        covariance, _ = lapack.dpotri(half, lower=1)
-        covariance *= self._variance
-        covariance += np.tril(covariance, -1).T
+        half, _ = lapack.dpotri(step.factor, lower=1)
+        covariance = self._variance * (half + half.T)
+        covariance.ravel()[:: len(half) + 1] *= 0.5
         return LivePose(
             step.state,
             step.at.world[0, :, :3, :3],
@@ -215,13 +229,25 @@ class LiveInverseKinematics:
 _ZERO = np.zeros(1)
 
 
+class _Equations(NamedTuple):
+    """What a step is computed from."""
+
+    H: Array
+    """Its lower triangle, shape (nq, nq)."""
+    g: Array
+    factor: Array
+    """Lower Cholesky factor of H."""
+    is_open: bool
+
+
 @dataclass(frozen=True, slots=True)
 class _Step:
     """Where an instant ended."""
 
     state: ChainState
     at: Fit
-    H: Array
+    factor: Array
+    """Lower Cholesky factor of the normal matrix."""
     cost: float
     is_open: bool
 

@@ -156,6 +156,12 @@ _INERTIA = _sums_to_inertia()
 
 def normal_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
     """Return J^T W J, shape (T, nq, nq), and J^T W e, shape (T, nq)."""
+    lower, g = lower_equations(slots, at)
+    return lower + (lower * slots.layout.strictly_lower).swapaxes(-1, -2), g
+
+
+def lower_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
+    """Return the lower triangle of J^T W J, which is all a Cholesky factor needs, and J^T W e."""
     layout, count = slots.layout, len(at.world)
     sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)
     beyond = layout.below @ sums.reshape(count, -1, 28)
@@ -163,5 +169,4 @@ def normal_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
     motion = twists(layout, at.world)
     push = (bodies[..., :36].reshape(count, -1, 6, 6) @ motion[..., None])[..., 0]
     lower = (push @ motion.swapaxes(-1, -2)) * layout.lower
-    H = lower + (lower * layout.strictly_lower).swapaxes(-1, -2)
-    return H, np.einsum("tki,tki->tk", motion, bodies[..., 36:])
+    return lower, np.einsum("tki,tki->tk", motion, bodies[..., 36:])
