@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from jointfit_daemon import __version__
-from jointfit_daemon.tools import calibrate, center, check, decode, demo, report, schema
+from jointfit_daemon.tools import calibrate, center, check, decode, demo, fuse, report, schema
 
 app = typer.Typer(
     name="jointfit",
@@ -19,6 +19,7 @@ app.command(name="demo")(demo.demo)
 app.command(name="calibrate")(calibrate.calibrate)
 app.command(name="center")(center.center)
 app.command(name="decode")(decode.decode)
+app.add_typer(fuse.app)
 app.command(name="report")(report.report)
 app.command(name="schema")(schema.schema)
 

@@ -1,0 +1,340 @@
+"""Fits and judgements on whole trials with a reference, as files hold them; no clocks, no markers.
+
+Law: pure. Sensors and reference are in one world and on one time axis already. What is judged was
+never fitted to: a whole trial is left out, or, of a single one, its last part. The calibration that
+comes out is the one the daemon uses, with lengths and joint centers unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration.anatomy import flexion_sign
+from jointfit_daemon.calibration.model_fit import METHODS, alive_sets, neighbor
+from jointfit_daemon.calibration.mount import fit_alignment
+from jointfit_daemon.calibration.redundancy import fit_segment
+from jointfit_daemon.calibration.result import (
+    Calibration,
+    JointCalibration,
+    SegmentCalibration,
+    SensorCalibration,
+    alive_key,
+    quaternion,
+)
+from jointfit_daemon.calibration.static import RobustMean, static_bias
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.joint_angles import functional_axis, joint_rotation, swing_twist
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from jointfit_daemon.calibration.segment_model import SegmentModel
+    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.model import Chain
+
+Array = NDArray[np.float64]
+
+MAX_TRAINING_FRAMES = 2000
+"""Of one trial; of a longer one every n-th frame is taken."""
+MISALIGNED = np.deg2rad(25.0)
+"""A heading that differs by more is no matter of skin."""
+HEADING_SEPARABLE = 0.98
+"""Above this ratio of singular values heading and mount cannot be told apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class OfflineTrial:
+    """One movement."""
+
+    name: str
+    t_s: Array
+    """Shape (n,), s."""
+    sensors: Mapping[str, Array]
+    """q_world_sensor by id, shape (n, 4); NaN where missing."""
+    reference: Mapping[str, Array]
+    """q_world_segment by segment, the same world, shape (n, 4); NaN where unseen."""
+
+    def part(self, chosen: slice) -> OfflineTrial:
+        """Return a contiguous part, or every n-th frame."""
+        return OfflineTrial(
+            self.name,
+            self.t_s[chosen],
+            {name: q[chosen] for name, q in self.sensors.items()},
+            {name: q[chosen] for name, q in self.reference.items()},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One method on one trial that it was not fitted to."""
+
+    trial: str
+    method: str
+    """A method of `METHODS`, or ``single S1+S3``: the first sensor of each segment alone."""
+    frames: int
+    segments: Mapping[str, float]
+    """RMS angle to the reference, rad."""
+    joints: Mapping[str, float]
+    """RMS error of flexion about the functional axis of the training movement, rad."""
+    flexion: Mapping[str, Array]
+    """That flexion over time, rad, shape (n,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """All methods on all trials left out."""
+
+    rows: tuple[Judged, ...]
+    reference: Mapping[str, Mapping[str, Array]]
+    """Flexion by the reference, rad: by trial, then joint."""
+    held_out: str
+    """What was left out, in words."""
+
+
+def mounts_of(chain: Chain, trials: Sequence[OfflineTrial]) -> dict[str, RobustMean]:
+    """Return ``q_sensor_segment`` of every sensor as the reference of whole trials says it.
+
+    On a still trial this is the static calibration. On movements it is the mean over what skin
+    and muscle do, and learns from the reference: good for research, not for another day.
+    """
+    found = {}
+    for i, segment in enumerate(chain.segments):
+        reference = np.concatenate([trial.reference[segment] for trial in trials])
+        for sensor in chain.sensors[i]:
+            found[sensor] = static_bias(
+                np.concatenate([trial.sensors[sensor] for trial in trials]), reference
+            )
+    return found
+
+
+def fit_offline(
+    chain: Chain,
+    trials: Sequence[OfflineTrial],
+    mounts: Mapping[str, Array],
+    method: Method,
+    *,
+    notes: tuple[str, ...] = (),
+    software: str = "",
+    created_utc: str = "",
+) -> Calibration:
+    """Fit every model that live fusion may need to all trials.
+
+    Parameters
+    ----------
+    mounts : mapping
+        ``q_sensor_segment`` per sensor, shape (4,).
+
+    Raises
+    ------
+    ValueError
+        Fewer than 30 complete frames.
+    """
+    training = _Training.of(chain, trials, mounts)
+    return Calibration(
+        method=method,
+        joints=chain.joints,
+        segments=chain.segments,
+        chain_sensors=chain.sensors,
+        sensor={
+            name: SensorCalibration(
+                quaternion(rotation.IDENTITY.tolist()), quaternion(mounts[name].tolist())
+            )
+            for group in chain.sensors
+            for name in group
+        },
+        segment={
+            segment: SegmentCalibration(
+                quaternion(rotation.IDENTITY.tolist()), None, None, training.models(i, method)
+            )
+            for i, segment in enumerate(chain.segments)
+        },
+        joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
+        notes=notes,
+        quality={"offline": {"trials": [trial.name for trial in trials]}},
+        software=software,
+        created_utc=created_utc,
+    )
+
+
+def evaluate(
+    chain: Chain,
+    trials: Sequence[OfflineTrial],
+    mounts: Mapping[str, Array] | None = None,
+    *,
+    methods: Sequence[Method] = METHODS,
+    holdout: float = 0.4,
+) -> Judgement:
+    """Judge every method where it was not fitted: leave one trial out, or the end of the only one.
+
+    Parameters
+    ----------
+    mounts : mapping, optional
+        ``q_sensor_segment`` per sensor; None: from the reference of the training part.
+    holdout : float
+        Share of a single trial that judges.
+    """
+    if len(trials) == 1:
+        cut = round(len(trials[0].t_s) * (1.0 - holdout))
+        folds = [([trials[0].part(slice(None, cut))], trials[0].part(slice(cut, None)))]
+        said = f"the last {100 * holdout:.0f} % of the trial, fitted to the rest"
+    else:
+        folds = [([t for t in trials if t is not left], left) for left in trials]
+        said = "one trial after the other, fitted to the others"
+    rows: list[Judged] = []
+    reference = {}
+    for training, test in folds:
+        judge = _Judge.of(chain, training, test, mounts)
+        rows += judge.singles()
+        rows += [judge.method(method) for method in reversed(methods)]
+        reference[test.name] = judge.truth
+    return Judgement(tuple(rows), reference, said)
+
+
+def turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> dict[str, float]:
+    """Return sensors whose world is turned about the vertical against the reference's, rad.
+
+    Only clear cases: the movement must tell heading and mount apart.
+    """
+    found = {}
+    for i, segment in enumerate(chain.segments):
+        reference = np.concatenate([trial.reference[segment] for trial in trials])
+        for sensor in chain.sensors[i]:
+            q = np.concatenate([trial.sensors[sensor] for trial in trials])
+            alignment = fit_alignment("heading", q, reference)
+            angle = float(rotation.heading_of(alignment.q_world))
+            if alignment.kappa <= HEADING_SEPARABLE and abs(angle) > MISALIGNED:
+                found[sensor] = angle
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Training:
+    """Bone-aligned frames of several trials, one after the other."""
+
+    chain: Chain
+    sensors: Mapping[str, Array]
+    reference: Mapping[str, Array]
+    labels: NDArray[np.int64]
+
+    @staticmethod
+    def of(chain: Chain, trials: Sequence[OfflineTrial], mounts: Mapping[str, Array]) -> _Training:
+        thin = [t.part(slice(None, None, -(-len(t.t_s) // MAX_TRAINING_FRAMES))) for t in trials]
+        return _Training(
+            chain,
+            {
+                name: np.concatenate([rotation.multiply(t.sensors[name], mount) for t in thin])
+                for name, mount in mounts.items()
+            },
+            {s: np.concatenate([t.reference[s] for t in thin]) for s in chain.segments},
+            np.repeat(np.arange(len(thin)), [len(t.t_s) for t in thin]),
+        )
+
+    def model(
+        self, i: int, method: Method, alive: Sequence[str], other: str | None
+    ) -> SegmentModel:
+        """Fit one model of segment `i`."""
+        return fit_segment(
+            method,
+            [self.sensors[name] for name in alive],
+            None if other is None else self.sensors[other],
+            self.reference[self.chain.segments[i]],
+            self.labels,
+        )
+
+    def models(self, i: int, method: Method) -> dict[str, SegmentModel]:
+        """Fit a model for every set of sensors of segment `i` that may be alive."""
+        others = (*neighbor(self.chain, i), None)
+        return {
+            alive_key(alive, other): self.model(i, method, alive, other)
+            for alive in alive_sets(self.chain.sensors[i])
+            for other in others
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Judge:
+    """What was fitted to, what judges, and the flexion axes of the former."""
+
+    training: _Training
+    test: OfflineTrial
+    sensors: Mapping[str, Array]
+    """Of the test, bone-aligned."""
+    axes: Mapping[str, Array]
+    """Flexion of each inner joint is positive about it: `functional_axis`, and a knee's turned."""
+    truth: Mapping[str, Array]
+
+    @staticmethod
+    def of(
+        chain: Chain,
+        training: Sequence[OfflineTrial],
+        test: OfflineTrial,
+        mounts: Mapping[str, Array] | None,
+    ) -> _Judge:
+        if mounts is None:
+            mounts = {name: mean.q for name, mean in mounts_of(chain, training).items()}
+        known = _Training.of(chain, training, mounts)
+        axes, truth = {}, {}
+        for joint, above, below in _inner(chain):
+            q = joint_rotation(known.reference[above], known.reference[below])
+            axis = functional_axis(q[np.isfinite(q).all(axis=1)])
+            axes[joint] = flexion_sign(joint) * axis
+            truth[joint] = _flexion(test.reference[above], test.reference[below], axes[joint])
+        aligned = {name: rotation.multiply(test.sensors[name], m) for name, m in mounts.items()}
+        return _Judge(known, test, aligned, axes, truth)
+
+    def method(self, method: Method) -> Judged:
+        """Judge one method with all sensors alive."""
+        chain, said = self.training.chain, {}
+        for i, segment in enumerate(chain.segments):
+            other = next(iter(neighbor(chain, i)), None)
+            model = self.training.model(i, method, chain.sensors[i], other)
+            said[segment] = model.predict(
+                [self.sensors[name] for name in chain.sensors[i]],
+                None if other is None else self.sensors[other],
+            )
+        return self._judged(method, said)
+
+    def singles(self) -> list[Judged]:
+        """Judge the first sensor of each segment alone, then the second, as far as all have one."""
+        chain = self.training.chain
+        return [
+            self._judged(
+                f"single {'+'.join(names)}",
+                dict(zip(chain.segments, (self.sensors[name] for name in names), strict=True)),
+            )
+            for names in zip(*chain.sensors, strict=False)
+        ]
+
+    def _judged(self, method: str, said: Mapping[str, Array]) -> Judged:
+        chain, reference = self.training.chain, self.test.reference
+        flexion = {
+            joint: _flexion(said[above], said[below], self.axes[joint])
+            for joint, above, below in _inner(chain)
+        }
+        off = {j: flexion[j] - self.truth[j] for j in flexion}
+        return Judged(
+            self.test.name,
+            method,
+            len(self.test.t_s),
+            {s: _rms(rotation.angle_between(said[s], reference[s])) for s in chain.segments},
+            {j: _rms(np.arctan2(np.sin(angle), np.cos(angle))) for j, angle in off.items()},
+            flexion,
+        )
+
+
+def _inner(chain: Chain) -> Iterable[tuple[str, str, str]]:
+    return zip(chain.joints[1:-1], chain.segments, chain.segments[1:], strict=False)
+
+
+def _flexion(above: Array, below: Array, axis: Array) -> Array:
+    angle: Array = swing_twist(joint_rotation(above, below), axis)[1]
+    return angle
+
+
+def _rms(values: Array) -> float:
+    good = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(good**2))) if good.size else float("nan")

@@ -1,0 +1,283 @@
+"""`jointfit fuse fit|apply|evaluate`: redundant sensors on a limb, from files.
+
+Law: a model file is the calibration of the daemon; applying it runs the daemon's own fusion.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from jointfit_daemon.calibration.offline import OfflineTrial
+    from jointfit_daemon.tools.fuse_trial import Limb
+
+MISUSE = 2
+
+app = typer.Typer(
+    name="fuse",
+    help="Fit, judge and apply the fusion of redundant sensors on trials in files.",
+    no_args_is_help=True,
+)
+
+Trials = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="SENSORS[=REFERENCE]...",
+        help="Sensors: .npz or .sto. Reference, if it is another file: .npz, .sto, .trc or .c3d.",
+    ),
+]
+Segments = Annotated[
+    list[str],
+    typer.Option(
+        "--segment",
+        help="NAME=SENSOR,SENSOR[:BONE], from proximal to distal; BONE is its name in the "
+        "reference, NAME by default.",
+    ),
+]
+Joints = Annotated[
+    str | None,
+    typer.Option("--joints", help="Names, one more than segments: hip,knee,ankle. A knee bends "
+    "back, so it pays to call it knee."),
+]  # fmt: skip
+Static = Annotated[
+    str | None,
+    typer.Option(
+        "--static",
+        help="Still trial SENSORS[=REFERENCE], or a .json of mounts. Without it mounts are learned "
+        "from the movement.",
+    ),
+]
+Markers = Annotated[
+    list[str] | None,
+    typer.Option("--markers", help="NAME=M1,M2,M3: markers of a segment, for .trc and .c3d."),
+]
+Up = Annotated[str, typer.Option("--up", help="Upward axis of .sto files: z, or y (OpenSim).")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
+
+
+@app.command()
+def evaluate(
+    trials: Trials,
+    *,
+    segment: Segments,
+    joints: Joints = None,
+    static: Static = None,
+    markers: Markers = None,
+    up: Up = "z",
+    holdout: Annotated[
+        float, typer.Option("--holdout", min=0.1, max=0.9, help="Share judged, of a single trial.")
+    ] = 0.4,
+    json: Json = False,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw all methods: .png, .svg or .pdf.")
+    ] = None,
+) -> None:
+    """Judge every method where it was not fitted: leave one trial out."""
+    with _told():
+        from jointfit_daemon.calibration import offline
+        from jointfit_daemon.tools import fuse_report
+
+        limb, read, mounts, doubts = _inputs(
+            trials, segment, joints, static, markers=markers, up=up
+        )
+        found = offline.evaluate(limb.chain, read, mounts, holdout=holdout)
+        _warn(doubts)
+        if json:
+            _echo_json(fuse_report.judgement_json(found) | {"notes": doubts})
+        else:
+            typer.echo(fuse_report.judgement(found))
+        if plot is not None:
+            from jointfit_daemon.tools.fuse_plot import draw_judgement
+
+            draw_judgement(plot, found)
+            typer.echo(f"wrote {plot}", err=True)
+
+
+@app.command()
+def fit(
+    trials: Trials,
+    *,
+    segment: Segments,
+    out: Annotated[Path, typer.Option("--out", help="Model file to write, .json.")],
+    method: Annotated[
+        str, typer.Option("--method", help="anchored, patent12, patent6 or mean.")
+    ] = "anchored",
+    joints: Joints = None,
+    static: Static = None,
+    markers: Markers = None,
+    up: Up = "z",
+    json: Json = False,
+) -> None:
+    """Fit a model to all trials and write it: a calibration as the daemon keeps it."""
+    with _told():
+        from datetime import UTC, datetime
+
+        from jointfit_daemon import __version__
+        from jointfit_daemon.calibration import offline
+        from jointfit_daemon.tools import fuse_report
+
+        limb, read, mounts, doubts = _inputs(
+            trials, segment, joints, static, markers=markers, up=up
+        )
+        if mounts is None:
+            mounts = {s: mean.q for s, mean in offline.mounts_of(limb.chain, read).items()}
+        calibration = offline.fit_offline(
+            limb.chain,
+            read,
+            mounts,
+            _method(method),
+            notes=tuple(doubts),
+            software=__version__,
+            created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
+        _write_json(out, calibration.to_dict())
+        frames = sum(len(trial.t_s) for trial in read)
+        if json:
+            _echo_json({"model": str(out), "frames": frames, "notes": doubts})
+        else:
+            typer.echo(fuse_report.fitted(calibration, frames))
+            typer.echo(f"wrote {out}", err=True)
+
+
+@app.command()
+def apply(
+    model: Annotated[Path, typer.Argument(help="Model file that `fit` wrote.")],
+    sensors: Annotated[Path, typer.Argument(help="Sensors: .npz or .sto.")],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", help="Orientations and joint angles: .sto, .npz or .csv.")
+    ],
+    left: Annotated[bool, typer.Option("--left", help="A left limb: signs of two angles.")] = False,
+    up: Up = "z",
+    json: Json = False,
+) -> None:
+    """Fuse the sensors of a trial as the daemon would live, with its uncertainty."""
+    with _told():
+        from jointfit_daemon.tools import fuse_output, fuse_report
+        from jointfit_daemon.tools.fuse_trial import Unusable, read_sensors
+
+        if out.suffix.lower() not in fuse_output.ENDINGS:
+            raise Unusable(f"--out {out}: expected a name that ends in .sto, .npz or .csv")
+        axis = _axis(up)
+        calibration = _read_model(model)
+        table = read_sensors(sensors, fuse_output.chain_of(calibration, left=left), axis)
+        found = fuse_output.fuse_trial(calibration, table, left=left)
+        files = fuse_output.write_fused(out, found, table, axis)
+        if json:
+            said = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
+            _echo_json(said | {"files": [str(file) for file in files]})
+        else:
+            typer.echo(fuse_report.applied(found))
+            typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Turn what a user can mend into one line on stderr and exit code 2."""
+    from jointfit_daemon.calibration.refused import CalibrationRefused
+    from jointfit_daemon.files.c3d import PackageMissing
+    from jointfit_daemon.tools.plotting import PlotMissing
+
+    try:
+        yield
+    except (OSError, ValueError, CalibrationRefused, PackageMissing, PlotMissing) as fault:
+        why = f"{fault.filename}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
+        typer.echo(f"jointfit fuse: {why}", err=True)
+        raise typer.Exit(MISUSE) from None
+
+
+def _inputs(
+    trials: Sequence[str],
+    segments: Sequence[str],
+    joints: str | None,
+    static: str | None,
+    *,
+    markers: Sequence[str] | None,
+    up: str,
+) -> tuple[Limb, list[OfflineTrial], dict[str, Any] | None, list[str]]:
+    """Return limb, trials, mounts (None: to be learned) and what to doubt."""
+    from jointfit_daemon.calibration.offline import turned_worlds
+    from jointfit_daemon.tools import fuse_trial
+
+    limb = fuse_trial.read_limb(segments, joints, markers or (), _axis(up))
+    mounts, still = None, None
+    if static is not None and static.lower().endswith(".json"):
+        mounts = fuse_trial.read_mounts(Path(static), limb.chain)
+    elif static is not None:
+        mounts, still = fuse_trial.read_static(*_pair(static), limb)
+    read = [fuse_trial.read_trial(*_pair(text), limb, still) for text in trials]
+    doubts = list(_turned(turned_worlds(limb.chain, read)))
+    if mounts is None:
+        doubts.append(
+            "no --static: mounts are means over the movement and learn from the reference; "
+            "figures hold for this wearing only"
+        )
+    return limb, read, mounts, doubts
+
+
+def _turned(worlds: dict[str, float]) -> Iterator[str]:
+    from math import degrees
+
+    for sensor, angle in worlds.items():
+        yield (
+            f"{sensor}: its world seems turned by {degrees(angle):.0f}° about the vertical against "
+            "the reference's: bring both into one world first, or check --up"
+        )
+
+
+def _pair(text: str) -> tuple[Path, Path | None]:
+    sensors, equals, reference = text.partition("=")
+    return Path(sensors), Path(reference) if equals else None
+
+
+def _axis(up: str) -> Any:
+    if up not in {"y", "z"}:
+        raise ValueError(f"--up is {up!r}, expected y or z")
+    return up
+
+
+def _method(name: str) -> Any:
+    from difflib import get_close_matches
+
+    from jointfit_daemon.calibration.model_fit import METHODS
+
+    if name in METHODS:
+        return name
+    near = get_close_matches(name, METHODS, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ValueError(f"no method {name!r}; {hint}there are: {', '.join(METHODS)}")
+
+
+def _read_model(path: Path) -> Any:
+    import orjson
+
+    from jointfit_daemon.calibration.result import Calibration, UnknownSchema
+
+    try:
+        said = orjson.loads(path.read_bytes())
+        return Calibration.from_dict(said if isinstance(said, dict) else {})
+    except (orjson.JSONDecodeError, UnknownSchema) as fault:
+        raise ValueError(f"{path}: not a model that `jointfit fuse fit` wrote: {fault}") from fault
+
+
+def _write_json(path: Path, said: dict[str, Any]) -> None:
+    import orjson
+
+    path.write_bytes(orjson.dumps(said, option=orjson.OPT_INDENT_2) + b"\n")
+
+
+def _echo_json(said: dict[str, Any]) -> None:
+    import orjson
+
+    typer.echo(orjson.dumps(said))
+
+
+def _warn(doubts: Sequence[str]) -> None:
+    for doubt in doubts:
+        typer.echo(f"warning: {doubt}", err=True)

@@ -1,0 +1,172 @@
+"""Applying a model to sensors of a file, and writing what comes out.
+
+Law: the fusion of the daemon itself, frame by frame, so that a file says what the rig would have.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from math import isfinite
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.calibration.markers import visible
+from jointfit_daemon.files.npz import OrientationTrial, write_orientations_npz
+from jointfit_daemon.files.sto import (
+    OrientationTable,
+    TimeTable,
+    write_orientations_sto,
+    write_sto,
+)
+from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.model import Chain
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.files.marker_trial import Axis
+    from jointfit_daemon.model import LimbState
+    from jointfit_daemon.tools.fuse_trial import Table
+
+Array = NDArray[np.float64]
+
+ANGLES = ("flexion", "adduction", "rotation")
+ENDINGS = (".sto", ".npz", ".csv")
+_UNKNOWN = (float("nan"),) * 4
+
+
+@dataclass(frozen=True, slots=True)
+class FusedTrial:
+    """A limb over time."""
+
+    t_s: Array
+    segments: Mapping[str, Array]
+    """q_world_segment, z up, shape (n, 4); NaN where unknown."""
+    sd: Mapping[str, Array]
+    """Standard deviation of each segment, rad, shape (n,)."""
+    angles: Mapping[str, Array]
+    """Flexion, adduction, internal rotation of each inner joint, rad, shape (n, 3)."""
+    angle_sd: Mapping[str, Array]
+    """Standard deviation of flexion, rad, shape (n,)."""
+    flags: Mapping[str, float]
+    """Share of frames by flag."""
+
+    @property
+    def known(self) -> dict[str, float]:
+        """Share of frames in which each segment is known."""
+        return {s: float(visible(q).mean()) for s, q in self.segments.items()}
+
+
+def chain_of(calibration: Calibration, *, left: bool) -> Chain:
+    """Return the chain that a model was fitted for."""
+    return Chain(
+        calibration.joints, calibration.segments, calibration.chain_sensors, left_side=left
+    )
+
+
+def fuse_trial(calibration: Calibration, table: Table, *, left: bool) -> FusedTrial:
+    """Run the daemon's fusion over the sensors of a file."""
+    chain = chain_of(calibration, left=left)
+    fuser = LimbFuser(chain, calibration)
+    columns = {name: q.tolist() for name, q in table.q.items()}
+    seen = {name: visible(q) for name, q in table.q.items()}
+    states = []
+    for k, t_s in enumerate(table.t_s.tolist()):
+        alive = {name: tuple(columns[name][k]) for name in columns if seen[name][k]}
+        t_ns = round(t_s * 1e9)
+        states.append(fuser.fuse(t_ns, t_ns, k, alive))
+    return _collected(chain, table.t_s, states)
+
+
+def _collected(chain: Chain, t_s: Array, states: list[LimbState]) -> FusedTrial:
+    nan = float("nan")
+    flags = Counter(flag for state in states for flag in state.flags)
+    inner = range(1, len(chain.joints) - 1)
+    return FusedTrial(
+        t_s,
+        {
+            name: np.array([state.segments[i].q_world_segment or _UNKNOWN for state in states])
+            for i, name in enumerate(chain.segments)
+        },
+        {
+            name: np.array([_or(state.segments[i].sd, nan) for state in states])
+            for i, name in enumerate(chain.segments)
+        },
+        {
+            chain.joints[i]: np.array(
+                [state.joints[i].angles or (nan, nan, nan) for state in states]
+            )
+            for i in inner
+        },
+        {
+            chain.joints[i]: np.array([_or(state.joints[i].angle_sd, nan) for state in states])
+            for i in inner
+        },
+        {flag: count / len(states) for flag, count in sorted(flags.items())},
+    )
+
+
+def _or(value: float | None, unknown: float) -> float:
+    return unknown if value is None else value
+
+
+def write_fused(path: Path, found: FusedTrial, table: Table, up: Axis) -> list[Path]:
+    """Write a fused trial by the ending of the name; return the files written.
+
+    ``.sto``: orientations, and joint angles in a second file ``NAME_angles.sto`` (degrees).
+    ``.npz``: as `read_orientations_npz` reads it, with ``angles_JOINT``, ``sd_SEGMENT`` (rad).
+    ``.csv``: all in one table.
+    """
+    kind = path.suffix.lower()
+    if kind == ".npz":
+        _write_npz(path, found, table)
+        return [path]
+    if kind == ".csv":
+        _write_csv(path, found)
+        return [path]
+    rate_hz = float(np.round(1.0 / np.median(np.diff(found.t_s)), 6))
+    q = np.stack(list(found.segments.values()), axis=1)
+    turned = q[..., [0, 2, 3, 1]] if up == "y" else q
+    write_orientations_sto(
+        path, OrientationTable(tuple(found.segments), found.t_s, turned, rate_hz)
+    )
+    second = path.with_name(f"{path.stem}_angles.sto")
+    columns, values = _angle_columns(found)
+    write_sto(second, TimeTable(columns, found.t_s, values, in_degrees=True, name="joint angles"))
+    return [path, second]
+
+
+def _angle_columns(found: FusedTrial) -> tuple[tuple[str, ...], Array]:
+    """Return names and degrees of all angles and standard deviations, shape (n, columns)."""
+    names, columns = [], []
+    for joint, angles in found.angles.items():
+        names += [f"{joint}_{angle}" for angle in ANGLES] + [f"{joint}_flexion_sd"]
+        columns += [*angles.T, found.angle_sd[joint]]
+    for segment, sd in found.sd.items():
+        names.append(f"{segment}_sd")
+        columns.append(sd)
+    return tuple(names), np.rad2deg(np.stack(columns, axis=1))
+
+
+def _write_npz(path: Path, found: FusedTrial, table: Table) -> None:
+    write_orientations_npz(path, OrientationTrial(found.t_s, table.q, found.segments, {}))
+    with np.load(path, allow_pickle=False) as arrays:
+        all_arrays = {name: arrays[name] for name in arrays.files}
+    all_arrays |= {f"angles_{joint}": angles for joint, angles in found.angles.items()}
+    all_arrays |= {f"sd_flexion_{joint}": sd for joint, sd in found.angle_sd.items()}
+    all_arrays |= {f"sd_{segment}": sd for segment, sd in found.sd.items()}
+    np.savez_compressed(path, allow_pickle=False, **all_arrays)
+
+
+def _write_csv(path: Path, found: FusedTrial) -> None:
+    names, degrees = _angle_columns(found)
+    quaternions = [f"{segment}_q{part}" for segment in found.segments for part in "wxyz"]
+    head = ",".join(("t_s", *quaternions, *(f"{name}_deg" for name in names)))
+    values = np.column_stack((found.t_s, *found.segments.values(), degrees))
+    rows = (",".join(f"{x:.9g}" if isfinite(x) else "" for x in row) for row in values.tolist())
+    path.write_text("\n".join((head, *rows)) + "\n", encoding="utf-8")

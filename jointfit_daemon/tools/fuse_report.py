@@ -1,0 +1,131 @@
+"""Judgements and fused limbs as text and JSON. Law: pure; degrees for people only, JSON is SI."""
+
+from __future__ import annotations
+
+from math import degrees, isfinite
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from jointfit_daemon.calibration.offline import Judged, Judgement
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.tools.fuse_output import FusedTrial
+
+BASELINE = "mean"
+_DIGITS = 2
+"""Of degrees shown; what looks alike is not called worse."""
+
+
+def judgement(found: Judgement) -> str:
+    """Return the table of all methods, and where a method is worse than the plain mean."""
+    first = found.rows[0]
+    head = (
+        "trial",
+        "frames",
+        "method",
+        *first.segments,
+        *(f"{joint} flexion" for joint in first.joints),
+    )
+    rows: list[tuple[str, ...]] = [head]
+    last = None
+    for row in found.rows:
+        lead = (row.trial, str(row.frames)) if row.trial != last else ("", "")
+        last = row.trial
+        rows.append((*lead, row.method, *map(_deg, _figures(row))))
+    lines = [f"RMS error in degrees; judged on {found.held_out}", "", aligned(rows), ""]
+    return "\n".join(lines + _verdicts(found))
+
+
+def _figures(row: Judged) -> list[float]:
+    return [*row.segments.values(), *row.joints.values()]
+
+
+def _verdicts(found: Judgement) -> list[str]:
+    """Return, for each method that learns, the columns in which it does worse than the mean."""
+    base = {row.trial: row for row in found.rows if row.method == BASELINE}
+    worse: dict[str, list[str]] = {}
+    for row in found.rows:
+        if row.method == BASELINE or row.method.startswith("single") or row.trial not in base:
+            continue
+        names = [*row.segments, *(f"{joint} flexion" for joint in row.joints)]
+        pairs = zip(names, _figures(row), _figures(base[row.trial]), strict=True)
+        lost = [n for n, mine, plain in pairs if _shown(mine) > _shown(plain)]
+        worse.setdefault(row.method, []).extend(f"{n} in {row.trial}" for n in lost)
+    return [
+        f"{method} is worse than {BASELINE}: {', '.join(lost)}"
+        if lost
+        else f"{method} is nowhere worse than {BASELINE}"
+        for method, lost in worse.items()
+    ]
+
+
+def judgement_json(found: Judgement) -> dict[str, Any]:
+    """Return the same for programs, rad."""
+    return {
+        "judged_on": found.held_out,
+        "unit": "rad",
+        "rows": [
+            {
+                "trial": row.trial,
+                "method": row.method,
+                "frames": row.frames,
+                "segments_rms": {name: _known(x) for name, x in row.segments.items()},
+                "flexion_rms": {name: _known(x) for name, x in row.joints.items()},
+            }
+            for row in found.rows
+        ],
+    }
+
+
+def fitted(calibration: Calibration, frames: int) -> str:
+    """Return what was fitted: one line a segment, notes after."""
+    rows = [("segment", "sensors", "models", "left over, deg")]
+    for i, (name, segment) in enumerate(calibration.segment.items()):
+        sensors = calibration.chain_sensors[i]
+        whole = max(segment.models, key=len, default=None)
+        left = "–" if whole is None else _deg(segment.models[whole].residual_sd)
+        rows.append((name, ", ".join(sensors), str(len(segment.models)), left))
+    lines = [f"method {calibration.method}, {frames} frames", "", aligned(rows)]
+    return "\n".join([*lines, *(f"note: {note}" for note in calibration.notes)])
+
+
+def applied(found: FusedTrial) -> str:
+    """Return how the limb was known over the trial: shares of frames by flag."""
+    count = len(found.t_s)
+    lines = [f"{count} frames, {found.t_s[-1] - found.t_s[0]:.2f} s"]
+    for name, known in found.known.items():
+        lines.append(f"{name}: known in {100 * known:.0f} % of the frames")
+    lines += [f"{flag}: {100 * share:.0f} % of the frames" for flag, share in found.flags.items()]
+    return "\n".join(lines)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows as columns; what looks like a number stands to the right."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    right = [all(_is_number(row[k]) for row in rows[1:]) for k in range(len(rows[0]))]
+
+    def line(row: Iterable[str]) -> str:
+        cells = (
+            cell.rjust(width) if to_right else cell.ljust(width)
+            for cell, width, to_right in zip(row, widths, right, strict=True)
+        )
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(map(line, rows))
+
+
+def _is_number(text: str) -> bool:
+    return text in {"", "–"} or text.replace(".", "", 1).isdigit()
+
+
+def _shown(angle: float) -> float:
+    return round(degrees(angle), _DIGITS)
+
+
+def _deg(angle: float) -> str:
+    return f"{degrees(angle):.{_DIGITS}f}" if isfinite(angle) else "–"
+
+
+def _known(value: float) -> float | None:
+    return value if isfinite(value) else None

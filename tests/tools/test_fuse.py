@@ -1,0 +1,416 @@
+"""`jointfit fuse` on files: what it judges, what it writes, and what it says of wrong files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.files.npz import (
+    OrientationTrial,
+    read_orientations_npz,
+    write_orientations_npz,
+)
+from jointfit_daemon.files.sto import (
+    OrientationTable,
+    read_orientations_sto,
+    read_sto,
+    write_orientations_sto,
+)
+from jointfit_daemon.files.trc import MarkerTrajectories, write_trc
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.tools.__main__ import app
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+N = 200
+RATE_HZ = 50.0
+LIMB = ["--segment", "thigh=A,B", "--segment", "shank=C,D", "--joints", "hip,knee,ankle"]
+MARKERS = {
+    "thigh": np.array([(0.0, 0.1, 0.3), (0.05, -0.05, 0.2), (-0.06, 0.02, 0.1)]),
+    "shank": np.array([(0.0, 0.1, -0.1), (0.05, -0.05, -0.2), (-0.06, 0.02, -0.3)]),
+}
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["fuse", *map(str, arguments)], catch_exceptions=False)
+
+
+def said(result: Any) -> str:
+    """Return what went to stderr of a refused command, on one line."""
+    assert result.exit_code == 2, result.output
+    return " ".join(result.stderr.split())
+
+
+def limb(k: int) -> tuple[Array, Array]:
+    """Return thigh and shank of movement `k`, shape (N, 4); both upright in the first frame."""
+    t = np.arange(N) / RATE_HZ
+    swing = (0.4 + 0.1 * k) * np.sin((1.0 + 0.3 * k) * t)
+    bend = -(0.5 + 0.2 * k) * (1.0 - np.cos((1.4 + 0.2 * k) * t))
+    zero = np.zeros(N)
+    thigh = rotation.exp(np.stack((swing, 0.05 * np.sin(2 * t), zero), axis=1))
+    return thigh, rotation.multiply(thigh, rotation.exp(np.stack((bend, zero, zero), axis=1)))
+
+
+def movement(k: int = 0, *, tissue: float = 0.1) -> OrientationTrial:
+    """Return a trial whose sensors ride on skin that moves with the knee."""
+    thigh, shank = limb(k)
+    rng = np.random.default_rng(k)
+    joint = rotation.log(rotation.multiply(rotation.conjugate(thigh), shank))
+    sensors = {}
+    for number, name in enumerate("ABCD"):
+        bone = thigh if name in "AB" else shank
+        skin = rotation.exp(tissue * (1 + number) / 4 * joint + 0.005 * rng.normal(size=(N, 3)))
+        mount = rotation.exp(np.array((0.3 * number, -0.2, 0.1)))
+        sensors[name] = rotation.multiply(rotation.multiply(bone, skin), rotation.conjugate(mount))
+    return OrientationTrial(np.arange(N) / RATE_HZ, sensors, {"thigh": thigh, "shank": shank}, {})
+
+
+def still() -> OrientationTrial:
+    moving = movement()
+    upright = np.tile(rotation.IDENTITY, (N, 1))
+    return OrientationTrial(
+        moving.t_s,
+        {name: np.tile(q[0], (N, 1)) for name, q in moving.sensors.items()},
+        {"thigh": upright, "shank": upright},
+        {},
+    )
+
+
+def write_trials(folder: Path) -> Path:
+    for k in range(3):
+        write_orientations_npz(folder / f"m{k}.npz", movement(k))
+    write_orientations_npz(folder / "still.npz", still())
+    return folder
+
+
+def trials(files: Path, count: int = 3) -> list[Path]:
+    return [files / f"m{k}.npz" for k in range(count)]
+
+
+def rows(result: Any) -> dict[tuple[str, str], dict[str, Any]]:
+    found = json.loads(result.stdout)["rows"]
+    return {(row["trial"], row["method"]): row for row in found}
+
+
+def test_every_method_is_judged_on_every_trial_left_out(files: Path) -> None:
+    result = run("evaluate", *trials(files), *LIMB, "--static", files / "still.npz", "--json")
+    found = rows(result)
+    methods = {method for _, method in found}
+    assert {"anchored", "patent12", "patent6", "mean", "single A+C", "single B+D"} <= methods
+    assert {trial for trial, _ in found} == {"m0", "m1", "m2"}
+    for trial in ("m0", "m1", "m2"):
+        best, mean = found[trial, "anchored"], found[trial, "mean"]
+        assert best["segments_rms"]["thigh"] < 0.5 * mean["segments_rms"]["thigh"]
+
+
+def test_a_single_trial_is_judged_on_its_end(files: Path) -> None:
+    options = ["--static", files / "still.npz", "--holdout", "0.25", "--json"]
+    result = run("evaluate", files / "m1.npz", *LIMB, *options)
+    assert json.loads(result.stdout)["judged_on"].startswith("the last 25 %")
+    assert {row["frames"] for row in rows(result).values()} == {50}
+
+
+def test_what_is_judged_was_not_fitted_to(files: Path) -> None:
+    """A trial whose reference is nonsense spoils its own row and the others' by training only."""
+    spoiled = movement(2)
+    turned = rotation.multiply(spoiled.bones["thigh"], rotation.exp(np.array((1.0, 0, 0))))
+    write_orientations_npz(
+        files / "m2.npz",
+        OrientationTrial(spoiled.t_s, spoiled.sensors, {**spoiled.bones, "thigh": turned}, {}),
+    )
+    options = [*LIMB, "--static", files / "still.npz", "--json"]
+    found = rows(run("evaluate", *trials(files), *options))
+    assert found["m2", "anchored"]["segments_rms"]["thigh"] > 0.8
+
+
+def test_the_table_names_where_a_method_is_worse_than_the_mean(files: Path) -> None:
+    result = run("evaluate", *trials(files), *LIMB, "--static", files / "still.npz")
+    assert result.exit_code == 0
+    assert "knee flexion" in result.stdout
+    assert "anchored is nowhere worse than mean" in result.stdout
+
+
+def test_the_semireal_squats_reproduce_their_published_figures(shared_data: Path) -> None:
+    folder = shared_data / "semireal_knee4imu"
+    result = run(
+        "evaluate", folder / "squats1.npz", "--segment", "thigh=S1,S2:femur_r",
+        "--segment", "shank=S3,S4:tibia_r", "--joints", "hip,knee,ankle",
+        "--static", folder / "static_bias.json", "--json",
+    )  # fmt: skip
+    found = rows(result)
+    published = {
+        "single S1+S3": (10.46, 10.39, 2.56),
+        "mean": (9.29, 9.61, 3.21),
+        "patent12": (3.45, 2.81, 2.11),
+        "patent6": (5.37, 3.83, 4.21),
+    }
+    for method, expected in published.items():
+        row = found["squats1", method]
+        figures = [*row["segments_rms"].values(), *row["flexion_rms"].values()]
+        assert np.rad2deg(figures) == pytest.approx(expected, abs=0.05), method
+
+
+@cache
+def model_text(folder: Path, method: str) -> str:
+    """Return the model of the three trials, which are the same in every folder."""
+    static = ["--static", folder / "still.npz", "--method", method]
+    result = run("fit", *trials(folder), *LIMB, *static, "--out", folder / "fit.json")
+    assert result.exit_code == 0, result.output
+    return (folder / "fit.json").read_text()
+
+
+@pytest.fixture(scope="module")
+def three_trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_trials(tmp_path_factory.mktemp("trials"))
+
+
+@pytest.fixture
+def files(three_trials: Path, tmp_path: Path) -> Path:
+    """Return a folder of one's own with the three movements and the still pose."""
+    return Path(shutil.copytree(three_trials, tmp_path / "files"))
+
+
+@pytest.fixture
+def fitted(three_trials: Path, files: Path) -> Callable[..., Path]:
+    """Return what writes a fitted model beside the trials."""
+
+    def write(method: str = "anchored") -> Path:
+        (files / "model.json").write_text(model_text(three_trials, method))
+        return files / "model.json"
+
+    return write
+
+
+def test_a_model_is_a_calibration_with_a_model_for_every_set_of_sensors(
+    files: Path, fitted: Callable[..., Path]
+) -> None:
+    calibration = Calibration.from_dict(json.loads(fitted().read_text()))
+    assert calibration.chain_sensors == (("A", "B"), ("C", "D"))
+    for segment, others in (("thigh", "CD"), ("shank", "AB")):
+        keys = set(calibration.segment[segment].models)
+        assert len(keys) == 9
+        assert {key.partition("|")[2] for key in keys} == {"", *others}
+
+
+def test_a_fitted_model_applied_is_nearer_to_the_bones_than_the_mean(
+    files: Path, fitted: Callable[..., Path]
+) -> None:
+    truth = movement(1)
+    errors = {}
+    for method in ("anchored", "mean"):
+        model = fitted(method)
+        result = run("apply", model, files / "m1.npz", "--out", files / "out.npz")
+        assert result.exit_code == 0, result.output
+        found = read_orientations_npz(files / "out.npz").bones["shank"]
+        errors[method] = float(np.mean(rotation.angle_between(found, truth.bones["shank"])))
+    assert errors["anchored"] < 0.4 * errors["mean"]
+
+
+def test_the_three_formats_say_the_same(files: Path, fitted: Callable[..., Path]) -> None:
+    model = fitted()
+    for ending in ("npz", "sto", "csv"):
+        result = run("apply", model, files / "m0.npz", "--out", files / f"out.{ending}")
+        assert result.exit_code == 0, result.output
+    with np.load(files / "out.npz", allow_pickle=False) as arrays:
+        thigh, angles, sd = arrays["q_thigh"], arrays["angles_knee"], arrays["sd_thigh"]
+    sto = read_orientations_sto(files / "out.sto")
+    assert sto.names == ("thigh", "shank")
+    assert sto.quaternions[:, 0] == pytest.approx(thigh, abs=1e-7)
+    second = read_sto(files / "out_angles.sto")
+    assert second.in_degrees
+    assert second.column("knee_flexion") == pytest.approx(np.rad2deg(angles[:, 0]), abs=1e-4)
+    with (files / "out.csv").open() as text:
+        first = next(csv.DictReader(text))
+    assert float(first["knee_flexion_deg"]) == pytest.approx(np.rad2deg(angles[0, 0]), abs=1e-6)
+    assert float(first["thigh_sd_deg"]) == pytest.approx(np.rad2deg(sd[0]), abs=1e-6)
+    assert float(first["thigh_qw"]) == pytest.approx(thigh[0, 0], abs=1e-8)
+
+
+def test_a_bent_knee_is_positive_flexion(files: Path, fitted: Callable[..., Path]) -> None:
+    run("apply", fitted(), files / "m2.npz", "--out", files / "out.npz")
+    with np.load(files / "out.npz", allow_pickle=False) as arrays:
+        assert np.rad2deg(arrays["angles_knee"][:, 0].max()) > 60.0
+
+
+def test_a_sensor_that_is_missing_is_told_and_fused_around(
+    files: Path, fitted: Callable[..., Path]
+) -> None:
+    trial = movement(0)
+    trial.sensors["B"][50:100] = np.nan
+    write_orientations_npz(files / "gap.npz", trial)
+    result = run("apply", fitted(), files / "gap.npz", "--out", files / "out.npz")
+    assert "one_sensor:thigh: 25 %" in result.stdout
+    assert "thigh: known in 100 %" in result.stdout
+
+
+def as_sto(path: Path, trial: OrientationTrial, *, bones: bool, up: str = "z") -> None:
+    """Write sensors, or bones, as OpenSim would."""
+    columns = trial.bones if bones else trial.sensors
+    q = np.stack(list(columns.values()), axis=1)
+    q = q[..., [0, 2, 3, 1]] if up == "y" else q
+    write_orientations_sto(path, OrientationTable(tuple(columns), trial.t_s, q, RATE_HZ))
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_orientations_and_their_reference_may_be_two_sto_files(files: Path, up: str) -> None:
+    for name, trial in (("m0", movement(0)), ("m1", movement(1)), ("still", still())):
+        as_sto(files / f"{name}.sto", trial, bones=False, up=up)
+        as_sto(files / f"{name}_ref.sto", trial, bones=True, up=up)
+    pairs = [f"{files}/{name}.sto={files}/{name}_ref.sto" for name in ("m0", "m1", "still")]
+    result = run("evaluate", *pairs[:2], *LIMB, "--static", pairs[2], "--up", up, "--json")
+    direct = run("evaluate", *trials(files, 2), *LIMB, "--static", files / "still.npz", "--json")
+    for key, row in rows(direct).items():
+        assert rows(result)[key]["segments_rms"] == pytest.approx(row["segments_rms"], abs=1e-5)
+
+
+def as_trc(path: Path, trial: OrientationTrial, rate_hz: float = 100.0) -> None:
+    """Write markers on the bones, sampled at another rate, y up."""
+    t_s = np.arange(0.0, trial.t_s[-1], 1.0 / rate_hz)
+    names, positions = [], []
+    for segment, places in MARKERS.items():
+        at = np.clip(np.searchsorted(trial.t_s, t_s, side="right") - 1, 0, N - 2)
+        q = trial.bones[segment]
+        share = (t_s - trial.t_s[at]) * RATE_HZ
+        q = rotation.interpolate(q[at], q[at + 1], share)
+        names += [f"{segment}{k}" for k in range(3)]
+        moved = rotation.rotate(q[:, None], places) + np.array((1.0, 2.0, 1.0))
+        positions.append(moved[..., [1, 2, 0]])  # z up to y up: (x, y, z) was (z, x, y)
+    frames = np.arange(1, len(t_s) + 1)
+    seen = np.concatenate(positions, axis=1)
+    write_trc(path, MarkerTrajectories(tuple(names), t_s, frames, seen, rate_hz))
+
+
+def test_markers_at_another_rate_serve_as_the_reference(files: Path) -> None:
+    for name, trial in (("m0", movement(0)), ("m1", movement(1)), ("still", still())):
+        as_trc(files / f"{name}.trc", trial)
+    pairs = [f"{files}/{name}.npz={files}/{name}.trc" for name in ("m0", "m1", "still")]
+    names = [
+        option
+        for segment in MARKERS
+        for option in ("--markers", f"{segment}=" + ",".join(f"{segment}{k}" for k in range(3)))
+    ]
+    result = run("evaluate", *pairs[:2], *LIMB, *names, "--static", pairs[2], "--json")
+    assert result.exit_code == 0, result.output
+    direct = run("evaluate", *trials(files, 2), *LIMB, "--static", files / "still.npz", "--json")
+    for key, row in rows(direct).items():
+        assert rows(result)[key]["segments_rms"] == pytest.approx(row["segments_rms"], abs=2e-3)
+
+
+def test_markers_without_a_still_trial_are_refused_with_the_remedy(files: Path) -> None:
+    as_trc(files / "m0.trc", movement())
+    text = said(run("evaluate", f"{files}/m0.npz={files}/m0.trc", *LIMB))
+    assert "--static SENSORS=MARKERS" in text
+
+
+def test_the_same_without_a_static_pose_says_what_that_means(files: Path) -> None:
+    result = run("evaluate", *trials(files), *LIMB)
+    assert result.exit_code == 0
+    assert "hold for this wearing only" in result.stderr
+
+
+def test_a_plot_is_written(files: Path) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    static = ["--static", files / "still.npz", "--plot", files / "plot.png"]
+    arguments = ["fuse", "evaluate", files / "m0.npz", *LIMB, *static]
+    subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+        [sys.executable, "-m", "jointfit_daemon.tools", *map(str, arguments)],
+        check=True,
+        timeout=25,
+    )
+    assert (files / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+WRONG = {
+    "sensor": (["--segment", "thigh=A,Bb", "--segment", "shank=C,D"], "did you mean 'B'?"),
+    "bone": (["--segment", "thigh=A,B:tigh", "--segment", "shank=C,D"], "did you mean 'thigh'?"),
+    "no sensors": (["--segment", "thigh"], "expected NAME=SENSOR,SENSOR"),
+    "twice": (["--segment", "thigh=A,B", "--segment", "shank=A,D"], "A is named more than once"),
+    "joints": ([*LIMB[:4], "--joints", "hip,knee"], "expected 3 names, one more than segments"),
+    "axis": ([*LIMB, "--up", "x"], "expected y or z"),
+    "markers": ([*LIMB, "--markers", "tigh=a,b,c"], "did you mean 'thigh'?"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_names_are_told_with_the_nearest_right_one(files: Path, case: str) -> None:
+    options, expected = WRONG[case]
+    assert expected in said(run("evaluate", files / "m0.npz", *options))
+
+
+def rewritten(files: Path, **arrays: Any) -> Path:
+    with np.load(files / "m0.npz", allow_pickle=False) as found:
+        held = {name: found[name] for name in found.files}
+    held |= {name: change(held[name]) for name, change in arrays.items()}
+    np.savez(files / "odd.npz", **held)
+    return files / "odd.npz"
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"A_quat": lambda q: 57.3 * q}, "not angles in degrees"),
+        ({"q_shank": lambda q: 0.01 * q}, "q_shank: its four numbers have norm 0.01"),
+        ({"t": lambda t: 1000.0 * t}, "are they milliseconds"),
+        ({"t": lambda t: t[::-1]}, "whose times grow"),
+    ],
+)
+def test_other_units_are_refused_with_what_they_look_like(
+    files: Path, change: dict[str, Any], expected: str
+) -> None:
+    assert expected in said(run("evaluate", rewritten(files, **change), *LIMB))
+
+
+def test_clocks_that_do_not_meet_are_told_with_both_spans(files: Path) -> None:
+    late = movement()
+    shifted = OrientationTrial(late.t_s + 1000.0, late.sensors, late.bones, {})
+    write_orientations_npz(files / "late.npz", shifted)
+    text = said(run("evaluate", f"{files}/m0.npz={files}/late.npz", *LIMB))
+    assert "reference 1000.00 to 1003.98 s" in text
+
+
+def test_a_sensor_world_that_is_turned_is_pointed_out(files: Path) -> None:
+    found = []
+    for k in range(2):
+        trial = movement(k, tissue=0.0)
+        about_y = rotation.exp(np.array((0.0, 0.8, 0.0))[None] * np.sin(np.arange(N) / 20)[:, None])
+        turn = rotation.heading(1.2)
+        sensors = {name: rotation.multiply(about_y, q) for name, q in trial.sensors.items()}
+        sensors["A"] = rotation.multiply(turn, sensors["A"])
+        bones = {name: rotation.multiply(about_y, q) for name, q in trial.bones.items()}
+        write_orientations_npz(files / f"t{k}.npz", OrientationTrial(trial.t_s, sensors, bones, {}))
+        found.append(files / f"t{k}.npz")
+    result = run("evaluate", *found, *LIMB, "--static", files / "still.npz")
+    assert "A: its world seems turned by -69° about the vertical" in result.stderr
+
+
+def test_an_unknown_method_is_told_with_the_nearest(files: Path) -> None:
+    options = ["--static", files / "still.npz", "--out", files / "x.json", "--method", "anchord"]
+    assert "did you mean 'anchored'?" in said(run("fit", *trials(files), *LIMB, *options))
+
+
+def test_what_is_no_model_and_what_is_no_format_are_told(
+    files: Path, fitted: Callable[..., Path]
+) -> None:
+    (files / "no.json").write_text("{}")
+    out = ["--out", files / "o.csv"]
+    assert "not a model that" in said(run("apply", files / "no.json", files / "m0.npz", *out))
+    model = fitted()
+    text = said(run("apply", model, files / "m0.npz", "--out", files / "o.txt"))
+    assert "ends in .sto, .npz or .csv" in text
+    assert "No such file" in said(run("apply", model, files / "none.npz", *out))
