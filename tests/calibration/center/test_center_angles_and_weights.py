@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,18 +19,18 @@ WIDE = Limits(0.0, (0.0, inf), 0.0, inf)
 values = st.one_of(st.floats(-1.0, 1.0), st.just(nan), st.just(0.0))
 
 
-def arc(degrees, n=100, seed=0, at=0.0, noise=0.002):
+def arc(degrees: Any, n: int = 100, seed: int = 0, at: Any = 0.0, noise: float = 0.002) -> Any:
     rng = np.random.default_rng(seed)
     t = np.linspace(-0.5, 0.5, n) * np.deg2rad(degrees)
     p = 0.3 * np.stack((np.cos(t + at), np.sin(t + at)), axis=-1)
     return p + rng.normal(0.0, noise, p.shape), t
 
 
-def rms(centers):
+def rms(centers: Any) -> Any:
     return float(np.sqrt((np.array(centers) ** 2).sum(axis=1).mean()))
 
 
-def test_angles_halve_the_error_of_a_short_arc():
+def test_angles_halve_the_error_of_a_short_arc() -> None:
     rng, aided, alone = np.random.default_rng(0), [], []
     for seed in range(60):
         p, t = arc(20.0, seed=seed)
@@ -39,7 +40,7 @@ def test_angles_halve_the_error_of_a_short_arc():
     assert rms(aided) < 0.65 * rms(alone)
 
 
-def test_angles_of_another_limb_do_little_harm():
+def test_angles_of_another_limb_do_little_harm() -> None:
     aided, alone, flagged = [], [], 0
     for seed in range(60):
         p, t = arc(60.0, seed=seed)
@@ -53,7 +54,7 @@ def test_angles_of_another_limb_do_little_harm():
 
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 @settings(max_examples=40, deadline=None)
-def test_an_answer_never_leaves_the_circle_by_more_than_its_guard_allows(x, y):
+def test_an_answer_never_leaves_the_circle_by_more_than_its_guard_allows(x: Any, y: Any) -> None:
     circle = fit_circles(arc(90.0)[0])
     held, covariance, _ = guarded(np.array([x, y]), circle.covariance * 0.1, circle)
     away = held - circle.center
@@ -62,14 +63,14 @@ def test_an_answer_never_leaves_the_circle_by_more_than_its_guard_allows(x, y):
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
 
 
-def test_more_frames_than_needed_are_averaged():
+def test_more_frames_than_needed_are_averaged() -> None:
     p, t = arc(60.0, n=1500)
     found = oriented_estimate(p, t, 0.01)
     assert found.refused is None
     assert np.linalg.norm(found.center) < 0.005
 
 
-def test_a_place_that_is_known_pulls():
+def test_a_place_that_is_known_pulls() -> None:
     p, t = arc(20.0, seed=3)
     near = (np.zeros(2), 0.005)
     found = oriented_estimate(p, t, 0.02, near=near, limits=WIDE)
@@ -78,7 +79,7 @@ def test_a_place_that_is_known_pulls():
     assert found.sd < far.sd
 
 
-def test_what_the_angles_may_be_wrong_by_is_the_callers():
+def test_what_the_angles_may_be_wrong_by_is_the_callers() -> None:
     p, t = arc(30.0, seed=1)
     t = t + 0.05 * np.random.default_rng(0).normal(size=100)
     sure = oriented_estimate(p, t, 0.02, noise=AngleNoise(0.001, 1.0, 0.06, 0.001), limits=WIDE)
@@ -95,7 +96,7 @@ def test_what_the_angles_may_be_wrong_by_is_the_callers():
         (arc(60.0)[0], np.full(100, nan), "0 frames"),
     ],
 )
-def test_angles_without_a_movement_are_refused(points, angles, cause):
+def test_angles_without_a_movement_are_refused(points: Any, angles: Any, cause: Any) -> None:
     found = oriented_estimate(points, angles, 0.01)
     assert found.refused is not None
     assert cause in found.refused
@@ -106,7 +107,7 @@ def test_angles_without_a_movement_are_refused(points, angles, cause):
     st.lists(st.tuples(values, values, st.floats(-4.0, 4.0)), max_size=30),
 )
 @settings(deadline=None, max_examples=60)
-def test_any_input_gives_a_finite_center_or_a_reason(rows):
+def test_any_input_gives_a_finite_center_or_a_reason(rows: Any) -> None:
     data = np.reshape(rows, (-1, 3))
     aided = oriented_estimate(data[:, :2], data[:, 2], 0.01)
     for found in (aided, geometric_estimate(data[:, :2])):
@@ -116,7 +117,7 @@ def test_any_input_gives_a_finite_center_or_a_reason(rows):
             assert ":" in found.refused or ";" in found.refused
 
 
-def test_least_distance_is_hyper_on_clean_points_and_bears_outliers():
+def test_least_distance_is_hyper_on_clean_points_and_bears_outliers() -> None:
     p, _ = arc(90.0)
     plain = circle_estimate(p)
     found = geometric_estimate(p, robust=False)
@@ -127,7 +128,7 @@ def test_least_distance_is_hyper_on_clean_points_and_bears_outliers():
     assert np.linalg.norm(circle_estimate(p).center) > 0.01
 
 
-def test_a_known_radius_makes_a_short_arc_enough():
+def test_a_known_radius_makes_a_short_arc_enough() -> None:
     p, _ = arc(15.0, seed=2)
     found = geometric_estimate(p, radii=[0.3], robust=False, start=(0.02, 0.0))
     assert np.linalg.norm(found.center) < 0.008
@@ -135,7 +136,7 @@ def test_a_known_radius_makes_a_short_arc_enough():
     assert found.refused is None
 
 
-def test_markers_round_the_joint_share_their_center():
+def test_markers_round_the_joint_share_their_center() -> None:
     each = [arc(20.0, seed=k, at=a)[0] for k, a in enumerate((0.0, 0.25, -0.3, 0.6))]
     together = geometric_estimate(np.stack(each, axis=1), robust=False)
     joined, C = combine([circle_estimate(p, limits=WIDE) for p in each])
@@ -144,6 +145,6 @@ def test_markers_round_the_joint_share_their_center():
     assert np.sqrt(np.trace(C)) == pytest.approx(together.sd, rel=0.3)
 
 
-def test_nothing_cannot_be_combined():
+def test_nothing_cannot_be_combined() -> None:
     with pytest.raises(ValueError, match="nothing"):
         combine([circle_estimate(np.ones((9, 2)))])

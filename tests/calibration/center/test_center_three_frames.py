@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,19 +42,21 @@ numbers = st.floats(-10.0, 10.0)
 anything = st.floats(allow_nan=True, allow_infinity=True)
 
 
-def on_circle(angles, radius=0.3, center=(0.0, 0.0)):
+def on_circle(angles: Any, radius: Any = 0.3, center: tuple[float, float] = (0.0, 0.0)) -> Any:
     t = np.asarray(angles)
     return np.asarray(center) + radius * np.stack((np.cos(t), np.sin(t)), axis=-1)
 
 
 @given(numbers, numbers, st.floats(0.02, 1.0), st.floats(0.0, 6.0), st.floats(0.3, 2.0))
-def test_three_points_of_a_circle_give_its_center(x, y, radius, first, step):
+def test_three_points_of_a_circle_give_its_center(
+    x: Any, y: Any, radius: Any, first: Any, step: Any
+) -> None:
     points = on_circle([first, first + step, first + 2 * step], radius, (x, y))
     assert np.abs(three_frame_center(points) - (x, y)).max() < 1e-11
 
 
 @given(st.lists(anything, min_size=6, max_size=6))
-def test_any_three_points_give_a_center_or_a_reason_never_silent_nan(values):
+def test_any_three_points_give_a_center_or_a_reason_never_silent_nan(values: Any) -> None:
     with np.errstate(all="ignore"):
         found = three_frame_estimate(np.reshape(values, (3, 2)), 0.001)
     assert np.isfinite(found.center).all()
@@ -63,7 +66,7 @@ def test_any_three_points_give_a_center_or_a_reason_never_silent_nan(values):
 
 
 @pytest.mark.parametrize("points", [[[0, 0], [1, 1], [2, 2]], [[0, 0], [0, 0], [1, 0]]])
-def test_points_on_a_line_are_infinitely_far_and_refused(points):
+def test_points_on_a_line_are_infinitely_far_and_refused(points: Any) -> None:
     assert (three_frame_center(points) == inf).all()
     found = three_frame_estimate(points, 0.001)
     assert found.refused is not None
@@ -71,14 +74,14 @@ def test_points_on_a_line_are_infinitely_far_and_refused(points):
     assert found.sd == inf
 
 
-def test_an_arc_that_noise_hides_is_refused():
+def test_an_arc_that_noise_hides_is_refused() -> None:
     found = three_frame_estimate(on_circle(np.deg2rad([0, 5, 10])), 0.001)
     assert found.refused is not None
     assert "noise" in found.refused
     assert three_frame_estimate(on_circle(np.deg2rad([0, 60, 120])), 0.001).refused is None
 
 
-def test_the_three_forms_of_the_predicted_error_are_one():
+def test_the_three_forms_of_the_predicted_error_are_one() -> None:
     t = np.array([0.2, 0.9, 1.7])
     expected = circle_rms_bound(t, 0.001)
     assert arbitrary_error(t, 0.001) == pytest.approx(expected, rel=1e-12)
@@ -91,21 +94,21 @@ def test_the_three_forms_of_the_predicted_error_are_one():
 @pytest.mark.parametrize(
     ("step", "factor"), [(5, 322), (10, 80.7), (30, 9.25), (60, 2.58), (90, 1.414), (120, 1.155)]
 )
-def test_equal_steps_have_the_known_errors(step, factor):
+def test_equal_steps_have_the_known_errors(step: Any, factor: Any) -> None:
     found = float(equal_step_error(np.deg2rad(step), 1.0))
     assert found == pytest.approx(factor, rel=2e-3)
     angles = np.deg2rad(step) * np.arange(3)
     assert found == pytest.approx(float(arbitrary_error(angles, 1.0)), rel=1e-12)
 
 
-def test_no_turn_and_half_turns_show_nothing():
+def test_no_turn_and_half_turns_show_nothing() -> None:
     assert equal_step_error(0.0, 0.001) == inf
     assert equal_step_error(np.pi, 0.001) == inf
     assert arbitrary_error([0.0, 0.0, 1.0], 0.001) == inf
     assert triangle_error([[0, 0], [1, 1], [2, 2]], 0.001) == inf
 
 
-def test_noise_that_differs_between_axes_is_told_per_axis():
+def test_noise_that_differs_between_axes_is_told_per_axis() -> None:
     rng = np.random.default_rng(0)
     t = np.array([0.0, 1.2, 2.0])
     noisy = on_circle(t) + rng.normal(size=(100_000, 3, 2)) * (0.001, 0.0003)
@@ -113,18 +116,18 @@ def test_noise_that_differs_between_axes_is_told_per_axis():
     assert rms == pytest.approx(np.ravel(component_errors(t, 0.001, 0.0003)), rel=0.02)
 
 
-def test_the_needed_step_reaches_the_target():
+def test_the_needed_step_reaches_the_target() -> None:
     step = needed_step(0.001, 0.006)
     assert np.rad2deg(step) == pytest.approx(38, abs=1)
     assert float(equal_step_error(step, 0.001)) == pytest.approx(0.006)
     assert needed_step(0.01, 0.01) == inf
 
 
-def test_a_chain_is_found_joint_by_joint_in_its_parents_coordinates():
+def test_a_chain_is_found_joint_by_joint_in_its_parents_coordinates() -> None:
     n, rng = 200, np.random.default_rng(2)
     hip, knee = 0.4 * np.sin(np.linspace(0, 3, n)), np.linspace(0.1, 1.9, n)
 
-    def turn(angle, at):
+    def turn(angle: Any, at: Any) -> Any:
         c, s = np.cos(angle), np.sin(angle)
         return np.stack((c * at[0] - s * at[1], s * at[0] + c * at[1]), axis=-1)
 
@@ -141,7 +144,7 @@ def test_a_chain_is_found_joint_by_joint_in_its_parents_coordinates():
     assert [f.refused for f in found] == [None, None]
 
 
-def test_a_parent_whose_markers_meet_has_no_plane_of_its_own():
+def test_a_parent_whose_markers_meet_has_no_plane_of_its_own() -> None:
     here = np.zeros((1, 2))
     assert np.isnan(in_segment_plane(here, here, np.ones((1, 2)))).all()
     with pytest.raises(ValueError, match="axis"):
@@ -149,7 +152,7 @@ def test_a_parent_whose_markers_meet_has_no_plane_of_its_own():
 
 
 @given(st.tuples(numbers, numbers, numbers).filter(lambda a: np.linalg.norm(a) > 0.1))
-def test_a_plane_is_across_its_axis_and_right_handed(axis):
+def test_a_plane_is_across_its_axis_and_right_handed(axis: Any) -> None:
     first, second = plane_of(axis).T
     n = np.array(axis) / np.linalg.norm(axis)
     assert np.cross(first, second) == pytest.approx(n, abs=1e-12)
@@ -157,7 +160,7 @@ def test_a_plane_is_across_its_axis_and_right_handed(axis):
     assert plane_of((1, 0, 0)) == pytest.approx(np.eye(3)[:, 1:])
 
 
-def test_the_parents_noise_is_turned_by_the_lever():
+def test_the_parents_noise_is_turned_by_the_lever() -> None:
     rng = np.random.default_rng(1)
     n, noise, apart, at = 100_000, 0.001, 0.2, np.array([0.05, 0.3])
     p, q, m = (v + rng.normal(0, noise, (n, 2)) for v in ((-apart / 2, 0), (apart / 2, 0), at))
@@ -167,7 +170,7 @@ def test_the_parents_noise_is_turned_by_the_lever():
     assert sideways == pytest.approx(np.sqrt(expected[0, 0]))
 
 
-def test_a_grid_finds_the_node_an_arc_is_round_about():
+def test_a_grid_finds_the_node_an_arc_is_round_about() -> None:
     grid = Grid((0.0, 0.0), 0.05, 0.01)
     points = on_circle(np.linspace(0, 4, 30), 0.2, (0.02, -0.03))
     assert grid_center(points, grid) == pytest.approx([0.02, -0.03])
@@ -179,7 +182,7 @@ def test_a_grid_finds_the_node_an_arc_is_round_about():
 @pytest.mark.parametrize(
     ("arc", "free", "known"), [(10, 86.4, 1.97), (45, 4.34, 0.455), (90, 1.14, 0.258)]
 )
-def test_bounds_of_even_arcs_are_the_known_ones(arc, free, known):
+def test_bounds_of_even_arcs_are_the_known_ones(arc: float, free: Any, known: Any) -> None:
     phi, n = np.deg2rad(arc), 20_000
     middles = (np.arange(n) + 0.5) / n * phi
     scale = np.sqrt(n / 100)
@@ -193,7 +196,7 @@ def test_bounds_of_even_arcs_are_the_known_ones(arc, free, known):
     assert uniform_arc_rms(1e-3, 100, 1.0) == pytest.approx(26.8 / 10 / 1e-6, rel=2e-3)
 
 
-def test_known_angles_leave_the_mean_to_be_found():
+def test_known_angles_leave_the_mean_to_be_found() -> None:
     t = np.linspace(-0.5, 0.5, 101) * np.deg2rad(30)
     z = np.exp(1j * t)
     expected = np.sqrt(2 / (101 * (1 - abs(z.mean()) ** 2)))
@@ -201,7 +204,7 @@ def test_known_angles_leave_the_mean_to_be_found():
 
 
 @pytest.mark.parametrize("angles", [[], [0.3], [0.3, 0.3, 0.3], [0.0, np.pi]])
-def test_what_shows_no_center_has_an_infinite_bound(angles):
+def test_what_shows_no_center_has_an_infinite_bound(angles: Any) -> None:
     assert circle_rms_bound(angles, 0.001) == inf
     assert np.isinf(np.diag(circle_bound(angles, 0.001))).all()
     assert oriented_rms_bound(angles[:1], 0.001) == inf
