@@ -47,7 +47,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--deb", type=Path, help="the package (default: built now)")
     parser.add_argument("--image", type=Path, help="the disk (default: this week's, see vm_image)")
-    parser.add_argument("--time-limit", type=float, default=300.0, help="seconds, whole run")
+    parser.add_argument("--time-limit", type=float, default=600.0, help="seconds, whole run")
     parser.add_argument("--memory", default="768M", help="memory of the guest")
     parser.add_argument("--out", type=Path, help="folder for logs and junit.xml")
     parser.add_argument("tests", nargs="*", help="pytest arguments for tests/vm_service")

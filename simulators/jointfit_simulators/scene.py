@@ -107,11 +107,8 @@ class Scene:
             self._tickers[name].ask(fault, now_ns)
         for stream in self._hardware.streams.values():
             stream.told = told
-        self._server: NatNetServer | None = None
-        if options.mocap:
-            self._server = optical_server(
-                knobs, subject.clusters, cameras.bodies, ticker, ptp=options.ptp
-            )
+        serve = optical_server if options.mocap else _no_server
+        self._server = serve(knobs, subject.clusters, cameras.bodies, ticker, ptp=options.ptp)
         self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
         self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
@@ -301,6 +298,10 @@ class Scene:
             "refused": {n: s.refused for n, s in streams.items()},
             "unheard": {n: s.unheard for n, s in streams.items()},
         }
+
+
+def _no_server(*_: object, ptp: bool) -> NatNetServer | None:  # noqa: ARG001 - as the other
+    return None
 
 
 def _check_clocks(asked: Mapping[str, ClockFault], known: tuple[str, ...]) -> None:

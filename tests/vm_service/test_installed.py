@@ -40,6 +40,7 @@ def complaints_of_udev() -> str:
     run("udevadm", "control", "--reload")
     run("udevadm", "trigger", "--subsystem-match=tty")
     run("udevadm", "settle", "--timeout=60")
+    run("journalctl", "--sync")
     return journal(since, UDEV)
 
 
