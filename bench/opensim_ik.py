@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.model_joints import quiet
+from jointfit_daemon.calibration.marker_refinement.block import Carriers
+from jointfit_daemon.files.osim import to_y_up
 from jointfit_daemon.files.sto import read_sto
 from jointfit_daemon.files.trc import MarkerTrajectories, read_trc, write_trc
 
@@ -25,21 +27,23 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+
+_ACCURACY = 1e-5
+"""InverseKinematicsTool's own default."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """How well a model followed a trial."""
 
     frame_rms: NDArray[np.float64]
-    """RMS over the markers of every frame, m."""
+    """RMS over the markers seen in every frame, m."""
+    rms: float
+    """Over all frames, m."""
     coordinates: NDArray[np.float64]
     """Joint angles of every frame, rad (translations, m), shape (frames, coordinates)."""
     seconds: float
-
-    @property
-    def rms(self) -> float:
-        """RMS over all frames, m."""
-        return float(np.sqrt(np.mean(self.frame_rms**2)))
 
     @property
     def variance(self) -> float:
@@ -70,17 +74,15 @@ def shared_markers(model: Path, trial: Path, leave_out: Sequence[str] = ()) -> t
     return tuple(m.getName() for m in loaded.getMarkerSet() if m.getName() in in_trial)
 
 
-def judge(
-    model: Path, trial: MarkerTrajectories, places: Mapping[str, NDArray[np.float64]] | None = None
-) -> Verdict:
+def judge(model: Path, trial: MarkerTrajectories, refined: ChainModel | None = None) -> Verdict:
     """Run InverseKinematicsTool, unit weights, on the markers of a trial.
 
     Parameters
     ----------
     model
         An .osim file, left as it is.
-    places
-        Where markers are on their bodies, m, by name; the model's own where not given.
+    refined
+        Where markers are on their bodies; the model's own if None.
     """
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
@@ -88,7 +90,9 @@ def judge(
     with tempfile.TemporaryDirectory() as name, quiet():
         folder = Path(name)
         loaded = without_forces(model)
-        place(loaded, places or {})
+        if refined is not None:
+            places = dict(zip(refined.marker_names, to_y_up(refined.positions), strict=True))
+            place(loaded, places, [m.segment for m in refined.markers])
         loaded.finalizeConnections()
         loaded.printToXML(os.fspath(folder / "model.osim"))
         write_trc(folder / "trial.trc", trial)
@@ -113,7 +117,10 @@ def judge(
         errors = read_sto(next(folder.glob("*ik_marker_errors.sto")))
         motion = read_sto(folder / "ik.mot")
     turns = np.radians(motion.values) if motion.in_degrees else motion.values
-    return Verdict(errors.values[:, errors.columns.index("marker_error_RMS")], turns, seconds)
+    total = errors.values[:, errors.columns.index("total_squared_error")]
+    seen = np.isfinite(trial.positions).all(axis=-1).sum(axis=1)
+    rms = float(np.sqrt(total.sum() / seen.sum()))
+    return Verdict(np.sqrt(total / seen), rms, turns, seconds)
 
 
 def without_forces(model: Path) -> Any:
@@ -126,10 +133,79 @@ def without_forces(model: Path) -> Any:
     return loaded
 
 
-def place(model: Any, places: Mapping[str, NDArray[np.float64]]) -> None:
-    """Move markers of a loaded model on their bodies."""
+def place(
+    model: Any, places: Mapping[str, NDArray[np.float64]], bodies: Sequence[str] | None = None
+) -> None:
+    """Move markers of a loaded model on their bodies, or onto these."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     markers = model.updMarkerSet()
-    for name, at in places.items():
-        markers.get(name).set_location(opensim.Vec3(*map(float, at)))
+    for i, (name, at) in enumerate(places.items()):
+        marker = markers.get(name)
+        marker.set_location(opensim.Vec3(*map(float, at)))
+        if bodies is not None:
+            marker.setParentFrame(model.getBodySet().get(bodies[i]))
+
+
+class OpenSimFollower:
+    """A model of OpenSim that follows a trial again and again, its markers elsewhere each time.
+
+    Positions and poses are in our axes: z up, bodies turned alike.
+    """
+
+    def __init__(self, model: Path, trial: MarkerTrajectories, segments: Sequence[str]) -> None:
+        import opensim  # noqa: PLC0415 - optional, and slow to import
+
+        opensim.Logger.setLevelString("off")
+        self._opensim: Any = opensim
+        self._model = without_forces(model)
+        self._trial = trial
+        self._segments = tuple(segments)
+        self._folder = tempfile.TemporaryDirectory()
+        path = Path(self._folder.name) / "trial.trc"
+        write_trc(path, trial)
+        self._measured = opensim.MarkersReference(os.fspath(path), opensim.SetMarkerWeights())
+        self.runs = 0
+
+    def __call__(self, positions: NDArray[np.float64], _weights: Any = None) -> Carriers:
+        """Return where the markers' segments are in every frame."""
+        poses, _ = self._run(positions)
+        at = [sorted(set(self._segments)).index(s) for s in self._segments]
+        turned = poses[:, at][:, :, [2, 0, 1]]  # y up to z up, rows and columns
+        return Carriers(turned[..., [2, 0, 1]], turned[..., 3])
+
+    def tracking_error(self, positions: NDArray[np.float64]) -> float:
+        """Return the RMS distance after inverse kinematics, m."""
+        return float(np.sqrt(self._run(positions, poses=False)[1].mean()))
+
+    def _run(
+        self, positions: NDArray[np.float64], *, poses: bool = True
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return body poses, shape (T, B, 3, 4), and squared errors of what is seen, m²."""
+        opensim, model = self._opensim, self._model
+        self.runs += 1
+        place(model, dict(zip(self._trial.names, to_y_up(positions), strict=True)), self._segments)
+        state = model.initSystem()
+        solver = opensim.InverseKinematicsSolver(
+            model, self._measured, opensim.SimTKArrayCoordinateReference()
+        )
+        solver.setAccuracy(_ACCURACY)
+        found: list[list[list[list[float]]]] = []
+        squared: list[float] = []
+        bodies = [model.getBodySet().get(name) for name in sorted(set(self._segments))]
+        errors = opensim.SimTKArrayDouble()
+        for frame, t in enumerate(self._trial.t_s):
+            state.setTime(float(t))
+            (solver.track if frame else solver.assemble)(state)
+            solver.computeCurrentSquaredMarkerErrors(errors)
+            row = (errors.getElt(i) for i in range(errors.size()))
+            squared += [value for value in row if np.isfinite(value)]
+            if poses:
+                model.realizePosition(state)
+                found.append([_pose(body.getTransformInGround(state)) for body in bodies])
+        return np.array(found), np.array(squared)
+
+
+def _pose(transform: Any) -> list[list[float]]:
+    turn, at = transform.R(), transform.p()
+    return [[*(turn.get(i, j) for j in range(3)), at.get(i)] for i in range(3)]

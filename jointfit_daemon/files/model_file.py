@@ -100,13 +100,13 @@ def _marker_data(m: Marker) -> dict[str, Any]:
 
 
 def _segment(data: dict[str, Any]) -> Segment:
-    given = {
+    given: dict[str, Any] = {
         key: tuple(float(x) for x in data[key])
         for key in ("center_in_parent", "center", "axis", "rest", "limits")
         if key in data
     }
     kind = data.get("joint", "ball" if "parent" in data else "free")
-    return Segment(data["name"], data.get("parent"), Joint(kind, **given))  # type: ignore[arg-type]
+    return Segment(data["name"], data.get("parent"), Joint(kind, **given))
 
 
 def _marker(data: dict[str, Any]) -> Marker:

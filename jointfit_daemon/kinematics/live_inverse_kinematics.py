@@ -1,7 +1,8 @@
 r"""Inverse kinematics one instant at a time, with the covariance of each pose.
 
-Law: an instant begins where the last one ended and takes a few safeguarded Gauss-Newton steps; if
-its markers are then still far off, it begins anew from the markers alone. The covariance of a pose,
+Law: an instant begins where the last one would have been led by its own motion and takes one or a
+few safeguarded Gauss-Newton steps; if its markers are then still far off, it begins anew from the
+markers alone. The covariance of a pose,
 in the columns of a step, is
 
 .. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
@@ -12,7 +13,7 @@ markers leave open is held to the last instant, and :math:`\Sigma` is wide there
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
 
 _TRIES = 6
+_LAST_STEP = 3e-3
+"""rad, m: what a step below it leaves is below what markers can tell."""
 _DAMPING = 1e-2
 _RIDGE = 1e-9
 _ROUNDING = 1e-9
@@ -44,7 +47,7 @@ class LiveOptions:
     """How to follow; the defaults are for markers on skin at 100 Hz."""
 
     steps: int = 2
-    """Steps an instant, at least one; two are within a thousandth of the least error at 100 Hz."""
+    """Steps an instant at most; two are within a thousandth of the least error at 100 Hz."""
     huber_m: float | None = None
     """Errors beyond weigh as c/|e|, m; None: plain least squares."""
     hold_m2: float = 1e-4
@@ -95,6 +98,7 @@ class LiveInverseKinematics:
         weighing = model.weights[model.weights > 0.0]
         self._typical = float(np.median(weighing)) if weighing.size else 1.0
         self._fed = 0
+        self._lead = np.zeros(model.nq)
 
     def feed(self, markers: ArrayLike) -> LivePose:
         """Return the pose of the next instant.
@@ -117,20 +121,23 @@ class LiveInverseKinematics:
         seen: NDArray[np.bool_] = np.asarray(np.isfinite(given).all(axis=-1))
         measured = self._slots.filled_vectors(np.where(seen[:, None], given, 0.0)[None])
         weights = self._slots.filled((self._model.weights * seen)[None])
-        restarted = self._state is None
-        state = self._anew(given) if self._state is None else self._state
-        if seen.any():
-            step = self._follow(state, measured, weights)
-            if not restarted and self._is_lost(step):
-                again = self._follow(self._anew(given), measured, weights)
-                restarted = again.cost < step.cost
-                step = again if restarted else step
-        else:
-            at = fit(self._slots, state.rotations, state.origins, measured, weights)
-            step = _Step(state, at, np.eye(self._model.nq), 0.0, is_open=True)
+        place, restarted = self._found(given, measured, weights)
         self._fed += 1
-        self._state = step.state if self._fed % _STRAIGHTEN else _straightened(step.state)
-        return self._pose(step, seen, restarted=restarted)
+        self._lead = np.zeros(self._model.nq) if place.is_open or restarted else place.moved
+        self._state = place.state if self._fed % _STRAIGHTEN else _straightened(place.state)
+        return self._pose(place, seen, restarted=restarted)
+
+    def _found(self, given: Array, measured: Array, weights: Array) -> tuple[_Place, bool]:
+        """Return where the chain is, and whether it was found anew."""
+        if self._state is None:
+            start = self._anew(given)
+            return self._follow(start, np.zeros(self._model.nq), measured, weights), True
+        place = self._follow(self._state, self._lead, measured, weights)
+        if not self._is_lost(place):
+            return place, False
+        start = self._anew(given)
+        again = self._follow(start, np.zeros(self._model.nq), measured, weights)
+        return (again, True) if again.cost < place.cost else (place, False)
 
     def _anew(self, given: Array) -> ChainState:
         if not np.isfinite(given).any():
@@ -138,27 +145,39 @@ class LiveInverseKinematics:
         options = IkOptions(iterations=15, huber_m=self._options.huber_m)
         return solve_frames(self._model, given[None], options=options).state
 
-    def _is_lost(self, step: _Step) -> bool:
-        weights = float(step.at.weighted[..., 3, :].sum())
-        return step.cost > weights * self._options.lost_m**2
+    def _is_lost(self, place: _Place) -> bool:
+        return place.cost > float(place.at.weighted[..., 3, :].sum()) * self._options.lost_m**2
 
-    def _follow(self, state: ChainState, measured: Array, weights: Array) -> _Step:
-        """Take the steps of one instant from `state`.
+    def _follow(self, last: ChainState, lead: Array, measured: Array, weights: Array) -> _Place:
+        """Take the steps of one instant, from the last one's state led on by `lead`.
 
-        The normal matrix that goes with the result is that of the last step's beginning: it differs
-        by the turn of that step, which is far below what a covariance is good for.
+        The factor that goes with the result is that of the last step's beginning: it differs by the
+        turn of that step, which is far below what a covariance is good for.
         """
-        reference = state.rotations
-        at = fit(self._slots, state.rotations, state.origins, measured, weights)
-        equations = self._equations(state, at, reference)
-        for taken in range(self._options.steps):
-            w = self._robust(at, weights)
+        place = self._moved(last, lead, measured, weights)
+        travelled, equations = lead, None
+        for _ in range(max(self._options.steps, 1)):
+            w = self._robust(place.at, weights)
             if w is not weights:
-                at = fit(self._slots, state.rotations, state.origins, measured, w)
-            if taken or w is not weights:
-                equations = self._equations(state, at, reference)
-            state, at = self._one_step(state, at, equations, measured, w)
-        return _Step(state, at, equations.factor, float(at.cost[0]), is_open=equations.is_open)
+                place = self._moved(place.state, None, measured, w)
+            equations = self._equations(place, last.rotations)
+            step, place = self._one_step(place, equations, measured, w)
+            travelled = travelled + step
+            if np.abs(step).max() < _LAST_STEP:
+                break
+        return replace(place, moved=travelled, equations=equations)
+
+    def _moved(
+        self, state: ChainState, step: Array | None, measured: Array, weights: Array
+    ) -> _Place:
+        layout = self._slots.layout
+        if step is not None:
+            state = ChainState(
+                turned(layout, state.rotations, step[None]),
+                state.origins + step[layout.shifts].reshape(1, -1, 3),
+            )
+        at = fit(self._slots, state.rotations, state.origins, measured, weights)
+        return _Place(state, at, float(at.cost[0]))
 
     def _robust(self, at: Fit, weights: Array) -> Array:
         if self._options.huber_m is None:
@@ -167,56 +186,52 @@ class LiveInverseKinematics:
         size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
         return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
 
-    def _equations(self, state: ChainState, at: Fit, reference: Array) -> _Equations:
+    def _equations(self, place: _Place, reference: Array) -> _Equations:
         """Return normal matrix and gradient, held to `reference` if the markers leave one open."""
-        lower, gradient = lower_equations(self._slots, at)
+        lower, gradient = lower_equations(self._slots, place.at)
         H, g = lower[0], gradient[0]
         diagonal = H.ravel()[:: len(g) + 1]
         diagonal += _RIDGE
         factor, failed = lapack.dpotrf(H, lower=1)
-        pivots = factor.diagonal()
-        is_open = failed != 0 or float(pivots.min()) ** 2 < OPEN_M2 * self._typical
+        is_open = failed != 0 or float(factor.diagonal().min()) ** 2 < OPEN_M2 * self._typical
         if is_open:
             weight = self._options.hold_m2 * self._typical
             hold = Band(reference, np.full((1, len(g)), weight), _ZERO, _ZERO)
-            g = g + weight * hold.excess(self._slots.layout, state.rotations)[0]
+            g = g + weight * hold.excess(self._slots.layout, place.state.rotations)[0]
             diagonal += weight
             factor, _ = lapack.dpotrf(H, lower=1)
         return _Equations(H, g, factor, is_open)
 
     def _one_step(
-        self, state: ChainState, at: Fit, equations: _Equations, measured: Array, weights: Array
-    ) -> tuple[ChainState, Fit]:
-        layout, factor, damping = self._slots.layout, equations.factor, 0.0
-        most = float(at.cost[0]) * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
+        self, place: _Place, equations: _Equations, measured: Array, weights: Array
+    ) -> tuple[Array, _Place]:
+        """Return a step that does not raise the cost, and where it leads."""
+        factor, damping = equations.factor, 0.0
+        most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
         for _ in range(_TRIES):
-            step = lapack.dpotrs(factor, -equations.g, lower=1)[0][None]
-            onward = ChainState(
-                turned(layout, state.rotations, step),
-                state.origins + step[:, layout.shifts].reshape(1, -1, 3),
-            )
-            there = fit(self._slots, onward.rotations, onward.origins, measured, weights)
-            if there.cost[0] <= most:
-                return onward, there
+            step = lapack.dpotrs(factor, -equations.g, lower=1)[0]
+            there = self._moved(place.state, step, measured, weights)
+            if there.cost <= most:
+                return step, there
             damping = max(_DAMPING, 10.0 * damping)
             damped = equations.H + damping * np.diag(equations.H.diagonal())
             factor, _ = lapack.dpotrf(damped, lower=1)
-        return state, at
+        return np.zeros(self._model.nq), place
 
-    def _pose(self, step: _Step, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
-        residuals = self._slots.taken(step.at.errors)[0]
+    def _pose(self, place: _Place, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
+        residuals = self._slots.taken(place.at.errors)[0]
         residuals[~seen] = np.nan
-        self._learn(step.cost, int(seen.sum()))
-        half, _ = lapack.dpotri(step.factor, lower=1)
+        self._learn(place.cost, int(seen.sum()))
+        half, _ = lapack.dpotri(place.factor, lower=1)
         covariance = self._variance * (half + half.T)
         covariance.ravel()[:: len(half) + 1] *= 0.5
         return LivePose(
-            step.state,
-            step.at.world[0, :, :3, :3],
-            step.at.world[0, :, :3, 3],
+            place.state,
+            place.at.world[0, :, :3, :3],
+            place.at.world[0, :, :3, 3],
             residuals,
             covariance,
-            step.is_open,
+            place.is_open,
             restarted,
         )
 
@@ -241,15 +256,25 @@ class _Equations(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class _Step:
-    """Where an instant ended."""
+class _Place:
+    """Where the chain may be."""
 
     state: ChainState
     at: Fit
-    factor: Array
-    """Lower Cholesky factor of the normal matrix."""
     cost: float
-    is_open: bool
+    moved: Array = field(default_factory=lambda: _ZERO)
+    """Step from the last instant."""
+    equations: _Equations | None = None
+    """Those of the last step."""
+
+    @property
+    def factor(self) -> Array:
+        """Lower Cholesky factor of the normal matrix; of the unit matrix before any step."""
+        return np.eye(len(self.moved)) if self.equations is None else self.equations.factor
+
+    @property
+    def is_open(self) -> bool:
+        return self.equations is None or self.equations.is_open
 
 
 def _straightened(state: ChainState) -> ChainState:
