@@ -53,6 +53,7 @@ def solve_in_turns(
     follow: Callable[[Array, Array], Carriers],
     on_step: Callable[[Turn], bool] | None = None,
     *,
+    start: Array | None = None,
     tolerance: float = _TOLERANCE,
     most_iterations: int = _MOST_ITERATIONS,
 ) -> list[Turn]:
@@ -64,6 +65,8 @@ def solve_in_turns(
         Given positions, m, shape (M, 3), and weights of squared errors, shape (T, M): the poses.
     on_step
         Told every accepted place; True ends the iteration.
+    start
+        Positions to begin with, m, shape (M, 3); the nominal ones if None.
     tolerance
         Relative decrease of F in one turn at which it is done.
 
@@ -73,7 +76,7 @@ def solve_in_turns(
         Start and every accepted place; F falls along it.
     """
     turns = _Turns(problem, follow)
-    path, anderson = [turns.first()], Anderson()
+    path, anderson = [turns.first(start)], Anderson()
     while len(path) <= most_iterations:
         last = path[-1]
         plain = turns.means(last)
@@ -99,9 +102,9 @@ class _Turns:
         self._problem = problem
         self._follow = follow
 
-    def first(self) -> Turn:
-        nominal = self._problem.model.positions
-        return self._at(nominal, self._follow(nominal, self._problem.weights))
+    def first(self, start: Array | None) -> Turn:
+        begin = self._problem.model.positions if start is None else start
+        return self._at(begin, self._follow(begin, self._problem.weights))
 
     def follow(self, positions: Array, last: Turn) -> Turn:
         """Return the poses for new positions, robust weights as at the last poses."""

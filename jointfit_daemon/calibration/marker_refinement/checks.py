@@ -69,7 +69,7 @@ def check(
         faults.append(_why_nothing_moves(model))
     if faults:
         raise Unrefinable("; ".join(faults))
-    mended, notes = [], [*held, *_gaps(model, every), *_rates(every), *_stretches(model, every)]
+    mended, notes = [], [*held, *_gaps(model, every), *_stretches(model, every)]
     for trial in trials:
         fixed, said, wrong = _labels(model, trial)
         mended.append(fixed)
@@ -172,14 +172,6 @@ def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
     ]
 
 
-def _rates(trials: Sequence[MotionTrial]) -> list[str]:
-    rates = sorted({round(trial.rate_hz, 6) for trial in trials})
-    if len(rates) < 2:
-        return []
-    told = ", ".join(f"{rate:g}" for rate in rates)
-    return [f"frames of {told} Hz: every trial counts by its frames, not by its time"]
-
-
 def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[str], list[str]]:
     """Return the trial without frames of exchanged labels, notes, and faults."""
     found = solve_frames(model, trial.targets, options=_ROBUST)
@@ -189,7 +181,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
     for i, j, frames in _exchanged(found.residuals, trial.targets):
         pair = f"{model.markers[i].name} and {model.markers[j].name}"
         if frames.mean() >= _SWAPPED_TRIAL:
-            faults.append(f"{trial.name}: the labels of {pair} look exchanged: exchange them back")
+            faults.append(f"{trial.name}: {pair} look exchanged: exchange their labels back")
         else:
             notes.append(f"{trial.name}: {pair} look exchanged in {frames.sum()} frames: left out")
             targets[frames, i] = targets[frames, j] = np.nan

@@ -68,7 +68,7 @@ class NormalEquations:
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Return the step of the markers, shape (f,), and of the poses, shape (T, nq)."""
         solved, S, r = self._reduced(damping)
-        dp: Array = -np.linalg.solve(S, self.h - r)
+        dp = np.asarray(-np.linalg.solve(S, self.h - r), dtype=np.float64)
         return dp, -(solved[..., -1] + solved[..., :-1] @ dp)
 
     def reduced(self) -> Array:
@@ -80,7 +80,7 @@ class NormalEquations:
         A = self.A + _FLOOR * np.eye(nq)
         A[:, range(nq), range(nq)] += damping * self.A[:, range(nq), range(nq)]
         both = np.concatenate((self.B, self.g[..., None]), axis=-1)
-        solved: Array = np.linalg.solve(A, both)
+        solved = np.asarray(np.linalg.solve(A, both), dtype=np.float64)
         f = len(self.C)
         product = self.B.reshape(-1, f).T @ solved.reshape(-1, f + 1)
         S: Array = np.diag(self.C * (1.0 + damping)) - product[:, :f]

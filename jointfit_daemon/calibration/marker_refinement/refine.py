@@ -88,8 +88,16 @@ def refine_markers(
         ended.runs,
         ended.stopped,
         _gauge(task, ended.positions, settings),
-        checked.notes,
+        (*checked.notes, *_rates([*trials, *validation])),
     )
+
+
+def _rates(trials: Sequence[MotionTrial]) -> list[str]:
+    rates = sorted({round(trial.rate_hz, 6) for trial in trials})
+    if len(rates) == 1:
+        return []
+    told = ", ".join(f"{rate:g}" for rate in rates)
+    return [f"recorded at {told} Hz: every trial counts by its frames, not by its time"]
 
 
 @dataclass(frozen=True, slots=True)
