@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import inf
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jointfit_daemon.calibration.center.error_prediction import triangle_error
 from jointfit_daemon.calibration.center.moments import seen_places
 from jointfit_daemon.calibration.center.planar_reduction import in_segment_plane
 from jointfit_daemon.calibration.center.result import CenterEstimate
@@ -48,7 +47,25 @@ def three_frame_center(points: ArrayLike) -> Array:
         Centers, m; inf where the points are on a line or repeat, NaN only where a point is NaN.
     """
     p = np.asarray(points, dtype=np.float64)
+    u, v, size = _sides(p)
+    offset, flat = _offset(u, v)
+    flat = (flat | np.isinf(size))[..., None]
+    return np.where(flat, inf, p[..., 0, :] + size[..., None] * offset)
+
+
+def _sides(p: Array) -> tuple[Array, Array, Array]:
+    """Return the sides from the first point over the largest of them, and that, m.
+
+    Squares of sides as they are would vanish or overflow for coordinates that are mistakes.
+    """
     u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
+    size = np.maximum(np.abs(u).max(axis=-1), np.abs(v).max(axis=-1))
+    scale = np.where(size > 0.0, size, 1.0)[..., None]
+    return u / scale, v / scale, size
+
+
+def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the center from the first point, in the sides' unit, and where there is none."""
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
     longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
@@ -56,8 +73,7 @@ def three_frame_center(points: ArrayLike) -> Array:
     safe = np.where(flat, 1.0, 2.0 * D)
     x = (s2 * v[..., 1] - s3 * u[..., 1]) / safe
     y = (s3 * u[..., 0] - s2 * v[..., 0]) / safe
-    offset = np.stack((x, y), axis=-1)
-    return np.where(flat[..., None], inf, p[..., 0, :] + offset)
+    return np.stack((x, y), axis=-1), flat
 
 
 def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
@@ -79,22 +95,21 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
     p = np.asarray(points, dtype=np.float64)
     if not seen_places(p).all():
         return _refusal(p, noise, "a marker is not seen in one of the frames: choose other frames")
-    center = three_frame_center(p)
-    if not np.isfinite(center).all():
+    u, v, size = _sides(p)
+    offset, flat = _offset(u, v)
+    if flat or not np.isfinite(size):
         reason = "the three points are on a line or repeat: choose frames further apart"
         return _refusal(p, noise, reason)
-    spokes = p - center
-    radius = float(np.hypot(*spokes[0]))
-    u = spokes / radius
-    design = np.column_stack((u, np.ones(3)))
-    covariance = np.asarray(noise**2 * np.linalg.inv(design.T @ design)[:2, :2])
-    error = float(triangle_error(p, noise))
+    spokes = np.stack((-offset, u - offset, v - offset))
+    covariance = _covariance(u, v, float(np.hypot(*offset)), noise)
+    error = sqrt(float(np.trace(covariance)))
+    radius = float(size * np.hypot(*offset))
     # beyond it the smallest turn of the center is lost in noise and the error has no mean square
     lost = f"noise of {1000 * noise:.1f} mm hides the arc: choose frames further apart"
-    turned = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
+    turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
     return CenterEstimate(
         method="three_frames",
-        center=center,
+        center=p[0] + size * offset,
         covariance=covariance,
         noise=noise,
         residual=0.0,
@@ -106,6 +121,19 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
         effective_frames=3.0,
         refused=lost if 6.0 * error > radius else None,
     )
+
+
+def _covariance(u: Array, v: Array, radius: float, noise: float) -> Array:
+    r"""Return what noise along the spokes does to the center, m².
+
+    .. math:: C = σ^2 r^2 A^{-1} \begin{pmatrix} 2 & 1 \\ 1 & 2 \end{pmatrix} A^{-T},
+              \qquad A = (u\; v)^T
+
+    since each spoke's noise e gives u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁). Sides and radius in one
+    unit, which cancels.
+    """
+    moves = radius * np.linalg.inv(np.stack((u, v)))
+    return np.asarray(noise**2 * moves @ np.array([[2.0, 1.0], [1.0, 2.0]]) @ moves.T)
 
 
 def _refusal(points: Array, noise: float, reason: str) -> CenterEstimate:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jointfit_daemon.calibration.center.bounds import (
@@ -56,13 +56,29 @@ def test_three_points_of_a_circle_give_its_center(
 
 
 @given(st.lists(anything, min_size=6, max_size=6))
+@example([0.0, 0.0, 7e-155, 0.0, 0.0, 7e-155])  # squares that vanish
+@example([0.0, 0.0, 2e-162, 1e-162, 1e-162, 2e-162])
+@example([0.0, 0.0, 5e-324, 0.0, 0.0, 5e-324])
+@example([0.0, 0.0, 1e200, 0.0, 0.0, 1e200])  # squares that overflow
+@example([1e308, 0.0, -1e308, 0.0, 0.0, 1.0])
+@example([1.0, 1.0, 1.0, 1.0 + 2**-52, 1.0 + 2**-52, 1.0])  # a center that rounds to a point
+@example([0.0, 0.0, 1.0, 0.0, 2.0, 5e-9])  # nearly a line
 def test_any_three_points_give_a_center_or_a_reason_never_silent_nan(values: Any) -> None:
     with np.errstate(all="ignore"):
         found = three_frame_estimate(np.reshape(values, (3, 2)), 0.001)
     assert np.isfinite(found.center).all()
     assert np.isfinite(found.covariance).all()
+    assert not np.isnan([found.sd, found.arc, found.bound, found.conditioning]).any()
+    assert np.isfinite(found.radii).all()
     if found.refused is not None:
         assert ":" in found.refused  # cause: remedy
+
+
+def test_the_covariance_is_the_bound_of_three_points() -> None:
+    t = np.array([0.2, 0.9, 1.7])
+    found = three_frame_estimate(on_circle(t, center=(3.0, -2.0)), 0.001)
+    assert found.covariance == pytest.approx(circle_bound(t, 0.001)[:2, :2], rel=1e-9)
+    assert found.sd == pytest.approx(found.bound)
 
 
 @pytest.mark.parametrize("points", [[[0, 0], [1, 1], [2, 2]], [[0, 0], [0, 0], [1, 0]]])
