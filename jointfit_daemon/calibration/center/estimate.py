@@ -6,6 +6,7 @@ Law: a name, a movement, one `CenterEstimate`; what a method needs is said by `M
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import degrees, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +14,13 @@ from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center import in_plane
 from jointfit_daemon.calibration.center.movement import Movement
+from jointfit_daemon.calibration.center.parent_noise import turn_noise
 from jointfit_daemon.calibration.center.running_sphere import RunningSphere
 from jointfit_daemon.calibration.center.sara import fit_axis
 from jointfit_daemon.calibration.center.score import fit_score
 from jointfit_daemon.calibration.center.sphere import fit_sphere, gamage_lasenby, halvorsen
 from jointfit_daemon.calibration.center.sphere_directions import Limits
-from jointfit_daemon.calibration.center.sphere_solve import SphereOptions
+from jointfit_daemon.calibration.center.sphere_solve import NOISE_FACTOR, SphereOptions
 from jointfit_daemon.calibration.center.sphere_verdict import refusal
 
 if TYPE_CHECKING:
@@ -82,7 +84,22 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     if points is not None and not np.isfinite(points).any():
         reason = "no marker was seen in any frame: check marker names, cameras and what covers them"
         return refusal(chosen.name, points.shape[-1], 0, reason)
-    return chosen.run(movement)
+    return _beyond_parent(chosen.run(movement), movement.parent_markers)
+
+
+def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
+    """Refuse a turn that the noise of the parent's own frame may be: the child need not move."""
+    if parent is None or found.refused is not None or len(found.center) < 3:
+        return found
+    turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)
+    # directions spread evenly over an arc are a quarter of it away from their mean
+    if found.arc / 4.0 > turn:
+        return found
+    why = (
+        f"the joint turned {degrees(found.arc):.0f}°, which noise of the parent's markers may be: "
+        "move it further, or put the parent's markers further apart"
+    )
+    return replace(found, refused=why)
 
 
 def _checked(movement: Movement) -> Movement:

@@ -54,6 +54,23 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     return np.asarray(noise**2 * ((1.0 + 1.0 / len(parent)) * np.eye(3) + turned))
 
 
+def turn_noise(parent: Array, noise: float) -> float:
+    r"""Return how far a frame fitted to noisy markers turns about its loosest axis, RMS, rad.
+
+    .. math:: σ_φ^2 = σ^2\, λ_{max}(G^{-1})
+
+    Parameters
+    ----------
+    parent : ndarray, shape (m, 3)
+        The parent's markers in its own coordinates, m.
+    noise : float
+        Standard deviation of every coordinate of every marker, m.
+    """
+    d = parent - parent.mean(axis=0)
+    stiff = float(np.linalg.eigvalsh(np.trace(d.T @ d) * np.eye(3) - d.T @ d)[0])
+    return noise / stiff**0.5 if stiff > 0.0 else np.inf
+
+
 def planar_noise(points: Array, parent: Array, noise: float) -> Array:
     r"""Return the same in a plane, for any number of parent markers.
 
