@@ -5,7 +5,17 @@ from __future__ import annotations
 import typer
 
 from jointfit_daemon import __version__
-from jointfit_daemon.tools import calibrate, center, check, decode, demo, fuse, report, schema
+from jointfit_daemon.tools import (
+    calibrate,
+    center,
+    check,
+    decode,
+    demo,
+    fuse,
+    markers,
+    report,
+    schema,
+)
 
 app = typer.Typer(
     name="jointfit",
@@ -20,6 +30,7 @@ app.command(name="calibrate")(calibrate.calibrate)
 app.command(name="center")(center.center)
 app.command(name="decode")(decode.decode)
 app.add_typer(fuse.app)
+app.command(name="markers")(markers.markers)
 app.command(name="report")(report.report)
 app.command(name="schema")(schema.schema)
 

@@ -1,0 +1,182 @@
+"""`jointfit markers`: where the markers really are on their segments, from moving trials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
+    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.tools.markers_trials import Asked
+
+MISUSE = 2
+REFUSED = 1
+
+
+Trials = Annotated[list[Path], typer.Argument(help="Trials to learn from, .trc or .c3d.")]
+Model = Annotated[Path, typer.Option("--model", help="The chain: .toml, .json or OpenSim's .osim.")]
+Lock = Annotated[
+    list[str] | None,
+    typer.Option("--lock", help="Hold NAME, or one coordinate of it: NAME.x. Repeatable."),
+]
+Unlock = Annotated[
+    list[str] | None,
+    typer.Option("--unlock", help="Let go what the model holds; '*' is all. Repeatable."),
+]
+Without = Annotated[
+    list[str] | None,
+    typer.Option("--without", help="Do not track NAME, as computed points. Repeatable."),
+]
+Validate = Annotated[
+    list[Path] | None,
+    typer.Option("--validate", help="A trial that only judges. Repeatable."),
+]
+Method = Annotated[
+    str, typer.Option("--method", help="joint (fast), block, or search (as published, slow).")
+]
+Prior = Annotated[
+    float,
+    typer.Option("--prior", min=0.0, help="What moving a marker costs beside its error."),
+]
+Holdout = Annotated[
+    float,
+    typer.Option("--holdout", min=0.0, max=0.5, help="Last share of each trial: when to stop."),
+]
+Frames = Annotated[
+    int, typer.Option("--frames", min=10, help="Frames of a trial at most, evenly taken.")
+]
+Up = Annotated[
+    str | None, typer.Option("--up", help="The trials' axis that is up, if they do not say.")
+]
+Out = Annotated[
+    list[Path] | None,
+    typer.Option("--out", help=".toml/.json model, .xml marker set, .trc offsets. Repeatable."),
+]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
+Plot = Annotated[Path | None, typer.Option("--plot", help="Draw it: .png, .svg or .pdf.")]
+
+
+def markers(
+    trials: Trials,
+    *,
+    model: Model,
+    lock: Lock = None,
+    unlock: Unlock = None,
+    without: Without = None,
+    validate: Validate = None,
+    method: Method = "joint",
+    prior: Prior = 0.05,
+    holdout: Holdout = 0.0,
+    frames: Frames = 150,
+    up: Up = None,
+    out: Out = None,
+    json: Json = False,
+    plot: Plot = None,
+) -> None:
+    """Refine where markers are on their segments, and tell what that is worth.
+
+    Ends with 1 where model and trials do not belong together.
+    """
+    from jointfit_daemon.calibration.marker_refinement.motion import Unrefinable
+    from jointfit_daemon.files.c3d import PackageMissing
+    from jointfit_daemon.tools.markers_trials import Asked
+    from jointfit_daemon.tools.plotting import PlotMissing
+
+    try:
+        _check(method=method, up=up, out=out or [])
+        asked = Asked(
+            model, tuple(lock or ()), tuple(unlock or ()), tuple(without or ()), up or None
+        )
+        chain, remarks, found = _refined(
+            asked,
+            (trials, validate or []),
+            {"method": method, "prior": prior, "holdout_share": holdout, "frames": frames},
+        )
+        _print(chain, remarks, found, as_json=json)
+        _write(chain, found, out or [], plot)
+    except Unrefinable as refused:
+        typer.echo(f"jointfit markers: refused: {refused}", err=True)
+        raise typer.Exit(REFUSED) from None
+    except (OSError, ValueError, PackageMissing, PlotMissing) as fault:
+        why = f"{fault.filename}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
+        typer.echo(f"jointfit markers: {why}", err=True)
+        raise typer.Exit(MISUSE) from None
+
+
+def _check(*, method: str, up: str | None, out: Sequence[Path]) -> None:
+    from typing import get_args
+
+    from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
+    from jointfit_daemon.tools.markers_write import ENDINGS
+
+    methods = get_args(RefinementMethod)
+    if method not in methods:
+        raise ValueError(f"--method is {method!r}, expected {', '.join(methods)}")
+    if up is not None and up not in ("x", "y", "z"):
+        raise ValueError(f"--up is {up!r}, expected x, y or z")
+    for path in out:
+        if path.suffix.lower() not in ENDINGS:
+            raise ValueError(f"--out {path}: expected a name that ends in {', '.join(ENDINGS)}")
+
+
+def _refined(
+    asked: Asked, trials: tuple[list[Path], list[Path]], options: dict[str, object]
+) -> tuple[ChainModel, tuple[str, ...], Refinement]:
+    from rich.console import Console
+    from rich.progress import Progress, TextColumn
+
+    from jointfit_daemon.calibration.marker_refinement.motion import RefinementSettings
+    from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
+    from jointfit_daemon.tools.markers_trials import load
+
+    chain, remarks, learned, judged = load(asked, *trials)
+    settings = RefinementSettings(
+        method=cast("RefinementMethod", options["method"]),
+        prior=cast("float", options["prior"]),
+        holdout_share=cast("float", options["holdout_share"]),
+        frames=cast("int", options["frames"]),
+    )
+    with Progress(
+        *Progress.get_default_columns(),
+        TextColumn("{task.fields[error]}"),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("refining", total=1.0, error="")
+
+        def told(share: float, rms: float) -> None:
+            bar.update(task, completed=share, error=f"{1000 * rms:.2f} mm")
+
+        return chain, remarks, refine_markers(chain, learned, settings, judged, told)
+
+
+def _print(
+    chain: ChainModel, remarks: tuple[str, ...], found: Refinement, *, as_json: bool
+) -> None:
+    from jointfit_daemon.tools import markers_report
+
+    if as_json:
+        import orjson
+
+        typer.echo(orjson.dumps(markers_report.as_json(chain, remarks, found)))
+        return
+    typer.echo(markers_report.as_text(chain, remarks, found))
+
+
+def _write(chain: ChainModel, found: Refinement, out: Sequence[Path], plot: Path | None) -> None:
+    from jointfit_daemon.tools.markers_write import write_markers
+
+    for path in out:
+        write_markers(path, chain, found.model)
+        typer.echo(f"wrote {path}", err=True)
+    if plot is not None:
+        from jointfit_daemon.tools.markers_plot import draw_refinement
+
+        draw_refinement(plot, found)
+        typer.echo(f"wrote {plot}", err=True)

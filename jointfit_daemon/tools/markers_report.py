@@ -1,0 +1,171 @@
+"""Refinements as text and JSON. Law: pure; millimetres and degrees for people only."""
+
+from __future__ import annotations
+
+from math import degrees, isfinite
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.calibration.marker_refinement.outcome import (
+        Fit,
+        MarkerOutcome,
+        Refinement,
+        TrialOutcome,
+    )
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+
+_MM = 1000.0
+_MM2 = 1e6
+_MARKER_HEAD = ("marker", "segment", "moved, mm", "x, y, z", "held", "residual, mm")
+_TRIAL_HEAD = ("trial", "", "frames", "RMS, mm", "", "variance over time, mm²", "joints, °")
+
+
+def as_text(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> str:
+    """Return markers, trials, and what to know about both."""
+    lines = [
+        f"model     {chain.name}: {len(chain.segments)} segments, {chain.nq} degrees of freedom,"
+        f" {len(chain.markers)} markers",
+        f"method    {found.method}: {_effort(found)}; {found.stopped}",
+        *(f"import    {text}" for text in remarks),
+        *(f"note      {text}" for text in found.notes),
+        "",
+        _table([_MARKER_HEAD, *(_marker(m) for m in found.markers)]),
+        "",
+        _table([_TRIAL_HEAD, *(_trial(t) for t in found.trials)]),
+        "",
+        *_summary(found),
+    ]
+    return "\n".join(lines)
+
+
+def _effort(found: Refinement) -> str:
+    if found.method == "search":
+        return f"{found.runs} runs of inverse kinematics"
+    return f"{len(found.costs) - 1} steps, prior {found.prior:g}"
+
+
+def _marker(m: MarkerOutcome) -> tuple[str, ...]:
+    held = "".join(axis for axis, is_held in zip("xyz", m.held, strict=True) if is_held)
+    moved = " ".join(f"{_MM * v:+.1f}" for v in m.moved)
+    residual = f"{_mm(m.rms_before)} → {_mm(m.rms_after)}"
+    return (m.name, m.segment, f"{_MM * m.distance:.1f}", moved, held, residual)
+
+
+def _trial(t: TrialOutcome) -> tuple[str, ...]:
+    turned = max((most for _, most in t.angles.values()), default=float("nan"))
+    return (
+        t.name,
+        "trained" if t.trained else "unseen",
+        f"{t.frames} at {t.rate_hz:g} Hz",
+        f"{_mm(t.before.rms)} → {_mm(t.after.rms)}",
+        _change(t.before.rms, t.after.rms),
+        f"{_mm2(t.before.variance)} → {_mm2(t.after.variance)}",
+        f"≤ {degrees(turned):.1f}" if isfinite(turned) else "",
+    )
+
+
+def _summary(found: Refinement) -> list[str]:
+    rms, most = found.angle_change()
+    lines = [f"joints    turned by {degrees(rms):.1f}° RMS, {degrees(most):.1f}° at most"]
+    for trained, word in ((True, "trained"), (False, "unseen")):
+        before, after = found.variance_of_trials(trained=trained)
+        if isfinite(before):
+            lines.append(
+                f"variance  of RMS across {word} trials: {_mm2(before)} → {_mm2(after)} mm²"
+            )
+    gauge = found.gauge
+    if gauge.free:
+        held = {
+            "prior": "held by the prior alone",
+            "nothing": "HELD BY NOTHING: joint angles may be off at no cost; lock anatomical"
+            " markers or give a prior",
+        }[gauge.fixed_by]
+        lines.append(
+            f"unseen    {gauge.free} ways to move markers and joints together change no error"
+            f" ({', '.join(gauge.involved)}): {held}"
+        )
+    if gauge.weak:
+        lines.append(f"weak      {gauge.weak} more ways hardly change it")
+    return lines
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> str:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )
+
+
+def _mm(metres: float) -> str:
+    return f"{_MM * metres:.2f}" if isfinite(metres) else "–"
+
+
+def _mm2(square: float) -> str:
+    return f"{_MM2 * square:.2f}" if isfinite(square) else "–"
+
+
+def _change(before: float, after: float) -> str:
+    return f"{100 * (after / before - 1):+.0f} %" if before > 0.0 else ""
+
+
+def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dict[str, Any]:
+    """Return everything for programs, SI; null is unknown."""
+    rms, most = found.angle_change()
+    return {
+        "model": chain.name,
+        "method": found.method,
+        "prior": found.prior,
+        "stopped": found.stopped,
+        "runs": found.runs,
+        "costs": list(found.costs),
+        "remarks": list(remarks),
+        "notes": list(found.notes),
+        "markers": [
+            {
+                "name": m.name,
+                "segment": m.segment,
+                "position_m": list(position.position),
+                "moved_m": list(m.moved),
+                "held": [bool(h) for h in m.held],
+                "rms_before_m": _nullable(m.rms_before),
+                "rms_after_m": _nullable(m.rms_after),
+            }
+            for m, position in zip(found.markers, found.model.markers, strict=True)
+        ],
+        "trials": [_trial_json(t) for t in found.trials],
+        "angle_change_rad": {"rms": _nullable(rms), "max": _nullable(most)},
+        "variance_of_trials_m2": {
+            word: [_nullable(v) for v in found.variance_of_trials(trained=trained)]
+            for word, trained in (("trained", True), ("unseen", False))
+        },
+        "gauge": {
+            "free": found.gauge.free,
+            "weak": found.gauge.weak,
+            "fixed_by": found.gauge.fixed_by,
+            "markers": list(found.gauge.involved),
+            "eigenvalues": found.gauge.eigenvalues.tolist(),
+        },
+    }
+
+
+def _trial_json(t: TrialOutcome) -> dict[str, Any]:
+    return {
+        "name": t.name,
+        "trained": t.trained,
+        "frames": t.frames,
+        "rate_hz": t.rate_hz,
+        "before": _fit_json(t.before),
+        "after": _fit_json(t.after),
+        "angles_rad": {name: {"rms": rms, "max": most} for name, (rms, most) in t.angles.items()},
+    }
+
+
+def _fit_json(fit: Fit) -> dict[str, Any]:
+    return {"rms_m": _nullable(fit.rms), "variance_m2": _nullable(fit.variance)}
+
+
+def _nullable(value: float) -> float | None:
+    return float(value) if isfinite(value) else None

@@ -1,0 +1,117 @@
+"""What `jointfit markers` works on: a chain, and trials in the order of its markers.
+
+Law: a marker that a trial lacks is missing there, NaN; a name that nothing has is a fault.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
+from jointfit_daemon.files.marker_trial import UnknownMarker, read_marker_trial
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+
+_AXES = "xyz"
+_ALL = "*"
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What the command line says of the model."""
+
+    model: Path
+    lock: tuple[str, ...] = ()
+    unlock: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    up: str | None = None
+
+
+def load(
+    asked: Asked, trials: Sequence[Path], validation: Sequence[Path]
+) -> tuple[ChainModel, tuple[str, ...], list[MotionTrial], list[MotionTrial]]:
+    """Return the chain, remarks of its import, and both kinds of trials.
+
+    Raises
+    ------
+    ValueError
+        Unknown names in locks; `Malformed` for broken files.
+    """
+    read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
+    judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
+    chain, remarks = _chain(asked)
+    chain = _locked(chain, asked.unlock, hold=False)
+    chain = _locked(chain, asked.lock, hold=True)
+    learned = [_motion(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
+    judged = [_motion(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
+    return chain, remarks, learned, judged
+
+
+def _chain(asked: Asked) -> tuple[ChainModel, tuple[str, ...]]:
+    from jointfit_daemon.files.model_file import read_model
+    from jointfit_daemon.files.osim import read_osim
+
+    remarks: tuple[str, ...] = ()
+    if asked.model.suffix.lower() == ".osim":
+        imported = read_osim(asked.model)
+        chain, remarks = imported.model, imported.remarks
+    else:
+        chain = read_model(asked.model)
+    for name in asked.without:
+        _known(chain, name, "--without")
+    kept = tuple(m for m in chain.markers if m.name not in asked.without)
+    return replace(chain, markers=kept), remarks
+
+
+def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainModel:
+    """Return the chain with locks set or taken off."""
+    locks = {m.name: list(m.locked) for m in chain.markers}
+    for text in texts:
+        if text == _ALL:
+            locks = {name: [hold] * 3 for name in locks}
+            continue
+        name, axis = _split(chain, text)
+        _known(chain, name, "--lock" if hold else "--unlock")
+        for at in range(3) if axis is None else (axis,):
+            locks[name][at] = hold
+    return chain.with_locks({name: (x, y, z) for name, (x, y, z) in locks.items()})
+
+
+def _split(chain: ChainModel, text: str) -> tuple[str, int | None]:
+    """Return marker and coordinate; names may have dots of their own, so a whole name wins."""
+    head, dot, tail = text.rpartition(".")
+    if text not in chain.marker_names and dot and tail in tuple(_AXES):
+        return head, _AXES.index(tail)
+    return text, None
+
+
+def _known(chain: ChainModel, name: str, option: str) -> None:
+    if name in chain.marker_names:
+        return
+    near = get_close_matches(name, chain.marker_names, n=3)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {_listed(chain)}"
+    raise ValueError(f"{option} {name}: no such marker in the model; {hint}")
+
+
+def _listed(chain: ChainModel) -> str:
+    return ", ".join(chain.marker_names)
+
+
+def _motion(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:
+    count = len(trial.trajectories.t_s)
+    targets = np.full((count, len(chain.markers), 3), np.nan)
+    for at, marker in enumerate(chain.marker_names):
+        try:
+            targets[:, at] = trial.points([marker])[:, 0]
+        except UnknownMarker:
+            continue  # missing throughout; the refinement says so
+    return MotionTrial(name, targets, trial.trajectories.rate_hz)

@@ -1,0 +1,173 @@
+"""`jointfit markers` as a user runs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import orjson
+import pytest
+from typer.testing import CliRunner
+
+from jointfit_daemon.files.model_file import read_model, write_model
+from jointfit_daemon.files.trc import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, Marker, Segment
+from jointfit_daemon.kinematics.chain_motion import apply_step, marker_positions, rest_state
+from jointfit_daemon.tools.__main__ import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+run = CliRunner().invoke
+TO_Y_UP = [1, 2, 0]
+
+
+def true_model() -> ChainModel:
+    rng = np.random.default_rng(8)
+    thigh = Segment("thigh", "pelvis", Joint("ball", (0.1, 0.0, -0.1)))
+    shank = Segment("shank", "thigh", Joint("hinge", (0.0, 0.0, -0.4)))
+    markers = [
+        Marker(f"{name[0].upper()}{k}.x" if k == 3 else f"{name[0].upper()}{k}", name, tuple(at))
+        for name in ("pelvis", "thigh", "shank")
+        for k, at in enumerate(rng.normal(0.0, 0.1, (4, 3)).tolist())
+    ]
+    return ChainModel((Segment("pelvis"), thigh, shank), tuple(markers), "leg")
+
+
+def walked(frames: int, pace: float) -> MarkerTrajectories:
+    model, t = true_model(), np.linspace(0.0, 6.0, frames)[:, None]
+    move = 0.4 * np.sin(pace * t + np.linspace(0.0, 3.0, model.nq))
+    y = marker_positions(model, apply_step(model, rest_state(model, frames), move))
+    y += np.random.default_rng(1).normal(0.0, 0.002, y.shape)
+    count = np.arange(1, frames + 1)
+    return MarkerTrajectories(model.marker_names, t[:, 0], count, y[..., TO_Y_UP], frames / 6.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    model = true_model()
+    off = np.random.default_rng(2).normal(0.0, 0.01, model.positions.shape)
+    write_model(tmp_path / "leg.toml", model.with_markers(model.positions + off))
+    write_trc(tmp_path / "walk.trc", walked(60, 1.0))
+    write_trc(tmp_path / "run.trc", walked(80, 1.7))
+    return tmp_path
+
+
+def asked(folder: Path, *options: str) -> list[str]:
+    return ["markers", str(folder / "walk.trc"), "--model", str(folder / "leg.toml"), *options]
+
+
+def answer(folder: Path, *options: str) -> dict[str, Any]:
+    result = run(app, [*asked(folder, *options), "--json"])
+    assert result.exit_code == 0, result.stderr
+    found: dict[str, Any] = orjson.loads(result.stdout)
+    return found
+
+
+@pytest.mark.parametrize("method", ["joint", "block"])
+def test_trained_and_unseen_trials_are_told_apart(folder: Path, method: str) -> None:
+    found = answer(folder, "--validate", str(folder / "run.trc"), "--method", method)
+    walk, ran = found["trials"]
+    assert (walk["trained"], ran["trained"]) == (True, False)
+    assert walk["after"]["rms_m"] < 0.5 * walk["before"]["rms_m"]
+    assert ran["after"]["rms_m"] < 0.7 * ran["before"]["rms_m"]
+    assert found["method"] == method
+
+
+def test_the_search_says_how_often_it_ran_inverse_kinematics(folder: Path) -> None:
+    found = answer(folder, "--method", "search", "--frames", "10")
+    assert found["runs"] > 50
+    assert found["trials"][0]["after"]["rms_m"] < found["trials"][0]["before"]["rms_m"]
+
+
+def test_a_person_reads_markers_trials_and_what_nothing_shows(folder: Path) -> None:
+    result = run(app, asked(folder, "--lock", "P0", "--lock", "T3.x.z"))
+    assert result.exit_code == 0, result.stderr
+    lines = {line.split()[0]: line for line in result.stdout.splitlines() if line}
+    assert " xyz " in lines["P0"]
+    assert " z " in lines["T3.x"]
+    assert "trained" in lines["walk"]
+    assert "held by the prior alone" in lines["unseen"]
+    assert "nan" not in result.stdout
+
+
+def test_a_lock_on_a_marker_with_a_dot_in_its_name_holds_it_whole(folder: Path) -> None:
+    found = answer(folder, "--lock", "T3.x")
+    held = {m["name"]: m["held"] for m in found["markers"]}
+    assert held["T3.x"] == [True, True, True]
+
+
+def test_what_the_model_locks_can_be_let_go(folder: Path) -> None:
+    model = read_model(folder / "leg.toml")
+    write_model(folder / "leg.toml", model.with_locks({"S1": (True, True, True)}))
+    held = {m["name"]: m["held"] for m in answer(folder)["markers"]}
+    assert all(held["S1"])
+    held = {m["name"]: m["held"] for m in answer(folder, "--unlock", "*")["markers"]}
+    assert not any(held["S1"])
+
+
+def test_markers_go_back_in_every_format(folder: Path) -> None:
+    outs = [folder / f"new.{kind}" for kind in ("toml", "json", "xml", "trc")]
+    found = answer(folder, *(word for out in outs for word in ("--out", str(out))))
+    expected = np.array([m["position_m"] for m in found["markers"]])
+    before = read_model(folder / "leg.toml").positions
+    for out in outs[:2]:
+        np.testing.assert_allclose(read_model(out).positions, expected)
+    markers = ET.parse(outs[2]).getroot().findall(".//Marker")
+    told = [[float(v) for v in m.findtext("location", "").split()] for m in markers]
+    np.testing.assert_allclose(told, expected[:, TO_Y_UP], atol=1e-8)
+    assert [m.findtext("socket_parent_frame") for m in markers[:1]] == ["/bodyset/pelvis"]
+    offsets = read_trc(outs[3])
+    assert offsets.names == read_model(folder / "leg.toml").marker_names
+    np.testing.assert_allclose(offsets.positions[0], expected - before, atol=1e-8)
+
+
+def test_opensim_reads_the_marker_set(folder: Path) -> None:
+    opensim = pytest.importorskip("opensim", reason="opensim is not installed")
+    opensim.Logger.setLevelString("off")
+    answer(folder, "--out", str(folder / "new.xml"))
+    loaded = opensim.MarkerSet(str(folder / "new.xml"))
+    assert loaded.getSize() == len(true_model().markers)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--lock", "T3"], 2, ["--lock T3", "did you mean T3.x"]),
+        (["--without", "Z"], 2, ["--without Z"]),
+        (["--method", "magic"], 2, ["joint, block, search"]),
+        (["--out", "new.osim"], 2, [".toml, .json, .xml, .trc"]),
+        (["--up", "w"], 2, ["x, y or z"]),
+        (["--lock", "*"], 1, ["all coordinates are locked"]),
+        (["--validate", "nowhere.trc"], 2, ["nowhere.trc"]),
+    ],
+)
+def test_a_wrong_question_is_answered_with_what_to_change(
+    folder: Path, options: list[str], code: int, words: list[str]
+) -> None:
+    result = run(app, asked(folder, *options))
+    assert result.exit_code == code
+    for word in words:
+        assert word in result.stderr
+
+
+def test_millimetres_called_metres_are_refused(folder: Path) -> None:
+    wrong = walked(60, 1.0)
+    wrong.positions[:] *= 1000.0
+    write_trc(folder / "walk.trc", wrong)
+    result = run(app, asked(folder))
+    assert result.exit_code == 1
+    assert "unit" in result.stderr
+
+
+def test_a_plot_is_drawn(folder: Path) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    command = [sys.executable, "-m", "jointfit_daemon.tools", *asked(folder)]
+    done = subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+        [*command, "--plot", str(folder / "a.png")], capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
