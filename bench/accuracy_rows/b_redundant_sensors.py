@@ -17,7 +17,7 @@ from jointfit_daemon.calibration.weighted_mean import fuse
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -33,7 +33,7 @@ THIGH, SHANK = (0, 1), (2, 3)
 class KneeModels:
     """Both segments' models of one method and one choice of sensors, trained on some trials.
 
-    What a segment sees of its neighbour is always the neighbour's first sensor.
+    What a segment sees of its neighbour is the mean of the neighbour's sensors, as in a rig.
     """
 
     def __init__(
@@ -49,18 +49,22 @@ class KneeModels:
         femur = np.concatenate([t.thigh for t in trials])
         tibia = np.concatenate([t.shank for t in trials])
         self.thigh: SegmentModel = fit_segment(
-            method, [sensors[i] for i in thigh], sensors[SHANK[0]], femur, labels
+            method, [sensors[i] for i in thigh], _mean_of(sensors, shank), femur, labels
         )
         self.shank: SegmentModel = fit_segment(
-            method, [sensors[i] for i in shank], sensors[THIGH[0]], tibia, labels
+            method, [sensors[i] for i in shank], _mean_of(sensors, thigh), tibia, labels
         )
 
     def predict(self, trial: KneeTrial) -> tuple[Array, Array]:
         q = trial.sensors
         return (
-            self.thigh.predict([q[i] for i in self._thigh], q[SHANK[0]]),
-            self.shank.predict([q[i] for i in self._shank], q[THIGH[0]]),
+            self.thigh.predict([q[i] for i in self._thigh], _mean_of(q, self._shank)),
+            self.shank.predict([q[i] for i in self._shank], _mean_of(q, self._thigh)),
         )
+
+
+def _mean_of(sensors: Sequence[Array], chosen: tuple[int, ...]) -> Array:
+    return fuse([sensors[i] for i in chosen], (1.0 / len(chosen),) * len(chosen))
 
 
 class Squats:

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from jointfit_daemon.calibration.anatomy import flexion_sign
 from jointfit_daemon.calibration.redundancy import SegmentModel, fit_segment
 from jointfit_daemon.calibration.result import alive_key
+from jointfit_daemon.calibration.weighted_mean import fuse
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.model import Chain
@@ -70,7 +71,7 @@ def alive_sets(sensors: tuple[str, ...]) -> list[tuple[str, ...]]:
 def fit_models(
     chain: Chain, training: LimbTraining, method: Method
 ) -> dict[str, dict[str, SegmentModel]]:
-    """Fit, per segment, a model for every alive set with every sensor of its neighbor, and without.
+    """Fit, per segment, a model for every alive set with every one of its neighbor, and without.
 
     Without the neighbor only the weighted mean is possible for ``anchored``; the patent's methods
     never look at it, so each alive set has one model under every key.
@@ -82,9 +83,9 @@ def fit_models(
             x = [training.sensors[s] for s in alive]
             alone = fit_segment(method, x, None, reference)
             models[alive_key(alive, None)] = alone
-            for other in neighbor(chain, i):
-                models[alive_key(alive, other)] = (
-                    fit_segment(method, x, training.sensors[other], reference)
+            for near in alive_sets(neighbor(chain, i)):
+                models[alive_key(alive, "+".join(near))] = (
+                    fit_segment(method, x, _mean(training, near), reference)
                     if method == "anchored"
                     else alone
                 )
@@ -131,15 +132,17 @@ def _all_alive(
 ) -> Array:
     segment, sensors = chain.segments[i], chain.sensors[i]
     near = neighbor(chain, i)
-    other = near[0] if near else None
     model = fit_segment(
         method,
         [first.sensors[s] for s in sensors],
-        None if other is None else first.sensors[other],
+        _mean(first, near) if near else None,
         first.reference[segment],
     )
-    q_other = None if other is None else last.sensors[other]
-    return model.predict([last.sensors[s] for s in sensors], q_other)
+    return model.predict([last.sensors[s] for s in sensors], _mean(last, near) if near else None)
+
+
+def _mean(training: LimbTraining, sensors: Sequence[str]) -> Array:
+    return fuse([training.sensors[s] for s in sensors], (1.0 / len(sensors),) * len(sensors))
 
 
 def _flexions(

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.anchored import AnchoredModel, fit_anchored
+from jointfit_daemon.calibration.anchored import AnchoredModel
+from jointfit_daemon.calibration.kernel_model import KernelModel, fit_kernel
 from jointfit_daemon.calibration.mean_model import MeanModel, fit_mean, plain_mean
 from jointfit_daemon.calibration.patent import PatentModel, fit_patent
 from jointfit_daemon.calibration.segment_model import (
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AnchoredModel",
+    "KernelModel",
     "MeanModel",
     "PatentModel",
     "Prediction",
@@ -53,12 +55,12 @@ def fit_segment(
         q_world_segment as each sensor says it through its static mount. Any number: means
         weigh each, the regressions have a column for each, ``anchored`` a difference for each.
     q_other : array_like, shape (n, 4), or None
-        The same of one sensor of the neighbouring segment.
+        The same of the neighbouring segment: of one sensor, or the mean of several.
     q_reference : array_like, shape (n, 4)
         q_world_segment by optics, same world. Frames with NaN anywhere are left out.
     trials : array_like of int, shape (n,), optional
-        Which trial, that is kind of movement, each frame belongs to; one if None. Fewer than
-        three widen the claimed standard deviation 2.5-fold.
+        Which trial, that is kind of movement, each frame belongs to; one if None. What carries
+        over from one to another decides how much is corrected, and how sure it is.
 
     Raises
     ------
@@ -69,7 +71,7 @@ def fit_segment(
     if method == "patent12" or method == "patent6":  # noqa: PLR1714 - narrows the literal
         return fit_patent(method, training)
     if method == "anchored" and training.q_other is not None:
-        return fit_anchored(training)
+        return fit_kernel(training)
     if method == "anchored":
         return fit_mean(training)
     if method == "mean":

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from jointfit_daemon.model import Quaternion
+    from jointfit_daemon.model import Quaternion, Vector
 
     Array = NDArray[np.float64]
 
@@ -42,6 +42,8 @@ class Prediction(NamedTuple):
     """Standard deviation of the orientation, rad (root of the mean variance per axis)."""
     extrapolating: bool
     """The pose lies outside what training has shown; treat with care."""
+    axis_sd: Vector | None = None
+    """Standard deviations about x, y and z of the segment, rad, where they are known apart."""
 
 
 class SegmentModel(ABC):
@@ -160,14 +162,14 @@ class SegmentTraining:
         """Kinds of movement: trials."""
         return len(np.unique(self.trials))
 
-    def folds(self) -> Iterator[NDArray[np.bool_]]:
+    def folds(self, of_one: int = 5) -> Iterator[NDArray[np.bool_]]:
         """Yield masks of hold-out blocks, contiguous in time.
 
-        Five of a single trial, three of each of several. Never random frames: neighbouring frames
-        are nearly copies, and would tell the fit what it is judged on.
+        `of_one` blocks of a single trial, three of each of several. Never random frames:
+        neighbouring frames are nearly copies, and would tell the fit what it is judged on.
         """
         labels = np.unique(self.trials)
-        blocks = 5 if len(labels) == 1 else 3
+        blocks = of_one if len(labels) == 1 else 3
         for label in labels:
             for block in np.array_split(np.flatnonzero(self.trials == label), blocks):
                 held = np.zeros(len(self), dtype=bool)

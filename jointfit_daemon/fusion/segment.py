@@ -10,9 +10,10 @@ what was said and what is now to be said fades over a quarter of a second.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
+from math import radians, sqrt
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.calibration.redundancy import Prediction
 from jointfit_daemon.calibration.result import alive_key
 from jointfit_daemon.calibration.static_pose import UNREFERENCED_SD
 from jointfit_daemon.kinematics.rotation_scalar import (
@@ -26,12 +27,15 @@ from jointfit_daemon.kinematics.rotation_scalar import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.redundancy import SegmentModel
     from jointfit_daemon.calibration.result import SegmentCalibration
     from jointfit_daemon.model import Quaternion, Vector
 
 FLOOR_SD = 0.0005
 """No orientation is claimed to be better than this, rad."""
+HEADING_SD = radians(2.0)
+"""How far the heading of a sensor's world has wandered from where the calibration found it, rad: a
+turn about the vertical, common to a segment's pair, that no training frame shows (measured on
+simulated people a minute after calibration). It hardly touches flexion."""
 BLEND_NS = 250_000_000
 HOLD_NS = 200_000_000
 HELD_RATE = 2.0
@@ -49,6 +53,8 @@ class Fused:
     sd: float | None
     used: tuple[str, ...]
     flags: tuple[str, ...]
+    flexion_sd: float | None = None
+    """Standard deviation about the segment's x, rad, where the axes are known apart."""
 
 
 class SegmentFuser:
@@ -70,7 +76,7 @@ class SegmentFuser:
         widest = max((m.residual_sd for m in self._models.values()), default=UNREFERENCED_SD)
         self._untrained_sd = max(widest, FLOOR_SD)
         self._last: tuple[int, Quaternion, float] | None = None
-        self._before: tuple[tuple[str, ...], str | None, Inputs] | None = None
+        self._before: tuple[tuple[str, ...], tuple[str, ...], Inputs] | None = None
         self._fading: tuple[int, Vector] | None = None
 
     def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> Fused:
@@ -86,12 +92,13 @@ class SegmentFuser:
         alive = tuple([s for s in self._sensors if s in inputs])
         if not alive:
             return self._hold(t_ns)
-        other = next((s for s in neighbor if s in inputs), None)
-        target, sd, outside = self._say(alive, other, inputs)
-        self._note_change(t_ns, alive, other, inputs, target)
-        q = self._faded(t_ns, target)
-        self._last, self._before = (t_ns, q, sd), (alive, other, inputs)
-        return Fused(q, sd, alive, self._flags(alive, outside))
+        near = tuple([s for s in neighbor if s in inputs])
+        said = self._say(alive, near, inputs)
+        self._note_change(t_ns, alive, near, inputs, said.q)
+        q = self._faded(t_ns, said.q)
+        flexion_sd, sd = _claimed(said)
+        self._last, self._before = (t_ns, q, sd), (alive, near, inputs)
+        return Fused(q, sd, alive, self._flags(alive, said.extrapolating), flexion_sd)
 
     def _flags(self, alive: tuple[str, ...], outside: bool) -> tuple[str, ...]:
         few = len(alive) == 1 and len(self._sensors) > 1
@@ -109,23 +116,27 @@ class SegmentFuser:
         wide = sqrt(sd * sd + (HELD_RATE * age_s) ** 2)
         return Fused(q, wide, (), (f"held:{self._name}",))
 
-    def _say(
-        self, alive: tuple[str, ...], other: str | None, inputs: Inputs
-    ) -> tuple[Quaternion, float, bool]:
-        """Return orientation, standard deviation and whether the movement is outside training."""
-        model = self._models.get(alive_key(alive, other))
-        if model is not None:
-            return _predict(model, alive, other, inputs)
+    def _say(self, alive: tuple[str, ...], near: tuple[str, ...], inputs: Inputs) -> Prediction:
+        """Return what the model of this set says: with the neighbor, without, or the plain mean."""
+        sensors = [inputs[s] for s in alive]
+        if near:
+            model = self._models.get(alive_key(alive, "+".join(near)))
+            if model is not None:
+                q_other = mean_one([inputs[s] for s in near])
+                return model.predict_one(sensors, q_other)
+            model = self._models.get(alive_key(alive, near[0]))
+            if model is not None:
+                return model.predict_one(sensors, inputs[near[0]])
         model = self._models.get(alive_key(alive, None))
         if model is not None:
-            return _predict(model, alive, None, inputs)
-        return mean_one([inputs[s] for s in alive]), self._untrained_sd, False
+            return model.predict_one(sensors)
+        return Prediction(mean_one(sensors), self._untrained_sd, False)
 
     def _note_change(
         self,
         t_ns: int,
         alive: tuple[str, ...],
-        other: str | None,
+        near: tuple[str, ...],
         inputs: Inputs,
         target: Quaternion,
     ) -> None:
@@ -133,16 +144,16 @@ class SegmentFuser:
         if self._last is None or t_ns - self._last[0] > HOLD_NS or self._before is None:
             self._fading = None
             return
-        was_alive, was_other, was_inputs = self._before
-        if (alive, other) == (was_alive, was_other):
+        was_alive, was_near, was_inputs = self._before
+        if (alive, near) == (was_alive, was_near):
             return
-        if all(s in inputs for s in was_alive) and (was_other is None or was_other in inputs):
+        if all(s in inputs for s in (*was_alive, *was_near)):
             # the old set still speaks: what would it have said now?
-            old = self._faded(t_ns, self._say(was_alive, was_other, inputs)[0])
+            old = self._faded(t_ns, self._say(was_alive, was_near, inputs).q)
             offset = log_one(between_one(target, old))
-        elif all(s in was_inputs for s in alive) and (other is None or other in was_inputs):
+        elif all(s in was_inputs for s in (*alive, *near)):
             # the new set spoke before: what would it have said then?
-            then = self._say(alive, other, was_inputs)[0]
+            then = self._say(alive, near, was_inputs).q
             offset = log_one(between_one(then, self._last[1]))
         else:
             offset = log_one(between_one(target, self._last[1]))
@@ -159,12 +170,11 @@ class SegmentFuser:
         return multiply_one(target, exp_one((left * x, left * y, left * z)))
 
 
-def _predict(
-    model: SegmentModel, alive: tuple[str, ...], other: str | None, inputs: Inputs
-) -> tuple[Quaternion, float, bool]:
-    o = inputs[other] if other is not None else None
-    said = model.predict_one([inputs[s] for s in alive], o)
-    return said.q, max(said.sd, FLOOR_SD), said.extrapolating
+def _claimed(said: Prediction) -> tuple[float | None, float]:
+    """Return the standard deviations about x and overall, with what no training can show."""
+    sd = max(said.sd, FLOOR_SD)
+    sd = sqrt(sd * sd + HEADING_SD * HEADING_SD / 3.0)
+    return None if said.axis_sd is None else max(said.axis_sd[0], FLOOR_SD), sd
 
 
 def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:

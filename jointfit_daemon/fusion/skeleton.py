@@ -70,9 +70,13 @@ def read_angles(above: Fused, below: Fused, *, sign: float, left: bool) -> Angle
     With isotropic errors :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, whose
     first entry is :math:`1 / \cos^2\theta` times the sum: the deviation of flexion, to first order
     (E: rates of Grood and Suntay's angles to angular velocity). It is None where the axes lock.
+    Where a segment's deviation about its x is known apart, that stands for its sigma: flexion
+    hardly feels the others.
     """
     if above.q is None or below.q is None or above.sd is None or below.sd is None:
         return None
     angles, inner, gimbal = read_joint(above.q, below.q, flexion_sign=sign, left=left)
-    sd = None if gimbal else hypot(above.sd, below.sd) / cos(angles.adduction)
+    first = above.sd if above.flexion_sd is None else above.flexion_sd
+    second = below.sd if below.flexion_sd is None else below.flexion_sd
+    sd = None if gimbal else hypot(first, second) / cos(angles.adduction)
     return AngleState(angles, inner, sd, gimbal)

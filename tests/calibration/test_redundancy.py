@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from jointfit_daemon.calibration.anchored import AnchoredModel, fit_anchored
 from jointfit_daemon.calibration.redundancy import (
-    AnchoredModel,
+    KernelModel,
     MeanModel,
     PatentModel,
     SegmentModel,
@@ -130,7 +131,7 @@ def test_the_anchored_correction_is_nothing_in_the_static_pose() -> None:
 def test_far_outside_training_the_correction_fades_and_says_so() -> None:
     limb = Limb(range_rad=0.6)
     model = limb.fit("anchored")
-    assert isinstance(model, AnchoredModel)
+    assert isinstance(model, KernelModel)
     inside = model.predict_one(
         [as_quaternion(q[100]) for q in limb.sensors], as_quaternion(limb.other[100])
     )
@@ -145,7 +146,7 @@ def test_far_outside_training_the_correction_fades_and_says_so() -> None:
 def test_without_the_neighbor_the_anchored_model_is_the_mean() -> None:
     limb = Limb()
     model = limb.fit("anchored")
-    assert isinstance(model, AnchoredModel)
+    assert isinstance(model, KernelModel)
     alone = model.predict_one([as_quaternion(q[200]) for q in limb.sensors])
     assert alone.sd == model.mean_sd > model.residual_sd
     assert rot.angle_between(alone.q, model.predict(limb.sensors)[200]) < 1e-12
@@ -161,15 +162,41 @@ def test_the_claimed_deviation_is_what_later_frames_show() -> None:
         assert 0.4 * real < model.residual_sd < 2.5 * real, method
 
 
-def test_three_kinds_of_movement_claim_less_than_one() -> None:
+def test_axes_are_claimed_apart_and_together() -> None:
     limb = Limb()
-    sensors = [as_quaternion(q[10]) for q in limb.sensors]
-    other = as_quaternion(limb.other[10])
-    labels = np.arange(N) // 200
-    three = fit_segment("anchored", limb.sensors, limb.other, limb.segment, labels)
-    one = fit_segment("anchored", limb.sensors, limb.other, limb.segment)
-    ratio = one.predict_one(sensors, other).sd / three.predict_one(sensors, other).sd
-    assert ratio == pytest.approx(2.5 * one.residual_sd / three.residual_sd, rel=0.2)
+    model = limb.fit("anchored")
+    said = model.predict_one(
+        [as_quaternion(q[100]) for q in limb.sensors], as_quaternion(limb.other[100])
+    )
+    assert said.axis_sd is not None
+    assert np.sqrt(np.mean(np.square(said.axis_sd))) == pytest.approx(said.sd)
+
+
+def test_where_nothing_can_be_learned_the_mean_stays() -> None:
+    rng = np.random.default_rng(3)
+    limb = Limb()
+    limb.sensors = [
+        rot.multiply(limb.segment, rot.exp(rng.normal(0, 0.02, (N, 3)))) for _ in range(2)
+    ]
+    labels = np.arange(N) // 150
+    model = fit_segment("anchored", limb.sensors, limb.other, limb.segment, labels)
+    mean = fit_segment("mean", limb.sensors, limb.other, limb.segment)
+    assert limb.error(model, slice(0, N)) < 1.02 * limb.error(mean, slice(0, N))
+
+
+def test_the_linear_correction_of_older_calibrations_still_reads_and_runs() -> None:
+    limb = Limb()
+    training = SegmentTraining.of(limb.sensors, limb.other, limb.segment)
+    model = fit_anchored(training)
+    assert isinstance(
+        SegmentModel.from_dict(json.loads(json.dumps(model.to_dict()))), AnchoredModel
+    )
+    for i in range(0, N, 50):
+        said = model.predict_one(
+            [as_quaternion(q[i]) for q in limb.sensors], as_quaternion(limb.other[i])
+        )
+        assert rot.angle_between(said.q, model.predict(limb.sensors, limb.other)[i]) < 1e-9
+    assert limb.error(model, slice(0, N)) < 0.35 * limb.error(limb.fit("mean"))
 
 
 def test_patent6_shares_the_coefficients_and_patent12_does_not() -> None:
