@@ -164,15 +164,17 @@ class PythonCanBus:
 
     def _drain(self, bus: can.BusABC, deliver: Callable[[int, list[CanFrame]], None]) -> None:
         """Read up to 64 frames and hand them on, also those before an error."""
-        now, frames = self._stamps.pair(), []
+        frames: list[CanFrame] = []
+        self._stamps.pair()
         try:
             for _ in range(_BATCH):
                 message = bus.recv(0)
                 if message is None:
                     break
                 if not message.is_fd:  # no device of ours sends CAN FD
-                    frames.append(self._frame(message, now))
+                    frames.append(self._frame(message))
         finally:
+            now = time.monotonic_ns()  # not before the reads: see `_frame`
             if self._kernel and now - self._drops_read_ns > _DROPS_EVERY_NS:
                 self._drops_read_ns = now
                 frames += self._dropped(bus, now)
@@ -186,11 +188,16 @@ class PythonCanBus:
         lost, self._drops = (drops - self._drops) % 2**32, drops
         return [host_dropped(now, lost)] if lost else []
 
-    def _frame(self, message: can.Message, now: int) -> CanFrame:
+    def _frame(self, message: can.Message) -> CanFrame:
+        """Return the frame just read, stamped: by now, unless the kernel did.
+
+        A time from before its read would stamp what came meanwhile too early, and clocks rest on
+        the earliest.
+        """
         data, extended = bytes(message.data[:8]), message.is_extended_id
-        t_ns = (
-            self._stamps.start_ns(message.timestamp, len(data), extended) if self._kernel else now
-        )
+        t_ns = time.monotonic_ns()
+        if self._kernel:
+            t_ns = self._stamps.start_ns(message.timestamp, len(data), extended)
         return CanFrame(
             t_ns,
             message.arbitration_id,
@@ -270,7 +277,7 @@ class _Pump:
     def __init__(
         self,
         bus: can.BusABC,
-        convert: Callable[[can.Message, int], CanFrame],
+        convert: Callable[[can.Message], CanFrame],
         deliver: Callable[[int, list[CanFrame]], None],
         failed: Callable[[Exception], None],
     ) -> None:
@@ -297,11 +304,12 @@ class _Pump:
                 self._call(self._failed, error)
 
     def _hand_on(self, message: can.Message | None) -> None:
-        now, frames = time.monotonic_ns(), []
+        frames: list[CanFrame] = []
         while message is not None:
             if not message.is_fd:
-                frames.append(self._convert(message, now))
+                frames.append(self._convert(message))
             message = self._bus.recv(0) if len(frames) < _BATCH else None
+        now = time.monotonic_ns()
         while not self._room.acquire(timeout=_PUMP_S):
             if self._stopped.is_set():
                 return
