@@ -79,8 +79,7 @@ class DeviceClock:
         self.news: deque[ClockNews] = deque(maxlen=16)
         """What is to be published; whoever does takes it out."""
         self._unix_offset_ns: int | None = None
-        self._period_ns = period_ns
-        self._line = StampLine(period_ns)
+        self._period_ns, self._line = period_ns, StampLine(period_ns)
         self._arrival_ns = 0
         self._tick_clock: TickClock | None = None
         self._kind, self._absent, self._looked, self._warned = _ARRIVAL, 0, 0, False
@@ -242,15 +241,15 @@ class DeviceClock:
         if reader is None:
             return self._by_arrival(arrival_ns)
         u = reader.feed(ticks, counter, arrival_ns, self._envelope)
-        news: ClockNews | None = None
-        if u is None:
-            news = reader.explain(ticks, counter, arrival_ns - before_ns)
-        else:
-            news = self._impossible(u, arrival_ns)
+        news = (
+            reader.explain(ticks, counter, arrival_ns - before_ns)
+            if u is None
+            else self._impossible(u, arrival_ns)
+        )
         if u is None or news is not None:
             self._begin(news)
             u = self._afresh(ticks, counter, arrival_ns, tick_clock)
-        elif self._doubts.doubtful:
+        elif self._doubts.early:
             return self._by_arrival(arrival_ns)
         last_u = self._line.last_u
         if last_u is not None and u <= last_u:
@@ -313,7 +312,8 @@ class DeviceClock:
             return doubts.feed(min(arrival_ns - echo.host_ns(u), 0), 0.0, arrival_ns)
         excess = envelope.residual(u, arrival_ns - u)
         if -STEP_NS <= excess < LATE_NS:
-            doubts.on_time()
+            if doubts.any:
+                doubts.clear()
             return None
         if envelope.settled:
             return doubts.feed(excess, envelope.sigma_ns(u), arrival_ns)

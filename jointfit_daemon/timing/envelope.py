@@ -24,7 +24,7 @@ BUCKET_NS = 250_000_000
 BUCKETS = 240
 """One minute: long against jitter, short against the temperature of a crystal."""
 YOUNG_NS = 10_000_000_000
-"""Until this span every bucket is worth a refit; later one in two seconds is."""
+"""Until this span every bucket is worth a refit; later one in four seconds is."""
 SETTLED_NS = 2_000_000_000
 SETTLED_POINTS = 10
 TRUSTED_NS = 2_000_000.0
@@ -36,7 +36,7 @@ CRYSTAL = 50e-6
 NOMINAL_RATE = 5000e-6
 """Prior standard deviation of a sample rate against its nominal value."""
 
-_OLD_REFIT_BUCKETS = 8
+_OLD_REFIT_BUCKETS = 16
 _FLOOR_VAR = FLOOR_NS**2
 _LINE_POINTS = 3  # two make a line, the third a doubt
 

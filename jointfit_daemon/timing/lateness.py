@@ -48,31 +48,30 @@ class _Look(NamedTuple):
 class Plausibility:
     """Judges every sample of a settled clock."""
 
-    __slots__ = ("_early", "_look", "_looks", "_until_ns")
+    __slots__ = ("_look", "_looks", "_until_ns", "any", "early")
 
     def __init__(self) -> None:
-        self._early = 0
+        self.any = False
+        """Whether the last sample was not as it should be."""
+        self.early = 0
+        """Samples in a row that were too early; if any, the next ones must tell why."""
         self._until_ns: int | None = None
         self._looks: list[_Look] = []
         self._look = _Look(0.0, 0.0, 1)
 
-    @property
-    def doubtful(self) -> bool:
-        """Whether the last sample was too early, and the next ones must tell why."""
-        return self._early > 0
-
-    def on_time(self) -> None:
+    def clear(self) -> None:
         """Take a sample that is as it should be."""
-        self._early, self._until_ns = 0, None
+        self.any, self.early, self._until_ns = False, 0, None
 
     def feed(self, excess_ns: float, sigma_ns: float, arrival_ns: int) -> ClockNews | None:
         """Return what follows from a sample that far later than the fastest ones, if anything."""
+        self.any = True
         if excess_ns < -STEP_NS:
-            self._early += 1
-            return too_early(-excess_ns) if self._early >= EARLY_SAMPLES else None
-        self._early = 0
+            self.early += 1
+            return too_early(-excess_ns) if self.early >= EARLY_SAMPLES else None
+        self.early = 0
         if excess_ns < LATE_NS or excess_ns < LATE_SIGMAS * sigma_ns:
-            self._until_ns = None
+            self.clear()
             return None
         return self._late(excess_ns, arrival_ns)
 
