@@ -77,6 +77,14 @@ class ImuSettings(Settings):
         description="smallest delay from measuring to arrival and its standard deviation, ms; by "
         "default that of the transport",
     )
+    lag_ms: float | None = Field(
+        None,
+        ge=-1000,
+        le=1000,
+        description="stamp of this sensor minus that of the cameras for the same event, ms, where "
+        "it is known: it is used as it is, and the motion only checks it",
+    )
+    lag_sd_ms: float = Field(0.1, gt=0, le=100, description="standard deviation of `lag_ms`, ms")
 
 
 class MocapSettings(Settings):

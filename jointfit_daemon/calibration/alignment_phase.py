@@ -6,7 +6,7 @@ motion never decides it. What the movement did not show is refused with the reas
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,6 +55,8 @@ class AlignedSensor:
     """RMS angle between plate and model, rad."""
     lag_ns: int | None = None
     """Sensor stamp minus optical stamp of the same event; None where the turning showed none."""
+    lag_sigma_ns: float | None = None
+    """Standard deviation; None where it was given without one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,7 @@ class Alignment:
                 "error_rad": item.error,
                 "rms_rad": item.rms,
                 "lag_ns": item.lag_ns,
+                "lag_sigma_ns": item.lag_sigma_ns,
             }
             for name, item in self.sensors.items()
         }
@@ -114,6 +117,7 @@ class Alignment:
                     item["error_rad"],
                     item["rms_rad"],
                     item["lag_ns"],
+                    item.get("lag_sigma_ns"),
                 )
                 for name, item in data["sensors"].items()
             },
@@ -150,12 +154,15 @@ def fit_alignment(
         )
     t_ns, q_plate = plate_track(trial.optical, settings)
     unknown = {n: track for n, track in trial.sensors.items() if n not in (lag_ns or {})}
-    lags = {**usable_ns(sensor_lags(t_ns, q_plate, unknown)), **(lag_ns or {})}
+    turning = sensor_lags(t_ns, q_plate, unknown)
+    lags = {**usable_ns(turning), **(lag_ns or {})}
     reasons: list[str] = []
     found: dict[str, AlignedSensor] = {}
     for name, track in trial.sensors.items():
         try:
-            found[name] = _align_one(name, track, (t_ns, q_plate), lags.get(name))
+            aligned = _align_one(name, track, (t_ns, q_plate), lags.get(name))
+            sigma = turning[name].sigma_ns if name in turning and name in lags else None
+            found[name] = replace(aligned, lag_sigma_ns=sigma)
         except CalibrationRefused as refusal:
             reasons += refusal.reasons
     if reasons:

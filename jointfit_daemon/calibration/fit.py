@@ -15,7 +15,15 @@ from jointfit_daemon.calibration import mount
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, Anatomy, JointFound, find_anatomy
 from jointfit_daemon.calibration.digest import trials_digest
 from jointfit_daemon.calibration.judgement import better
-from jointfit_daemon.calibration.lags import SKIN, sensor_lags, usable_ns
+from jointfit_daemon.calibration.lags import (
+    NO_LAG,
+    SKIN,
+    ChosenLag,
+    known_lag,
+    seen_lags,
+    segment_lags,
+    sensor_lags,
+)
 from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
 from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
 from jointfit_daemon.calibration.refused import CalibrationRefused
@@ -53,8 +61,10 @@ MAX_FRAMES = 2000
 """More frames than this of one movement repeat themselves; the fit takes every n-th."""
 MIN_FRAMES = 300
 MIN_SEEN = 0.5
-SKIN_LAG_NS = 8_000_000
-"""A lag found on skin that is nearer to the plate's than this says the same."""
+PLATE_SD_NS = 500_000.0
+"""Of a lag from the align phase that came without its standard deviation."""
+STORED_SD_NS = 3e6
+"""Of a lag of the calibration in force: it may have been found on skin."""
 MISALIGNED = np.deg2rad(25.0)
 """A heading that differs by more is no matter of skin; below, skin may be all of it."""
 MEANING = (
@@ -74,6 +84,7 @@ def fit_calibration(
     software: str = "",
     created_utc: str = "",
     lag_ns: Mapping[str, int] | None = None,
+    tracked: Mapping[str, tuple[float, float]] | None = None,
 ) -> Calibration:
     """Calibrate a limb.
 
@@ -89,6 +100,8 @@ def fit_calibration(
         Gives lags where this movement shows none.
     lag_ns : mapping, optional
         Lags known beforehand; the others are estimated.
+    tracked : mapping, optional
+        Lag and sigma, ns, that earlier movement showed: used where this one shows none.
 
     Raises
     ------
@@ -99,13 +112,14 @@ def fit_calibration(
     tracks = _tracks(pose, functional, chain)
     anatomy = find_anatomy(chain, tracks)
     lags = _lags(chain, functional, tracks, lag_ns or {})
-    used_ns = {**_chosen_lags(usable_ns(lags), alignment, previous), **(lag_ns or {})}
+    used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}))
+    used |= {name: known_lag(lag) for name, lag in (lag_ns or {}).items()}
+    used_ns = {name: item.lag_ns for name, item in used.items()}
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
     training, raw = _training(chain, functional, tracks, anatomy, sensors)
     figures = judge(chain, training, settings.holdout_share)
     models = fit_models(chain, training, settings.method)
-    notes = [*anatomy.notes, *_lag_notes(lags, used_ns)]
-    flags = [*anatomy.flags]
+    notes, flags = [*anatomy.notes, *_lag_notes(lags, used_ns)], [*anatomy.flags]
     if alignment is None:
         flags.append("headings_from_static")
         notes += _heading_notes(chain, raw, training)
@@ -123,7 +137,7 @@ def fit_calibration(
         quality={
             "static": pose.quality,
             "alignment": None if alignment is None else alignment.quality,
-            "lag": {name: _lag_figures(lag) for name, lag in lags.items()},
+            "lag": {n: _lag_figures(lags.get(n), used.get(n, NO_LAG)) for n in sensors},
             "anatomy": _anatomy_figures(anatomy),
             "holdout": {"method": settings.method, **figures, "meaning": MEANING},
         },
@@ -179,19 +193,42 @@ def _lags(
 
 
 def _chosen_lags(
-    moving: Mapping[str, int], alignment: Alignment | None, previous: Calibration | None
-) -> dict[str, int]:
-    """Return the lag of every sensor: of the plate unless this movement contradicts it.
-
-    Skin motion goes with the movement and shifts its lag by a few milliseconds; a plate has none.
-    """
+    chain: Chain,
+    moving: Mapping[str, LagEstimate],
+    alignment: Alignment | None,
+    earlier: Mapping[str, ChosenLag],
+) -> dict[str, ChosenLag]:
+    """Return the lag of every sensor, of this movement and the plate together, else an earlier."""
+    lags = dict(earlier)
     plate = {} if alignment is None else alignment.sensors
-    lags = ({} if previous is None else previous.lag_ns) | dict(moving)
-    for name, item in plate.items():
-        known = item.lag_ns
-        if known is not None and abs(moving.get(name, known) - known) < SKIN_LAG_NS:
-            lags[name] = known
+    prior = {
+        name: (
+            item.lag_ns,
+            item.lag_sigma_ns or (STORED_SD_NS if item.kind == "stored" else PLATE_SD_NS),
+        )
+        for name, item in plate.items()
+        if item.lag_ns is not None
+    }
+    for group in chain.sensors:
+        lags |= segment_lags(
+            {name: moving[name] for name in group if name in moving},
+            {name: prior[name] for name in group if name in prior},
+        )
     return lags
+
+
+def _earlier(
+    previous: Calibration | None, tracked: Mapping[str, tuple[float, float]]
+) -> dict[str, ChosenLag]:
+    """Return what was known before: as stored, or as seen since where that is surer."""
+    stored = {} if previous is None else previous.lag_ns
+    seen = seen_lags(tracked)
+    kept = {
+        name: ChosenLag(lag, STORED_SD_NS, "stored")
+        for name, lag in stored.items()
+        if name not in seen or (seen[name].sigma_ns or 0.0) >= STORED_SD_NS
+    }
+    return seen | kept
 
 
 def _lag_notes(lags: Mapping[str, LagEstimate], used_ns: Mapping[str, int]) -> list[str]:
@@ -279,10 +316,19 @@ def _joint(found: JointFound | None) -> JointCalibration:
     return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
 
 
-def _lag_figures(lag: LagEstimate) -> dict[str, Any]:
-    if lag.refused is not None:
-        return {"refused": lag.refused}
-    return {"lag_ns": round(lag.lag_ns), "sigma_ns": round(lag.sigma_ns), "r2": lag.r2}
+def _lag_figures(moving: LagEstimate | None, used: ChosenLag) -> dict[str, Any]:
+    """Return the lag in use, and beside it what this movement alone said."""
+    figures: dict[str, Any] = {"source": used.source}
+    if used.source != "none":
+        figures["lag_ns"] = used.lag_ns
+    if used.sigma_ns is not None:
+        figures["sigma_ns"] = round(used.sigma_ns)
+    if moving is not None and moving.refused is not None:
+        return figures | {"refused": moving.refused}
+    if moving is not None:
+        said = {"lag_ns": round(moving.lag_ns), "sigma_ns": round(moving.sigma_ns), "r2": moving.r2}
+        figures["movement"] = said
+    return figures
 
 
 def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:

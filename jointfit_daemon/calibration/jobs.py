@@ -79,7 +79,7 @@ def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
         raise CalibrationRefused(
             *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
         )
-    found = fit_alignment(payload["trial"], payload["settings"])
+    found = fit_alignment(payload["trial"], payload["settings"], lag_ns=payload.get("lag_ns"))
     return {"alignment": found.to_dict(), "quality": found.quality}
 
 
@@ -105,6 +105,8 @@ def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
         payload["settings"],
         payload["chain"],
         software=__version__,
+        lag_ns=payload.get("lag_ns"),
+        tracked=payload.get("tracked"),
     )
     result: dict[str, Any] = {"quality": dict(found.quality), "calibration": found.to_dict()}
     previous = _previous(payload)

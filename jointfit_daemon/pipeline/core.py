@@ -28,7 +28,7 @@ from jointfit_daemon.pipeline.events import (
     UnixOffset,
 )
 from jointfit_daemon.pipeline.health import health_of
-from jointfit_daemon.pipeline.lag_watch import LagWatch
+from jointfit_daemon.pipeline.lag_watch import LagWatch, known_lags
 from jointfit_daemon.pipeline.session import CalibrationSession
 from jointfit_daemon.pipeline.source import SourceState, Stamped
 from jointfit_daemon.pipeline.sync_lines import SyncLines
@@ -176,10 +176,12 @@ class Core:
             self._fuser = LimbFuser(rig.chain, calibration)
             self._optical_origin, self._origin = None, None
             worn = calibration if calibration and calibration.fits(rig.chain) else None
-            self._lags = LagWatch(rig.chain, worn, self._lags)
+            self._lags = LagWatch(rig.chain, worn, self._lags, known_lags(rig))
+            self._session.lags = self._lags
             if calibration is not None and calibration.fits(rig.chain):
                 self._optical_origin = OpticalOrigin(rig.chain, calibration)
             self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
+            self._lag_ns |= self._lags.known_ns()
 
     # --- sources -----------------------------------------------------------------------------
 

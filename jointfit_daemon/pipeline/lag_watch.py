@@ -14,6 +14,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.calibration.static_pose import live_cluster
+from jointfit_daemon.driver import ImuSettings
 from jointfit_daemon.pipeline.events import Notice
 from jointfit_daemon.timing.lag import LagEstimate, LagSettings, estimate_in_steps
 from jointfit_daemon.timing.lag_tracker import LagTracker
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.markers import Cluster
     from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.config import Rig
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.timing.lag_tracker import TrackedLag
 
@@ -49,10 +51,20 @@ _LEAST_FRAMES = 100
 
 
 class KnownLag(NamedTuple):
-    """A lag that needs no estimate: a sync pulse, or PTP at both ends."""
+    """A lag that needs no estimate: ``lag_ms`` of rig.toml, from a sync line or a measurement."""
 
     lag_ns: float
     sigma_ns: float
+
+
+def known_lags(rig: Rig) -> dict[str, KnownLag]:
+    """Return the lags that a rig's tables give."""
+    asked = {source.id: source.settings for source in rig.sources if source.kind == "imu"}
+    return {
+        name: KnownLag(1e6 * settings.lag_ms, 1e6 * settings.lag_sd_ms)
+        for name, settings in asked.items()
+        if isinstance(settings, ImuSettings) and settings.lag_ms is not None
+    }
 
 
 class _Window(NamedTuple):
@@ -90,7 +102,7 @@ class LagWatch:
     before : LagWatch, optional
         Goes on with its lags: a calibration that changed is no change of clocks.
     known : mapping, optional
-        Lags of sensors with hardware sync: they are used, and the motion only checks them.
+        Lags that rig.toml gives: they are used, and the motion only checks them.
     """
 
     def __init__(
@@ -110,6 +122,7 @@ class LagWatch:
             for sensor in group
         }
         self._stored = {} if calibration is None else calibration.lag_ns
+        self._stored_sigma = {} if calibration is None else _sigmas(calibration)
         self._known = dict(known or {})
         self._sensors = {name: _Sensor() for name in self._segment}
         self._frames: deque[tuple[int, MocapFrame]] = deque(maxlen=MOST)
@@ -238,8 +251,8 @@ class LagWatch:
         if before or not state.contradicted:
             return []
         text = (
-            f"the motion says a lag of {_ms(tracked.lag_ns)}, hardware sync {_ms(known.lag_ns)}: "
-            f"{abs(apart) / sigma:.0f} sigma apart; check the sync cable and what it triggers"
+            f"the motion says a lag of {_ms(tracked.lag_ns)}, rig.toml {_ms(known.lag_ns)}: "
+            f"{abs(apart) / sigma:.0f} sigma apart; check the sync cable and lag_ms"
         )
         return [Notice(now_ns, "clock", name, text, "warning", {"lag_ms": tracked.lag_ns * 1e-6})]
 
@@ -250,6 +263,18 @@ class LagWatch:
         """What a watch that takes over goes on with."""
         return self._sensors
 
+    def known_ns(self) -> dict[str, int]:
+        """Return the lags that rig.toml gives."""
+        return {name: round(lag.lag_ns) for name, lag in self._known.items()}
+
+    def tracked(self) -> dict[str, tuple[float, float]]:
+        """Return the lags seen while running, and their standard deviations, ns."""
+        return {
+            name: (state.tracked.lag_ns, state.tracked.sigma_ns)
+            for name, state in self._sensors.items()
+            if state.tracked is not None
+        }
+
     def health(self) -> dict[str, dict[str, object]]:
         """Return for every sensor what is known of its lag, JSON-able."""
         return {sensor: self._health(sensor) for sensor in self._sensors}
@@ -257,20 +282,23 @@ class LagWatch:
     def _health(self, sensor: str) -> dict[str, object]:
         state = self._sensors[sensor]
         known, tracked, stored = self._known.get(sensor), state.tracked, self._stored.get(sensor)
-        lag_ns, sigma_ns, source = (None, None, "none")
+        used, source = (None, "none") if stored is None else (float(stored), "calibration")
         if known is not None:
-            lag_ns, sigma_ns, source = known.lag_ns, known.sigma_ns, "hardware"
-        elif tracked is not None:
-            lag_ns, sigma_ns, source = tracked.lag_ns, tracked.sigma_ns, "tracked"
-        elif stored is not None:
-            lag_ns, source = float(stored), "calibration"
+            used, source = known.lag_ns, "configured"
+        sigma_ns = None if known is None else known.sigma_ns
         return {
-            "lag_ms": None if lag_ns is None else round(lag_ns * 1e-6, 3),
-            "lag_sigma_ms": None if sigma_ns is None else round(sigma_ns * 1e-6, 3),
-            "lag_drift_ppm": None if tracked is None else round(1e6 * tracked.drift, 3),
+            "lag_ms": _rounded(used),
+            "lag_sigma_ms": _rounded(sigma_ns or self._stored_sigma.get(sensor)),
             "lag_source": source,
-            "lag_refused": state.refused,
+            "tracked_ms": None if tracked is None else _rounded(tracked.lag_ns),
+            "tracked_sigma_ms": None if tracked is None else _rounded(tracked.sigma_ns),
+            "tracked_drift_ppm": None if tracked is None else round(1e6 * tracked.drift, 3),
+            "tracked_refused": state.refused,
         }
+
+
+def _rounded(value_ns: float | None) -> float | None:
+    return None if value_ns is None else round(value_ns * 1e-6, 3)
 
 
 def _orientations(
@@ -293,6 +321,12 @@ def _orientations(
             parts.append(rigid_fit(cluster.template, positions)[0])
             yield
     return np.array([t for t, _ in rows], dtype=np.int64), np.concatenate(parts)
+
+
+def _sigmas(calibration: Calibration) -> dict[str, float]:
+    """Return the standard deviations of the lags in use, where the calibration tells them."""
+    found = calibration.quality.get("lag") or {}
+    return {name: said["sigma_ns"] for name, said in found.items() if "sigma_ns" in said}
 
 
 def _nothing(refused: str) -> LagEstimate:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
+    from jointfit_daemon.pipeline.lag_watch import LagWatch
 
 COLLECTING = tuple(TEXTS)
 
@@ -77,6 +78,8 @@ class CalibrationSession:
         self.calibration = calibration
         self.version = version
         """Of the calibration in force; None while it is not stored."""
+        self.lags: LagWatch | None = None
+        """Knows the lags that are configured and those seen while running."""
         self._phase: Phase | None = None
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
@@ -240,6 +243,8 @@ class CalibrationSession:
         elif phase.name == "functional":
             payload["static"] = self._static
         payload["settings"] = settings
+        if self.lags is not None:
+            payload |= {"lag_ns": self.lags.known_ns(), "tracked": self.lags.tracked()}
         self._jobs += 1
         self._fitting = _Fit(self._jobs, phase.name, trial if phase.name == "static" else None)
         outputs: list[Output] = []
