@@ -28,8 +28,6 @@ EXIT_BUG, EXIT_USAGE = 1, 2
 LAST_WAIT_S = 2.0
 """How long leaving may wait for a thread: a name lookup cannot be interrupted."""
 
-_JOURNAL_LEVEL = {"CRITICAL": 2, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7}
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jointfitd`` and return its exit code."""
@@ -44,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.check:
         print(describe(rig))
         return 0
-    _start_logging(options.log_level)
+    _start_logging(options.log_level, rig.name)
     return _run(options.config, rig)
 
 
@@ -65,27 +63,27 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-class _JournalFormatter(logging.Formatter):
-    """Prefixes every line with its level, as sd-daemon(3) has it; the journal has the time."""
+def _start_logging(level: str, rig: str) -> None:
+    faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
+    logging.basicConfig(
+        level=level.upper(), handlers=[_log_handler(rig, all_of_it=level == "debug")]
+    )
+    logging.getLogger("mqtt").setLevel(logging.ERROR)  # aiomqtt's: we tell its troubles ourselves
 
-    def format(self, record: logging.LogRecord) -> str:  # type: ignore[explicit-override]  # Python 3.12's
-        """Return the record as the journal reads it."""
-        level = _JOURNAL_LEVEL.get(record.levelname, _JOURNAL_LEVEL["INFO"])
-        return "\n".join(f"<{level}>{line}" for line in super().format(record).splitlines())
 
-
-def _start_logging(level: str) -> None:
+def _log_handler(rig: str, *, all_of_it: bool) -> logging.Handler:
+    """Return what writes the log: with fields, with levels, or with the time, by who reads it."""
+    from jointfit_daemon.outputs.journal import JournalHandler, LevelFormatter, is_journal
     from jointfit_daemon.outputs.log_limit import LimitedHandler
 
-    faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
-    asked_for_all = level == "debug"
-    handler = (logging.StreamHandler if asked_for_all else LimitedHandler)(sys.stderr)
+    if is_journal(sys.stderr):
+        return JournalHandler(rig, limited=not all_of_it)
+    handler = (logging.StreamHandler if all_of_it else LimitedHandler)(sys.stderr)
     if "JOURNAL_STREAM" in os.environ or "INVOCATION_ID" in os.environ:
-        handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
+        handler.setFormatter(LevelFormatter())
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.basicConfig(level=level.upper(), handlers=[handler])
-    logging.getLogger("mqtt").setLevel(logging.ERROR)  # aiomqtt's: we tell its troubles ourselves
+    return handler
 
 
 def describe(rig: Rig) -> str:

@@ -53,12 +53,19 @@ class LimitedHandler(logging.StreamHandler["TextIO"]):
         Where to.
     clock
         Tells the time, s.
+    allowance
+        How much may be said.
     """
 
-    def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        stream: TextIO,
+        clock: Callable[[], float] = time.monotonic,
+        allowance: Allowance | None = None,
+    ) -> None:
         super().__init__(stream)
         self._clock = clock
-        self._allowance = Allowance(RATE_HZ, BURST, clock())
+        self._allowance = allowance or Allowance(RATE_HZ, BURST, clock())
         self._left_out = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
@@ -71,7 +78,9 @@ class LimitedHandler(logging.StreamHandler["TextIO"]):
             text = (
                 f"{count} line{'s' if count > 1 else ''} left out: more than {RATE_HZ:g} a second"
             )
-            super().emit(
-                logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None)
-            )
+            self.put(logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None))
+        self.put(record)
+
+    def put(self, record: logging.LogRecord) -> None:
+        """Write one record, whatever was said before."""
         super().emit(record)

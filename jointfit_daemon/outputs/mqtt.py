@@ -124,8 +124,12 @@ class MqttConnection:
 
     async def __aenter__(self) -> Self:
         self._client = self._new_client()
+        task = asyncio.current_task()
+        asked_before = task.cancelling() if task else 0  # by others, of tasks that go on
         try:
             await self._client.__aenter__()
+            if task and task.cancelling() > asked_before:
+                stop_if_cancelled()
         except aiomqtt.MqttError as error:
             self._client.abandon()
             raise BrokerLost(f"{self._place()}: {error}{self._hint(error)}") from error

@@ -7,6 +7,7 @@ this file moves them.
     core time        ticks the core when nothing else does             never
     source ID        runs one driver, retries it                       with the rig
     mqtt             keeps the broker link, hands on requests          with its settings
+    ready            tells systemd when every source is known          when it has
     health           tells health, status and the watchdog             never
     recording        writes the event log                              when the disk is full
     fit KIND         one calibration fit in a worker process           with its result
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import ConfigError, load_rig
 from jointfit_daemon.outputs.event_log import EventLog
+from jointfit_daemon.outputs.journal import about
 from jointfit_daemon.outputs.log_topic import LogTopic
 from jointfit_daemon.outputs.mqtt import LoopNoise
 from jointfit_daemon.outputs.outbox import Outbox
@@ -49,6 +51,7 @@ from jointfit_daemon.supervisor.process import ProcessWatch
 from jointfit_daemon.supervisor.request_guard import RequestGuard
 from jointfit_daemon.supervisor.requests import reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
+from jointfit_daemon.supervisor.status import Pace, Seen, phase_of, status_line
 from jointfit_daemon.supervisor.storing import StoreRunner
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
 from jointfit_daemon.supervisor.watchdog import Progress
@@ -68,6 +71,8 @@ LOOK_S = 0.1
 """How often the process looks at itself."""
 HEALTH_SOON_S = 0.5
 """Health follows a device that came or went by this much, so that losses show in time."""
+KNOWN_S = 2.0
+"""A source that was silent for so long after the start counts as absent."""
 FAREWELL_S = 0.5
 """How long a stop may wait for the broker to take the last words."""
 STOP_S = 4.8
@@ -92,7 +97,7 @@ class Daemon:
         self._config, self._rig = config, rig
         self._heart = Heart(core, self._send)
         self._process, self._systemd = ProcessWatch(), SystemdNotifier()
-        self._progress = Progress()
+        self._progress, self._pace = Progress(), Pace()
         self._noise = LoopNoise()
         self._asking: Incoming | None = None
         self._online: set[str] = set()
@@ -163,8 +168,13 @@ class Daemon:
         tasks.create_task(self._reload_when_asked(), name="reload")
         await self._sources.apply(self._rig.sources)
         gc.freeze()  # what a start made stays: going through it all again takes milliseconds
-        self._systemd.ready()
         log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
+        tasks.create_task(self._ready_when_inputs_are_known(), name="ready")
+
+    async def _ready_when_inputs_are_known(self) -> None:
+        await self._sources.known(KNOWN_S)
+        self._tell_health()
+        self._systemd.ready()
 
     def _open_log(self, tasks: asyncio.TaskGroup) -> None:
         recording = self._rig.recording
@@ -184,7 +194,7 @@ class Daemon:
 
     def _tell(self, kind: str, text: str, level: str = "info") -> None:
         """Tell what only the shell knows, on the log and on ``bridge/event``."""
-        log.log(_LEVELS[level], "%s: %s", kind, text)
+        log.log(_LEVELS[level], "%s: %s", kind, text, extra=about(kind, self._rig.name))
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text)
         self._reporter.event(notice, level)
 
@@ -201,7 +211,8 @@ class Daemon:
             case Reply():
                 self._answer(output)
             case Notice():
-                log.log(_LEVELS[output.level], "%s: %s", output.id, output.text)
+                extra = about(output.kind, output.id)
+                log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=extra)
             case DeviceStatus():
                 self._came_or_went(output)
         self._reporter.handle(output)
@@ -260,12 +271,9 @@ class Daemon:
         if self._heart.log is not None:
             health["recording"] = self._heart.log.figures()
         self._reporter.health(health)
-        imus = [source.id for source in self._rig.sources if source.kind == "imu"]
-        missing = [name for name in imus if name not in self._online]
-        words = [f"{len(imus) - len(missing)} of {len(imus)} IMUs"]
-        words += [f"missing {', '.join(missing)}"] if missing else []
-        words += [] if self._link.connected else ["no broker"]
-        self._systemd.status(", ".join(words))
+        pace_hz = self._pace.since(self._heart.states, time.monotonic())
+        seen = Seen(self._online, phase_of(health), pace_hz, self._link.connected)
+        self._systemd.status(status_line(self._rig.sources, seen))
 
     # --- configuration -----------------------------------------------------------------------
 

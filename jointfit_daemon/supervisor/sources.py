@@ -14,6 +14,7 @@ import time
 from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.outputs.journal import about
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened
 
 if TYPE_CHECKING:
@@ -33,8 +34,8 @@ HEALTHY_S = 5.0  # after this long a loss is a new one, and is tried again at on
 class _Life:
     """Tells the core about one source: opened with its first bytes, closed once."""
 
-    def __init__(self, source: str, deliver: Callable[[Event], None]) -> None:
-        self._source, self._deliver = source, deliver
+    def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
+        self._source, self._deliver, self._known = source, deliver, known
         self._open = False
         self._said = ""
 
@@ -42,11 +43,13 @@ class _Life:
         """Hand a chunk to the core."""
         if not self._open:
             self._open, self._said = True, ""
+            self._known.set()
             self._deliver(SourceOpened(chunk.t_ns, self._source))
         self._deliver(ChunkArrived(self._source, chunk))
 
     def closed(self, reason: Literal["lost", "misconfigured"], text: str) -> None:
         """Tell the end of the source, unless it never began and the same was said before."""
+        self._known.set()
         if self._open or text != self._said:
             self._deliver(SourceClosed(time.monotonic_ns(), self._source, reason, text))
         self._open, self._said = False, text
@@ -58,9 +61,22 @@ class _Life:
             self._open = False
 
 
-async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None:
-    """Run one source for ever, or until its settings prove wrong: only a reload tries again."""
-    life, loop = _Life(source.id, deliver), asyncio.get_running_loop()
+async def keep_running(
+    source: Source, deliver: Callable[[Event], None], known: asyncio.Event | None = None
+) -> None:
+    """Run one source for ever, or until its settings prove wrong: only a reload tries again.
+
+    Parameters
+    ----------
+    source
+        What to run.
+    deliver
+        Feeds one event to the core.
+    known
+        Set once the source has sent something or was found absent.
+    """
+    life = _Life(source.id, deliver, known or asyncio.Event())
+    loop = asyncio.get_running_loop()
     delay = FIRST_RETRY_S
     while True:
         began = loop.time()
@@ -73,7 +89,12 @@ async def keep_running(source: Source, deliver: Callable[[Event], None]) -> None
             life.closed("lost", str(lost))  # the core tells it, on the log too
         except DeviceMisconfigured as wrong:
             life.closed("misconfigured", str(wrong))
-            log.error("%s: stopped until the next reload: %s", source.id, wrong)  # noqa: TRY400 - it says enough
+            log.error(  # noqa: TRY400 - it says enough
+                "%s: stopped until the next reload: %s",
+                source.id,
+                wrong,
+                extra=about("device", source.id),
+            )
             return
         except asyncio.CancelledError:
             life.removed()
@@ -96,6 +117,7 @@ class SourceTasks:
     def __init__(self, tasks: asyncio.TaskGroup, deliver: Callable[[Event], None]) -> None:
         self._tasks, self._deliver = tasks, deliver
         self._running: dict[str, tuple[Source, asyncio.Task[None]]] = {}
+        self._known: dict[str, asyncio.Event] = {}
 
     async def retire(self, sources: Iterable[Source]) -> None:
         """Stop those that are not among these; one whose settings are the same keeps its port.
@@ -116,10 +138,21 @@ class SourceTasks:
         await self.retire(wanted.values())
         for name, source in wanted.items():
             if name not in self._running:
+                known = self._known[name] = asyncio.Event()
                 task = self._tasks.create_task(
-                    keep_running(source, self._deliver), name=f"source {name}"
+                    keep_running(source, self._deliver, known), name=f"source {name}"
                 )
                 self._running[name] = (source, task)
+
+    async def known(self, within_s: float) -> None:
+        """Wait until every source has sent something or was found absent.
+
+        One that has done neither within `within_s` is taken for absent: it is silent.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                for known in [self._known[name] for name in self._running]:
+                    await known.wait()
 
     async def stop(self) -> None:
         """Stop all sources and wait until their ports are closed."""

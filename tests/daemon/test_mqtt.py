@@ -8,6 +8,7 @@ import logging
 import time
 from typing import TYPE_CHECKING, Any
 
+import aiomqtt
 import orjson
 import pytest
 
@@ -57,6 +58,24 @@ async def running(link: Link) -> AsyncIterator[Link]:
         task.cancel()
         await asyncio.wait([task])
         assert task.cancelled()
+
+
+async def test_a_stop_that_comes_with_the_brokers_first_word_is_not_lost(
+    mosquitto: MosquittoBroker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connect = aiomqtt.Client.__aenter__
+
+    async def connected_after_all(client: aiomqtt.Client) -> aiomqtt.Client:
+        made = await connect(client)
+        link.cancel()
+        with contextlib.suppress(asyncio.CancelledError):  # as Python 3.11's wait_for may
+            await asyncio.sleep(0)
+        return made
+
+    monkeypatch.setattr(aiomqtt.Client, "__aenter__", connected_after_all)
+    link = asyncio.create_task(Link(mosquitto.port).publisher.run())
+    await asyncio.wait([link], timeout=5)
+    assert link.cancelled()
 
 
 async def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
@@ -298,8 +317,6 @@ async def test_a_wrong_password_says_so(tmp_path: Path) -> None:
 async def test_messages_of_ours_carry_expiry_content_type_and_version(
     mosquitto: MosquittoBroker,
 ) -> None:
-    import aiomqtt  # noqa: PLC0415 - the one independent reader
-
     async with (
         aiomqtt.Client("127.0.0.1", mosquitto.port, protocol=aiomqtt.ProtocolVersion.V5) as reader,
         MqttConnection(settings(mosquitto.port)) as connection,

@@ -7,74 +7,31 @@ Runs where the kernel has an interface vcan0 that may be changed: in the light v
 from __future__ import annotations
 
 import asyncio
-import shutil
 import socket
-import subprocess
 import time
-from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
-from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
+from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.can_bus import shared_bus
-from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
-from jointfit_protocols.can_frame import HOST_DROPPED, CanFrame, host_count, unpack_frames
+from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu
+from jointfit_protocols.can_frame import HOST_DROPPED, host_count
 from jointfit_protocols.xcdi import XcdiIds, id_block
 from jointfit_simulators.can_wire import PythonCanWire
 from jointfit_simulators.driver_contract import DriverContract
 from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from tests.vm.vcan_link import BUS, LINK, NEEDS_VCAN, Heard, identity, ip, running, settings
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
-LINK = "vcan0"
-
-
-def has_vcan() -> bool:
-    try:
-        socket.if_nametoindex(LINK)
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError:
-        return False
-    return True
-
-
-pytestmark = [
-    pytest.mark.vm,
-    pytest.mark.skipif(
-        not has_vcan(), reason=f"no interface {LINK}: run .ci/light_vm.py, or `ip link add {LINK}`"
-    ),
-]
-
-
-def ip(*words: str) -> None:
-    tool = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
-    assert tool is not None
-    subprocess.run([tool, "link", *words], check=True)
-
-
-@pytest.fixture(autouse=True)
-def vcan_is_up_before_and_after(request: pytest.FixtureRequest) -> Any:
-    yield
-    if LINK not in {name for _, name in socket.if_nameindex()}:
-        ip("add", "dev", LINK, "type", "vcan")
-    ip("set", LINK, "up")
-
-
-BUS = CanBusSettings(interface="socketcan", channel=LINK, bitrate=1_000_000)
-
-
-def settings(name: str = "S3", **more: Any) -> XcdiSettings:
-    return XcdiSettings(
-        id=name, segment="shank", driver="xcdi", can=BUS, **({"silence_s": 0.5} | more)
-    )
+pytestmark = NEEDS_VCAN
 
 
 class LinkWire(PythonCanWire):
@@ -135,54 +92,6 @@ class TestXcdiOnVcanThatIsRemoved(TestXcdiOnVcanThatGoesDown):
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
         return XcdiDevice(RemovableWire())
-
-
-class Heard:
-    """Everything a driver emitted, decoded."""
-
-    def __init__(self, driver: XcdiImu) -> None:
-        self.decoder = driver.decoder()
-        self.events: list[Any] = []
-        self.frames: list[CanFrame] = []
-
-    def emit(self, chunk: Chunk) -> None:
-        self.frames += [f for f in unpack_frames(chunk.data) if isinstance(f, CanFrame)]
-        self.events += self.decoder.feed(chunk)
-
-    @property
-    def samples(self) -> list[ImuSample]:
-        return [event for event in self.events if isinstance(event, ImuSample)]
-
-    async def wait_for(self, count: int) -> None:
-        async with asyncio.timeout(5):
-            while len(self.samples) < count:
-                await asyncio.sleep(0.005)
-
-
-@asynccontextmanager
-async def running(driver: XcdiImu) -> AsyncIterator[Heard]:
-    heard = Heard(driver)
-    task = asyncio.create_task(driver.run(heard.emit))
-    await asyncio.sleep(0.05)
-    try:
-        yield heard
-    finally:
-        task.cancel()
-        await asyncio.wait({task})
-        if not task.cancelled():
-            task.result()
-
-
-@pytest.fixture
-def wire() -> Any:
-    made = PythonCanWire("socketcan", LINK)
-    yield made
-    made.unplug()
-
-
-def identity(device: XcdiDevice, count: int, first: int = 0) -> None:
-    for number in range(first, first + count):
-        device.push(number * 10_000_000, (1.0, 0.0, 0.0, 0.0))
 
 
 async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanWire) -> None:
@@ -266,13 +175,22 @@ async def test_frames_that_the_kernel_dropped_are_counted_exactly(wire: PythonCa
     async with running(XcdiImu(settings(silence_s=10))) as heard:
         device, burst = XcdiDevice(wire), 3000
         identity(device, burst)  # the loop does not run meanwhile: 12 000 frames into one queue
-        await asyncio.sleep(0.5)
+
+        def arrived() -> int:
+            return sum(not frame.error for frame in heard.frames)
+
+        seen = 0
+        while not seen or seen != arrived():  # until the queue is empty
+            seen = arrived()
+            await asyncio.sleep(0.3)  # the kernel's counter is looked at every 0.25 s
         identity(device, 1, first=burst)
-        await asyncio.sleep(0.5)
-        dropped = sum(host_count(f) for f in heard.frames if f.can_id == HOST_DROPPED)
-        arrived = sum(not frame.error for frame in heard.frames)
+        dropped = 0
+        async with asyncio.timeout(10):
+            while arrived() + dropped < 4 * (burst + 1):
+                await asyncio.sleep(0.05)
+                dropped = sum(host_count(f) for f in heard.frames if f.can_id == HOST_DROPPED)
         assert dropped > 0
-        assert arrived + dropped == 4 * (burst + 1)
+        assert arrived() + dropped == 4 * (burst + 1)
         told = [
             e.data["dropped_frames"]
             for e in heard.events
