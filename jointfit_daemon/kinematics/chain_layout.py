@@ -40,6 +40,8 @@ class Layout:
     """m, shape (S, 3); zero for free segments."""
     segment_of: Index
     """Segment of each degree of freedom, shape (nq,)."""
+    columns: tuple[tuple[int, slice], ...]
+    """Each segment and its degrees of freedom."""
     turns: Array
     """Axis (x, y, z, 0) of each turn, and a point (x, y, z, 1) it leaves in place, in segment axes;
     no axis for shifts. Shape (nq, 4, 2)."""
@@ -97,6 +99,7 @@ def _layout(model: ChainModel) -> Layout:
         has_own_centers=bool(center.any()),
         center=center,
         segment_of=segment_of,
+        columns=tuple(enumerate(model.columns)),
         turns=turns,
         shifts=shifts,
         shift_twists=np.tile(np.eye(6)[3:], (len(shifts) // 3, 1)),

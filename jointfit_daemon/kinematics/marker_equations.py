@@ -133,21 +133,21 @@ def fit(slots: Slots, rotations: Array, origins: Array, measured: Array, weights
 
 
 def _sums_to_inertia() -> Array:
-    """Return what takes the sums (x, y, z, 1) w (x, y, z, 1, e)^T to I, 6 x 6, and (x x e, e)."""
-    out = np.zeros((4, 7, 42))
+    """Return what takes the sums (x, y, z, 1) w (x, y, z, 1, e)^T to (I, (x x e, e)), 6 x 7."""
+    out = np.zeros((4, 7, 6, 7))
     cross = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
     for i, j, k in cross:
         for other in (j, k):
-            out[other, other, 6 * i + i] += 1.0
-            out[i, other, 6 * i + other] -= 1.0
-        out[i, 3, 6 * k + 3 + j] += 1.0  # [s]x at (k, j) is s_i
-        out[i, 3, 6 * j + 3 + k] -= 1.0
-        out[i, 3, 6 * (3 + k) + j] -= 1.0
-        out[i, 3, 6 * (3 + j) + k] += 1.0
-        out[3, 3, 7 * (3 + i)] += 1.0
-        out[j, 4 + k, 36 + i] += 1.0
-        out[k, 4 + j, 36 + i] -= 1.0
-        out[3, 4 + i, 39 + i] += 1.0
+            out[other, other, i, i] += 1.0
+            out[i, other, i, other] -= 1.0
+        out[i, 3, k, 3 + j] += 1.0  # [s]x at (k, j) is s_i
+        out[i, 3, j, 3 + k] -= 1.0
+        out[i, 3, 3 + k, j] -= 1.0
+        out[i, 3, 3 + j, k] += 1.0
+        out[3, 3, 3 + i, 3 + i] += 1.0
+        out[j, 4 + k, i, 6] += 1.0
+        out[k, 4 + j, i, 6] -= 1.0
+        out[3, 4 + i, 3 + i, 6] += 1.0
     return out.reshape(28, 42)
 
 
@@ -165,8 +165,11 @@ def lower_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
     layout, count = slots.layout, len(at.world)
     sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)
     beyond = layout.below @ sums.reshape(count, -1, 28)
-    bodies = (beyond @ _INERTIA)[:, layout.segment_of]
+    bodies = (beyond @ _INERTIA).reshape(count, -1, 6, 7)
     motion = twists(layout, at.world)
-    push = (bodies[..., :36].reshape(count, -1, 6, 6) @ motion[..., None])[..., 0]
-    lower = (push @ motion.swapaxes(-1, -2)) * layout.lower
-    return lower, np.einsum("tki,tki->tk", motion, bodies[..., 36:])
+    # by segment: gathering bodies for every degree of freedom would cost memory, and so time
+    pushed = np.empty((*motion.shape[:2], 7))
+    for s, columns in layout.columns:
+        np.matmul(motion[:, columns], bodies[:, s], out=pushed[:, columns])
+    lower = (pushed[..., :6] @ motion.swapaxes(-1, -2)) * layout.lower
+    return lower, pushed[..., 6]
