@@ -1,7 +1,7 @@
 """Chain models as small files: TOML to be written by hand, JSON for programs; the same keys.
 
 Law: metres and radians in the file as in the program, z up; whatever has a default may be left out.
-All that is wrong is told at once. docs/chain-model.md describes the format.
+All that is wrong is told at once. docs/kinematics.md describes the format.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import tomllib
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, get_args
 
+from jointfit_daemon.files.model_units import in_metres
 from jointfit_daemon.files.text_table import Malformed
 from jointfit_daemon.kinematics.chain_model import (
     ChainModel,
@@ -39,7 +40,8 @@ def read_model(path: Path) -> ChainModel:
     Raises
     ------
     Malformed
-        Broken, keys that are not known, values of the wrong kind, segments that make no chain.
+        Broken, keys that are not known, values of the wrong kind, segments that make no chain,
+        lengths that cannot be metres.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -50,13 +52,14 @@ def read_model(path: Path) -> ChainModel:
     if wrong:
         raise Malformed(f"{path}: {'; '.join(wrong)}")
     try:
-        return ChainModel(
+        model = ChainModel(
             tuple(_segment(s) for s in data.get("segment", ())),
             tuple(_marker(m) for m in data.get("marker", ())),
             data.get("name", path.stem),
         )
     except ImpossibleModel as error:
         raise Malformed(f"{path}: {error}") from error
+    return in_metres(path, model)
 
 
 def write_model(path: Path, model: ChainModel) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.model_units import in_metres
 from jointfit_daemon.files.osim_joints import nearest_joint
 from jointfit_daemon.files.osim_tree import GROUND, markers_of, read_document, read_xml
 from jointfit_daemon.files.text_table import Malformed
@@ -76,7 +77,8 @@ def read_osim(
     Raises
     ------
     Malformed
-        No OpenSim 4 model; joints or functions that are not known; names that are not there.
+        No OpenSim 4 model; joints or functions that are not known; names that are not there;
+        lengths that are not metres.
     """
     document = read_document(path)
     found = document.markers if marker_set is None else read_marker_set(marker_set)
@@ -99,7 +101,7 @@ def read_osim(
         model = ChainModel(tuple(segments), tuple(riders), document.name)
     except ImpossibleModel as error:
         raise Malformed(f"{path}: {error}") from error
-    return ImportedModel(model, tuple(tree.remarks))
+    return ImportedModel(in_metres(path, model), tuple(tree.remarks))
 
 
 def read_marker_set(path: Path) -> tuple[OsimMarker, ...]:

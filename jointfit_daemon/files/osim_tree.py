@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 LARGEST = 64 << 20
 GROUND = "ground"
+_METRES = "meters"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +90,8 @@ def read_document(path: Path) -> OsimDocument:
     Raises
     ------
     Malformed
-        No OpenSim model of version 4, broken XML, XML with a document type, a file out of size.
+        No OpenSim model of version 4, broken XML, XML with a document type, a file out of size,
+        another unit of length than metres.
     """
     root = read_xml(path)
     model = root.find("Model")
@@ -99,6 +101,9 @@ def read_document(path: Path) -> OsimDocument:
         raise Malformed(
             f"{path}: written by OpenSim before 4.0; open it there once and save it again"
         )
+    unit = text_of(model, "length_units", _METRES)
+    if unit != _METRES:
+        raise Malformed(f"{path}: length_units is {unit!r}, expected {_METRES!r}")
     try:
         return OsimDocument(
             model.get("name", path.stem),

@@ -90,6 +90,16 @@ def test_a_model_is_short_by_hand(tmp_path: Path) -> None:
         ("[[segment]]\nname = 'a'\nparent = 'b'", "'b' is unknown"),
         ("name = ", "m.toml: "),
         ("name = 3\n[[segment]]\nname = 'a'", "the model: name must be text"),
+        (
+            "[[segment]]\nname = 'a'\n[[marker]]\nname = 'm'\nsegment = 'a'\n"
+            "position = [12.0, -85.0, 3.0]",
+            "marker 'm' is 85 m away.*is the file in millimetres",
+        ),
+        (
+            "[[segment]]\nname = 'a'\n[[segment]]\nname = 'b'\nparent = 'a'\n"
+            "center_in_parent = [0, 0, -410]",
+            "center of 'b' in its parent is 410 m away",
+        ),
     ],
 )
 def test_all_that_is_wrong_is_told(tmp_path: Path, text: str, said: str) -> None:

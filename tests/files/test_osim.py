@@ -266,6 +266,18 @@ def test_names_that_are_not_there_are_told_together(tmp_path: Path) -> None:
         read_osim(path, bodies=["shin"], markers=["tibia9"])
 
 
+def test_millimetres_are_refused_whether_they_are_told_or_not(tmp_path: Path) -> None:
+    large = [(name, body, tuple(1000 * np.array(at)), fixed) for name, body, at, fixed in MARKERS]
+    path = write_osim(tmp_path / "mm.osim", [ROOT, HIP, KNEE], large)
+    with pytest.raises(Malformed, match="must be metres: is the file in millimetres"):
+        read_osim(path)
+    path = write_osim(tmp_path / "told.osim", [ROOT, HIP, KNEE], MARKERS)
+    text = path.read_text().replace("<BodySet>", "<length_units>mm</length_units><BodySet>", 1)
+    path.write_text(text)
+    with pytest.raises(Malformed, match="length_units is 'mm', expected 'meters'"):
+        read_osim(path)
+
+
 def test_vectors_go_there_and_back() -> None:
     v = np.arange(6.0).reshape(2, 3)
     assert to_z_up(v).tolist() == [[2.0, 0.0, 1.0], [5.0, 3.0, 4.0]]
