@@ -201,6 +201,8 @@ class Handshake:
                 "to device, or set reset_if_stuck = true"
             )
         speed = await self._other_speed() if self._hunt or heard else None
+        if speed is not None and await self._listen_at(self._settings.baud):  # USB has no speed
+            raise DeviceLost(f"{self._who}: answered too late; asking again")
         if speed is not None:
             raise DeviceMisconfigured(
                 f"{self._who}: {self._settings.baud} baud but nothing decodes; "

@@ -221,6 +221,13 @@ async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(
     assert "set baud = 9600" in said
 
 
+async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_path: Path) -> None:
+    options = XbusDeviceOptions(measures_at_once=True, config_delay_s=1.6)  # as over USB: any speed
+    device = XbusDevice(tmp_path / "imu", options=options)
+    async with powered(device):
+        assert "too late" in await refusal(make(tmp_path), DeviceLost)
+
+
 async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
     line = PtyLine(tmp_path / "imu")
     driver = make(tmp_path)
