@@ -55,7 +55,7 @@ class MarkerTrial:
         wanted = [self._index(name) for name in names]
         unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
         if unknown:
-            raise UnknownMarker("; ".join(self._explain(name) for name in unknown))
+            raise UnknownMarker(self._explain(unknown))
         return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
@@ -72,14 +72,22 @@ class MarkerTrial:
         bare = [at for at, full in enumerate(self.trajectories.names) if _bare(full) == name]
         return bare[0] if len(bare) == 1 else None
 
-    def _explain(self, name: str) -> str:
+    def _explain(self, unknown: Sequence[str]) -> str:
+        """Name the nearest of each, and all there are, once, where one has none near."""
+        hints = [(name, self._near(name)) for name in unknown]
+        said = [
+            f"no marker {name!r}" + (f": did you mean {' or '.join(near)}?" if near else "")
+            for name, near in hints
+        ]
+        if all(near for _, near in hints):
+            return "; ".join(said)
+        return f"{'; '.join(said)}; there are: {', '.join(self.trajectories.names)}"
+
+    def _near(self, name: str) -> list[str]:
         known = self.trajectories.names
         folded = {full.lower(): full for full in known}
         folded |= {_bare(full).lower(): _bare(full) for full in known}
-        near = get_close_matches(name.lower(), folded, n=3, cutoff=_NEAR)
-        if near:
-            return f"no marker {name!r}: did you mean {' or '.join(folded[key] for key in near)}?"
-        return f"no marker {name!r}; there are: {', '.join(known)}"
+        return [folded[key] for key in get_close_matches(name.lower(), folded, n=3, cutoff=_NEAR)]
 
 
 def _bare(name: str) -> str:

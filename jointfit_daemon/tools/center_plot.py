@@ -1,6 +1,7 @@
 """Markers in the parent's coordinates with the center they turn about, seen from three sides.
 
 Law: equal scales, so that a circle is a circle; the 95 % ellipse is drawn as it is, never enlarged.
+Where the place along an axis is not known the axis is drawn, and the ellipse is of what is across.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _MOST_POINTS = 600
+_END_ON = 0.1
 
 
 def draw_center(
@@ -70,8 +72,14 @@ def _center(axes: Any, answer: Answer, side: tuple[int, int], *, labelled: bool)
     axes.plot(*at, "kx" if refused else "k+", markersize=9, label=label)
     if refused:
         return
+    for direction in e.unseen[:, list(side)]:
+        if np.hypot(*direction) > _END_ON:  # else it is seen from its end
+            along = "unknown along this line" if labelled else None
+            axes.axline(at, at + direction, color="k", ls="--", linewidth=0.8, label=along)
     values, vectors = np.linalg.eigh(e.covariance[np.ix_(side, side)])
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
-    lengths = _MM * np.sqrt(CHI2_95[2] * np.maximum(values, 0.0))
+    rank = len(e.center) - len(e.unseen)
+    told = 1.0 if e.within95 is None or rank < 1 else e.within95 / CHI2_95[rank]
+    lengths = _MM * np.sqrt(told * CHI2_95[2] * np.maximum(values, 0.0))
     outline = vectors @ (lengths[:, None] * np.stack((np.cos(turn), np.sin(turn))))
     axes.plot(at[0] + outline[0], at[1] + outline[1], "k-", linewidth=0.8)

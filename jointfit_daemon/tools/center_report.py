@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import degrees, inf, isfinite
+from math import degrees, inf, isfinite, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,8 +75,7 @@ def details(answer: Answer) -> str:
         f"center    in the parent  {_point(e.center)} mm",
         f"          in the world   {_point(answer.world)} mm, at the parent's mean pose, in the"
         " file's axes",
-        f"error     {_mm(e.sd)} mm RMS predicted; no method can be below {_mm(e.bound)} mm on this"
-        " movement",
+        _error(answer),
         f"          95 % ellipsoid: semi-axes {_semi_axes(answer)} mm",
         f"arc       {degrees(e.arc):.0f}°",
         f"residual  {_mm(e.residual)} mm RMS; noise of a marker {_mm(e.noise)} mm a coordinate",
@@ -89,6 +88,24 @@ def details(answer: Answer) -> str:
         lines.append(f"axis      {_direction(e.axis)} of the parent: a hinge")
     lines += [f"note      {_FLAGS.get(flag, flag.replace('_', ' '))}" for flag in e.flags]
     return "\n".join(lines)
+
+
+def _error(answer: Answer) -> str:
+    e = answer.estimate
+    if len(e.unseen) == 0:
+        least = f"no method can be below {_mm(e.bound)} mm on this movement"
+        return f"error     {_mm(e.sd)} mm RMS predicted; {least}"
+    seen = f"; {_mm(_sd_seen(answer))} mm RMS predicted across that"
+    known = len(e.unseen) < len(e.center)
+    return f"error     unknown along what is unseen{seen if known else ''}"
+
+
+def _sd_seen(answer: Answer) -> float:
+    """Return the predicted RMS error in the directions that the movement showed, m."""
+    e = answer.estimate
+    if len(e.unseen) >= len(e.center):
+        return inf
+    return sqrt(max(float(np.trace(e.covariance)), 0.0))
 
 
 def windows(found: Sequence[Answer]) -> str:
@@ -173,6 +190,7 @@ def _answer(answer: Answer) -> dict[str, Any]:
         "center_world_m": [_nullable(v) for v in answer.world],
         "covariance_m2": [[_nullable(v) for v in row] for row in e.covariance],
         "sd_m": _nullable(e.sd),
+        "sd_seen_m": _nullable(_sd_seen(answer)),
         "bound_m": _nullable(e.bound),
         "semi_axes_95_m": [_nullable(v) for v in answer.semi_axes],
         "unseen": e.unseen.tolist(),

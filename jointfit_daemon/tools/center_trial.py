@@ -39,6 +39,8 @@ CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
 """Squared semi-axes of the 95 % ellipsoid over the variances, by the number of dimensions."""
 STILL_M = 0.005
 """RMS movement of the child's markers below which there is no center, m."""
+_SEGMENT_M = (0.005, 2.0)
+"""How far apart the markers of one segment may be, m."""
 _LEAST_PLANAR = 2
 _FEWEST_FRAMES = 3
 
@@ -143,13 +145,18 @@ def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int) -> None
             f"--parent: no frame shows all of them (frames seen: {counts}): leave out the one seen"
             " least"
         )
-    if least == MIN_MARKERS:
-        whole = trial.points(parent)[seen.all(axis=1)]
-        if is_line(whole[0]):
-            raise Unanswerable(
-                f"--parent: {', '.join(parent)} lie on a line: turns about it do not show; add"
-                " a marker beside it, or use --plane with two markers"
-            )
+    whole = trial.points(parent)[seen.all(axis=1)]
+    apart = float(np.ptp(whole[0], axis=0).max())
+    if not _SEGMENT_M[0] <= apart <= _SEGMENT_M[1]:
+        raise Unanswerable(
+            f"--parent: {', '.join(parent)} are {1000 * apart:.3g} mm apart, which no segment is:"
+            " the unit that the file states is not the one of its numbers, or the names are wrong"
+        )
+    if least == MIN_MARKERS and is_line(whole[0]):
+        raise Unanswerable(
+            f"--parent: {', '.join(parent)} lie on a line: turns about it do not show; add"
+            " a marker beside it, or use --plane with two markers"
+        )
 
 
 def _own_axes(template: Array) -> Array:
@@ -218,11 +225,13 @@ def answers(
 def _moved_enough(found: CenterEstimate, points: Array) -> CenterEstimate:
     """Refuse what the parent's own noise, turned by the lever to the child, may have drawn."""
     seen = visible(points)
+    if not seen.any():
+        return found
     away = np.where(seen[..., None], points, 0.0)
     counts = np.maximum(seen.sum(axis=0), 1)
     away = np.where(seen[..., None], points - away.sum(axis=0) / counts[:, None], 0.0)
     moved = float(np.sqrt(((away**2).sum(axis=(0, 2)) / counts).max()))
-    if found.refused is not None or moved >= STILL_M:
+    if moved >= STILL_M:
         return found
     why = f"the markers moved {1000 * moved:.1f} mm RMS only, which noise of the parent may be"
     return replace(found, refused=f"{why}: move the joint through at least 30°")

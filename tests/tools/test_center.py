@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,6 +44,19 @@ def ball_trial(noise: float = 0.0005, frames: int = 400, span: float = 1.0) -> M
         seen[:, 4 + k] = parent.apply(CENTER) + at + child.apply(CHILD[k])
     seen += rng.normal(0.0, noise, seen.shape)
     return MarkerTrajectories(NAMES, t, np.arange(1, frames + 1), seen, 100.0)
+
+
+def hinge_trial() -> MarkerTrajectories:
+    """Return a joint that turns about x only, beside a parent at rest; y is up."""
+    rng = np.random.default_rng(4)
+    t = np.arange(400) / 100.0
+    turn = Rotation.from_rotvec(np.outer(0.8 * np.sin(2 * t), (1.0, 0.0, 0.0)))
+    seen = np.empty((400, 8, 3))
+    for k in range(4):
+        seen[:, k] = PARENT[k]
+        seen[:, 4 + k] = CENTER + turn.apply(CHILD[k])
+    seen += np.array([0.0, 1.0, 0.0]) + rng.normal(0.0, 0.0005, seen.shape)
+    return MarkerTrajectories(NAMES, t, np.arange(1, 401), seen, 100.0)
 
 
 def expected_in_parent() -> NDArray[np.float64]:
@@ -160,8 +174,8 @@ def test_standing_still_is_refused_with_a_remedy_and_exit_code_1(tmp_path: Path)
     write_trc(tmp_path / "still.trc", ball_trial(span=0.0))
     result = run(app, ["center", str(tmp_path / "still.trc"), *OPTIONS])
     assert result.exit_code == 1
-    assert "REFUSED" in result.stdout
-    assert "move" in result.stdout
+    assert "REFUSED   the markers moved" in result.stdout
+    assert "move the joint" in result.stdout
     assert "nan" not in result.stdout
 
 
@@ -199,14 +213,47 @@ def test_a_parent_on_a_line_or_never_whole_is_named(tmp_path: Path) -> None:
     assert (result.exit_code, "leave out the one seen least" in result.stderr) == (2, True)
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_numbers_in_another_unit_than_the_file_states_are_told(
+    tmp_path: Path, factor: float
+) -> None:
+    trial = ball_trial()
+    write_trc(tmp_path / "unit.trc", replace(trial, positions=factor * trial.positions))
+    result = run(app, ["center", str(tmp_path / "unit.trc"), *OPTIONS])
+    assert result.exit_code == 2
+    assert "unit that the file states" in result.stderr
+
+
+def test_all_markers_are_listed_once_however_many_names_are_wrong(trc: Path) -> None:
+    asked = ["--parent", "thigh,shank,foot", "--markers", "C1"]
+    result = run(app, ["center", str(trc), *asked])
+    assert result.exit_code == 2
+    assert result.stderr.count("there are: P1, P2") == 1
+    assert result.stderr.count("no marker") == 3
+
+
+def test_a_hinge_is_told_by_its_error_across_the_axis(tmp_path: Path) -> None:
+    write_trc(tmp_path / "hinge.trc", hinge_trial())
+    asked = [str(tmp_path / "hinge.trc"), *OPTIONS]
+    found = answer(*asked)
+    assert found["sd_m"] is None
+    assert 0.0 < found["sd_seen_m"] < 0.003
+    told = run(app, ["center", *asked]).stdout
+    assert "error     unknown along what is unseen; " in told
+    assert "across that" in told
+
+
 def test_a_missing_file_is_named() -> None:
     result = run(app, ["center", "nowhere.trc", *OPTIONS])
     assert result.exit_code == 2
     assert "nowhere.trc" in result.stderr
 
 
-def test_a_plot_is_drawn(trc: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["ball", "hinge"])
+def test_a_plot_is_drawn(tmp_path: Path, kind: str) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    trc = tmp_path / "any.trc"
+    write_trc(trc, ball_trial() if kind == "ball" else hinge_trial())
     done = subprocess.run(  # a process of its own: matplotlib keeps its fonts open
         [
             sys.executable,

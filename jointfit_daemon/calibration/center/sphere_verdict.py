@@ -38,6 +38,11 @@ LOUD = 9.0
 PERSISTENT = 0.5
 """Correlation of residuals from frame to frame from which it is flagged."""
 STRAIGHT = "the markers' paths show no bend: move the joint further, at least 30° each way"
+FURTHER = ": move this joint further"
+SKIN = (
+    ", since markers leave their spheres as the posture goes, as on skin: move further and in more "
+    "directions, slowly, or put the markers where skin slides least; of a hinge sara shows the axis"
+)
 STILL = "the markers stood still in the parent: move the joint, at least 30° each way"
 
 
@@ -157,7 +162,7 @@ def _answer(
         axis=unseen[0] if len(unseen) == 1 and len(basis) == 3 else None,
         flags=_flags(seen, len(unseen)),
         within95=seen.within95,
-        refused=objection(arc, radius, conditioning, limits),
+        refused=objection(arc, radius, conditioning, limits, skin=seen.left.posture > 0.0),
     )
 
 
@@ -199,12 +204,14 @@ def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
     return (*flags, *(f"noisy_marker:{j}" for j in loud))
 
 
-def objection(arc: float, radius: float, conditioning: float, limits: Limits) -> str | None:
+def objection(
+    arc: float, radius: float, conditioning: float, limits: Limits, *, skin: bool = False
+) -> str | None:
     """Say why a center is not to be used and what to do; None if it may."""
     if arc < limits.min_arc:
         return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
     if not limits.reach[0] <= radius <= limits.reach[1]:
         return f"the markers would be {radius:.2f} m from the center: check marker names"
     if conditioning < MIN_CONDITIONING:
-        return f"uncertain to {1000 * radius / conditioning:.0f} mm: move this joint further"
+        return f"uncertain to {1000 * radius / conditioning:.0f} mm{SKIN if skin else FURTHER}"
     return None

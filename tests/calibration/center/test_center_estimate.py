@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from bench.moving_joint import ball_turns, carried, covers, fan, hinge_turns, watched
 from jointfit_daemon.calibration.center.estimate import METHODS, estimate_center
-from jointfit_daemon.calibration.center.movement import Movement
+from jointfit_daemon.calibration.center.movement import BodyPoses, Movement
 
 Array = NDArray[np.float64]
 IN_A_PLANE = sorted(name for name, method in METHODS.items() if method.planar)
@@ -126,6 +127,20 @@ def test_points_without_a_center_are_refused_by_every_method(name: str, kind: st
     assert found.refused is not None
     assert len(found.refused) > 25
     assert found.sd == inf
+
+
+@pytest.mark.parametrize("name", ["sphere", "running_sphere", "geometric", "score", "sara"])
+def test_a_marker_that_jumps_moves_no_robust_method_far(name: str) -> None:
+    movement = whole("hinge" if name in {"geometric", "sara"} else "ball")
+    assert movement.points is not None
+    assert movement.child is not None
+    points, t = movement.points.copy(), movement.child.t.copy()
+    points[30:200:17, 1] += 0.08
+    t[30:200:17] += 0.05
+    jumped = replace(movement, points=points, child=BodyPoses(movement.child.q, t))
+    before, after = (estimate_center(m, name) for m in (movement, jumped))
+    assert after.refused is None
+    assert np.linalg.norm(after.center - before.center) < 5e-3
 
 
 @given(st.integers(0, 1000), st.floats(0.0, 0.9), st.sampled_from([*IN_SPACE, "sara"]))

@@ -95,6 +95,14 @@ def test_the_error_told_on_skin_is_about_the_error_made() -> None:
     assert 0.2 < np.mean(squares) < 2.0
 
 
+def test_a_refusal_for_skin_does_not_ask_for_a_longer_arc_alone() -> None:
+    told = [found.refused for seed in range(24) if (found := fit_sphere(on_skin(seed))).refused]
+    assert any("where skin slides least" in why for why in told)
+    clean = watched(np.random.default_rng(1), ball_turns(np.random.default_rng(1), 9.0))
+    why = fit_sphere(clean.points).refused
+    assert why is None or "skin" not in why
+
+
 def test_cycles_repeated_do_not_make_skin_known_better() -> None:
     few, many = (fit_sphere(on_skin(3, cycles)) for cycles in (4, 40))
     assert np.trace(many.covariance) == pytest.approx(np.trace(few.covariance), rel=0.2)
