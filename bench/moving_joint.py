@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.movement import BodyPoses
+from jointfit_daemon.calibration.center.parent_noise import spatial_noise
 from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.kinematics import rotation
 
@@ -99,6 +100,24 @@ def sphere_bound(paths: Array, noise: float) -> float:
     u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
     u = u - u.mean(axis=0)
     return float(np.trace(np.linalg.inv(np.einsum("tja,tjb->ab", u, u)))) * noise**2
+
+
+def joint_bound(paths: Array, noise: float, frame: Array = PARENT) -> float:
+    r"""Return the same for markers seen from a parent that is a fit to noisy markers, m².
+
+    .. math:: \left[ \sum_t A_t^T S_t^{-1} A_t \right]^{-1}, \qquad A_t = (U_t \; I), \quad
+              S_t = σ^2 \left( I + U_t Σ_c U_t^T \right)
+
+    U the directions, the columns of I for the radii, Σ_c what the fit does to the center, which all
+    markers share, over σ².
+    """
+    u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
+    k = u.shape[1]
+    shared = spatial_noise(np.zeros(3), frame, 1.0) - np.eye(3)
+    together = np.eye(k) + u @ shared @ np.swapaxes(u, 1, 2)
+    design = np.concatenate((u, np.broadcast_to(np.eye(k), (len(u), k, k))), axis=2)
+    information = (np.swapaxes(design, 1, 2) @ np.linalg.solve(together, design)).sum(axis=0)
+    return float(np.trace(np.linalg.inv(information)[:3, :3])) * noise**2
 
 
 def covers(found: CenterEstimate) -> bool:

@@ -65,6 +65,13 @@ class Judged:
         axis = hinge(self.reduced)
         return float(np.linalg.norm(gap - axis * (gap @ axis)))
 
+    def told_across(self, method: str) -> float:
+        """Return the RMS error across the axis that the estimate tells, m."""
+        axis = hinge(self.reduced)
+        across = np.eye(3) - np.outer(axis, axis)
+        spread = across @ self.estimates[method].covariance @ across
+        return float(np.sqrt(max(np.trace(spread), 0.0)))
+
 
 def hinge(reduced: Reduced) -> NDArray[np.float64]:
     """Return the direction about which the child turned most, in the parent's coordinates."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -18,13 +19,14 @@ from bench.moving_joint import (
     covers,
     fan,
     hinge_turns,
+    joint_bound,
     sphere_bound,
     star_turns,
     watched,
 )
 from jointfit_daemon.calibration.center.parent_noise import relative, spatial_noise
 from jointfit_daemon.calibration.center.planar_estimate import Limits, circle_estimate
-from jointfit_daemon.calibration.center.running_sphere import fit_running
+from jointfit_daemon.calibration.center.running_sphere import RunningSphere, fit_running
 from jointfit_daemon.calibration.center.sara import fit_axis
 from jointfit_daemon.calibration.center.score import fit_score
 from jointfit_daemon.calibration.center.several import fuse_centers
@@ -71,12 +73,40 @@ def four_markers(_: Path) -> list[Figure]:
     ]
 
 
-def ball_joint(rom: float, goals: tuple[float, ...]) -> list[Figure]:
-    """C-10: 1 mm on all markers of both bodies, 200 runs."""
+def upper_rms(errors: list[Array]) -> float:
+    """Return the RMS that one in twenty such sets of runs would pass, m."""
+    squares = np.array([e @ e for e in errors])
+    return float(np.sqrt(squares.mean() + 1.645 * squares.std() / np.sqrt(len(squares))))
+
+
+def frame_by_frame(_: Path) -> list[Figure]:
+    """C-5b: the streaming sphere against the sums of all frames, hidden markers included."""
+    rng = np.random.default_rng(5)
+    points = carried(star_turns(45.0, 1000)) + rng.normal(0, NOISE, (1000, 4, 3))
+    points[rng.uniform(size=points.shape[:2]) < 0.1] = np.nan
+    stream = RunningSphere(4)
+    for frame in points:
+        stream.feed(frame)
+    live, batch = stream.estimate(), fit_running(points)
+    off = float(np.abs(live.center - batch.center).max())
+    return [
+        Figure("center", off, 1e-9, unit="m"),
+        Figure("predicted error", abs(live.sd - batch.sd), 1e-9, unit="m"),
+    ]
+
+
+def ball_joint(rom: float, goals: tuple[float, ...], runs: int = 200) -> list[Figure]:
+    """C-10: 1 mm on all markers of both bodies; from 1000 runs on, their upper 95 % limits.
+
+    Fewer than the 200 of the row's definition may be off by chance, and get room for it.
+    """
     rng = np.random.default_rng(10)
     errors: dict[str, list[Array]] = {}
-    for _run in range(200):
-        seen = watched(rng, ball_turns(rng, rom), template_error=TEMPLATE_ERROR_M)
+    bounds = []
+    for _run in range(runs):
+        turns = ball_turns(rng, rom)
+        seen = watched(rng, turns, template_error=TEMPLATE_ERROR_M)
+        bounds.append(joint_bound(carried(turns), NOISE))
         shape = relative(seen.points, PARENT, halvorsen(seen.points).center)
         for name, found in (
             ("sphere", fit_sphere(seen.points, SphereOptions(huber=inf), parent=PARENT)),
@@ -86,10 +116,19 @@ def ball_joint(rom: float, goals: tuple[float, ...]) -> list[Figure]:
             ("Gamage-Lasenby", gamage_lasenby(seen.points)),
         ):
             errors.setdefault(name, []).append(found.center)
+    room = 1.15 if runs >= 200 else 1.15 * (1.0 + 1.645 / float(np.sqrt(3.0 * runs)))
+    size, kind = (upper_rms, ", upper 95 % limit") if runs >= 1000 else (rms, "")
     return [
-        Figure(name, MM * rms(found), 1.15 * goal, unit="mm")
-        for (name, found), goal in zip(errors.items(), goals, strict=True)
+        *(
+            Figure(f"{name}{kind}", MM * size(found), room * goal, unit="mm")
+            for (name, found), goal in zip(errors.items(), goals, strict=True)
+        ),
+        Figure("Cramér-Rao bound", MM * float(np.sqrt(np.mean(bounds))), inf, unit="mm"),
     ]
+
+
+def _many(rom: float, goals: tuple[float, ...], _: Path) -> list[Figure]:
+    return ball_joint(rom, goals, runs=1000)
 
 
 def hinge_axis(_: Path) -> list[Figure]:
@@ -213,10 +252,28 @@ def coverage(runs: int) -> list[Figure]:
 
 
 EXPERIMENTS = (
+    Experiment("C-5b", "sphere, one frame at a time against all at once", frame_by_frame),
     Experiment("C-7", "four markers round a joint, 20° arc", four_markers),
-    Experiment("C-10", "ball joint 20°, both bodies noisy, RMS", lambda _: ball_joint(20.0, AT_20)),
     Experiment(
-        "C-10b", "ball joint 45°, both bodies noisy, RMS", lambda _: ball_joint(45.0, AT_45)
+        "C-10",
+        "ball joint 20°, both bodies noisy, RMS of 200 runs",
+        lambda _: ball_joint(20.0, AT_20),
+        long=True,
+    ),
+    Experiment(
+        "C-10b",
+        "ball joint 45°, both bodies noisy, RMS of 200 runs",
+        lambda _: ball_joint(45.0, AT_45),
+        long=True,
+    ),
+    *(
+        Experiment(
+            f"C-10{letter}",
+            f"the same at {rom:g}°, 1000 runs",
+            partial(_many, rom, goals),
+            long=True,
+        )
+        for letter, rom, goals in (("d", 20.0, AT_20), ("e", 45.0, AT_45))
     ),
     Experiment("C-11", "SARA at 45°", hinge_axis),
     Experiment("C-12", "noise of the parent's frame against Monte-Carlo", parent_covariance),

@@ -42,6 +42,10 @@ def compare(trial: str, data: Path) -> list[Figure]:
                 name += " (refused)"
             figures.append(Figure(f"{name}: error it tells", 1000 * e.sd, inf, unit="mm"))
             if np.isfinite(e.center).all():
+                told = 1000 * found.told_across(method)
+                figures.append(
+                    Figure(f"{name}: error it tells across the axis", told, inf, unit="mm")
+                )
                 off, across = 1000 * found.off(method), 1000 * found.off_axis(method)
                 figures += [
                     Figure(f"{name}: from the model", off, inf, unit="mm"),

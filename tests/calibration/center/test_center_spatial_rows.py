@@ -5,11 +5,19 @@ from __future__ import annotations
 import pytest
 
 from bench.experiment import DATA, Experiment
-from bench.joint_center_rows.b_spatial import EXPERIMENTS
+from bench.joint_center_rows.b_spatial import AT_20, AT_45, EXPERIMENTS, ball_joint
 
 
 @pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if not e.long], ids=lambda e: e.id)
 def test_every_spatial_figure_keeps_its_goal(experiment: Experiment) -> None:
     figures = experiment.run(DATA)
     assert figures
+    assert [figure for figure in figures if not figure.kept] == []
+
+
+@pytest.mark.parametrize(("rom", "goals"), [(20.0, AT_20), (45.0, AT_45)])
+def test_a_ball_joint_between_two_noisy_bodies_is_found_as_well_in_fewer_runs(
+    rom: float, goals: tuple[float, ...]
+) -> None:
+    figures = ball_joint(rom, goals, runs=40)
     assert [figure for figure in figures if not figure.kept] == []
