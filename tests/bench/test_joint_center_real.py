@@ -1,0 +1,40 @@
+"""A real trial through the bench that prints it: where recordings and the model's program are."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench.experiment import find_experiments
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.timeout(180)
+def test_an_error_told_of_a_real_joint_is_not_far_too_small(tmp_path: Path) -> None:
+    row = next(e for e in find_experiments("joint_center_rows") if e.id == "R-2")
+    reason = row.missing()
+    if reason is not None:
+        pytest.skip(reason)
+    # a process of its own: the model's program prints and warns as it likes
+    script = [sys.executable, str(ROOT / "bench" / "joint_center.py"), "R-2"]
+    done = subprocess.run(
+        [*script, "--json", str(tmp_path / "a.json")], capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    figures = {
+        f["name"]: f["value"] for f in json.loads((tmp_path / "a.json").read_text())[0]["figures"]
+    }
+    joints = {name.split(":")[0] for name in figures if "refused" not in name}
+    assert any("knee, sphere" in joint for joint in joints)
+    for joint in joints:
+        told = figures[f"{joint}: error it tells across the axis"]
+        # the model's own center moves 4 to 18 mm under the markers
+        assert figures[f"{joint}: across the axis"] < 2.0 * told + 18.0
+        assert (
+            figures[f"{joint}: from the model"] < 2.0 * figures[f"{joint}: error it tells"] + 18.0
+        )
