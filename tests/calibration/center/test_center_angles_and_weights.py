@@ -103,6 +103,24 @@ def test_angles_without_a_movement_are_refused(points: Any, angles: Any, cause: 
     assert ":" in found.refused
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.linspace(0, 1, 50)[:, None] * (1.0, 2.0),
+        np.linspace(0, 1, 50)[:, None] * (1.0, 0.0),
+        np.round(np.linspace(0, 1, 50))[:, None] * (0.3, 0.1),
+        np.eye(2)[np.arange(50) % 2],
+        1e-9 * arc(60.0)[0][:50],
+    ],
+    ids=["a line", "along x", "two places in turn", "two places by turns", "tiny"],
+)
+def test_paths_without_a_second_dimension_warn_of_nothing_and_are_judged(points: Any) -> None:
+    found = oriented_estimate(points, np.linspace(0.0, 1.0, len(points)), 0.01)
+    assert np.isfinite(found.center).all()
+    assert np.isfinite(found.covariance).all()
+    assert found.refused is not None or np.isfinite(found.sd)
+
+
 @given(
     st.lists(st.tuples(values, values, st.floats(-4.0, 4.0)), max_size=30),
 )
