@@ -2,5 +2,6 @@
 
 from jointfit_daemon.fusion.limb import LimbFuser
 from jointfit_daemon.fusion.origin import OpticalOrigin
+from jointfit_daemon.fusion.sensor_watch import SensorWatch
 
-__all__ = ["LimbFuser", "OpticalOrigin"]
+__all__ = ["LimbFuser", "OpticalOrigin", "SensorWatch"]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.calibration.anatomy import flexion_sign
 from jointfit_daemon.calibration.model_fit import neighbor
 from jointfit_daemon.fusion.segment import Fused, SegmentFuser
+from jointfit_daemon.fusion.sensor_watch import SensorWatch
 from jointfit_daemon.fusion.skeleton import Reach, joint_positions, read_angles
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.model import JointState, LimbState, SegmentState
@@ -33,10 +34,15 @@ class LimbFuser:
         Joints, segments and sensors of the rig.
     calibration : Calibration or None
         None, or one of another chain (flag ``other_chain``): every state is ``uncalibrated``.
+    watch : SensorWatch, optional
+        What is known of the sensors already: a calibration that changed is no change of sensors.
     """
 
-    def __init__(self, chain: Chain, calibration: Calibration | None) -> None:
+    def __init__(
+        self, chain: Chain, calibration: Calibration | None, watch: SensorWatch | None = None
+    ) -> None:
         self._chain = chain
+        self.watch = watch or SensorWatch(chain)
         known = calibration is not None and calibration.fits(chain)
         self._calibration = calibration if known else None
         self._standing: tuple[str, ...] = ("uncalibrated",)
@@ -85,7 +91,7 @@ class LimbFuser:
             Instant, arrival of what completed the frame, running number; handed through.
         orientations : mapping of str to Quaternion
             q_world_sensor of every sensor that is alive, each in its own world; unknown ids are
-            ignored.
+            ignored. Not to be changed afterwards.
         extrapolated : frozenset of str
             Sensors whose value is extrapolated beyond their last sample.
         optical_origin : Vector, optional
@@ -97,9 +103,11 @@ class LimbFuser:
         -----
         Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
         (a sample was extrapolated in time), ``origin_fixed`` (cameras run but do not see O1, so
-        that it is at the configured origin), per segment ``one_sensor:``, ``untrained:`` (outside
-        the movements of the calibration), ``held:``, ``lost:``; ``gimbal`` last.
+        that it is at the configured origin), ``stuck:`` per sensor, per segment ``one_sensor:``,
+        ``untrained:`` (outside the movements of the calibration), ``held:``, ``lost:``; ``gimbal``
+        last.
         """
+        orientations, stuck = self.watch.look(t_ns, completed_ns, orientations)
         if self._calibration is None:
             return self._uncalibrated(t_ns, completed_ns, seq, sync)
         inputs = {
@@ -116,6 +124,7 @@ class LimbFuser:
             flags.append("extrapolating")
         if optical_origin is None and mode == "imu+mocap":
             flags.append("origin_fixed")
+        flags += [f"stuck:{name}" for name in stuck]
         for one in fused:
             flags += one.flags
         joints = self._joints(fused, optical_origin, flags)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.config.checks import headings
-from jointfit_daemon.fusion import LimbFuser, OpticalOrigin
+from jointfit_daemon.fusion import LimbFuser, OpticalOrigin, SensorWatch
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline.bulletin import Bulletin, unix_time_set
 from jointfit_daemon.pipeline.events import (
@@ -29,6 +29,7 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_daemon.pipeline.health import health_of
 from jointfit_daemon.pipeline.lag_watch import LagWatch, known_lags
+from jointfit_daemon.pipeline.sensor_notices import sensor_notices
 from jointfit_daemon.pipeline.session import CalibrationSession
 from jointfit_daemon.pipeline.source import SourceState, Stamped
 from jointfit_daemon.pipeline.sync_lines import SyncLines
@@ -74,6 +75,7 @@ class Core:
         self._aligner: FrameAligner
         self._aligned: tuple[str, ...] = ()
         self._fuser: LimbFuser
+        self._watch: SensorWatch | None = None
         self._optical_origin: OpticalOrigin | None = None
         self._origin: Vector | None = None
         self._lag_ns: dict[str, int] = {}
@@ -109,7 +111,12 @@ class Core:
     @property
     def next_deadline_ns(self) -> int | None:
         """Return when the core wants a ``Tick`` at the latest; None while nothing is pending."""
-        return None if self._rig is None else self._aligner.next_deadline_ns
+        if self._rig is None:
+            return None
+        frame_ns, silence_ns = self._aligner.next_deadline_ns, self._fuser.watch.due_ns
+        if frame_ns is None or silence_ns is None:
+            return frame_ns or silence_ns
+        return min(frame_ns, silence_ns)
 
     def health(self, now_ns: int) -> dict[str, object]:
         """Return counters and clocks of every device: the part of ``bridge/health`` known here."""
@@ -118,7 +125,7 @@ class Core:
         mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
         verdicts = {"mocap": mocap} | {name: self._counts(name) for name in self._aligned}
         lags = {} if self._lags is None else self._lags.health()
-        return health_of(self._sources, verdicts, self._session, now_ns) | {
+        return health_of(self._sources, verdicts, self._session, self._fuser.watch, now_ns) | {
             "lags": lags,
             "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames},
         }
@@ -153,6 +160,8 @@ class Core:
             session.take_over(self._session, same_rig=_worn(before) == _worn(rig))
         if before is None or _frame_layout(before) != _frame_layout(rig):
             self._replace_aligner(rig)
+        if before is None or before.chain != rig.chain:
+            self._watch = SensorWatch(rig.chain)
         self._session = session
         self._use_calibration()
         if (doubt := headings(rig.sources)) is not None:
@@ -173,7 +182,7 @@ class Core:
     def _use_calibration(self) -> None:
         rig, calibration = self._rig, self._session.calibration
         if rig is not None:
-            self._fuser = LimbFuser(rig.chain, calibration)
+            self._fuser = LimbFuser(rig.chain, calibration, self._watch)
             self._optical_origin, self._origin = None, None
             worn = calibration if calibration and calibration.fits(rig.chain) else None
             self._lags = LagWatch(rig.chain, worn, self._lags, known_lags(rig))
@@ -305,6 +314,7 @@ class Core:
         if self._session.collecting:
             outputs += self._session.advance(now_ns)
         outputs += self._bulletin.due(now_ns)
+        outputs += sensor_notices(now_ns, self._fuser.watch.news(now_ns))
         return outputs
 
     def _fuse(self, frame: AlignedFrame) -> LimbState:

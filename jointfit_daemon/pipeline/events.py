@@ -126,7 +126,8 @@ class Notice:
 
     t_ns: int
     kind: str
-    """``device`` | ``clock`` | ``calibration`` | ``wire`` | ``reload`` | ``frames``."""
+    """``device`` | ``sensor`` | ``clock`` | ``calibration`` | ``wire`` | ``reload`` |
+    ``frames``."""
     id: str
     text: str
     level: Literal["info", "warning", "error"] = "info"

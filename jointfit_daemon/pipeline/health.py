@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.fusion import SensorWatch
     from jointfit_daemon.pipeline.session import CalibrationSession
     from jointfit_daemon.pipeline.source import SourceState
 
@@ -22,6 +23,7 @@ def health_of(
     sources: Mapping[str, SourceState],
     counted: Mapping[str, Mapping[str, int]],
     session: CalibrationSession,
+    watch: SensorWatch,
     now_ns: int,
 ) -> dict[str, object]:
     """Return the health of every device and of the calibration, as JSON-able values.
@@ -35,6 +37,8 @@ def health_of(
         if state.source.kind == "mocap":
             verdicts = _mocap(state, verdicts)
         devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state), **_filter(state)}
+        if state.source.kind == "imu":
+            devices[name]["sensor"] = watch.health(name)
     return {
         "devices": devices,
         "calibration": {"phase": session.phase, "version": session.version},
