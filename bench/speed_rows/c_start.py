@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 from bench.harness import Bench, Row
 from bench.worn import bench_rig, phases
@@ -55,7 +57,26 @@ def fit_rows(quick: bool) -> list[Row]:
     return [Row("fit: 60 s at 100 Hz and 120 Hz", round(cpu, 2), "s", 3.0, 12.0, note=note)]
 
 
+def exposure_rows(quick: bool) -> list[Row]:
+    """How open the shipped unit is, as systemd counts: 0 is locked, 10 is open."""
+    del quick
+    tool = shutil.which("systemd-analyze")
+    if tool is None:
+        print(
+            "not run: systemd-analyze is not installed: sudo apt install systemd", file=sys.stderr
+        )
+        return []
+    rows = []
+    for unit in sorted((Path(__file__).parents[2] / "systemd").glob("jointfitd*.service")):
+        words = [tool, "security", "--offline=yes", "--no-pager", str(unit)]
+        said = subprocess.run(words, check=True, capture_output=True, text=True).stdout  # noqa: S603 - systemd's
+        figure = float(said.partition("level for")[2].partition(":")[2].split()[0])
+        rows.append(Row(f"exposure of {unit.name}", figure, "of 10", 1.4, 1.4))
+    return rows
+
+
 BENCHES = (
+    Bench("unit", "what the shipped units allow", exposure_rows),
     Bench("import", "starting the program", import_rows),
     Bench("fit", "a calibration fit", fit_rows),
 )

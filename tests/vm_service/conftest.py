@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -10,6 +10,22 @@ from machine import SIM, UNIT, cursor, eventually, give_ports, run, show, write_
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+
+class TellsAtOnce:
+    """Prints why a test failed when it fails: a run that is cut short has no summary."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._plugins = config.pluginmanager
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            terminal: Any = self._plugins.get_plugin("terminalreporter")
+            terminal.write_line(f"\n{report.longreprtext}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(TellsAtOnce(config), "tells at once")
 
 
 @pytest.fixture

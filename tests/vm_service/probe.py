@@ -37,6 +37,12 @@ def write(path: str) -> int:
     return tried(lambda: Path(path).write_text("x"))
 
 
+def packet(address: str) -> int:
+    """Return the errno of a datagram to `address`; the machine has a route to it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
+        return tried(lambda: speaker.sendto(b"x", (address, 1511)))
+
+
 def capabilities() -> str:
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(line.split()[1] for line in lines if line.startswith("CapEff"))
@@ -67,10 +73,14 @@ found = {
     ),
     "new capability": 0 if int(capabilities(), 16) else 1,
     "setuid": tried(lambda: os.setuid(0)),
+    "public network": packet("198.51.100.7"),
     # what it must be able to do
     "may write its state": write(os.environ["STATE_DIRECTORY"] + "/probe"),
     "may open its port": tried(lambda: os.open(PORT, os.O_RDWR | os.O_NOCTTY)),
     "may speak CAN": tried(lambda: socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)),
+    "may speak to 10.x": packet("10.77.0.7"),
+    "may speak to 192.168.x": packet("192.168.77.7"),
+    "may speak to cameras by multicast": packet("239.255.42.99"),
     "may speak UDP": tried(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)),
 }
 print("PROBE " + json.dumps(found), flush=True)

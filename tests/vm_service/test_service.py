@@ -23,6 +23,7 @@ from machine import (
     run,
     show,
     sim,
+    slowness,
     write_rig,
 )
 
@@ -52,11 +53,11 @@ def test_angles_arrive_over_tls_from_two_serial_ports_and_two_on_a_bus(service: 
     eventually(lambda: "4 of 4 IMUs" in show("StatusText"), "all four stream")
     sim("play stand")
     ask("calibrate", phase="static", transaction="1")
-    eventually(lambda: calibration()["phase"] == "posed", "stood still", 40)
+    eventually(lambda: calibration()["phase"] == "posed", "stood still")
     sim("play squat")
     ask("calibrate", phase="functional", seconds=12, transaction="2")
-    eventually(lambda: calibration()["phase"] == "calibrated", "calibrated", 90)
-    poses = messages("pose", count=100, seconds=20)
+    eventually(lambda: calibration()["phase"] == "calibrated", "calibrated", 180)
+    poses = messages("pose", count=100, seconds=30)
     knees = [pose["joints"]["knee"]["flexion_deg"] for pose in poses]
     assert max(knees) - min(knees) > 30.0  # squats
     used = {name for pose in poses for part in pose["segments"].values() for name in part["used"]}
@@ -70,18 +71,18 @@ def test_the_status_line_counts_what_is_there(service: int) -> None:
 def test_a_start_is_ready_at_once_and_a_stop_takes_less_than_three_seconds(since: str) -> None:
     began = time.monotonic()
     run("systemctl", "start", UNIT)
-    assert time.monotonic() - began < 6.0  # Python alone takes two in here
+    assert time.monotonic() - began < 8.0 * slowness()  # Python alone takes two in here
     eventually(online, "online")
     began = time.monotonic()
     run("systemctl", "stop", UNIT)
-    assert time.monotonic() - began < 3.0
+    assert time.monotonic() - began < 3.0 * slowness()
     assert show("Result") == "success"
     assert messages("bridge/state", seconds=2) == [{"state": "offline"}]
 
 
 def test_a_hung_daemon_is_killed_by_the_watchdog_and_starts_again(service: int, since: str) -> None:
     os.kill(service, signal.SIGSTOP)
-    eventually(lambda: int(show("MainPID")) not in {0, service}, "a new process", 40)
+    eventually(lambda: int(show("MainPID")) not in {0, service}, "a new process")
     assert "watchdog" in journal(since).lower()
     eventually(lambda: show("ActiveState") == "active", "active again")
 
@@ -142,7 +143,7 @@ def test_a_bus_that_comes_later_is_taken(since: str) -> None:
         give_ports()  # udev's work, for ports that are links
         return "4 of 4 IMUs" in show("StatusText")
 
-    eventually(all_there, "all four", 40)
+    eventually(all_there, "all four")
 
 
 def test_a_wrong_rig_is_told_and_not_tried_again(since: str) -> None:
@@ -175,7 +176,7 @@ def test_an_upgrade_restarts_the_service_and_keeps_the_rig(service: int) -> None
     version = run("dpkg-query", "-W", "-f", "${Version}", "jointfitd")
     calibrations = sorted(Path("/var/lib/private/jointfitd").rglob("*"))
     run("dpkg", "-i", NEWER)
-    eventually(lambda: int(show("MainPID")) not in {0, service}, "the new version runs", 40)
+    eventually(lambda: int(show("MainPID")) not in {0, service}, "the new version runs")
     newer = run("dpkg-query", "-W", "-f", "${Version}", "jointfitd")
     assert run("dpkg", "--compare-versions", newer, "gt", version) == ""
     assert RIG.read_text() == rig
@@ -213,7 +214,9 @@ def test_purging_leaves_nothing_and_removing_keeps_the_rig(service: int) -> None
     assert not Path("/usr/lib/jointfitd").exists()
     run("dpkg", "-P", "jointfitd")
     left = [
-        path for path in ("/etc/jointfitd", "/var/lib/private/jointfitd") if Path(path).exists()
+        path
+        for folder in ("/etc", "/usr/lib", "/usr/share", "/var/lib", "/var/log", "/var/lib/private")
+        for path in Path(folder).glob("jointfitd*")
     ]
     run("dpkg", "-i", DEB)
     run("systemctl", "daemon-reload")
