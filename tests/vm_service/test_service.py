@@ -27,6 +27,11 @@ from machine import (
     write_rig,
 )
 
+PLACES = (
+    "/etc", "/etc/credstore", "/usr/lib", "/usr/share", "/var/lib", "/var/lib/private",
+    "/var/log", "/var/log/private",
+)  # fmt: skip
+"""Where something of ours may be left."""
 DEB, NEWER = "/mnt/jointfitd.deb", "/mnt/newer.deb"
 
 pytestmark = pytest.mark.usefixtures("machine")
@@ -146,6 +151,15 @@ def test_a_bus_that_comes_later_is_taken(since: str) -> None:
     eventually(all_there, "all four")
 
 
+def test_enabled_it_starts_with_the_machine() -> None:
+    run("systemctl", "enable", UNIT)
+    try:
+        run("systemctl", "start", "--no-block", "multi-user.target")  # what a boot ends with
+        eventually(lambda: show("ActiveState") == "active", "started by the target")
+    finally:
+        run("systemctl", "disable", "--now", UNIT)
+
+
 def test_a_wrong_rig_is_told_and_not_tried_again(since: str) -> None:
     write_rig(lambda text: text.replace("output_rate_hz = 50", 'output_rate_hz = "fast"'))
     run("systemctl", "start", UNIT, check=False)
@@ -213,11 +227,7 @@ def test_purging_leaves_nothing_and_removing_keeps_the_rig(service: int) -> None
     assert RIG.is_file()
     assert not Path("/usr/lib/jointfitd").exists()
     run("dpkg", "-P", "jointfitd")
-    left = [
-        path
-        for folder in ("/etc", "/usr/lib", "/usr/share", "/var/lib", "/var/log", "/var/lib/private")
-        for path in Path(folder).glob("jointfitd*")
-    ]
+    left = [path for folder in PLACES for path in Path(folder).glob("jointfitd*")]
     run("dpkg", "-i", DEB)
     run("systemctl", "daemon-reload")
     assert left == []
