@@ -88,7 +88,7 @@ def ask(command: str, user: str = "operator", password: str = "ask", **arguments
     )  # fmt: skip
 
 
-def answer(command: str, text: str = "", **arguments: object) -> dict[str, Any]:
+def answer(command: str, text: str = "", /, **arguments: object) -> dict[str, Any]:
     """Return the daemon's answer to a request of the operator: `text`, or JSON of `arguments`."""
     found: dict[str, Any] = json.loads(
         run(

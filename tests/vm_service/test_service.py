@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,17 +55,42 @@ def test_installing_gives_a_rig_to_edit_and_starts_nothing() -> None:
     assert "is right" in run("jointfit", "check", "/usr/share/jointfitd/examples/knee.toml")
 
 
+def outcome(phase: str, wanted: str, **arguments: object) -> str:
+    """Run a phase of the calibration to its end and return what it came to."""
+
+    def ended() -> str:
+        found = str(calibration()["phase"])
+        return found if found in {wanted, "aborted"} else ""
+
+    before = calibration()
+    assert answer("calibrate", phase=phase, **arguments)["status"] == "accepted"
+    eventually(lambda: calibration() != before, f"{phase} has begun")
+    return str(eventually(ended, f"{phase} has ended", 180))
+
+
+def collect(phase: str, wanted: str, **arguments: object) -> None:
+    """Run a phase of the calibration; again where a busy machine spoilt it."""
+    found = [outcome(phase, wanted, **arguments)]
+    while found[-1] != wanted and len(found) < 3:
+        found.append(outcome(phase, wanted, **arguments))
+    assert found[-1] == wanted, calibration()
+
+
+def squatting() -> list[dict[str, Any]]:
+    """Return some poses in a row in which the knee bends, if it does."""
+    poses = messages("pose", count=100, seconds=30)
+    knees = [pose["joints"]["knee"]["flexion_deg"] for pose in poses]
+    known = [angle for angle in knees if angle is not None]
+    return poses if known and max(known) - min(known) > 30.0 else []
+
+
 def test_angles_arrive_over_tls_from_two_serial_ports_and_two_on_a_bus(service: int) -> None:
     eventually(lambda: "4 of 4 IMUs" in show("StatusText"), "all four stream")
     sim("play stand")
-    ask("calibrate", phase="static", transaction="1")
-    eventually(lambda: calibration()["phase"] == "posed", "stood still")
+    collect("static", "posed")
     sim("play squat")
-    ask("calibrate", phase="functional", seconds=12, transaction="2")
-    eventually(lambda: calibration()["phase"] == "calibrated", "calibrated", 180)
-    poses = messages("pose", count=100, seconds=30)
-    knees = [pose["joints"]["knee"]["flexion_deg"] for pose in poses]
-    assert max(knees) - min(knees) > 30.0  # squats
+    collect("functional", "calibrated", seconds=12)
+    poses = eventually(squatting, "the knee bends")
     used = {name for pose in poses for part in pose["segments"].values() for name in part["used"]}
     assert used == {"S1", "S2", "S3", "S4"}
 
