@@ -88,7 +88,7 @@ def test_serial_ports_are_named_by_serial_number_never_by_vendor_alone() -> None
     assert named
     for line in named:
         assert 'ENV{ID_SERIAL_SHORT}=="?*"' in line
-        assert 'GROUP="dialout"' in line
+        assert 'GROUP:="dialout"' in line  # final: a later rule must not take the port away
         assert 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line
     assert any('ATTR{latency_timer}="1"' in line for line in rules)
 
