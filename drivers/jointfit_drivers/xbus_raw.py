@@ -162,7 +162,7 @@ def _sample(message: Message, reading: Reading, oriented: Oriented) -> ImuSample
         message.ticks,
         message.counter,
         message.status,
-        oriented.rate,
+        None,  # what is read is the mean since the sample before, and not the rate at its instant
         reading.force,
         reading.magnetic,
     )

@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from jointfit_daemon.kinematics.rotation_scalar import (
     angle_between_one,
+    between_one,
     interpolate_one,
+    log_one,
     normalize_one,
 )
 from jointfit_daemon.timing.interpolate import between, beyond
@@ -167,3 +169,20 @@ def test_a_bend_does_not_grow_beyond_one_interval() -> None:
 
 def turned(angle: float) -> Quaternion:
     return (cos(angle / 2), 0.0, sin(angle / 2), 0.0)
+
+
+def test_means_since_the_sample_before_are_worse_than_no_rates() -> None:
+    """Why a driver must leave such rates out (``ImuSample.rate``)."""
+
+    def mean(number: int) -> Sample:
+        q, before = MOTION(0.5 + number * STEP * 1e-9)[0], MOTION(0.5 + (number - 1) * STEP * 1e-9)
+        x, y, z = log_one(between_one(before[0], q))
+        return Sample(number * STEP, q, (x / STEP * 1e9, y / STEP * 1e9, z / STEP * 1e9))
+
+    def by(make: Callable[[int], Sample]) -> float:
+        return errors(
+            lambda t, x: between(make(t // STEP - 1), make(t // STEP), make(t // STEP + 1), t + x)
+        )
+
+    assert by(mean) > 2.0 * by(lambda number: sample(number * STEP))
+    assert by(lambda number: sample(number * STEP, rate=True)) < 0.2 * by(mean)
