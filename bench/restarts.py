@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
-from bench.stamp_truth import OPTICAL, WatchedCore, judge
+from bench.stamp_truth import OPTICAL, WatchedCore, judge, unexcused
 from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
 from tests.system.station import SENSORS, Listener, Station, running, stopped
 
@@ -23,6 +23,8 @@ SKEWS_PPM = {"S1": 50, "S2": -50, "S3": 31, "S4": -23, OPTICAL: 42}
 DELAY_MS = {"S1": 2.0, "S2": 1.0, "S3": 2.0, "S4": 1.0}
 """What the simulator's transports take at least; cameras answer echoes and need none."""
 EVERY = {*SENSORS, OPTICAL}
+PATIENCE_S = 40.0
+"""For what takes three seconds where nothing else runs."""
 
 
 class Outcome(NamedTuple):
@@ -41,6 +43,14 @@ class Outcome(NamedTuple):
             and sample.error_ns is not None
             and sample.source == source
             and method in {"", sample.method}
+        ]
+
+    def unexcused_ns(self, source: str) -> list[int]:
+        """Return what a machine short of time does not excuse of those errors."""
+        return [
+            unexcused(sample.error_ns, sample.excused_ns)
+            for sample in self.core.samples
+            if sample.synced and sample.error_ns is not None and sample.source == source
         ]
 
     @property
@@ -69,10 +79,12 @@ def locked(listener: Listener) -> bool:
 
 async def recovers(listener: Listener, name: str) -> None:
     """Wait until a loss is seen, the device is there again, and everything is locked."""
-    await listener.until(lambda: not locked(listener) or name not in listener.online, 10)
+    await listener.until(lambda: not locked(listener) or name not in listener.online, PATIENCE_S)
     before = listener.healths
-    await listener.until(lambda: name in listener.online and listener.healths > before + 2, 15)
-    await listener.until(lambda: locked(listener), 15)
+    await listener.until(
+        lambda: name in listener.online and listener.healths > before + 2, PATIENCE_S
+    )
+    await listener.until(lambda: locked(listener), PATIENCE_S)
 
 
 async def live(
@@ -94,8 +106,8 @@ async def live(
     clocks = [word for name, ppm in SKEWS_PPM.items() for word in ("--clock", f"{name}={ppm}")]
     options = ("--sample-log", "--programme", "walk", *clocks, *more)
     station = Station(folder, port, options, more_toml="[recording]\n")
-    async with running(station) as (simulator, daemon, listener):
-        await listener.until(lambda: locked(listener), 20)
+    async with running(station, PATIENCE_S) as (simulator, daemon, listener):
+        await listener.until(lambda: locked(listener), PATIENCE_S)
         for name in reboots:
             await asyncio.sleep(rest_s)
             await simulator.say(f"reboot {name}")

@@ -5,6 +5,10 @@ the simulator's sample log says when each sample was taken. Their difference is 
 the constant that no arrival can tell: where a stamp rests on arrivals, the transport's true least
 delay takes the place of the one the daemon assumed. With a lag in force, or edges of a sync line,
 nothing is taken off.
+
+On a machine that is short of time samples come later still, and before a quick one has come no
+clock can know. How much of an error that explains is told apart (`excused_ns`): what the quickest
+sample since the clock began took beyond the least delay, slewed down as stamps are.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from typing_extensions import override
 from jointfit_daemon.model import ImuSample, LimbState
 from jointfit_daemon.pipeline.core import Core
 from jointfit_daemon.pipeline.source import Stamped
+from jointfit_daemon.timing.stamps import SLEW
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -29,6 +34,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.source import SourceState
     from jointfit_daemon.timing.align import AlignedFrame
+    from jointfit_daemon.timing.stamps import Stamp
 
 _NS_PER_MS = 1e6
 OPTICAL = "mocap"
@@ -48,6 +54,8 @@ class Judged(NamedTuple):
     """How its clock told time: `passive`, `echo`, `direct` …"""
     error_ns: int | None
     """None: the simulator knows of no such sample."""
+    excused_ns: int
+    """How late every sample of this clock has been so far, beyond the least delay."""
 
 
 class JudgedFrame(NamedTuple):
@@ -59,6 +67,8 @@ class JudgedFrame(NamedTuple):
     worst_ns: float
     """Largest error among the samples next to it, of every sensor in it; 0 if none is known."""
     sensors: int
+    unexcused_ns: float = 0.0
+    """The same, but for what is excused."""
 
 
 class Truth:
@@ -92,6 +102,21 @@ class _Recent:
 
     t_ns: list[int] = field(default_factory=list)
     error_ns: list[int | None] = field(default_factory=list)
+    excused_ns: list[int] = field(default_factory=list)
+    epoch: int = -1
+    least_ns: int = 0
+    """How late the quickest sample of this epoch was."""
+
+    def excuse(self, late_ns: int | None, stamp: Stamp) -> int:
+        """Take how late a sample was; return how late nobody can blame the clock for being."""
+        if stamp.epoch != self.epoch:
+            self.epoch, self.least_ns = stamp.epoch, MOST_NS
+        if late_ns is not None:
+            self.least_ns = min(self.least_ns, late_ns)
+        excused_ns = max(0, self.least_ns)
+        if not (stamp.synced and self.excused_ns):
+            return excused_ns
+        return max(excused_ns, self.excused_ns[-1] - round(SLEW * (stamp.t_ns - self.t_ns[-1])))
 
 
 class WatchedCore(Core):
@@ -131,29 +156,47 @@ class WatchedCore(Core):
         known = lag_ns or state.clock.state not in {"passive", "settling", "arrival"}
         unseen_ns = 0 if known else self._delay_ns.get(source, 0) - state.clock.latency_ns
         error_ns = None if taken_ns is None else t_ns - unseen_ns - taken_ns
+        recent, delay_ns = self._recent[source], self._delay_ns.get(source, 0)
+        late_ns = None if taken_ns is None else measured.arrival_ns - taken_ns - delay_ns
+        excused_ns = 0 if known else recent.excuse(late_ns, stamp)
         self.samples.append(
-            Judged(source, arrival_ns, t_ns, stamp.synced, state.clock.state, error_ns)
+            Judged(source, arrival_ns, t_ns, stamp.synced, state.clock.state, error_ns, excused_ns)
         )
-        recent = self._recent[source]
         recent.t_ns.append(t_ns)
         recent.error_ns.append(error_ns)
+        recent.excused_ns.append(excused_ns)
 
     @override
     def _fuse(self, frame: AlignedFrame) -> LimbState:
-        worst = max((self._error_at(name, frame.t_ns) for name in frame.orientations), default=0.0)
+        found = [self._error_at(name, frame.t_ns) for name in frame.orientations]
+        worst = max((error for error, _ in found), default=0.0)
+        blamed = max((error for _, error in found), default=0.0)
         sensors = len(frame.orientations)
         self.frames.append(
-            JudgedFrame(frame.t_ns, frame.completed_ns, frame.synced, worst, sensors)
+            JudgedFrame(frame.t_ns, frame.completed_ns, frame.synced, worst, sensors, blamed)
         )
         return super()._fuse(frame)
 
-    def _error_at(self, source: str, t_ns: int) -> float:
-        """Return the larger error of the samples that an orientation at `t_ns` is made of."""
+    def _error_at(self, source: str, t_ns: int) -> tuple[float, float]:
+        """Return the larger error of the samples that an orientation at `t_ns` is made of.
+
+        And the larger of what is not excused of them.
+        """
         recent = self._recent[source]
         begin = max(0, len(recent.t_ns) - 512)
         after = bisect_left(recent.t_ns, t_ns, lo=begin)
-        around = recent.error_ns[max(0, after - 1) : after + 1]
-        return max((float(abs(error)) for error in around if error is not None), default=0.0)
+        around = slice(max(0, after - 1), after + 1)
+        pairs = zip(recent.error_ns[around], recent.excused_ns[around], strict=True)
+        known = [(error, excused) for error, excused in pairs if error is not None]
+        return (
+            max((float(abs(error)) for error, _ in known), default=0.0),
+            max((float(unexcused(error, excused)) for error, excused in known), default=0.0),
+        )
+
+
+def unexcused(error_ns: int, excused_ns: int) -> int:
+    """Return the size of an error but for what is excused of it: being late, never being early."""
+    return max(-error_ns, error_ns - excused_ns, 0)
 
 
 def judge(

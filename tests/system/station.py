@@ -202,7 +202,9 @@ class Station:
 
 
 @contextlib.asynccontextmanager
-async def running(station: Station) -> AsyncIterator[tuple[Simulator, Child, Listener]]:
+async def running(
+    station: Station, within_s: float = 15.0
+) -> AsyncIterator[tuple[Simulator, Child, Listener]]:
     """Yield simulator, daemon and listener, all sources online."""
     async with (
         station.simulator() as simulator,
@@ -210,7 +212,7 @@ async def running(station: Station) -> AsyncIterator[tuple[Simulator, Child, Lis
         listening(station.port) as listener,
     ):
         wanted = {source.id for source in load_rig(station.rig).sources}
-        await listener.connected(wanted)
+        await listener.connected(wanted, within_s)
         yield simulator, daemon, listener
 
 

@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.system
 
 MOST_ERROR_NS = 500_000
+"""Beyond what a machine short of time excuses; the bench holds a quiet one to it (row T9)."""
 MOST_TIED_ERROR_NS = 250_000
 """Ticks of 100 us, 20 us of jitter on each stamp, and the camera clock's own error."""
 MOST_PTP_ERROR_NS = 50_000
 """Both processes read the same clocks, each once; a microsecond where nothing else runs."""
 
 
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(180)
 async def test_time_is_right_in_every_frame_that_says_so(
     tmp_path: Path, mosquitto: MosquittoBroker
 ) -> None:
@@ -31,10 +32,10 @@ async def test_time_is_right_in_every_frame_that_says_so(
     assert found.replayed
     assert found.unknown < 0.01
     for source in EVERY:
-        errors = found.errors_ns(source)
+        errors = found.unexcused_ns(source)
         assert len(errors) > 200, source
-        assert max(map(abs, errors)) <= MOST_ERROR_NS, source
-    frames = found.frame_errors_ns
+        assert max(errors) <= MOST_ERROR_NS, source
+    frames = [frame.unexcused_ns for frame in found.core.frames if frame.synced]
     assert len(frames) > 300
     assert max(frames) <= MOST_ERROR_NS
     # before a clock has settled it may be wrong, and the judge sees that
@@ -42,7 +43,7 @@ async def test_time_is_right_in_every_frame_that_says_so(
     assert max(map(abs, unsynced)) > MOST_ERROR_NS
 
 
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(180)
 async def test_a_wired_sync_line_takes_even_the_delay_out(
     tmp_path: Path, mosquitto: MosquittoBroker
 ) -> None:
@@ -56,7 +57,7 @@ async def test_a_wired_sync_line_takes_even_the_delay_out(
         assert max(map(abs, errors[-100:])) <= MOST_TIED_ERROR_NS, source
 
 
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(180)
 async def test_cameras_on_ptp_need_no_echo_and_no_settling(
     tmp_path: Path, mosquitto: MosquittoBroker
 ) -> None:
