@@ -64,6 +64,8 @@ class Sent:
     counter: int
     arrival_ns: int = 0
     copies: int = 1
+    timed: bool = True
+    """Whether a CAN device tells its time at all."""
 
     def chunks(self) -> list[ChunkArrived]:
         ticks, q = self.device_ns // TICK_NS % WRAP, orientation(self.name, self.number)
@@ -83,7 +85,11 @@ class Sent:
                 strict=True,
             )
             data = pack_frames(
-                [CanFrame(self.arrival_ns, i, encode_xcdi(kind, n)) for i, kind, n in rows]
+                [
+                    CanFrame(self.arrival_ns, i, encode_xcdi(kind, n))
+                    for i, kind, n in rows
+                    if self.timed or kind != DataId.SAMPLE_TIME
+                ]
             )
         return [ChunkArrived(self.name, Chunk(self.arrival_ns, data))] * self.copies
 
@@ -128,9 +134,15 @@ class Lived:
 
 
 def live(
-    fault: Callable[[Sent], Sent | None], more: tuple[Event, ...] = (), count: int = COUNT
+    fault: Callable[[Sent], Sent | None],
+    more: tuple[Event, ...] = (),
+    count: int = COUNT,
+    untimed: str = "",
 ) -> Lived:
-    """Run four sensors; `fault` may change, or lose, every sample from number FAULT on."""
+    """Run four sensors; `fault` may change, or lose, every sample from number FAULT on.
+
+    A CAN sensor that is `untimed` has a counter and no clock.
+    """
     events: list[Event] = list(more)
     for name in SENSORS:
         skew = 1 + 2e-5 * SENSORS.index(name)
@@ -138,8 +150,9 @@ def live(
             taken_ns = BEGIN_NS + number * PERIOD_NS
             late_ns = DELAYS_NS[name] + (number * 7919 % 97) * 10_000
             sent: Sent | None = Sent(
-                name, number, taken_ns, round((taken_ns - BOOTED_NS) * skew), number
-            )
+                name, number, taken_ns, round((taken_ns - BOOTED_NS) * skew), number,
+                timed=name != untimed,
+            )  # fmt: skip
             if number >= FAULT and sent is not None:
                 sent = fault(sent)
             if sent is not None:
@@ -296,6 +309,22 @@ def test_a_counter_that_jumps_alone_changes_no_time(jump: int) -> None:
     assert_sane(run)
     assert_healed(run)
     assert max(frame.completed_ns - frame.t_ns for _, frame in run.between(0, NS)) < 40 * MS
+    assert "wire" in {n.kind for n in run.notices if n.id == "S1"}
+
+
+@pytest.mark.parametrize("jump", [-30_000, -20, 20, 30_000])
+def test_a_counter_that_jumps_where_there_is_no_clock_is_told_and_settles_anew(jump: int) -> None:
+    def jumped(sent: Sent) -> Sent:
+        if sent.name == "S4":
+            sent.counter += jump
+        return sent
+
+    run = live(jumped, untimed="S4")
+    assert_sane(run)
+    assert_healed(run)
+    assert told(run, "S4"), run.notices
+    assert not told(run, "S2")
+    assert run.sync_with("S4", 100 * MS, 1_500 * MS) == {"settling"}
 
 
 # --- any mixture of it --------------------------------------------------------------------------
