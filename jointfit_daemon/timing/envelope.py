@@ -27,7 +27,7 @@ YOUNG_NS = 10_000_000_000
 """Until this span every bucket is worth a refit; later one in four seconds is."""
 SETTLED_NS = 2_000_000_000
 SETTLED_POINTS = 10
-TRUSTED_NS = 2_000_000.0
+TRUSTED_NS = 500_000.0
 """Standard deviation below which the line is taken for settled; scattered delays leave it above."""
 FLOOR_NS = 10_000.0
 """No envelope is believed better than this."""

@@ -62,6 +62,7 @@ stalls = st.lists(
 @settings(max_examples=15, deadline=None)
 @given(stalls, st.sampled_from([0.0, 6.0]))
 @example([(0.01, 2.0)], 6.0)
+@example([(0.25, 1.0)], 0.0)  # a line through the ends of two bursts is not yet known to a ms
 def test_stalls_and_bursts_are_late_data_and_no_restart(
     stalls_s: list[tuple[float, float]], begin_s: float
 ) -> None:
