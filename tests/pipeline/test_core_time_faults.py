@@ -379,6 +379,7 @@ troubles = st.lists(
 )
 
 
+@pytest.mark.timeout(120)  # ten seconds where nothing else runs
 @settings(max_examples=6)
 @given(troubles)
 def test_whatever_happens_to_time_it_heals(script: list[tuple[str, str, int, int, int]]) -> None:
