@@ -122,7 +122,7 @@ class LagWatch:
             for sensor in group
         }
         self._stored = {} if calibration is None else calibration.lag_ns
-        self._stored_sigma = {} if calibration is None else _sigmas(calibration)
+        self._said = {} if calibration is None else calibration.quality.get("lag") or {}
         self._known = dict(known or {})
         self._sensors = {name: _Sensor() for name in self._segment}
         self._frames: deque[tuple[int, MocapFrame]] = deque(maxlen=MOST)
@@ -285,11 +285,12 @@ class LagWatch:
         used, source = (None, "none") if stored is None else (float(stored), "calibration")
         if known is not None:
             used, source = known.lag_ns, "configured"
-        sigma_ns = None if known is None else known.sigma_ns
+        said = self._said.get(sensor, {})
         return {
             "lag_ms": _rounded(used),
-            "lag_sigma_ms": _rounded(sigma_ns or self._stored_sigma.get(sensor)),
+            "lag_sigma_ms": _rounded(said.get("sigma_ns") if known is None else known.sigma_ns),
             "lag_source": source,
+            "lag_found_by": None if known is not None else said.get("source"),
             "tracked_ms": None if tracked is None else _rounded(tracked.lag_ns),
             "tracked_sigma_ms": None if tracked is None else _rounded(tracked.sigma_ns),
             "tracked_drift_ppm": None if tracked is None else round(1e6 * tracked.drift, 3),
@@ -321,12 +322,6 @@ def _orientations(
             parts.append(rigid_fit(cluster.template, positions)[0])
             yield
     return np.array([t for t, _ in rows], dtype=np.int64), np.concatenate(parts)
-
-
-def _sigmas(calibration: Calibration) -> dict[str, float]:
-    """Return the standard deviations of the lags in use, where the calibration tells them."""
-    found = calibration.quality.get("lag") or {}
-    return {name: said["sigma_ns"] for name, said in found.items() if "sigma_ns" in said}
 
 
 def _nothing(refused: str) -> LagEstimate:

@@ -33,6 +33,7 @@ CALIBRATION = Calibration(
     segment={},
     joint={},
     clusters={"thigh": StoredCluster(NAMES, None, PLACES, (0.0, 0.0, 0.0), IDENTITY_ONE)},
+    quality={"lag": {"S1": {"source": "plate and movement", "sigma_ns": 0.2 * MS}}},
 )
 MOUNT = rotation.exp(np.array([0.4, -0.9, 0.3]))
 
@@ -91,6 +92,7 @@ def test_the_lag_is_found_while_the_wearer_moves() -> None:
     found = watch.health()["S1"]
     assert found["lag_source"] == "calibration"
     assert found["lag_ms"] == 2.0  # in force: tracking only watches
+    assert (found["lag_sigma_ms"], found["lag_found_by"]) == (0.2, "plate and movement")
     assert found["tracked_ms"] == pytest.approx(7.3, abs=0.1)
     assert found["tracked_refused"] is None
     kept = LagWatch(CHAIN, replace(CALIBRATION, notes=("new",)), watch)
