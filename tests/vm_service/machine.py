@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 UNIT = "jointfitd.service"
 RIG = Path("/etc/jointfitd/rig.toml")
@@ -43,7 +43,7 @@ def eventually(claim: Callable[[], object], what: str, seconds: float = 60.0) ->
     end = time.monotonic() + seconds
     while not (answer := claim()):
         assert time.monotonic() < end, f"not within {seconds:g} s: {what}; {show('StatusText')}"
-        time.sleep(0.1)
+        time.sleep(0.5)  # a look costs as much as a second of the daemon
     return answer
 
 
@@ -77,6 +77,24 @@ def messages(topic: str, count: int = 1, seconds: float = 10.0) -> list[Any]:
         "-W", str(round(seconds)), check=False,
     )  # fmt: skip
     return [json.loads(line) for line in text.splitlines()]
+
+
+@contextlib.contextmanager
+def listening(topic: str, seconds: int = 240) -> Iterator[Iterator[Any]]:
+    """Give the messages below the base as they come, the retained one first.
+
+    One process for all of them: asking again and again takes the time that the daemon needs.
+    """
+    words = (
+        "mosquitto_sub", "-h", "localhost", "-p", "8883", "--cafile", CA, "-V", "mqttv5",
+        "-u", "viewer", "-P", "look", "-t", f"{BASE}/{topic}", "-W", str(seconds),
+    )  # fmt: skip
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as heard:
+        assert heard.stdout is not None
+        try:
+            yield (json.loads(line) for line in heard.stdout)
+        finally:
+            heard.terminate()
 
 
 def ask(command: str, user: str = "operator", password: str = "ask", **arguments: object) -> None:

@@ -21,6 +21,7 @@ from machine import (
     eventually,
     give_ports,
     journal,
+    listening,
     messages,
     run,
     show,
@@ -37,11 +38,6 @@ PLACES = (
 DEB, NEWER = "/mnt/jointfitd.deb", "/mnt/newer.deb"
 
 pytestmark = pytest.mark.usefixtures("machine")
-
-
-def calibration() -> dict[str, object]:
-    found = messages("calibration", seconds=2)
-    return found[0] if found else {"phase": None}
 
 
 def missing() -> set[str]:
@@ -61,25 +57,23 @@ def test_installing_gives_a_rig_to_edit_and_starts_nothing() -> None:
     assert "is right" in run("jointfit", "check", "/usr/share/jointfitd/examples/knee.toml")
 
 
-def outcome(phase: str, wanted: str, **arguments: object) -> str:
+def outcome(phase: str, wanted: str, **arguments: object) -> dict[str, Any]:
     """Run a phase of the calibration to its end and return what it came to."""
-
-    def ended() -> str:
-        found = str(calibration()["phase"])
-        return found if found in {wanted, "aborted"} else ""
-
-    before = calibration()
-    assert answer("calibrate", phase=phase, **arguments)["status"] == "accepted"
-    eventually(lambda: calibration() != before, f"{phase} has begun")
-    return str(eventually(ended, f"{phase} has ended", 180))
+    with listening("calibration") as heard:
+        said: dict[str, Any] = next(heard)  # what was before
+        assert answer("calibrate", phase=phase, **arguments)["status"] == "accepted"
+        for said in heard:
+            if said["phase"] in {wanted, "aborted"}:
+                break
+    return said
 
 
 def collect(phase: str, wanted: str, **arguments: object) -> None:
     """Run a phase of the calibration; again where a busy machine spoilt it."""
     found = [outcome(phase, wanted, **arguments)]
-    while found[-1] != wanted and len(found) < 3:
+    while found[-1]["phase"] != wanted and len(found) < 3:
         found.append(outcome(phase, wanted, **arguments))
-    assert found[-1] == wanted, calibration()
+    assert found[-1]["phase"] == wanted, [said["text"] for said in found]
 
 
 def squatting() -> list[dict[str, Any]]:
