@@ -13,7 +13,6 @@ from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import nnls
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -112,6 +111,8 @@ def _line(ratios: Array, squares: Array, shares: Array, *, alone: bool) -> tuple
         squares = np.append(squares, FAR_FACTOR**2 * typical)
         shares = np.append(shares, FAR_SHARE)
     design = np.stack([np.ones_like(ratios), ratios], axis=1)
+    from scipy.optimize import nnls  # noqa: PLC0415 - fits need it, a running daemon does not
+
     line = np.array([typical, 0.0])
     for _ in range(PASSES):
         scale = np.sqrt(shares) / (design @ line)
