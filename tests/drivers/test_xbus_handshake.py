@@ -222,8 +222,16 @@ async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(
 
 
 async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_path: Path) -> None:
-    options = XbusDeviceOptions(measures_at_once=True, config_delay_s=1.6)  # as over USB: any speed
-    device = XbusDevice(tmp_path / "imu", options=options)
+    class Late(XbusDevice):  # over USB, where any speed will do
+        awake_s: float | None = None
+
+        def _answer(self, message: XbusMessage) -> None:
+            loop = asyncio.get_running_loop()
+            if self.awake_s is None:
+                self.awake_s = loop.time() + 1.6  # between the last try and the next speed's end
+            loop.call_at(self.awake_s, super()._answer, message)
+
+    device = Late(tmp_path / "imu")
     async with powered(device):
         assert "too late" in await refusal(make(tmp_path), DeviceLost)
 
