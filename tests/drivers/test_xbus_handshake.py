@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from pydantic import ValidationError
+from typing_extensions import override
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
@@ -225,6 +226,7 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
     class Late(XbusDevice):  # over USB, where any speed will do
         awake_s: float | None = None
 
+        @override
         def _answer(self, message: XbusMessage) -> None:
             loop = asyncio.get_running_loop()
             if self.awake_s is None:
