@@ -26,6 +26,7 @@ from jointfit_daemon.calibration.lags import (
 )
 from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
 from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
+from jointfit_daemon.calibration.refined_clusters import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.result import (
     Calibration,
@@ -109,7 +110,7 @@ def fit_calibration(
         No optical system or markers, too little seen or moved, sensors missing.
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
-    tracks = _tracks(pose, functional, chain)
+    refined, tracks = _refined(_tracks(pose, functional, chain), pose, functional, settings)
     anatomy = find_anatomy(chain, tracks)
     lags = _lags(chain, functional, tracks, lag_ns or {})
     used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}))
@@ -119,7 +120,7 @@ def fit_calibration(
     training, raw = _training(chain, functional, tracks, anatomy, sensors)
     figures = judge(chain, training, settings.holdout_share)
     models = fit_models(chain, training, settings.method)
-    notes, flags = [*anatomy.notes, *_lag_notes(lags, used_ns)], [*anatomy.flags]
+    notes, flags = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns)], [*anatomy.flags]
     if alignment is None:
         flags.append("headings_from_static")
         notes += _heading_notes(chain, raw, training)
@@ -131,13 +132,14 @@ def fit_calibration(
         sensor=sensors,
         segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
-        clusters={name: stored_cluster(cluster) for name, cluster in pose.clusters.items()},
+        clusters={name: stored_cluster(cluster) for name, cluster in refined.clusters.items()},
         flags=tuple(flags),
         notes=tuple(notes),
         quality={
             "static": pose.quality,
             "alignment": None if alignment is None else alignment.quality,
             "lag": {n: _lag_figures(lags.get(n), used.get(n, NO_LAG)) for n in sensors},
+            **({} if refined.figures is None else {"markers": refined.figures}),
             "anatomy": _anatomy_figures(anatomy),
             "holdout": {"method": settings.method, **figures, "meaning": MEANING},
         },
@@ -176,6 +178,21 @@ def _tracks(
     if reasons:
         raise CalibrationRefused(*reasons)
     return tracks
+
+
+def _refined(
+    tracks: dict[str, ClusterTrack],
+    pose: StaticPose,
+    functional: CalibrationTrial,
+    settings: CalibrationSettings,
+) -> tuple[RefinedClusters, dict[str, ClusterTrack]]:
+    """Refine the markers if that is wanted, and follow the body parts by them."""
+    if not settings.refine_markers or functional.optical is None:
+        return RefinedClusters(pose.clusters, None), tracks
+    refined = refine_clusters(pose.clusters, tracks, settings.holdout_share)
+    if refined.figures is None:
+        return refined, tracks
+    return refined, track_clusters(functional.optical, refined.clusters)
 
 
 def _lags(

@@ -72,3 +72,5 @@ class CalibrationSettings:
     """Rigid body of the plate that carries the sensors in the align phase."""
     holdout_share: float = 0.4
     """Last share of the functional trial, contiguous, that judges the fit."""
+    refine_markers: bool = True
+    """Whether the movement refines where markers sit on their body parts."""

@@ -85,6 +85,10 @@ class CalibrationTable(Settings):
     holdout_share: float = Field(
         0.4, gt=0, lt=1, description="last share of the movement, which judges the fit"
     )
+    refine_markers: bool = Field(
+        True,
+        description="whether the movement refines where single markers sit on their body parts",
+    )
 
 
 def is_this_host(host: str) -> bool:

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+MOVED_M = 0.008
+"""Skin moves markers by 5 mm; what is farther away was touched."""
+
 
 def report(quality: Mapping[str, Any]) -> list[str]:
     """Return what `quality` of topic ``calibration`` says, one finding a line; what lacks is left.
@@ -23,6 +26,7 @@ def report(quality: Mapping[str, Any]) -> list[str]:
         _against_mean(f"{name}: flexion", by_method, method)
         for name, by_method in (holdout.get("flexion_deg") or {}).items()
     ]
+    lines += _marker_lines(quality.get("markers") or {})
     anatomy: Mapping[str, Any] = quality.get("anatomy") or {}
     for name, joint in (anatomy.get("joints") or {}).items():
         sd_m = joint.get("sd_m")
@@ -35,6 +39,22 @@ def report(quality: Mapping[str, Any]) -> list[str]:
             lines.append(f"{name}: {length_m:.3f} m long{by}")
     if "alignment" in quality and quality["alignment"] is None:
         lines.append("no align phase: headings come from the static pose")
+    return lines
+
+
+def _marker_lines(markers: Mapping[str, Any]) -> list[str]:
+    """Return what refining the markers did, a body part a line, and who moved most."""
+    lines = []
+    for name, part in (markers.get("parts") or {}).items():
+        before, after = (1000 * part[key] for key in ("before_m", "after_m"))
+        kept = "" if part.get("refined") else ", kept as in the static pose"
+        lines.append(f"{name}: markers {before:.1f} mm off, refined {after:.1f} mm{kept}")
+    moved: Mapping[str, float] = markers.get("moved_m") or {}
+    far = {name: m for name, m in moved.items() if m >= MOVED_M}
+    lines += [
+        f"{name}: {1000 * m:.0f} mm from where it was in the static pose: knocked off?"
+        for name, m in sorted(far.items(), key=lambda item: -item[1])
+    ]
     return lines
 
 
