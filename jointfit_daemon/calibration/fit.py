@@ -120,10 +120,9 @@ def fit_calibration(
     training, raw = _training(chain, functional, tracks, anatomy, sensors)
     figures = judge(chain, training, settings.holdout_share)
     models = fit_models(chain, training, settings.method)
-    notes, flags = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns)], [*anatomy.flags]
-    if alignment is None:
-        flags.append("headings_from_static")
-        notes += _heading_notes(chain, raw, training)
+    flags = [*anatomy.flags, *(["headings_from_static"] if alignment is None else [])]
+    notes = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns)]
+    notes += _heading_notes(chain, raw, training) if alignment is None else []
     return Calibration(
         method=settings.method,
         joints=chain.joints,
