@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.fit import _refined
 from jointfit_daemon.calibration.jobs import run_job
 from jointfit_daemon.calibration.markers import track_clusters
 from jointfit_daemon.calibration.refined_clusters import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.result import Calibration
-from jointfit_daemon.calibration.static_pose import StaticPose, fit_static
+from jointfit_daemon.calibration.static_pose import StaticPose, fit_static, stored_cluster
 from jointfit_daemon.outputs.figures import shown
 from jointfit_daemon.tools.calibration_report import report
 from tests.calibration.synthetic_limb import (
@@ -28,7 +27,6 @@ from tests.calibration.synthetic_limb import (
     Motion,
     Subject,
     motion,
-    plate_trial,
     record,
     static_and_functional,
 )
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
 
 KNOCKED, KNOCK = "thigh1", np.array([0.011, -0.009, 0.006])
 WORN = Subject(5, flaws=Imperfections(sensor_deg=0.3, tissue_deg=3.0, skin_m=0.002, occluded=0.03))
-PLAIN = replace(SETTINGS, refine_markers=False)
 
 
 @cache
@@ -175,25 +172,30 @@ def test_rigid_bodies_show_no_markers_and_that_is_said() -> None:
     assert "rigid bodies" in found.notes[0]
 
 
+@pytest.mark.timeout(90)
 def test_the_worker_stores_and_tells_what_refining_did() -> None:
     static, functional, _ = trials()
     payload = {
-        "chain": CHAIN, "settings": SETTINGS, "static": static, "functional": functional,
-        "alignment": fit_alignment(plate_trial(WORN), SETTINGS).to_dict(), "previous": None,
+        "chain": CHAIN, "settings": replace(SETTINGS, method="mean"), "static": static,
+        "functional": functional, "alignment": None, "previous": None,
     }  # fmt: skip
     result = run_job("functional", payload)
     figures = json.loads(json.dumps(result["quality"]["markers"], allow_nan=False))
     assert figures["parts"]["thigh"]["after_m"] < figures["parts"]["thigh"]["before_m"]
     stored = Calibration.from_dict(result["calibration"])
     assert stored.quality["markers"] == result["quality"]["markers"]
+    assert stored.clusters["thigh"] == stored_cluster(refined().clusters["thigh"])
     lines = report(shown(stored.quality))
     assert any(line.startswith("thigh: markers ") and "refined" in line for line in lines)
     assert any(line.startswith(f"{KNOCKED}: ") and "knocked off?" in line for line in lines)
-    plain = fit_calibration(
-        static, functional, None, PLAIN, CHAIN, lag_ns=dict.fromkeys(stored.sensor, 0)
-    )
-    assert "markers" not in plain.quality
-    assert plain.clusters["thigh"] != stored.clusters["thigh"]
+
+
+def test_turned_off_it_leaves_markers_and_tracks_as_they_were() -> None:
+    tracks = track_clusters(optical_of(trials()[1]), pose().clusters)
+    plain = replace(SETTINGS, refine_markers=False)
+    found, same = _refined(tracks, pose(), trials()[1], plain)
+    assert same is tracks
+    assert found == RefinedClusters(pose().clusters, None)
 
 
 def test_a_new_pose_fits_the_refined_markers() -> None:

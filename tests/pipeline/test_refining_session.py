@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from jointfit_daemon.calibration.jobs import run_job
 from jointfit_daemon.calibration.static_pose import fit_static
 from jointfit_daemon.pipeline.events import (
@@ -27,7 +29,7 @@ from tests.calibration.synthetic_limb import (
 
 S = 1_000_000_000
 WORN = Subject(5, flaws=Imperfections(skin_m=0.002))
-REFINING = replace(SETTINGS, static_s=3.0, functional_min_s=0.0)
+REFINING = replace(SETTINGS, method="mean", static_s=3.0, functional_min_s=0.0)
 
 
 def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
@@ -48,6 +50,7 @@ def asked(one: CalibrationSession, t_ns: int, phase: str) -> FitJob:
     return job
 
 
+@pytest.mark.timeout(90)
 def test_the_phase_ends_with_the_figures_of_the_markers() -> None:
     static, functional, _ = static_and_functional(WORN, 20.0)
     one = CalibrationSession(CHAIN, REFINING, mocap=True, calibration=None)
