@@ -26,7 +26,7 @@ from jointfit_daemon.kinematics.chain_model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
     from jointfit_daemon.files.osim_joints import NearestJoint
@@ -60,6 +60,7 @@ def read_osim(
     bodies: Collection[str] | None = None,
     markers: Collection[str] | None = None,
     marker_set: Path | None = None,
+    used: Mapping[str, tuple[float, float]] | None = None,
 ) -> ImportedModel:
     """Return the chain of an OpenSim 4 model.
 
@@ -73,6 +74,9 @@ def read_osim(
         Only these markers. None: all.
     marker_set
         An XML file whose markers replace the model's.
+    used
+        Range of a hinge's angle over which it shall be nearest to the model's joint, rad, by
+        segment: what a first chain used on the trials at hand. All of the joint's range if None.
 
     Raises
     ------
@@ -84,7 +88,7 @@ def read_osim(
     found = document.markers if marker_set is None else read_marker_set(marker_set)
     _check(path, document, found, bodies, markers)
     try:
-        tree = _Tree(document)
+        tree = _Tree(document, used or {})
     except ValueError as error:
         raise Malformed(f"{path}: {error}") from error
     chosen = [
@@ -137,7 +141,7 @@ def _check(
 class _Tree:
     """Bodies on joints, welded ones merged; parents first."""
 
-    def __init__(self, document: OsimDocument) -> None:
+    def __init__(self, document: OsimDocument, used: Mapping[str, tuple[float, float]]) -> None:
         self.remarks = [
             f"constraint {name} is not kept: what it couples moves on its own"
             for name in document.constraints
@@ -153,7 +157,8 @@ class _Tree:
             for joint in ready:
                 if joint.child.body in self._at:
                     raise ValueError(f"body {joint.child.body!r} hangs on two joints")
-                self._add(joint.parent.body, joint.child.body, nearest_joint(joint))
+                nearest = nearest_joint(joint, used.get(joint.child.body))
+                self._add(joint.parent.body, joint.child.body, nearest)
             waiting = [j for j in waiting if j not in ready]
         loose = [b for b in document.bodies if b not in self._at]
         for body in loose:

@@ -47,8 +47,13 @@ class NearestJoint:
     remarks: tuple[str, ...]
 
 
-def nearest_joint(joint: OsimJoint) -> NearestJoint:
+def nearest_joint(joint: OsimJoint, used: tuple[float, float] | None = None) -> NearestJoint:
     """Return the nearest of our joints, and remarks where it is not the same.
+
+    Parameters
+    ----------
+    used
+        Range of a hinge's coordinate over which it shall be near, rad; all of it if None.
 
     Raises
     ------
@@ -72,7 +77,10 @@ def nearest_joint(joint: OsimJoint) -> NearestJoint:
         remarks.append(f"{joint.name}: does not slide along {_names(shifting)}")
     if not turning:
         return replace(welded, remarks=tuple(remarks))
-    found = (_hinge if len(turning) == 1 else _ball)(joint, motion, turning, welded)
+    if len(turning) == 1:
+        found = _hinge(joint, motion, turning[0], welded, used)
+    else:
+        found = _ball(joint, motion, turning, welded)
     return replace(found, remarks=(*remarks, *found.remarks))
 
 
@@ -145,16 +153,23 @@ def _ball(
 
 
 def _hinge(
-    joint: OsimJoint, motion: JointMotion, turning: list[Coordinate], welded: NearestJoint
+    joint: OsimJoint,
+    motion: JointMotion,
+    coordinate: Coordinate,
+    welded: NearestJoint,
+    used: tuple[float, float] | None,
 ) -> NearestJoint:
-    coordinate = turning[0]
-    low, high = _span(coordinate)
-    zero = min(max(0.0, low), high)
-    values = np.concatenate(([zero], np.linspace(low, high, _SAMPLES)))
+    span = _span(coordinate)
+    low, high = np.clip(used, *span) if used is not None else span
+    if not low < high:
+        low, high = span
+    zero = min(max(0.0, span[0]), span[1])
+    values = np.concatenate(([zero, *span], np.linspace(low, high, _SAMPLES)))
     turns, shifts = _sampled(joint, motion, {coordinate.name: values})
-    rest, axis, angles, bent = _axis(turns)
-    above, own, missed = _centers(joint, turns[1:], shifts[1:])
-    limits = (float(angles[1:].min()), float(angles[1:].max()))
+    rest, axis, angles, bent = _axis(np.delete(turns, [1, 2], axis=0))
+    above, own, missed = _centers(joint, turns[3:], shifts[3:])
+    ends = _turned_about(rotation.from_matrix(rest), rotation.from_matrix(turns[1:3]), axis)[1]
+    limits = (min(ends[0], angles[1]), max(ends[1], angles[-1]))
     remarks = []
     if missed > _TELL_M or bent > _TELL_RAD:
         remarks.append(
@@ -171,7 +186,7 @@ def _hinge(
         center_in_parent=above,
         center=own,
         axis=axis,
-        limits=limits,
+        limits=(float(limits[0]), float(limits[1])),
         remarks=tuple(remarks),
     )
 
@@ -196,8 +211,9 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
     return rotation.to_matrix(rest), axis, angles, float(rotation.angle_between(nearest, q).max())
 
 
-def _turned_about(rest: Array, q: Array) -> tuple[Array, Array]:
-    """Return the direction about which most turns from `rest`, and by how much, rad."""
+def _turned_about(rest: Array, q: Array, axis: Array | None = None) -> tuple[Array, Array]:
+    """Return `axis`, or the direction about which most turns from `rest`, and the turns, rad."""
     v = rotation.log(rotation.multiply(rotation.conjugate(rest), q))
-    axis = np.asarray(np.linalg.svd(v, full_matrices=False)[2][0])
+    if axis is None:
+        axis = np.asarray(np.linalg.svd(v, full_matrices=False)[2][0])
     return axis, v @ axis

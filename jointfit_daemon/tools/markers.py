@@ -10,7 +10,10 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
+    from jointfit_daemon.calibration.marker_refinement.motion import (
+        RefinementMethod,
+        RefinementSettings,
+    )
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
     from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.tools.markers_trials import Asked
@@ -44,6 +47,12 @@ Prior = Annotated[
     float,
     typer.Option("--prior", min=0.0, help="What moving a marker costs beside its error."),
 ]
+Evenness = Annotated[
+    float,
+    typer.Option(
+        "--evenness", min=0.0, max=8.0, help="Trials weigh as this power of their error: 0 alike."
+    ),
+]
 Holdout = Annotated[
     float,
     typer.Option("--holdout", min=0.0, max=0.5, help="Last share of each trial: when to stop."),
@@ -72,6 +81,7 @@ def markers(
     validate: Validate = None,
     method: Method = "joint",
     prior: Prior = 0.05,
+    evenness: Evenness = 0.0,
     holdout: Holdout = 0.0,
     frames: Frames = 150,
     up: Up = None,
@@ -83,7 +93,10 @@ def markers(
 
     Ends with 1 where model and trials do not belong together.
     """
-    from jointfit_daemon.calibration.marker_refinement.motion import Unrefinable
+    from jointfit_daemon.calibration.marker_refinement.motion import (
+        RefinementSettings,
+        Unrefinable,
+    )
     from jointfit_daemon.files.c3d import PackageMissing
     from jointfit_daemon.tools.markers_trials import Asked
     from jointfit_daemon.tools.plotting import PlotMissing
@@ -96,7 +109,13 @@ def markers(
         chain, remarks, found = _refined(
             asked,
             (trials, validate or []),
-            {"method": method, "prior": prior, "holdout_share": holdout, "frames": frames},
+            RefinementSettings(
+                cast("RefinementMethod", method),
+                prior,
+                frames=frames,
+                evenness=evenness,
+                holdout_share=holdout,
+            ),
         )
         _print(chain, remarks, found, as_json=json)
         _write(chain, found, out or [], plot)
@@ -126,22 +145,15 @@ def _check(*, method: str, up: str | None, out: Sequence[Path]) -> None:
 
 
 def _refined(
-    asked: Asked, trials: tuple[list[Path], list[Path]], options: dict[str, object]
+    asked: Asked, trials: tuple[list[Path], list[Path]], settings: RefinementSettings
 ) -> tuple[ChainModel, tuple[str, ...], Refinement]:
     from rich.console import Console
     from rich.progress import Progress, TextColumn
 
-    from jointfit_daemon.calibration.marker_refinement.motion import RefinementSettings
     from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
     from jointfit_daemon.tools.markers_trials import load
 
     chain, remarks, learned, judged = load(asked, *trials)
-    settings = RefinementSettings(
-        method=cast("RefinementMethod", options["method"]),
-        prior=cast("float", options["prior"]),
-        holdout_share=cast("float", options["holdout_share"]),
-        frames=cast("int", options["frames"]),
-    )
     with Progress(
         *Progress.get_default_columns(),
         TextColumn("{task.fields[error]}"),

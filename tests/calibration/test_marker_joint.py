@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,11 @@ from jointfit_daemon.kinematics.chain_motion import (
     marker_positions,
     rest_state,
 )
-from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    IkOptions,
+    solve_frames,
+    tracking_error,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
@@ -146,6 +151,38 @@ def test_a_holdout_ends_the_work_and_gives_the_best_place_back() -> None:
     better = solve_frames(found.model, held.targets).residuals
     worse = solve_frames(misplaced(limb()), held.targets).residuals
     assert np.mean(better**2) < np.mean(worse**2)
+
+
+def clamped() -> ChainModel:
+    """Return the limb with a knee that its own walk overturns by up to 17 degrees."""
+    model = limb()
+    hip, knee = model.segments[1:]
+    short = replace(knee, joint=replace(knee.joint, limits=(-0.5, 1.0)))
+    return replace(model, segments=(model.segments[0], hip, short))
+
+
+def test_markers_suit_a_program_that_clamps_its_joints() -> None:
+    model, trial = clamped(), MotionTrial("walk", seen(0.002), 100.0)
+    model = model.with_locks(dict.fromkeys(model.marker_names[5:], (False,) * 3))
+    rms = {}
+    for limit in (0.0, 1.0):
+        found = refine_markers(model, [trial], RefinementSettings(limit_m2=limit))
+        hard = solve_frames(found.model, trial.targets, options=IkOptions(limit_m2=1.0))
+        rms[limit] = tracking_error(hard.residuals)
+        if limit:
+            assert found.trials[0].after.rms == pytest.approx(rms[limit], rel=0.01)
+    assert rms[1.0] < 0.8 * rms[0.0]
+
+
+def test_both_methods_find_the_same_within_limits() -> None:
+    trial, ends = MotionTrial("walk", seen(0.002), 100.0), []
+    methods: tuple[RefinementMethod, ...] = ("joint", "block")
+    for method in methods:
+        settings = RefinementSettings(method, tolerance=1e-7)
+        costs = refine_markers(clamped(), [trial], settings).costs
+        assert (np.diff(costs) < 0.0).all()
+        ends.append(costs[-1])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-3)
 
 
 def test_trials_are_thinned_evenly_and_split_in_two_runs_of_frames() -> None:

@@ -37,6 +37,8 @@ class Carriers(NamedTuple):
     """R_world_segment of each marker's segment, shape (T, M, 3, 3)."""
     origins: Array
     """m, shape (T, M, 3)."""
+    overturning: float = 0.0
+    """What hinges beyond their limits add to F."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,8 @@ class _Turns:
 
     def _at(self, positions: Array, carriers: Carriers) -> Turn:
         distances = np.linalg.norm(self._errors(positions, carriers), axis=-1)
-        return Turn(positions, carriers, self._problem.cost(distances, positions))
+        cost = self._problem.cost(distances, positions) + carriers.overturning
+        return Turn(positions, carriers, cost)
 
     def _errors(self, positions: Array, carriers: Carriers) -> Array:
         """Return errors in segment axes, shape (T, M, 3); zero where a marker is missing."""

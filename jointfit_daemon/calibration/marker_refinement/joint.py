@@ -112,6 +112,10 @@ def linearize(problem: Problem, positions: Array, state: ChainState) -> NormalEq
         A, B = X @ np.swapaxes(X, -1, -2), X[..., free] * w[:, None, free]
         parts.append((A, B, (X @ (w * e[some].reshape(len(at), -1))[..., None])[..., 0]))
     A, B, g = (np.concatenate(part) for part in zip(*parts, strict=True))
+    excess = problem.excess(state)
+    if excess is not None:
+        np.einsum("tkk->tk", A)[...] += problem.limit_m2 * (excess != 0.0)
+        g += problem.limit_m2 * excess
     total = (root**2).sum(axis=0)
     h = ((root**2)[..., None] * e).sum(axis=0)
     h += problem.pull * (positions - problem.model.positions)
@@ -155,7 +159,8 @@ def solve_jointly(
 def place(problem: Problem, positions: Array, state: ChainState) -> Step:
     """Return a place with its cost."""
     distances = np.linalg.norm(errors(problem, positions, state), axis=-1)
-    return Step(positions, state, problem.cost(distances, positions))
+    cost = problem.cost(distances, positions) + problem.overturning(state)
+    return Step(positions, state, cost)
 
 
 def _improve(problem: Problem, last: Step, damping: float) -> tuple[Step | None, float]:

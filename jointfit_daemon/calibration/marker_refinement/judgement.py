@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
     from jointfit_daemon.kinematics.chain_model import ChainModel
-    from jointfit_daemon.kinematics.inverse_kinematics import IkResult
+    from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, IkResult
 
     Array = NDArray[np.float64]
 
@@ -45,12 +45,17 @@ def _mean(square: Array, seen: NDArray[np.bool_], axis: int) -> Array:
 
 
 def judge_trial(
-    before: ChainModel, after: ChainModel, trial: MotionTrial, *, trained: bool
+    before: ChainModel,
+    after: ChainModel,
+    trial: MotionTrial,
+    *,
+    trained: bool,
+    options: IkOptions | None = None,
 ) -> TrialOutcome:
     """Return what a refinement did to one trial; both models follow it anew."""
     ones = np.ones(len(before.markers))
-    old = solve_frames(before, trial.targets, ones)
-    new = solve_frames(after, trial.targets, ones, start=old.state)
+    old = solve_frames(before, trial.targets, ones, options=options)
+    new = solve_frames(after, trial.targets, ones, start=old.state, options=options)
     return TrialOutcome(
         trial.name,
         trained,

@@ -57,6 +57,8 @@ class RefinementSettings:
     """Frames of every trial at most: long trials are thinned, so that none outweighs the others."""
     evenness: float = 0.0
     """Trials weigh as the power of their own error: more makes them more alike."""
+    limit_m2: float = 1.0
+    """Weight, m^2/rad^2, of a hinge's excess over its limits, where the model has limits."""
     holdout_share: float = 0.0
     """Last share of every training trial that only decides when to stop; 0: all is learned from."""
     tolerance: float | None = None

@@ -5,11 +5,13 @@ Law: with the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and 
 .. math::
 
     F(q, p) = \sum_{tm} w_{tm}\, \rho(|e_{tm}|)
-              + \tfrac12 \lambda \sum_m n_m\, |p_m - p^0_m|^2, \qquad n_m = \sum_t w_{tm}
+              + \tfrac12 \lambda \sum_m n_m\, |p_m - p^0_m|^2
+              + \tfrac12 \kappa \sum_{tk} x_{tk}^2, \qquad n_m = \sum_t w_{tm}
 
 where :math:`\rho(r) = r^2/2`, beyond c Huber's :math:`c (r - c/2)`. The prior grows with the frames
 in which a marker was seen, so thinning frames does not change what it means. Poses q are free in
-every frame, positions p are the same in all of them.
+every frame, positions p are the same in all of them; x is how far hinges are beyond their limits,
+rad. A program that clamps its joints would else be given markers that it cannot follow.
 """
 
 from __future__ import annotations
@@ -21,8 +23,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.kinematics.chain_layout import layout_of
+from jointfit_daemon.kinematics.pose_search import limits_of
+
 if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chain_motion import ChainState
+    from jointfit_daemon.kinematics.pose_search import Band
 
 Array = NDArray[np.float64]
 
@@ -45,6 +52,8 @@ class Problem:
     """lambda."""
     huber_m: float | None
     """c, m; None: plain squares."""
+    limit_m2: float = 0.0
+    """kappa; 0: hinges turn as far as they like."""
 
     @cached_property
     def seen(self) -> Array:
@@ -60,6 +69,24 @@ class Problem:
     def pull(self) -> Array:
         """Weight of the prior on every coordinate, shape (M, 3); none on what cannot move."""
         return self.prior * self.counts[:, None] * self.free
+
+    @cached_property
+    def limits(self) -> tuple[Band, ...]:
+        """Limits of hinges that are looked at."""
+        return limits_of(self.model, self.limit_m2)
+
+    def excess(self, state: ChainState) -> Array | None:
+        """Return how far hinges are beyond their limits, rad, shape (T, nq); None: no limits."""
+        for band in self.limits:
+            return np.where(
+                band.weights > 0.0, band.excess(layout_of(self.model), state.rotations), 0.0
+            )
+        return None
+
+    def overturning(self, state: ChainState) -> float:
+        """Return the part of F that is of hinges beyond their limits."""
+        excess = self.excess(state)
+        return 0.0 if excess is None else float(0.5 * self.limit_m2 * (excess**2).sum())
 
     def robust(self, distances: Array) -> Array:
         """Return the weights of squared errors at these distances, shape (T, M)."""

@@ -76,8 +76,11 @@ def refine_markers(
     task = _task(model, checked, settings)
     ended = _METHODS[settings.method](task, settings, progress)
     after = model.with_markers(ended.positions)
-    outcomes = tuple(judge_trial(model, after, t, trained=True) for t in checked.trials)
-    outcomes += tuple(judge_trial(model, after, t, trained=False) for t in unseen)
+    within = IkOptions(limit_m2=settings.limit_m2)
+    outcomes = tuple(
+        judge_trial(model, after, t, trained=n < len(thin), options=within)
+        for n, t in enumerate((*checked.trials, *unseen))
+    )
     return Refinement(
         after,
         settings.method,
@@ -121,15 +124,25 @@ def _task(model: ChainModel, checked: Checked, settings: RefinementSettings) -> 
     targets = np.concatenate([part.targets for part, _ in parts])
     present = np.isfinite(targets).all(axis=-1)
     weights = present * model.weights
-    problem = Problem(model, targets, weights, checked.free, settings.prior, settings.huber_m)
-    first = solve_frames(model, targets, weights, options=IkOptions(huber_m=settings.huber_m))
+    problem = Problem(
+        model,
+        targets,
+        weights,
+        checked.free,
+        settings.prior,
+        settings.huber_m,
+        settings.limit_m2,
+    )
+    options = IkOptions(huber_m=settings.huber_m, limit_m2=settings.limit_m2)
+    first = solve_frames(model, targets, weights, options=options)
     if settings.evenness > 0.0:
         lengths = [len(part.targets) for part, _ in parts]
         problem = replace(
             problem, weights=weights * _even(first, lengths, settings.evenness)[:, None]
         )
     held = [part.targets for _, part in parts if len(part.targets)]
-    return _Task(problem, first, _HoldOut(model, np.concatenate(held)) if held else None)
+    within = IkOptions(limit_m2=settings.limit_m2)
+    return _Task(problem, first, _HoldOut(model, np.concatenate(held), within) if held else None)
 
 
 def _even(first: IkResult, lengths: Sequence[int], power: float) -> Array:
@@ -143,9 +156,9 @@ def _even(first: IkResult, lengths: Sequence[int], power: float) -> Array:
 class _HoldOut:
     """Frames that only tell when to stop."""
 
-    def __init__(self, model: ChainModel, targets: Array) -> None:
-        self._model, self._targets = model, targets
-        self._last = solve_frames(model, targets)
+    def __init__(self, model: ChainModel, targets: Array, options: IkOptions) -> None:
+        self._model, self._targets, self._options = model, targets, options
+        self._last = solve_frames(model, targets, options=options)
         self._best = tracking_error(self._last.residuals)
         self._rises = 0
         self.positions = model.positions
@@ -153,7 +166,9 @@ class _HoldOut:
     def enough(self, positions: Array) -> bool:
         """Take note of a place; tell whether the error has risen twice running."""
         model = self._model.with_markers(positions)
-        self._last = solve_frames(model, self._targets, start=self._last.state)
+        self._last = solve_frames(
+            model, self._targets, start=self._last.state, options=self._options
+        )
         error = tracking_error(self._last.residuals)
         self._rises = self._rises + 1 if error >= self._best else 0
         if error < self._best:
@@ -184,11 +199,14 @@ def _in_turns(task: _Task, settings: RefinementSettings, progress: Progress | No
 def _searching(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
     problem, last = task.problem, task.first
     present = problem.weights > 0.0
+    within = IkOptions(limit_m2=settings.limit_m2)
 
     def error(positions: Array) -> float:
         nonlocal last
         model = problem.model.with_markers(positions)
-        last = solve_frames(model, problem.targets, problem.weights, start=last.state)
+        last = solve_frames(
+            model, problem.targets, problem.weights, start=last.state, options=within
+        )
         distances = np.linalg.norm(last.residuals, axis=-1)
         return float(np.sqrt(np.mean(distances[present] ** 2)))
 
@@ -218,12 +236,13 @@ class Follower:
     def __call__(self, positions: Array, weights: Array) -> Carriers:
         """Return the poses that follow the markers at these positions."""
         model = self._problem.model.with_markers(positions)
-        fine = IkOptions(tolerance=_FINE)
+        fine = IkOptions(tolerance=_FINE, limit_m2=self._problem.limit_m2)
         found = solve_frames(model, self._problem.targets, weights, start=self._state, options=fine)
         self._state = found.state
         self.runs += 1
         s = model.marker_segments
-        return Carriers(found.rotations[:, s], found.origins[:, s])
+        beyond = self._problem.overturning(found.state)
+        return Carriers(found.rotations[:, s], found.origins[:, s], beyond)
 
 
 class _Watch:
@@ -252,7 +271,7 @@ class _Watch:
 
 
 def _gauge(task: _Task, positions: Array, settings: RefinementSettings) -> Gauge:
-    plain = replace(task.problem, prior=0.0, huber_m=None)
+    plain = replace(task.problem, prior=0.0, huber_m=None, limit_m2=0.0)
     model = plain.model.with_markers(positions)
     state = solve_frames(model, plain.targets, plain.weights, start=task.first.state).state
     names = np.repeat([m.name for m in model.markers], 3)[plain.free.ravel()]
