@@ -173,7 +173,7 @@ def chosen_evenness(subject: Subject, trained: Sequence[str]) -> float:
 
 _OPENSIM = ("opensim",)
 EXPERIMENTS = (
-    Experiment("D-14", "gait2354 judged by OpenSim", scaled_only, (GAIT,), _OPENSIM),
+    Experiment("D-14", "gait2354 judged by OpenSim", scaled_only, (GAIT,), _OPENSIM, long=True),
     Experiment(
         "D-15", "beside the search through OpenSim", beside_opensim, (GAIT,), _OPENSIM, long=True
     ),

@@ -103,11 +103,9 @@ def markers(
 
     try:
         _check(method=method, up=up, out=out or [])
-        asked = Asked(
-            model, tuple(lock or ()), tuple(unlock or ()), tuple(without or ()), up or None
-        )
+        names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
         chain, remarks, found = _refined(
-            asked,
+            Asked(model, *names, up or None),
             (trials, validate or []),
             RefinementSettings(
                 cast("RefinementMethod", method),
