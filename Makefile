@@ -43,6 +43,7 @@ bench: $(STAMP)  ## measure speed, accuracy and timing; fails where a floor is m
 	@$(BIN)/python bench/accuracy.py
 	@$(BIN)/python bench/timing.py
 	@$(BIN)/python bench/joint_center.py
+	@$(BIN)/python bench/fusion.py
 	@$(BIN)/python bench/speed.py $(ARGS)
 
 docs: $(STAMP)  ## the documentation as a site, warnings are errors

@@ -82,7 +82,7 @@ class Errors:
     centers_mm: dict[str, float] = field(default_factory=dict)
 
 
-def _live(seed: int) -> Live:
+def wear_live(seed: int) -> Live:
     knobs = Knobs(seed=seed)
     still = Wearer(knobs, [Step("stand", 9.0)]).observe([np.empty(0)] * 4, np.empty(0), _STILL_S)
     wearer = Wearer(knobs, [Step("stand", BEGIN_S), *(Step(*motion) for motion in LIVE)])
@@ -152,9 +152,9 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
     rig = bench_rig()
     found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
     for seed in seeds:
-        trials, live = phases(seed), _live(seed)
+        trials, live = phases(seed), wear_live(seed)
         alignment = fit_alignment(trials.align, rig.calibration)
-        pose = _pose(trials.static, rig)
+        pose = take_pose(trials.static, rig)
         if pose is None:
             continue
         for method in METHODS:
@@ -164,7 +164,7 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
     return found
 
 
-def _pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
+def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
     """Return the pose that the daemon would take; None where it would ask for another."""
     until_ns = min(int(track.t_ns[0]) for track in static.sensors.values())
     until_ns += round(rig.calibration.static_s * NS)

@@ -1,6 +1,6 @@
 r"""How wrong a correction is, axis by axis, from frames that its fit has not seen.
 
-.. math:: \sigma_j^2(r) = a_j + b_j \min(r, 30)
+.. math:: \sigma_j^2(r) = a_j + b_j \max(0, \min(r, 30) - \tfrac12)
 
 with r the leverage of a frame over the training's 0.995 quantile: how far the pose lies outside
 what training has shown.
@@ -23,9 +23,13 @@ if TYPE_CHECKING:
 
 FARTHEST = 30.0
 """Leverage ratios beyond tell nothing more."""
-FAR, FAR_FACTOR, FAR_SHARE = 2.0, 3.0, 0.3
-"""With one trial: at this ratio errors are taken to be so many times larger, and this counts as
-much as so many parts of the trial."""
+WITHIN = 0.5
+"""Leverage ratios up to this are the heart of the training: there errors do not grow."""
+FAR, FAR_FACTOR, FAR_SHARE = 1.5, 3.0, 0.3
+"""Beforehand, at this ratio errors are taken to be so many times larger, and this counts as much as
+so many parts of the trials: training shows little of what lies far outside of it."""
+LEAST = 0.15
+"""Neither a nor b is less than so many parts of the mean square."""
 PASSES = 5
 SMALLEST_VARIANCE = 1e-8
 HULL_PENALTY = 1e-2
@@ -42,7 +46,7 @@ class Spread:
 
     def at(self, ratio: float) -> tuple[float, float, float]:
         """Return the standard deviations about x, y and z of the segment, rad."""
-        r = min(ratio, FARTHEST)
+        r = max(min(ratio, FARTHEST) - WITHIN, 0.0)
         a, b = self.inside, self.outside
         return (sqrt(a[0] + b[0] * r), sqrt(a[1] + b[1] * r), sqrt(a[2] + b[2] * r))
 
@@ -66,58 +70,60 @@ def hull(smooth: Array) -> Array:
     return found
 
 
-def measure_spread(
-    smooth: Array,
-    residuals: Sequence[Array],
-    ways: Sequence[Sequence[NDArray[np.bool_]]],
-) -> Spread:
+def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> Spread:
     """Fit variance against distance over all frames that some fit has not seen.
 
     Every way of leaving frames out adds its own: blocks of a trial lie near the rest of it, whole
-    trials far. With one trial nothing lies far, and the growth outside is that of `FAR_FACTOR`.
+    trials far. What is taken of a movement that nobody made is `FAR_FACTOR`.
+
+    Parameters
+    ----------
+    ratios_of : sequence of ndarray, shape (n,)
+        By way of leaving out: how far each frame lies outside all groups but its own.
+    residuals : sequence of ndarray, shape (n, 3)
+        By way: what is left over of each frame when its group is left out, rad.
+    """
+    distances = np.concatenate(ratios_of)
+    squares = np.concatenate([each**2 for each in residuals])
+    shares = np.full(len(distances), 1.0 / len(distances))
+    found = [_line(distances, square, shares) for square in squares.T]
+    (ax, bx), (ay, by), (az, bz) = found
+    return Spread((ax, ay, az), (bx, by, bz))
+
+
+def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
+    """Return how far each frame lies outside all groups but its own, shape (n,).
 
     Parameters
     ----------
     smooth : ndarray, shape (n, s)
         Smooth terms of all frames of training.
-    residuals : sequence of ndarray, shape (n, 3)
-        By way of leaving out: what is left over of each frame when its group is left out, rad.
-    ways : sequence of sequence of ndarray of bool, shape (n,)
-        By way of leaving out: the groups.
+    groups : sequence of ndarray of bool, shape (n,)
+        One way of leaving out.
     """
-    ratios = np.concatenate([_ratios(smooth, groups) for groups in ways])
-    squares = np.concatenate([each**2 for each in residuals])
-    shares = np.full(len(ratios), 1.0 / len(ratios))
-    found = [_line(ratios, square, shares, alone=len(ways) == 1) for square in squares.T]
-    (ax, bx), (ay, by), (az, bz) = found
-    return Spread((ax, ay, az), (bx, by, bz))
-
-
-def _ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
-    """Return how far each frame lies outside all groups but its own."""
-    ratios = np.empty(len(smooth))
+    found = np.empty(len(smooth))
     for held in groups:
         matrix = hull(smooth[~held])
         h = np.einsum("ij,jk,ik->i", smooth, matrix, smooth)
-        ratios[held] = h[held] / np.quantile(h[~held], 0.995)
-    return np.minimum(ratios, FARTHEST)
+        found[held] = h[held] / np.quantile(h[~held], 0.995)
+    return np.minimum(found, FARTHEST)
 
 
-def _line(ratios: Array, squares: Array, shares: Array, *, alone: bool) -> tuple[float, float]:
-    """Return a, b >= 0 of E(square) = a + b r: gamma regression, five passes."""
+def _line(distances: Array, squares: Array, shares: Array) -> tuple[float, float]:
+    """Return a, b of E(square) = a + b max(r - 1/2, 0): gamma regression, five passes."""
     typical = float(np.mean(squares)) + SMALLEST_VARIANCE
-    if alone:
-        ratios = np.append(ratios, FAR)
-        squares = np.append(squares, FAR_FACTOR**2 * typical)
-        shares = np.append(shares, FAR_SHARE)
-    design = np.stack([np.ones_like(ratios), ratios], axis=1)
+    distances = np.append(distances, FAR)
+    squares = np.append(squares, FAR_FACTOR**2 * typical)
+    shares = np.append(shares, FAR_SHARE)
+    beyond = np.maximum(distances - WITHIN, 0.0)
+    design = np.stack([np.ones_like(beyond), beyond], axis=1)
     from scipy.optimize import nnls  # noqa: PLC0415 - fits need it, a running daemon does not
 
     line = np.array([typical, 0.0])
     for _ in range(PASSES):
         scale = np.sqrt(shares) / (design @ line)
         line = nnls(design * scale[:, None], squares * scale)[0]
-        line[0] = max(line[0], 0.1 * typical)
+        line = np.maximum(line, LEAST * typical)
     return float(line[0]), float(line[1])
 
 

@@ -1,7 +1,8 @@
-r"""What the anchored model looks at: joint rotation, disagreement of sensors, bumps of both.
+r"""What the anchored model looks at: joint rotation, disagreement of sensors, tilt, bumps of them.
 
-Law: every feature is a function of body-frame relative rotations, so any constant turn of the world
-cancels exactly, and every feature vanishes in the static pose, so a correction needs no intercept.
+Law: relative rotations are blind to any constant turn of the world, tilts to any turn about the
+vertical, so both are to the heading of a person. Every feature vanishes where sensors agree, the
+joint is straight and the segment upright, as in the static pose: a correction needs no intercept.
 
 .. math:: a_z(x) = e^{-|x - z|^2 / 2} - e^{-|x|^2 / 2} - e^{-|z|^2 / 2} + 1
 
@@ -28,13 +29,15 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-JOINT_LENGTH = 0.5
-"""Joint rotations this far apart have much to do with each other, rad."""
-PAIR_LENGTH = 0.2
-"""The same of the disagreement of sensors, rad."""
+WIDTHS = (0.35, 0.5, 0.8)
+"""Joint rotations and tilts this far apart have much to do with each other, rad: what a fit may
+choose among."""
+PAIR_SHARE = 0.4
+"""The same of the disagreement of sensors, over that of joints: skin moves less than joints."""
 MOST_CENTERS = 24
 NEAREST_CENTERS = 0.01
-"""Centers nearer to each other than this (square root of it, in lengths) say the same."""
+"""Centers nearer to each other than this (square root of it, in widths) say the same."""
+TILTS = 3
 
 
 def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:
@@ -68,34 +71,46 @@ def relative_rotations_one(
     return found
 
 
+def tilts(q: Array) -> Array:
+    r"""Return :math:`[v_1, v_2, 1 - v_3]` of the vertical v seen from the segment, shape (n, 3).
+
+    Its tilt stands for the joint above, and for what gravity does to flesh.
+    """
+    w, x, y, z = q.T
+    found: Array = np.stack(
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 2.0 * (x * x + y * y)], axis=1
+    )
+    return found
+
+
+def tilts_one(q: Quaternion) -> list[float]:
+    """Return the same of one frame."""
+    w, x, y, z = q
+    return [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 2.0 * (x * x + y * y)]
+
+
 def smooth_terms(u: Array) -> Array:
-    r"""Return :math:`[u, 1 - \cos f, \sin f, 1 - \cos 2f, \sin 2f, f k_2, f k_3]`, f = k_1.
+    r"""Return :math:`[1 - \cos f, \sin f, 1 - \cos 2f, \sin 2f, f k_2, f k_3, u]`, f = k_1.
 
     f turns about x, the axis about which limbs flex: what skin does over a whole bend is a smooth
-    periodic function of it. Shape (n, 3 m + 6).
+    periodic function of it. Shape (n, 6 + columns of u); u may have tilts beside its rotations.
     """
     f = u[:, :1]
     bends = [1.0 - np.cos(f), np.sin(f), 1.0 - np.cos(2.0 * f), np.sin(2.0 * f)]
-    return np.concatenate([u, *bends, f * u[:, 1:3]], axis=1)
+    return np.concatenate([*bends, f * u[:, 1:3], u], axis=1)
 
 
 def smooth_terms_one(u: Sequence[float]) -> list[float]:
     """Return the same of one frame."""
     f = u[0]
-    bends = (1.0 - cos(f), sin(f), 1.0 - cos(2.0 * f), sin(2.0 * f))
-    return [*u, *bends, f * u[1], f * u[2]]
+    s, c = sin(f), cos(f)
+    return [1.0 - c, s, 2.0 * s * s, 2.0 * s * c, f * u[1], f * u[2], *u]
 
 
-def lengths(width: int) -> Array:
-    """Return what each of `width` relative rotations is measured by, rad, shape (width,)."""
-    return np.array([JOINT_LENGTH] * 3 + [PAIR_LENGTH] * (width - 3))
-
-
-def scaled_one(u: Sequence[float]) -> list[float]:
-    """Return [x, |x|^2 / 2, 1] of one frame's relative rotations, x in units of `lengths`."""
-    x = [u[0] / JOINT_LENGTH, u[1] / JOINT_LENGTH, u[2] / JOINT_LENGTH]
-    x += [d / PAIR_LENGTH for d in u[3:]]
-    return [*x, 0.5 * sum([c * c for c in x]), 1.0]
+def widths_of(width: float, sensors: int, *, tilted: bool) -> Array:
+    """Return what each rotation, and tilt, is measured by, rad; shape (3 m,) or (3 m + 3,)."""
+    joint, pairs = [width] * 3, [PAIR_SHARE * width] * (3 * sensors - 3)
+    return np.array(joint + pairs + [width] * (TILTS if tilted else 0))
 
 
 def spread_centers(x: Array) -> Array:
@@ -106,7 +121,7 @@ def spread_centers(x: Array) -> Array:
     Parameters
     ----------
     x : ndarray, shape (n, width)
-        Relative rotations in units of `lengths`.
+        Relative rotations, and tilts, in widths.
     """
     distance = np.sum(x**2, axis=1)
     chosen: list[int] = []

@@ -36,8 +36,11 @@ HEADING_SD = radians(2.0)
 """How far the heading of a sensor's world has wandered from where the calibration found it, rad: a
 turn about the vertical, common to a segment's pair, that no training frame shows (measured on
 simulated people a minute after calibration). It hardly touches flexion."""
+HEADING_WANDER = radians(0.3)
+"""How it goes on wandering, rad per root of a minute: after an hour the deviation has doubled."""
 BLEND_NS = 250_000_000
 HOLD_NS = 200_000_000
+MINUTE_NS = 60_000_000_000
 HELD_RATE = 2.0
 """How fast a held orientation goes out of date, rad/s: the RMS rate of a walking leg."""
 
@@ -75,6 +78,7 @@ class SegmentFuser:
         self._models = calibration.models
         widest = max((m.residual_sd for m in self._models.values()), default=UNREFERENCED_SD)
         self._untrained_sd = max(widest, FLOOR_SD)
+        self._since_ns: int | None = None
         self._last: tuple[int, Quaternion, float] | None = None
         self._before: tuple[tuple[str, ...], tuple[str, ...], Inputs] | None = None
         self._fading: tuple[int, Vector] | None = None
@@ -96,7 +100,9 @@ class SegmentFuser:
         said = self._say(alive, near, inputs)
         self._note_change(t_ns, alive, near, inputs, said.q)
         q = self._faded(t_ns, said.q)
-        flexion_sd, sd = _claimed(said)
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        flexion_sd, sd = _claimed(said, (t_ns - self._since_ns) / MINUTE_NS)
         self._last, self._before = (t_ns, q, sd), (alive, near, inputs)
         return Fused(q, sd, alive, self._flags(alive, said.extrapolating), flexion_sd)
 
@@ -170,10 +176,15 @@ class SegmentFuser:
         return multiply_one(target, exp_one((left * x, left * y, left * z)))
 
 
-def _claimed(said: Prediction) -> tuple[float | None, float]:
-    """Return the standard deviations about x and overall, with what no training can show."""
+def _claimed(said: Prediction, minutes: float) -> tuple[float | None, float]:
+    """Return the standard deviations about x and overall, with what no training can show.
+
+    A heading wanders about the vertical, one axis of three; `minutes` is for how long this
+    calibration, with its static pose, has been in use.
+    """
     sd = max(said.sd, FLOOR_SD)
-    sd = sqrt(sd * sd + HEADING_SD * HEADING_SD / 3.0)
+    heading = HEADING_SD * HEADING_SD + HEADING_WANDER * HEADING_WANDER * max(minutes, 0.0)
+    sd = sqrt(sd * sd + heading / 3.0)
     return None if said.axis_sd is None else max(said.axis_sd[0], FLOOR_SD), sd
 
 
