@@ -94,7 +94,7 @@ def fusion_rows(quick: bool) -> list[Row]:
     assert all(state.mode == "imu" and state.joints[1].angles for state in states)
     n = len(frames)
     return [
-        per_item("fusion: one frame of 4 sensors", fuse, items=n, goal_us=300, quick=quick),
+        per_item("fusion: one frame of 4 sensors", fuse, items=n, goal_us=100, quick=quick),
         per_item(
             "output: pose as JSON",
             lambda: lambda: [encode_pose(state, NS, 2 * NS) for state in states],
