@@ -142,5 +142,5 @@ EXPERIMENTS = (
     Experiment("D-1", "Jacobian against central differences", slope, _RECORDED),
     Experiment("D-2", "seven segments before refinement", fit, _RECORDED),
     Experiment("D-3", "occluded markers, no noise", occluded, _RECORDED),
-    Experiment("D-12", "speed of inverse kinematics", speed, _RECORDED),
+    Experiment("D-12", "speed of inverse kinematics", speed, _RECORDED, timed=True),
 )

@@ -322,7 +322,7 @@ EXPERIMENTS = (
     Experiment("T6", "lag from ten seconds of motion", ordinary, EXCERPTS + WHOLE, NEED),
     Experiment("T7", "lag: is sigma honest", sigma),
     Experiment("T8", "drift of the lag over two minutes", drift),
-    Experiment("T10-lag", "cost of the lag", cost, EXCERPTS),
+    Experiment("T10-lag", "cost of the lag", cost, EXCERPTS, timed=True),
     Experiment(
         "LAG-fast", "lag, fast excerpt", partial(excerpts, FAST, FAST_SD_MS, (4.17, 0.05)), EXCERPTS
     ),
