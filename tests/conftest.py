@@ -23,6 +23,8 @@ settings.register_profile("home", deadline=None)  # a loaded machine is no fault
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "home")
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
+
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
 
