@@ -1,0 +1,178 @@
+"""Rows FAULT and DRIFT: sensors that fall silent, stick, slip or drift, on simulated people.
+
+The person is at the demo's defaults: 5 degrees of skin in common and 3 of each sensor, errors of
+the sensors' own filters, mounts and headings of any kind. Jumps are counted against the same
+person without the fault, in units of the RMS error that is claimed in that very frame.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench import faults
+from bench.experiment import Experiment, Figure
+from bench.worn import bench_rig
+from jointfit_daemon.fusion import LimbFuser
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.fusion.sensor_watch import SensorNews
+
+    Array = NDArray[np.float64]
+
+SEEDS = (1, 2, 5, 6, 7, 8)
+RATE_HZ = 50.0
+FAULT_S = 60.0
+FIRST_S, APART_S = 17.3, 6.1
+"""Faults begin in all kinds of movement."""
+SLIPS_DEG = (10.0, 15.0, 30.0)
+RATES = (0.0, 1.0, 3.0, 10.0)
+DRIFT_S, DRIFT_HZ = 300.0, 25.0
+HOURS_EACH = 0.5
+JUMP_GOAL = 1.5
+
+
+def _people(seeds: tuple[int, ...]) -> Iterator[tuple[int, Calibration]]:
+    for seed in seeds:
+        calibration = faults.calibrated(seed)
+        if calibration is not None:
+            yield seed, calibration
+
+
+def _fuser(calibration: Calibration) -> LimbFuser:
+    return LimbFuser(bench_rig().chain, calibration)
+
+
+def _cases(
+    seeds: tuple[int, ...], spoil: Callable[[faults.Worn, str, float, int], faults.Worn]
+) -> Iterator[tuple[float, str, list[tuple[float, SensorNews]], Array]]:
+    """Yield, for every person and sensor: when the fault began, who, what was told, jumps."""
+    for seed, calibration in _people(seeds):
+        person = faults.live(seed, FAULT_S, RATE_HZ)
+        before, _ = faults.play(_fuser(calibration), person)
+        for k, name in enumerate(person.said):
+            at_s = FIRST_S + APART_S * k + 0.37 * seed
+            after, told = faults.play(_fuser(calibration), spoil(person, name, at_s, 10 * seed + k))
+            segment = 0 if name in ("S1", "S2") else 1
+            yield at_s, name, told, faults.jumps(before, after, segment)
+
+
+def _found(
+    spoil: Callable[[faults.Worn, str, float, int], faults.Worn],
+    state: str,
+    goal_s: float,
+    seeds: tuple[int, ...],
+) -> list[Figure]:
+    delays, jumps, wrong = [], [], 0
+    for at_s, name, told, jump in _cases(seeds, spoil):
+        segment = "thigh" if name in ("S1", "S2") else "shank"
+        right = [t for t, news in told if news.state == state and news.id in (name, segment)]
+        wrong += len(told) - len(right)
+        delays.append(right[0] - at_s if right else np.inf)
+        jumps.append(jump.max())
+    found = np.array(delays)
+    return [
+        Figure("found", 100.0 * float(np.mean(np.isfinite(found))), 100.0, 100.0, unit="%"),
+        Figure("told after, median", float(np.median(found)), float("inf"), unit="s"),
+        Figure("told after, worst", float(found.max()), goal_s, unit="s"),
+        Figure("others blamed", float(wrong), 0.0, unit=""),
+        Figure("largest jump / claimed, median", float(np.median(jumps)), 1.0, unit=""),
+        Figure("largest jump / claimed, worst", float(np.max(jumps)), JUMP_GOAL, unit=""),
+    ]
+
+
+def stuck(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+    """Return how soon a sensor that repeats itself is found."""
+    return _found(lambda p, name, t, _: faults.stuck(p, name, t), "stuck", 0.5, seeds)
+
+
+def silent(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+    """Return how soon a silent sensor is told."""
+    return _found(lambda p, name, t, _: faults.silent(p, name, t), "lost", 0.5, seeds)
+
+
+def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+    """Return how soon a slip is told."""
+    angle = np.deg2rad(degrees)
+    figures = _found(
+        lambda p, name, t, dice: faults.slipped(p, name, t, float(angle), dice),
+        "pair_disagrees", 2.0 if degrees > SLIPS_DEG[0] else float("inf"), seeds,
+    )  # fmt: skip
+    if degrees > SLIPS_DEG[0]:
+        return figures
+    share = figures[0]  # the smallest is at the limit of what skin allows
+    return [Figure(share.name, share.value, 100.0, 80.0, unit="%"), *figures[1:]]
+
+
+def false_alarms(
+    _: Path, seeds: tuple[int, ...] = SEEDS[:4], hours: float = HOURS_EACH
+) -> list[Figure]:
+    """Return how often healthy people are told anything, per hour."""
+    told, played = 0, 0.0
+    part_s = 300.0
+    for seed, calibration in _people(seeds):
+        fuser = _fuser(calibration)
+        for part in range(round(hours * 3600 / part_s)):
+            begin_s = faults.BEGIN_S + part_s * part
+            person = faults.live(seed, part_s, DRIFT_HZ, begin_s)
+            faults.live.cache_clear()
+            moved = faults.Worn(
+                person.t_s + part_s * part, person.said, person.bones, person.flexion
+            )
+            told += len(faults.play(fuser, moved)[1])
+            played += part_s / 3600
+    return [
+        Figure("hours played", played, float("inf"), unit="h"),
+        Figure("alarms an hour", told / played, 0.5, unit=""),
+    ]
+
+
+def drift(_: Path, seeds: tuple[int, ...] = SEEDS[:3]) -> list[Figure]:
+    """Return the error of the knee's rotation after 4 to 5 minutes of drift, without and with."""
+    figures = []
+    for rate in RATES:
+        for names, who in ((("S3", "S4"), "shank"), (("S4",), "one sensor")):
+            if rate in (0.0, 1.0) and len(names) == 1:
+                continue
+            without, taken_out = _drifted(seeds, names, rate)
+            title = f"{rate:g} deg/min, {who}"
+            figures.append(Figure(f"{title}: left in", without, float("inf")))
+            figures.append(Figure(f"{title}: taken out", taken_out, 5.0))
+    return figures
+
+
+def _drifted(seeds: tuple[int, ...], names: tuple[str, ...], rate: float) -> tuple[float, float]:
+    squares: dict[bool, list[float]] = {True: [], False: []}
+    for seed, calibration in _people(seeds):
+        person = faults.live(seed, DRIFT_S, DRIFT_HZ)
+        person = faults.drifting(person, names, float(np.deg2rad(rate)) / 60)
+        late = person.t_s > DRIFT_S - 60
+        for watched, found in squares.items():
+            fuser = _fuser(calibration)
+            if not watched:
+                fuser.links = None
+            states, _ = faults.play(fuser, person)
+            found.append(float(np.mean(faults.joint_errors(states, person)[late] ** 2)))
+    left, taken = (float(np.rad2deg(np.sqrt(np.mean(squares[key])))) for key in (False, True))
+    return left, taken
+
+
+EXPERIMENTS = (
+    Experiment("FAULT-lost", "a sensor falls silent", silent, long=True),
+    Experiment("FAULT-stuck", "a sensor repeats itself", stuck, long=True),
+    *(
+        Experiment(f"FAULT-slip-{degrees:g}", f"a sensor slips by {degrees:g} deg in 0.3 s",
+                   partial(slip, degrees=degrees), long=True)
+        for degrees in SLIPS_DEG
+    ),
+    Experiment("FAULT-none", "healthy sensors", false_alarms, long=True),
+    Experiment("DRIFT", "knee rotation in the fifth minute of heading drift", drift, long=True),
+)  # fmt: skip
