@@ -215,6 +215,8 @@ class JointState:
     """Included angle between the two segments, rad: pi when straight."""
     angle_sd: float | None = None
     """Standard deviation of the flexion angle, rad."""
+    rates: JointAngles | None = None
+    """How fast the angles change, over the last 50 ms, rad/s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,7 @@ from jointfit_daemon.calibration.result import (
     vector,
 )
 from jointfit_daemon.calibration.sampling import sensor_at
+from jointfit_daemon.calibration.sensor_links import fit_links
 from jointfit_daemon.calibration.static_pose import (
     StaticPose,
     fit_static,
@@ -145,6 +146,7 @@ def fit_calibration(
         digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
         software=software,
         created_utc=created_utc,
+        links=fit_links(chain, training.sensors, anatomy.q_static),
     )
 
 

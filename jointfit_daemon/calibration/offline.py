@@ -25,6 +25,7 @@ from jointfit_daemon.calibration.result import (
     alive_key,
     quaternion,
 )
+from jointfit_daemon.calibration.sensor_links import fit_links
 from jointfit_daemon.calibration.static import RobustMean, static_bias
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import functional_axis, joint_rotation, swing_twist
@@ -157,6 +158,7 @@ def fit_offline(
         quality={"offline": {"trials": [trial.name for trial in trials]}},
         software=software,
         created_utc=created_utc,
+        links=fit_links(chain, training.sensors, dict.fromkeys(chain.segments, rotation.IDENTITY)),
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 from jointfit_daemon.calibration.redundancy import SegmentModel
+from jointfit_daemon.calibration.sensor_links import SensorLink
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -100,6 +101,8 @@ class Calibration:
     """SHA-256 of the trials' arrays."""
     software: str = ""
     created_utc: str = ""
+    links: tuple[SensorLink, ...] = ()
+    """What is expected between sensors; empty where no movement was seen."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
@@ -129,6 +132,7 @@ class Calibration:
             "digest": self.digest,
             "software": self.software,
             "created_utc": self.created_utc,
+            "links": [link.to_dict() for link in self.links],
         }
 
     @staticmethod
@@ -219,6 +223,7 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         digest=data["digest"],
         software=data["software"],
         created_utc=data["created_utc"],
+        links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
     )
 
 

@@ -5,11 +5,14 @@ Law: pure, in order of time, plain floats. Unknown is None; every degradation is
 
 from __future__ import annotations
 
-from math import sqrt
+from dataclasses import replace
+from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.anatomy import flexion_sign
 from jointfit_daemon.calibration.model_fit import neighbor
+from jointfit_daemon.fusion.angle_rates import AngleRates
+from jointfit_daemon.fusion.link_watch import LinkWatch
 from jointfit_daemon.fusion.segment import Fused, SegmentFuser
 from jointfit_daemon.fusion.sensor_watch import SensorWatch
 from jointfit_daemon.fusion.skeleton import Reach, joint_positions, read_angles
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.fusion.segment import Inputs
+    from jointfit_daemon.fusion.sensor_watch import SensorNews
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
 _NOBODY: frozenset[str] = frozenset()
@@ -51,12 +56,15 @@ class LimbFuser:
         self._fusers: list[SegmentFuser] = []
         self._reaches: list[Reach] = []
         self._mounts: dict[str, tuple[Quaternion, Quaternion]] = {}
+        self.links: LinkWatch | None = None
+        self._rates = AngleRates()
         if self._calibration is not None:
             self._prepare(self._calibration)
 
     def _prepare(self, calibration: Calibration) -> None:
         chain = self._chain
         self._standing = calibration.flags
+        self.links = LinkWatch(chain, calibration)
         self._mounts = {
             name: (item.q_optical_world, item.q_sensor_segment)
             for name, item in calibration.sensor.items()
@@ -103,9 +111,9 @@ class LimbFuser:
         -----
         Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
         (a sample was extrapolated in time), ``origin_fixed`` (cameras run but do not see O1, so
-        that it is at the configured origin), ``stuck:`` per sensor, per segment ``one_sensor:``,
-        ``untrained:`` (outside the movements of the calibration), ``held:``, ``lost:``; ``gimbal``
-        last.
+        that it is at the configured origin), ``stuck:`` per sensor, ``slipped:`` per sensor or
+        ``pair_disagrees:`` per segment, per segment ``one_sensor:``, ``untrained:`` (outside the
+        movements of the calibration), ``held:``, ``lost:``; ``gimbal`` last.
         """
         orientations, stuck = self.watch.look(t_ns, completed_ns, orientations)
         if self._calibration is None:
@@ -115,27 +123,50 @@ class LimbFuser:
             for name, mount in self._mounts.items()
             if name in orientations
         }
-        fused = [
-            fuser.fuse(t_ns, inputs, near)
-            for fuser, near in zip(self._fusers, self._neighbors, strict=True)
-        ]
+        fused, doubts = self._fused(t_ns, inputs)
         flags = [*self._standing]
         if extrapolated and not extrapolated.isdisjoint(inputs):
             flags.append("extrapolating")
         if optical_origin is None and mode == "imu+mocap":
             flags.append("origin_fixed")
         flags += [f"stuck:{name}" for name in stuck]
+        flags += doubts
         for one in fused:
             flags += one.flags
-        joints = self._joints(fused, optical_origin, flags)
+        joints = self._joints(t_ns, fused, optical_origin, flags)
         segments = tuple(
             SegmentState(name, one.q, one.sd, one.used)
             for name, one in zip(self._chain.segments, fused, strict=True)
         )
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
+    def news(self, now_ns: int) -> list[SensorNews]:
+        """Return what is worth telling of the sensors at `now_ns`, each change once."""
+        told = self.watch.news(now_ns)
+        return told if self.links is None else told + self.links.news()
+
+    def _fused(self, t_ns: int, inputs: Inputs) -> tuple[list[Fused], tuple[str, ...]]:
+        """Return the segments, and flags of sensors that contradict each other."""
+        spread: tuple[float, ...] = ()
+        flags: tuple[str, ...] = ()
+        if self.links is not None:
+            inputs = self.links.correct(inputs)
+            spread, slipped, flags = self.links.look(t_ns, inputs)
+            if slipped:
+                inputs = {name: q for name, q in inputs.items() if name not in slipped}
+        fused = [
+            fuser.fuse(t_ns, inputs, near)
+            for fuser, near in zip(self._fusers, self._neighbors, strict=True)
+        ]
+        if any(spread):
+            fused = [
+                one if one.sd is None else replace(one, sd=hypot(one.sd, more))
+                for one, more in zip(fused, spread, strict=True)
+            ]
+        return fused, flags
+
     def _joints(
-        self, fused: list[Fused], optical_origin: Vector | None, flags: list[str]
+        self, t_ns: int, fused: list[Fused], optical_origin: Vector | None, flags: list[str]
     ) -> tuple[JointState, ...]:
         chain = self._chain
         origin = optical_origin or chain.origin or (0.0, 0.0, 0.0)
@@ -153,9 +184,9 @@ class LimbFuser:
                 continue
             if state.gimbal and "gimbal" not in flags:
                 flags.append("gimbal")
-            joints.append(
-                JointState(name, position, sd, state.angles, state.inner, state.flexion_sd)
-            )
+            joint = JointState(name, position, sd, state.angles, state.inner, state.flexion_sd)
+            rates = self._rates.rates(t_ns, joint, gimbal=state.gimbal)
+            joints.append(joint if rates is None else replace(joint, rates=rates))
         return tuple(joints)
 
     def _uncalibrated(self, t_ns: int, completed_ns: int, seq: int, sync: str) -> LimbState:

@@ -85,12 +85,16 @@ def _joint(joint: JointState, *, inner: bool) -> dict[str, Any]:
     if not inner and joint.angles is None and joint.inner is None:
         return shown  # an end of the chain has no angles
     flexion, adduction, rotation = joint.angles or (None, None, None)
+    rates = joint.rates or (None, None, None)
     return shown | {
         "flexion_deg": _degrees(flexion),
         "adduction_deg": _degrees(adduction),
         "rotation_deg": _degrees(rotation),
         "inner_deg": _degrees(joint.inner),
         "sd_deg": _degrees(joint.angle_sd),
+        "flexion_deg_s": _degrees(rates[0]),
+        "adduction_deg_s": _degrees(rates[1]),
+        "rotation_deg_s": _degrees(rates[2]),
     }
 
 

@@ -125,7 +125,7 @@ class Core:
         mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
         verdicts = {"mocap": mocap} | {name: self._counts(name) for name in self._aligned}
         lags = {} if self._lags is None else self._lags.health()
-        return health_of(self._sources, verdicts, self._session, self._fuser.watch, now_ns) | {
+        return health_of(self._sources, verdicts, self._session, self._fuser, now_ns) | {
             "lags": lags,
             "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames},
         }
@@ -314,7 +314,7 @@ class Core:
         if self._session.collecting:
             outputs += self._session.advance(now_ns)
         outputs += self._bulletin.due(now_ns)
-        outputs += sensor_notices(now_ns, self._fuser.watch.news(now_ns))
+        outputs += sensor_notices(now_ns, self._fuser.news(now_ns))
         return outputs
 
     def _fuse(self, frame: AlignedFrame) -> LimbState:

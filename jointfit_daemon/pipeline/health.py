@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.fusion import SensorWatch
+    from jointfit_daemon.fusion import LimbFuser
     from jointfit_daemon.pipeline.session import CalibrationSession
     from jointfit_daemon.pipeline.source import SourceState
 
@@ -23,7 +23,7 @@ def health_of(
     sources: Mapping[str, SourceState],
     counted: Mapping[str, Mapping[str, int]],
     session: CalibrationSession,
-    watch: SensorWatch,
+    fuser: LimbFuser,
     now_ns: int,
 ) -> dict[str, object]:
     """Return the health of every device and of the calibration, as JSON-able values.
@@ -38,10 +38,11 @@ def health_of(
             verdicts = _mocap(state, verdicts)
         devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state), **_filter(state)}
         if state.source.kind == "imu":
-            devices[name]["sensor"] = watch.health(name)
+            devices[name]["sensor"] = fuser.watch.health(name)
     return {
         "devices": devices,
         "calibration": {"phase": session.phase, "version": session.version},
+        "fusion": {} if fuser.links is None else fuser.links.health(),
     }
 
 

@@ -51,7 +51,7 @@ def test_a_knee_that_is_unknown_keeps_its_keys_and_a_hip_has_none() -> None:
     state = LimbState(1, 1, 1, "uncalibrated", "settling", (), (), tuple(lost))
     joints = orjson.loads(encode_pose(state, 0, 1))["joints"]
     nothing = {"p_m": None, "sd_m": None}
-    angles = dict.fromkeys(
-        ("flexion_deg", "adduction_deg", "rotation_deg", "inner_deg", "sd_deg"), None
-    )
+    names = ("flexion", "adduction", "rotation")
+    keys = [*(f"{name}_deg" for name in (*names, "inner", "sd")), *(f"{n}_deg_s" for n in names)]
+    angles = dict.fromkeys(keys, None)
     assert joints == {"hip": nothing, "knee": nothing | angles, "ankle": nothing}

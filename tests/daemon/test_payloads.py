@@ -38,6 +38,7 @@ KNEE = JointState(
     JointAngles(math.radians(28.314), math.radians(-1.92), math.radians(3.4)),
     math.radians(151.7),
     math.radians(1.4),
+    JointAngles(math.radians(120.004), math.radians(-3.0), 0.0),
 )
 STATE = LimbState(
     seq=184211,
@@ -80,6 +81,9 @@ def test_a_pose_is_this_text() -> None:
                 "rotation_deg": 3.4,
                 "inner_deg": 151.7,
                 "sd_deg": 1.4,
+                "flexion_deg_s": 120.0,
+                "adduction_deg_s": -3.0,
+                "rotation_deg_s": 0.0,
             },
             "ankle": {"p_m": None, "sd_m": None},
         },
@@ -90,7 +94,7 @@ def test_a_joint_is_scalars_only() -> None:
     assert json.loads(encode_joint(KNEE, 7)) == {
         "v": 1, "t_us": 7, "x_m": 0.021, "y_m": 0.104, "z_m": 0.481, "sd_m": 0.0051,
         "flexion_deg": 28.31, "adduction_deg": -1.92, "rotation_deg": 3.4, "inner_deg": 151.7,
-        "sd_deg": 1.4,
+        "sd_deg": 1.4, "flexion_deg_s": 120.0, "adduction_deg_s": -3.0, "rotation_deg_s": 0.0,
     }  # fmt: skip
 
 

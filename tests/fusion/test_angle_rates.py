@@ -1,0 +1,50 @@
+"""Rates of angles are those of the angles, and are not made up where there are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.fusion.angle_rates import AngleRates
+from jointfit_daemon.model import JointAngles, JointState
+
+MS = 1_000_000
+
+
+def knee(*angles: float) -> JointState:
+    return JointState("knee", None, None, JointAngles(*angles))
+
+
+@pytest.mark.parametrize("step_ms", [2, 10, 20, 50])
+def test_a_swing_has_the_rate_of_25_milliseconds_ago_or_half_a_frame(step_ms: int) -> None:
+    follower, off = AngleRates(), []
+    late_s = max(25, step_ms / 2) * 1e-3
+    for t_ms in range(0, 2000, step_ms):
+        t_s = t_ms * 1e-3
+        found = follower.rates(
+            t_ms * MS, knee(np.sin(3 * t_s), 0.2 * np.sin(3 * t_s), -0.5 * t_s), gimbal=False
+        )
+        if t_ms >= 100:
+            assert found is not None
+            assert found.rotation == pytest.approx(-0.5)
+            assert found.adduction == pytest.approx(0.2 * found.flexion)
+            off.append(found.flexion - 3 * np.cos(3 * (t_s - late_s)))
+    assert np.max(np.abs(off)) < 0.1
+
+
+def test_flexion_and_rotation_run_through_half_a_turn() -> None:
+    follower = AngleRates()
+    follower.rates(0, knee(np.pi - 0.01, 0.0, -np.pi + 0.02), gimbal=False)
+    found = follower.rates(10 * MS, knee(-np.pi + 0.01, 0.0, np.pi - 0.02), gimbal=False)
+    assert found == pytest.approx((2.0, 0.0, -4.0))
+
+
+def test_the_first_frame_a_gap_a_lock_and_an_unknown_joint_have_no_rate() -> None:
+    follower = AngleRates()
+    assert follower.rates(0, knee(0.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(200 * MS, knee(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(210 * MS, knee(1.0, 0.0, 0.0), gimbal=True) is None
+    assert follower.rates(220 * MS, knee(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(230 * MS, JointState("knee", None, None), gimbal=False) is None
+    assert follower.rates(240 * MS, knee(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(250 * MS, knee(1.01, 0.0, 0.0), gimbal=False) is not None

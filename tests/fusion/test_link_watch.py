@@ -1,0 +1,214 @@
+"""Slips and drifting headings: found, told, taken out or doubted, and nobody blamed for skin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
+from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.kinematics import rotation
+from tests.calibration.synthetic_limb import (
+    CHAIN,
+    SETTINGS,
+    Imperfections,
+    Subject,
+    motion,
+    plate_trial,
+    record,
+    static_and_functional,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.model import LimbState
+
+Array = np.ndarray
+SUBJECT = Subject(21, flaws=Imperfections(sensor_deg=0.2, tissue_deg=3.0, skin_m=0.003))
+SEGMENT = {"S1": 0, "S2": 0, "S3": 1, "S4": 1}
+
+
+@pytest.fixture(scope="module")
+def worn() -> Calibration:
+    static, functional, _ = static_and_functional(SUBJECT, 30.0)
+    alignment = fit_alignment(plate_trial(SUBJECT), SETTINGS)
+    return fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """Two minutes at 25 frames a second: instants (s), what sensors say, bones."""
+    moving = motion(SUBJECT, 120.0, 200.0)
+    tracks = record(SUBJECT, moving, 31, cameras=False).sensors
+    t_s = tracks["S1"].t_ns[::4] * 1e-9
+    bones = {
+        name: moving.q[name].as_quat(scalar_first=True)[:: 200 // 25][: len(t_s)]
+        for name in CHAIN.segments
+    }
+    return t_s, {name: track.q_world_sensor[::4] for name, track in tracks.items()}, bones
+
+
+def play(
+    fuser: LimbFuser, t_s: Array, said: Mapping[str, Array]
+) -> tuple[list[LimbState], list[tuple[float, str, str]]]:
+    """Return states, and time (s), id and state of what was told."""
+    rows = {name: [tuple(q) for q in array.tolist()] for name, array in said.items()}
+    states, told = [], []
+    for k, t in enumerate(t_s):
+        t_ns = round(t * 1e9)
+        states.append(fuser.fuse(t_ns, t_ns, k, {name: rows[name][k] for name in rows}))
+        told += [(t, news.id, news.state) for news in fuser.news(t_ns)]
+    return states, told
+
+
+def slipped(t_s: Array, q: Array, degrees: float, at_s: float) -> Array:
+    """Return a sensor that slides on its segment within 0.3 s."""
+    share = np.clip((t_s - at_s) / 0.3, 0.0, 1.0)
+    slide = Rotation.from_rotvec(np.radians(degrees) * np.outer(share, [0.6, -0.5, 0.62]))
+    return np.asarray((Rotation.from_quat(q, scalar_first=True) * slide).as_quat(scalar_first=True))
+
+
+def drifting(t_s: Array, q: Array, degrees_a_minute: float) -> Array:
+    """Return a sensor whose world turns about the vertical."""
+    turn = rotation.heading(np.radians(degrees_a_minute) * t_s / 60)
+    return rotation.multiply(turn, q)
+
+
+def oriented(states: list[LimbState], segment: int) -> Array:
+    return np.array([state.segments[segment].q_world_segment for state in states])
+
+
+def joint_error(states: list[LimbState], bones: Mapping[str, Array]) -> Array:
+    """Return the angle between the joint's rotation and the true one, deg."""
+    said = rotation.multiply(rotation.conjugate(oriented(states, 0)), oriented(states, 1))
+    true = rotation.multiply(rotation.conjugate(bones["thigh"]), bones["shank"])
+    return np.asarray(np.degrees(rotation.angle_between(said, true)))
+
+
+def test_healthy_sensors_are_left_alone(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    t_s, said, bones = walk
+    states, told = play(LimbFuser(CHAIN, worn), t_s, said)
+    assert told == []
+    assert {flag for s in states for flag in s.flags} == set()
+    unwatched = play(LimbFuser(CHAIN, replace(worn, links=())), t_s, said)[0]
+    watched, plain = (np.sqrt(np.mean(joint_error(x, bones) ** 2)) for x in (states, unwatched))
+    assert watched < plain + 0.3
+
+
+@pytest.mark.parametrize("name", ["S1", "S4"])
+@pytest.mark.parametrize("degrees", [12.0, 30.0])
+def test_a_slip_is_told_within_two_seconds_and_covered_by_the_deviation(
+    worn: Calibration,
+    walk: tuple[Array, dict[str, Array], dict[str, Array]],
+    name: str,
+    degrees: float,
+) -> None:
+    t_s, said, _ = walk
+    part = slice(0, 25 * 30)
+    t_s, said = t_s[part], {s: q[part] for s, q in said.items()}
+    before, _ = play(LimbFuser(CHAIN, worn), t_s, said)
+    spoilt = said | {name: slipped(t_s, said[name], degrees, 12.0)}
+    states, told = play(LimbFuser(CHAIN, worn), t_s, spoilt)
+    i = SEGMENT[name]
+    segment = CHAIN.segments[i]
+    assert [(who, what) for _, who, what in told] == [(segment, "pair_disagrees")]
+    assert 12.0 < told[0][0] < 14.0
+    assert f"pair_disagrees:{segment}" in states[-1].flags
+    claimed = np.array([s.segments[i].sd or 0.0 for s in states])
+    moved = rotation.angle_between(oriented(before, i), oriented(states, i))
+    assert np.max(moved / (np.sqrt(3) * claimed)) < 1.5
+
+
+def test_a_slip_that_is_set_right_is_told_to_be_over(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    t_s, said, _ = walk
+    wrong = slipped(t_s, said["S2"], 25.0, 10.0)
+    mended = np.where((t_s < 20.0)[:, None], wrong, said["S2"])
+    part = slice(0, 25 * 30)
+    spoilt = {s: q[part] for s, q in (said | {"S2": mended}).items()}
+    states, told = play(LimbFuser(CHAIN, worn), t_s[part], spoilt)
+    assert [what for _, _, what in told] == ["pair_disagrees", "agrees"]
+    assert states[-1].flags == ()
+
+
+def test_of_three_sensors_the_one_that_slipped_is_known_and_left_out() -> None:
+    chain = replace(CHAIN, sensors=(("S1", "S2", "S3"), ("S4",)))
+    rng = np.random.default_rng(5)
+    t_s = np.arange(0.0, 20.0, 0.04)
+    swing = Rotation.from_rotvec(np.outer(0.5 * np.sin(4 * t_s), [1.0, 0.0, 0.0]))
+    mounted = {}
+    for group, share in zip(chain.sensors, (1.0, -0.6), strict=True):
+        for name in group:
+            scatter = Rotation.from_rotvec(np.radians(0.5) * rng.normal(size=(len(t_s), 3)))
+            q = swing**share * scatter if share < 1 else swing * scatter
+            mounted[name] = q.as_quat(scalar_first=True)
+    static = record(SUBJECT, motion(SUBJECT, 6.0, 400.0, still=True), 1, cameras=False)
+    pose = fit_static(static, SETTINGS, chain)
+    calibration = fit_static_only(pose, None, chain)
+    bias = {s: item.q_sensor_segment for s, item in calibration.sensor.items()}
+    said = {s: rotation.multiply(q, rotation.conjugate(bias[s])) for s, q in mounted.items()}
+    spoilt = said | {"S2": slipped(t_s, said["S2"], 60.0, 8.0)}
+    states, told = play(LimbFuser(chain, calibration), t_s, spoilt)
+    assert {who for _, who, _ in told} == {"thigh"}
+    assert told[0][0] < 10.0
+    assert "slipped:S2" in states[-1].flags
+    assert states[-1].segments[0].used == ("S1", "S3")
+    clean = play(LimbFuser(chain, calibration), t_s, said)[0]
+    apart = rotation.angle_between(oriented(states, 0)[-1], oriented(clean, 0)[-1])
+    assert np.degrees(apart) < 1.0
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [{"S3": 8.0, "S4": 8.0}, {"S1": -4.0, "S2": -4.0, "S3": 4.0, "S4": 4.0}, {"S4": 10.0}],
+    ids=["shank", "both", "one"],
+)
+def test_a_drifting_heading_is_taken_out(
+    worn: Calibration,
+    walk: tuple[Array, dict[str, Array], dict[str, Array]],
+    rates: dict[str, float],
+) -> None:
+    t_s, said, bones = walk
+    spoilt = said | {s: drifting(t_s, said[s], rate) for s, rate in rates.items()}
+    fuser = LimbFuser(CHAIN, worn)
+    plain = LimbFuser(CHAIN, worn)
+    plain.links = None
+    last = slice(25 * 90, None)
+    with_, without, healthy = (
+        np.sqrt(np.mean(joint_error(play(f, t_s, q)[0], bones)[last] ** 2))
+        for f, q in ((fuser, spoilt), (plain, spoilt), (LimbFuser(CHAIN, worn), said))
+    )
+    assert with_ < healthy + 1.0
+    assert without > healthy + 2.0
+
+
+def test_a_joint_that_is_no_hinge_tells_nothing_of_headings(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    loose = tuple(
+        replace(link, spread=np.radians(9.0)) if link.kind == "joint" else link
+        for link in worn.links
+    )
+    t_s, said, _ = walk
+    fuser = LimbFuser(CHAIN, replace(worn, links=loose))
+    play(fuser, t_s[:500], {s: drifting(t_s, q, 8.0 * (s > "S2"))[:500] for s, q in said.items()})
+    assert fuser.links is not None
+    assert fuser.links.health()["headings"] == {"knee": {"drift_deg": None, "sd_deg": None}}
+
+
+def test_links_survive_storing_to_the_last_bit(worn: Calibration) -> None:
+    assert len(worn.links) == 6
+    assert Calibration.from_dict(worn.to_dict()) == worn
+    old = {key: value for key, value in worn.to_dict().items() if key != "links"}
+    assert Calibration.from_dict(old).links == ()
