@@ -4,10 +4,10 @@ Law: nothing but JSON lines on stdout. One when all is ready, one for every ``st
 …}`` for a command that was not understood, and one with the counts of all that was sent at the end.
 
 ``jointfit-sim play --directory DIR`` reads commands from stdin, one a line: ``play NAME``,
-``unplug ID``, ``plug ID``, ``reboot ID``, ``occlude on|off``, ``mocap stop|start|restart``, ``pause
-on|off``, ``status``, ``quit``. ID is a sensor, ``can0`` for the bus adapter, or (to reboot)
-``mocap``. ``--at SECONDS=COMMAND`` gives a command its time beforehand. The end of stdin changes
-nothing; SIGTERM and SIGINT quit.
+``unplug ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``, ``drift ID
+DEG``, ``occlude on|off``, ``mocap stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID
+is a sensor, ``can0`` for the bus adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND`` gives
+a command its time beforehand. The end of stdin changes nothing; SIGTERM and SIGINT quit.
 """
 
 from __future__ import annotations
@@ -46,6 +46,9 @@ COMMANDS = """commands, one a line on standard input:
   play NAME                   change to another motion
   unplug ID, plug ID          a sensor, or can0 for the bus adapter
   reboot ID                   a sensor, or mocap, restarts, and its clock with it
+  stick ID, free ID           a sensor repeats itself, or no more
+  slip ID DEG                 it slides on the skin within 0.3 s
+  drift ID DEG                its world turns by so much a minute; 0 ends it
   occlude on, occlude off     somebody stands before the cameras
   mocap stop, mocap start     the motion-capture server is silent
   mocap restart               it is closed and opened again; its clock goes on

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -126,6 +127,10 @@ class Scene:
             "unplug": lambda name: self._plugs(name)[0](),
             "plug": lambda name: self._plugs(name)[1](),
             "reboot": self._reboot,
+            "stick": lambda name: self._stream(name).mishaps.stick(),
+            "free": lambda name: self._stream(name).mishaps.free(),
+            "slip": self._slip,
+            "drift": self._drift,
             "occlude": lambda word: setattr(cameras, "covered", _on(word)),
             "mocap": self._mocap,
             "pause": lambda word: setattr(self._player, "paused", _on(word or "on")),
@@ -251,6 +256,25 @@ class Scene:
             self._restart_server(clock_anew=True)
         else:
             self._stream(name).device.power_cycle()
+
+    def _slip(self, words: str) -> None:
+        stream, degrees = self._with_number(words, "slip S1 15 (degrees)")
+        stream.mishaps.slip(math.radians(degrees))
+
+    def _drift(self, words: str) -> None:
+        stream, degrees = self._with_number(words, "drift S1 5 (degrees a minute)")
+        stream.mishaps.drift(math.radians(degrees) / 60.0)
+
+    def _with_number(self, words: str, example: str) -> tuple[ImuStream, float]:
+        name, _, number = words.partition(" ")
+        stream = self._stream(name)
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise BadCommand(f"{words!r}: expected a sensor and a number, as in {example}")
+        return stream, value
 
     def _mocap(self, word: str) -> None:
         if word == "restart":

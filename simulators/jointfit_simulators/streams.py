@@ -15,6 +15,7 @@ import numpy as np
 
 from jointfit_simulators.clocks import NS, Ticker
 from jointfit_simulators.imu_device import ImuDevice
+from jointfit_simulators.mishaps import Mishaps
 from jointfit_simulators.sensors import OrientationSensor
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ class ImuStream:
         told: SampleTold | None = None,
     ) -> None:
         self.name, self.device, self.told = name, device, told
-        self.sensor = OrientationSensor(knobs, name)
+        self.sensor, self.mishaps = OrientationSensor(knobs, name), Mishaps()
         self.ticker = Ticker(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
         self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
         self._unplugged = False
@@ -116,7 +117,7 @@ class ImuStream:
 
     def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
         """Give the planned samples their orientations; return when each is due on the wire."""
-        said = self.sensor.report(t_s, q_base_sensor)
+        said = self.mishaps.apply(t_s, self.sensor.report(t_s, q_base_sensor))
         lost = self._taken.dropped | ~np.isfinite(said[:, 0])
         for true_ns, stamp, q, never in zip(
             self._taken.host_ns.tolist(), self._taken.device_ns.tolist(), said.tolist(),

@@ -184,8 +184,12 @@ async def test_commands_change_the_scene_and_bad_ones_are_answered(tmp_path: Pat
             ("play hop", "no motion 'hop'"),
             ("unplug S9", "no sensor 'S9'"),
             ("occlude maybe", "expected on or"),
+            ("slip S1 far", "expected a sensor and a number"),
+            ("drift S9 1", "no sensor 'S9'"),
         ):
             assert hint in (await sim.ask(command))["error"]
+        for command in ("stick S3", "free S3", "slip S3 5", "drift S3 -1.5"):
+            await sim.tell(command)
         for command in ("reboot S3", "occlude on", "mocap stop", "mocap start", "pause off", ""):
             await sim.tell(command)
         assert (await sim.ask())["motion"] == "walk"
