@@ -119,7 +119,6 @@ def fit_calibration(
     used_ns = {name: item.lag_ns for name, item in used.items()}
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
     training, raw = _training(chain, functional, tracks, anatomy, sensors)
-    figures = judge(chain, training, settings.holdout_share)
     models = fit_models(chain, training, settings.method)
     flags = [*anatomy.flags, *(["headings_from_static"] if alignment is None else [])]
     notes = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns)]
@@ -141,13 +140,18 @@ def fit_calibration(
             "lag": {n: _lag_figures(lags.get(n), used.get(n, NO_LAG)) for n in sensors},
             **({} if refined.figures is None else {"markers": refined.figures}),
             "anatomy": _anatomy_figures(anatomy),
-            "holdout": {"method": settings.method, **figures, "meaning": MEANING},
+            "holdout": _holdout(chain, training, settings),
         },
         digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
         software=software,
         created_utc=created_utc,
         links=fit_links(chain, training.sensors, anatomy.q_static),
     )
+
+
+def _holdout(chain: Chain, training: LimbTraining, settings: CalibrationSettings) -> dict[str, Any]:
+    figures = judge(chain, training, settings.holdout_share)
+    return {"method": settings.method, **figures, "meaning": MEANING}
 
 
 def _tracks(

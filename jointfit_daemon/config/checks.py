@@ -178,16 +178,27 @@ def can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
                 yield Fault(f"imu[{source.id}].ids.{message}", text)
 
 
+def drifting(sources: Sequence[Source]) -> frozenset[str]:
+    """Return the IMUs whose heading is worked out on the gateway without a magnetometer."""
+    return frozenset(_on_gateway(sources)[True])
+
+
+def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
+    """Return the IMUs whose heading is worked out here, by whether it drifts."""
+    drifts: dict[bool, list[str]] = {True: [], False: []}
+    for source in sources:
+        if getattr(source.settings, "orientation", None) == "gateway":
+            drifts[not getattr(source.settings, "magnetometer", False)].append(source.id)
+    return drifts
+
+
 def headings(sources: Sequence[Source]) -> str | None:
     """Say what is wrong with IMUs of which some find north on the gateway and others drift.
 
     A fault it is not: who wants it may have it. Of a device that computes its own orientation it
     is not known which it is.
     """
-    drifts: dict[bool, list[str]] = {True: [], False: []}
-    for source in sources:
-        if getattr(source.settings, "orientation", None) == "gateway":
-            drifts[not getattr(source.settings, "magnetometer", False)].append(source.id)
+    drifts = _on_gateway(sources)
     if not drifts[True] or not drifts[False]:
         return None
     return (

@@ -15,12 +15,13 @@ from jointfit_daemon.fusion.angle_rates import AngleRates
 from jointfit_daemon.fusion.link_watch import LinkWatch
 from jointfit_daemon.fusion.segment import Fused, SegmentFuser
 from jointfit_daemon.fusion.sensor_watch import SensorWatch
+from jointfit_daemon.fusion.shared_heading import widened_joints, widened_segments
 from jointfit_daemon.fusion.skeleton import Reach, joint_positions, read_angles
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.model import JointState, LimbState, SegmentState
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion.segment import Inputs
@@ -41,12 +42,18 @@ class LimbFuser:
         None, or one of another chain (flag ``other_chain``): every state is ``uncalibrated``.
     watch : SensorWatch, optional
         What is known of the sensors already: a calibration that changed is no change of sensors.
+    drifting : collection of str
+        Sensors that are known to have no north, see ``LinkWatch``.
     """
 
     def __init__(
-        self, chain: Chain, calibration: Calibration | None, watch: SensorWatch | None = None
+        self,
+        chain: Chain,
+        calibration: Calibration | None,
+        watch: SensorWatch | None = None,
+        drifting: Collection[str] = (),
     ) -> None:
-        self._chain = chain
+        self._chain, self._drifting = chain, drifting
         self.watch = watch or SensorWatch(chain)
         known = calibration is not None and calibration.fits(chain)
         self._calibration = calibration if known else None
@@ -64,7 +71,7 @@ class LimbFuser:
     def _prepare(self, calibration: Calibration) -> None:
         chain = self._chain
         self._standing = calibration.flags
-        self.links = LinkWatch(chain, calibration)
+        self.links = LinkWatch(chain, calibration, self._drifting)
         self._mounts = {
             name: (item.q_optical_world, item.q_sensor_segment)
             for name, item in calibration.sensor.items()
@@ -112,8 +119,9 @@ class LimbFuser:
         Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
         (a sample was extrapolated in time), ``origin_fixed`` (cameras run but do not see O1, so
         that it is at the configured origin), ``stuck:`` per sensor, ``slipped:`` per sensor or
-        ``pair_disagrees:`` per segment, per segment ``one_sensor:``, ``untrained:`` (outside the
-        movements of the calibration), ``held:``, ``lost:``; ``gimbal`` last.
+        ``pair_disagrees:`` per segment, ``heading_unseen``, per segment ``one_sensor:``,
+        ``untrained:`` (outside the movements of the calibration), ``held:``, ``lost:``; ``gimbal``
+        last.
         """
         orientations, stuck = self.watch.look(t_ns, completed_ns, orientations)
         if self._calibration is None:
@@ -138,6 +146,8 @@ class LimbFuser:
             SegmentState(name, one.q, one.sd, one.used)
             for name, one in zip(self._chain.segments, fused, strict=True)
         )
+        if self.links is not None and (unseen := self.links.common_sd) > 0.0:
+            segments, joints = widened_segments(segments, unseen), widened_joints(joints, unseen)
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
     def news(self, now_ns: int) -> list[SensorNews]:
@@ -159,10 +169,7 @@ class LimbFuser:
             for fuser, near in zip(self._fusers, self._neighbors, strict=True)
         ]
         if any(spread):
-            fused = [
-                one if one.sd is None else replace(one, sd=hypot(one.sd, more))
-                for one, more in zip(fused, spread, strict=True)
-            ]
+            fused = [_widened(one, more) for one, more in zip(fused, spread, strict=True)]
         return fused, flags
 
     def _joints(
@@ -194,3 +201,11 @@ class LimbFuser:
         joints = tuple(JointState(name, None, None) for name in self._chain.joints)
         mode = "uncalibrated"
         return LimbState(seq, t_ns, completed_ns, mode, sync, self._standing, segments, joints)
+
+
+def _widened(one: Fused, more: float) -> Fused:
+    """Return a segment with a standard deviation added, per axis, rad."""
+    if one.sd is None:
+        return one
+    flexion = None if one.flexion_sd is None else hypot(one.flexion_sd, more)
+    return replace(one, sd=hypot(one.sd, more), flexion_sd=flexion)

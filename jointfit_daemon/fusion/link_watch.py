@@ -20,7 +20,7 @@ from jointfit_daemon.fusion.pair_watch import PairWatch, untrained
 from jointfit_daemon.fusion.sensor_watch import SensorNews
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.sensor_links import SensorLink
@@ -52,9 +52,11 @@ class Doubt(NamedTuple):
 class _Joint:
     """The headings of two neighboring segments."""
 
-    def __init__(self, links: list[SensorLink], standing: float) -> None:
+    def __init__(self, links: list[SensorLink], standing: float, *, drifts: bool) -> None:
         hinges = [link for link in links if link.spread <= HINGE_SPREAD]
         self.links, self.standing = hinges, standing
+        self.known = bool(hinges) or drifts
+        """Whether the drift is looked at, or known to go on unseen."""
         spread = max((link.spread for link in hinges), default=HINGE_SPREAD)
         self.drift = HeadingDrift(spread)
 
@@ -68,9 +70,14 @@ class LinkWatch:
         Who sits where.
     calibration : Calibration
         What was learnt of the links.
+    drifting : collection of str
+        Sensors that are known to have no north: where nobody looks at their headings, the
+        deviation grows without end. Of the others it is not known, and taken to be bounded.
     """
 
-    def __init__(self, chain: Chain, calibration: Calibration) -> None:
+    def __init__(
+        self, chain: Chain, calibration: Calibration, drifting: Collection[str] = ()
+    ) -> None:
         self._chain = chain
         known = {(link.a, link.b): link for link in calibration.links}
         self._pairs = [
@@ -87,9 +94,12 @@ class LinkWatch:
             _Joint(
                 [known[a, b] for a in above for b in below if (a, b) in known],
                 _standing(calibration, chain.segments[i], chain.segments[i + 1]),
+                drifts=any(name in drifting for name in (*above, *below)),
             )
             for i, (above, below) in enumerate(zip(chain.sensors, chain.sensors[1:], strict=False))
         ]
+        everyone = [name for group in chain.sensors for name in group]
+        self._common = HeadingDrift(0.0) if any(name in drifting for name in everyone) else None
         self._turns: dict[str, float] = dict.fromkeys(calibration.sensor, 0.0)
         """Heading errors that are taken out of the sensors, rad."""
         self._along = [0.0] * len(chain.segments)
@@ -177,6 +187,8 @@ class LinkWatch:
     def _step(self, t_ns: int) -> bool:
         news = [drift.step(t_ns) for drift in self._within.values()]
         news += [joint.drift.step(t_ns) for joint in self._joints]
+        if self._common is not None:
+            news.append(self._common.step(t_ns))
         return any(news)
 
     def _use_headings(self) -> None:
@@ -236,9 +248,11 @@ class LinkWatch:
             sure = [pair.excess for pair in pairs if odd not in (pair.link.a, pair.link.b)]
             spread.append(max(sure, default=0.0) / sqrt(3.0))
         for i, joint in enumerate(self._joints):
-            extra2 = max(0.0, joint.drift.sd**2 - joint.drift.least_sd**2) if joint.links else 0.0
+            extra2 = max(0.0, joint.drift.sd**2 - joint.drift.least_sd**2) if joint.known else 0.0
             for k in (i, i + 1):
                 spread[k] = sqrt(spread[k] ** 2 + extra2 / 6.0)
+        if self.common_sd > TOLD_DRIFT:
+            flags.append("heading_unseen")
         if not slipped and not flags and not any(spread):
             return self._calm
         return Doubt(tuple(spread), frozenset(slipped), tuple(flags))
@@ -257,6 +271,11 @@ class LinkWatch:
             if len(against) == len(here) - 1 and all(name in pair for pair in against):
                 return name
         return None
+
+    @property
+    def common_sd(self) -> float:
+        """Standard deviation of the heading that all segments share, rad; nobody here sees it."""
+        return 0.0 if self._common is None else self._common.sd
 
     # --- out ---------------------------------------------------------------------------------
 

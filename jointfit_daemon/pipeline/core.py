@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from jointfit_daemon.config.checks import headings
+from jointfit_daemon.config.checks import drifting, headings
 from jointfit_daemon.fusion import LimbFuser, OpticalOrigin, SensorWatch
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline.bulletin import Bulletin, unix_time_set
@@ -182,7 +182,7 @@ class Core:
     def _use_calibration(self) -> None:
         rig, calibration = self._rig, self._session.calibration
         if rig is not None:
-            self._fuser = LimbFuser(rig.chain, calibration, self._watch)
+            self._fuser = LimbFuser(rig.chain, calibration, self._watch, drifting(rig.sources))
             self._optical_origin, self._origin = None, None
             worn = calibration if calibration and calibration.fits(rig.chain) else None
             self._lags = LagWatch(rig.chain, worn, self._lags, known_lags(rig))

@@ -122,7 +122,11 @@ class Scene:
             sync_line=options.sync_line,
         )
         self._quit = asyncio.Event()
-        self._verbs: dict[str, Callable[[str], None]] = {
+        self._verbs = self._commands(cameras)
+
+    def _commands(self, cameras: Cameras) -> dict[str, Callable[[str], None]]:
+        """Return what each command does with the words after it."""
+        return {
             "play": self._play,
             "unplug": lambda name: self._plugs(name)[0](),
             "plug": lambda name: self._plugs(name)[1](),

@@ -212,3 +212,23 @@ def test_links_survive_storing_to_the_last_bit(worn: Calibration) -> None:
     assert Calibration.from_dict(worn.to_dict()) == worn
     old = {key: value for key, value in worn.to_dict().items() if key != "links"}
     assert Calibration.from_dict(old).links == ()
+
+
+def test_what_nobody_sees_of_sensors_without_north_grows_in_the_deviation(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    t_s, said, _ = walk
+    everyone = frozenset(said)
+    states, _ = play(LimbFuser(CHAIN, worn, drifting=everyone), t_s, said)
+    north, _ = play(LimbFuser(CHAIN, worn), t_s, said)
+    for k in (0, 1):
+        grown = [s.segments[k].sd or 0.0 for s in (states[25], states[-1])]
+        assert grown[1] > grown[0] + np.radians(2.0)
+        assert (north[-1].segments[k].sd or 0.0) < grown[1]
+    assert states[-1].joints[1].angle_sd == north[-1].joints[1].angle_sd  # the hinge tells
+    assert (states[-1].joints[2].position_sd or 0.0) >= (north[-1].joints[2].position_sd or 0.0)
+    assert "heading_unseen" in states[-1].flags
+    loose = tuple(link for link in worn.links if link.kind == "pair")
+    fuser = LimbFuser(CHAIN, replace(worn, links=loose), drifting=everyone)
+    blind, _ = play(fuser, t_s, said)
+    assert (blind[-1].joints[1].angle_sd or 0.0) > (north[-1].joints[1].angle_sd or 9.0) * 1.2
