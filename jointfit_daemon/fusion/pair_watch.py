@@ -19,7 +19,7 @@ SMOOTH_S = 0.4
 LASTS_NS, ENDS_NS = 500_000_000, 2_000_000_000
 LIMIT, LEAST_LIMIT = 3.0, radians(6.0)
 """Distance, smoothed, in units of its usual RMS length, from which on something slipped."""
-USUAL = 2.0
+USUAL = 1.5
 """Distance in the same units that is still no reason for doubt."""
 UNTRAINED_SD = radians(5.0)
 """Per component, of pairs that no movement has been seen of."""
