@@ -8,6 +8,8 @@ import time
 from functools import cache
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from bench import wires
 from bench.harness import Bench, Row, loop_s, per_item, percentile
 from bench.worn import bench_rig, fitted, walking
@@ -82,6 +84,23 @@ def _inputs(seconds: float) -> list[dict[str, Quaternion]]:
     return [dict(zip(SENSORS, row, strict=True)) for row in zip(*tracks.values(), strict=True)]
 
 
+def _plainly(frames: list[dict[str, Quaternion]]) -> Callable[[], object]:
+    """Return the same corrections by the arrays' way, one frame at a time; nothing around them."""
+    segments = list(worn().segment.values())
+    pairs = (("S1", "S2"), ("S3", "S4"))
+    models = [segments[i].models[f"{'+'.join(pairs[i])}|{'+'.join(pairs[1 - i])}"] for i in (0, 1)]
+    arrays = [{name: np.array([q]) for name, q in frame.items()} for frame in frames]
+
+    def work() -> object:
+        return [
+            models[i].predict([frame[s] for s in pairs[i]], frame[pairs[1 - i][0]])
+            for frame in arrays
+            for i in (0, 1)
+        ]
+
+    return work
+
+
 def fusion_rows(quick: bool) -> list[Row]:
     rig, frames = bench_rig(), _inputs(3.0)
 
@@ -95,6 +114,13 @@ def fusion_rows(quick: bool) -> list[Row]:
     n = len(frames)
     return [
         per_item("fusion: one frame of 4 sensors", fuse, items=n, goal_us=100, quick=quick),
+        per_item(
+            "fusion: its two corrections by plain numpy",
+            lambda: _plainly(frames),
+            items=n,
+            goal_us=None,
+            quick=quick,
+        ),
         per_item(
             "output: pose as JSON",
             lambda: lambda: [encode_pose(state, NS, 2 * NS) for state in states],
