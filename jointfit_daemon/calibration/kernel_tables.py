@@ -68,10 +68,9 @@ class Tables:
         bumps = np.exp(self.exponents @ np.array([*seen, *[v * v for v in seen], 1.0]))
         near = (self.of_bumps @ bumps).tolist()
         smooth = (self.of_smooth @ np.array(features.smooth_terms_one(seen))).tolist()
-        c = [
-            min(max(n + s + r, -LARGEST), LARGEST)
-            for n, s, r in zip(near, smooth, self.rest, strict=False)
-        ]
+        c = [n + s + r for n, s, r in zip(near, smooth, self.rest, strict=False)]
+        if max(c) > LARGEST or min(c) < -LARGEST:
+            c = [min(max(each, -LARGEST), LARGEST) for each in c]
         plain = sum([far * far for far in smooth[6 : self.first]])
         tilted = sum([far * far for far in smooth[self.first :]])
         return (c[0], c[1], c[2]), plain, (c[3], c[4], c[5]), tilted
