@@ -1,7 +1,7 @@
 """Trials and unchanged OpenSim models that refined markers are judged on.
 
-Law: what is learned from and what judges are told apart by name; a chain is made of the model and
-of training trials alone. All markers are let go, those that a model calls fixed included.
+Law: what is learned from and what judges are told apart by name; a chain is made of the model
+alone. All markers are let go, those that a model calls fixed included.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.opensim_ik import judge, shared_markers, trial_frames
-from jointfit_daemon.calibration.marker_refinement.hinges import used_ranges
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
 from jointfit_daemon.files.osim import read_osim, to_z_up
 
@@ -46,13 +45,9 @@ class Subject:
         trial = self.trials[name]
         return MotionTrial(name, to_z_up(trial.positions), trial.rate_hz)
 
-    def chain(self, *trained: str) -> ChainModel:
-        """Return the chain nearest to the model in what these trials use of it."""
-        first = self._markers(read_osim(self.model).model)
-        used = used_ranges(first, [self.motion(name) for name in trained])
-        return self._markers(read_osim(self.model, used=used).model)
-
-    def _markers(self, chain: ChainModel) -> ChainModel:
+    def chain(self) -> ChainModel:
+        """Return the chain of the model, all markers let go."""
+        chain = read_osim(self.model).model
         at = {m.name: m for m in chain.markers}
         kept = tuple(replace(at[n], locked=(False, False, False)) for n in self.names)
         return replace(chain, markers=kept)

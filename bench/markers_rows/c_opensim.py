@@ -45,7 +45,7 @@ def _less(before: float, after: float) -> float:
 def scaled_only(data: Path) -> list[Figure]:
     """D-14."""
     subject = gait2354(data)
-    chain, walk = subject.chain("walk1"), [subject.motion("walk1")]
+    chain, walk = subject.chain(), [subject.motion("walk1")]
     before = subject.verdicts(["walk1"])["walk1"].rms
     found = refine_markers(chain, walk, PLAIN)
     rms, most = np.degrees(found.angle_change())
@@ -67,7 +67,7 @@ def _off(found: Refinement, verdict: Verdict) -> float:
 def beside_opensim(data: Path) -> list[Figure]:
     """D-15: the published search through OpenSim, to its end; the joint method, the same frames."""
     subject = gait2354(data)
-    chain, walk = subject.chain("walk1"), [subject.motion("walk1")]
+    chain, walk = subject.chain(), [subject.motion("walk1")]
     refine_markers(chain, walk, PLAIN)
     began = time.perf_counter()
     joint = refine_markers(chain, walk, PLAIN)
@@ -112,7 +112,7 @@ def _untouched(data: Path) -> dict[str, Verdict]:
 def walking_alone(data: Path) -> list[Figure]:
     """D-16."""
     subject = opencap(data)
-    found = refine_markers(subject.chain("walking1"), [subject.motion("walking1")], PLAIN)
+    found = refine_markers(subject.chain(), [subject.motion("walking1")], PLAIN)
     after = subject.verdicts(EVERYTHING, found.model)
     return [
         Figure("walking1, learned from", _MM * after["walking1"].rms, 4.9, unit="mm"),
@@ -152,7 +152,7 @@ def refined_evenly(
     """Return markers learned from some trials, harder ones weighing more."""
     settings = RefinementSettings(huber_m=None, frames=100, evenness=power)
     trials, others = ([subject.motion(n) for n in names] for names in (trained, judged))
-    return refine_markers(subject.chain(*trained), trials, settings, others)
+    return refine_markers(subject.chain(), trials, settings, others)
 
 
 def chosen_evenness(subject: Subject, trained: Sequence[str]) -> float:

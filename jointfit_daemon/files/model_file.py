@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 _AXES = "xyz"
 _KEYS = {
     "model": {"name", "segment", "marker"},
-    "segment": {"name", "parent", "joint", "center_in_parent", "center", "axis", "rest", "limits"},
+    "segment": {"name", "parent", "joint", "center_in_parent", "center", "axis", "rest", "limits", "path"},
     "marker": {"name", "segment", "position", "weight", "locked"},
 }
 _LENGTHS = {"center_in_parent": 3, "center": 3, "axis": 3, "rest": 4, "limits": 2, "position": 3}
+_SAMPLE = 8
 
 
 def read_model(path: Path) -> ChainModel:
@@ -90,6 +91,8 @@ def _segment_data(s: Segment) -> dict[str, Any]:
         value = getattr(s.joint, key)
         if value != getattr(Joint(), key):
             data[key] = list(value)
+    if s.joint.path:
+        data["path"] = [list(sample) for sample in s.joint.path]
     return data
 
 
@@ -108,6 +111,7 @@ def _segment(data: dict[str, Any]) -> Segment:
         for key in ("center_in_parent", "center", "axis", "rest", "limits")
         if key in data
     }
+    given["path"] = tuple(tuple(float(x) for x in sample) for sample in data.get("path", ()))
     kind = data.get("joint", "ball" if "parent" in data else "free")
     return Segment(data["name"], data.get("parent"), Joint(kind, **given))
 
@@ -158,6 +162,9 @@ def _wrong_values(what: str, label: str, row: dict[str, Any]) -> list[str]:
         for key, count in _LENGTHS.items()
         if key in row and not _are_numbers(row[key], count)
     ]
+    path = row.get("path", [])
+    if not isinstance(path, list) or not all(_are_numbers(sample, _SAMPLE) for sample in path):
+        wrong.append(f"{label}: path must be a list of samples, {_SAMPLE} numbers each")
     texts = {"name"} | ({"segment"} if what == "marker" else set())
     wrong += [f"{label}: needs a {key}" for key in sorted(texts) if key not in row]
     wrong += [
@@ -203,6 +210,8 @@ def _toml(data: dict[str, Any]) -> str:
 def _value(value: Any) -> str:
     if isinstance(value, str):
         return _quoted(value)
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        return "[\n" + "".join(f"    {_value(row)},\n" for row in value) + "]"
     if isinstance(value, list):
         return f"[{', '.join(repr(float(x)) for x in value)}]"
     return repr(float(value))

@@ -26,11 +26,12 @@ from jointfit_daemon.kinematics.chain_model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection
     from pathlib import Path
 
     from jointfit_daemon.files.osim_joints import NearestJoint
     from jointfit_daemon.files.osim_tree import Array, OsimDocument, OsimMarker
+    from jointfit_daemon.kinematics.chain_model import Sample
     from jointfit_daemon.model import Quaternion, Vector
 
 _TO_Z_UP = [2, 0, 1]
@@ -60,7 +61,6 @@ def read_osim(
     bodies: Collection[str] | None = None,
     markers: Collection[str] | None = None,
     marker_set: Path | None = None,
-    used: Mapping[str, tuple[float, float]] | None = None,
 ) -> ImportedModel:
     """Return the chain of an OpenSim 4 model.
 
@@ -74,9 +74,6 @@ def read_osim(
         Only these markers. None: all.
     marker_set
         An XML file whose markers replace the model's.
-    used
-        Range of a hinge's angle over which it shall be nearest to the model's joint, rad, by
-        segment: what a first chain used on the trials at hand. All of the joint's range if None.
 
     Raises
     ------
@@ -88,7 +85,7 @@ def read_osim(
     found = document.markers if marker_set is None else read_marker_set(marker_set)
     _check(path, document, found, bodies, markers)
     try:
-        tree = _Tree(document, used or {})
+        tree = _Tree(document)
     except ValueError as error:
         raise Malformed(f"{path}: {error}") from error
     chosen = [
@@ -141,7 +138,7 @@ def _check(
 class _Tree:
     """Bodies on joints, welded ones merged; parents first."""
 
-    def __init__(self, document: OsimDocument, used: Mapping[str, tuple[float, float]]) -> None:
+    def __init__(self, document: OsimDocument) -> None:
         self.remarks = [
             f"constraint {name} is not kept: what it couples moves on its own"
             for name in document.constraints
@@ -157,7 +154,7 @@ class _Tree:
             for joint in ready:
                 if joint.child.body in self._at:
                     raise ValueError(f"body {joint.child.body!r} hangs on two joints")
-                nearest = nearest_joint(joint, used.get(joint.child.body))
+                nearest = nearest_joint(joint)
                 self._add(joint.parent.body, joint.child.body, nearest)
             waiting = [j for j in waiting if j not in ready]
         loose = [b for b in document.bodies if b not in self._at]
@@ -192,6 +189,7 @@ class _Tree:
                 _vector(joint.axis),
                 _turned(rest),
                 joint.limits,
+                () if joint.path is None else _path(joint.path, placed[:3, :3]),
             ),
         )
 
@@ -243,6 +241,16 @@ class _Tree:
 def _vector(v: Array) -> Vector:
     x, y, z = to_z_up(v).tolist()
     return (x, y, z)
+
+
+def _path(path: Array, placed: Array) -> tuple[Sample, ...]:
+    """Return a coupled joint's samples in our axes, its parent part of another body."""
+    turns = rotation.multiply(rotation.from_matrix(placed), path[:, 1:5])
+    shifts = path[:, 5:] @ placed.T
+    return tuple(
+        (q, *_turned(turn), *_vector(shift))
+        for q, turn, shift in zip(path[:, 0].tolist(), turns, shifts, strict=True)
+    )
 
 
 def _turned(q: Array) -> Quaternion:

@@ -1,12 +1,13 @@
 r"""The nearest of our joints to one of OpenSim's.
 
-Law: what moves about one coordinate becomes a hinge, about two or three a ball. A hinge's axis and
-both centers are those that, over the range of its coordinate, come nearest to the motion:
+Law: what moves about one coordinate becomes a hinge if it is one, else a coupled joint on samples of
+its motion; about two or three it becomes a ball. Axis and centers come nearest to the motion over
+the range of its coordinates:
 
 .. math:: A_i \approx A_{rest}\exp(a\varphi_i), \qquad
           \min_{c, C} \sum_i |t_i + A_i c - C|^2
 
-and how far the motion is from it is told.
+and how far the motion is from what it became is told.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from jointfit_daemon.files.osim_motion import JointMotion
 from jointfit_daemon.files.osim_tree import GROUND
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.coupled_joint import CoupledCurve
 
 if TYPE_CHECKING:
     from jointfit_daemon.files.osim_tree import Array, Coordinate, OsimJoint
@@ -30,6 +32,8 @@ _AT_HOME = 0.05
 """Pull of a center to the joint's own frame: a centimetre away counts as half a millimetre off."""
 _WIDEST = np.pi / 2
 """Coordinates with wider ranges are looked at this far to either side of their default."""
+_BEYOND = 0.3
+"""Samples of a coupled joint go on so far beyond its range, rad: not all programs clamp it."""
 _TELL_M, _TELL_RAD = 1e-4, 1e-3
 
 
@@ -45,15 +49,12 @@ class NearestJoint:
     axis: Array
     limits: tuple[float, float] | None
     remarks: tuple[str, ...]
+    path: Array | None = None
+    """Of a coupled joint: coordinate, quaternion, shift of its center; shape (n, 8)."""
 
 
-def nearest_joint(joint: OsimJoint, used: tuple[float, float] | None = None) -> NearestJoint:
+def nearest_joint(joint: OsimJoint) -> NearestJoint:
     """Return the nearest of our joints, and remarks where it is not the same.
-
-    Parameters
-    ----------
-    used
-        Range of a hinge's coordinate over which it shall be near, rad; all of it if None.
 
     Raises
     ------
@@ -78,7 +79,7 @@ def nearest_joint(joint: OsimJoint, used: tuple[float, float] | None = None) -> 
     if not turning:
         return replace(welded, remarks=tuple(remarks))
     if len(turning) == 1:
-        found = _hinge(joint, motion, turning[0], welded, used)
+        found = _about_one(joint, motion, turning[0], welded)
     else:
         found = _ball(joint, motion, turning, welded)
     return replace(found, remarks=(*remarks, *found.remarks))
@@ -152,31 +153,20 @@ def _ball(
     return replace(welded, kind="ball", center_in_parent=above, center=own, remarks=tuple(remarks))
 
 
-def _hinge(
-    joint: OsimJoint,
-    motion: JointMotion,
-    coordinate: Coordinate,
-    welded: NearestJoint,
-    used: tuple[float, float] | None,
+def _about_one(
+    joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
+    """Return the hinge that a coordinate turns, or the curve on which it leads its segment."""
     span = _span(coordinate)
-    low, high = np.clip(used, *span) if used is not None else span
-    if not low < high:
-        low, high = span
     zero = min(max(0.0, span[0]), span[1])
-    values = np.concatenate(([zero, *span], np.linspace(low, high, _SAMPLES)))
+    values = np.concatenate(([zero, *span], np.linspace(*span, _SAMPLES)))
     turns, shifts = _sampled(joint, motion, {coordinate.name: values})
     rest, axis, angles, bent = _axis(np.delete(turns, [1, 2], axis=0))
     above, own, missed = _centers(joint, turns[3:], shifts[3:])
+    if missed > _TELL_M or bent > _TELL_RAD:
+        return _coupled(joint, motion, coordinate, welded)
     ends = _turned_about(rotation.from_matrix(rest), rotation.from_matrix(turns[1:3]), axis)[1]
     limits = (min(ends[0], angles[1]), max(ends[1], angles[-1]))
-    remarks = []
-    if missed > _TELL_M or bent > _TELL_RAD:
-        remarks.append(
-            f"{joint.name}: {joint.kind} of {coordinate.name} became a hinge, the nearest from "
-            f"{np.degrees(low):.0f} to {np.degrees(high):.0f} degrees: "
-            f"off by {1000 * missed:.1f} mm and {np.degrees(bent):.1f} degrees at most"
-        )
     transform = np.eye(4)
     transform[:3, :3] = rest
     return replace(
@@ -187,7 +177,36 @@ def _hinge(
         center=own,
         axis=axis,
         limits=(float(limits[0]), float(limits[1])),
-        remarks=tuple(remarks),
+    )
+
+
+def _coupled(
+    joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
+) -> NearestJoint:
+    """Return the joint as samples of its motion, some beyond its range; both told apart."""
+    low, high = _span(coordinate)
+    zero = min(max(0.0, low), high)
+    values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)
+    turns, shifts = _sampled(joint, motion, {coordinate.name: np.append(values, zero)})
+    own = joint.child.transform[:3, 3]
+    seen = shifts + turns @ own
+    above = seen[-1]
+    path = np.column_stack((values, rotation.from_matrix(turns[:-1]), seen[:-1] - above))
+    # every second sample stands for all; those in between tell how well
+    turned, found = CoupledCurve.through(path[::2].tolist()).at(values)
+    missed = float(np.linalg.norm(found[:, 1:4] - path[:, 5:], axis=1).max())
+    bent = float(np.linalg.norm(turned - turns[:-1], axis=(1, 2)).max() / np.sqrt(2.0))
+    remark = f"{joint.name}: {joint.kind} of {coordinate.name} became a coupled joint"
+    if missed > _TELL_M or bent > _TELL_RAD:
+        remark += f", off by {1000 * missed:.1f} mm and {np.degrees(bent):.1f} degrees at most"
+    return replace(
+        welded,
+        kind="coupled",
+        center_in_parent=above,
+        center=own,
+        limits=(low, high),
+        path=path[::2],
+        remarks=(remark,),
     )
 
 

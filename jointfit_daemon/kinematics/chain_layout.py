@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.kinematics.coupled_joint import CoupledCurve
+
 if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
 
@@ -60,6 +62,8 @@ class Layout:
     column is not after the row; shape (nq, nq)."""
     strictly_lower: Array
     """The same without the diagonal."""
+    coupled: tuple[tuple[int, int, CoupledCurve], ...]
+    """Segment, column and curve of each coupled joint."""
 
 
 def layout_of(model: ChainModel) -> Layout:
@@ -78,7 +82,7 @@ def _layout(model: ChainModel) -> Layout:
     columns = [(i, k) for i, c in enumerate(model.columns) for k in range(c.stop - c.start)]
     axes = np.zeros((len(columns), 3))
     for row, (i, k) in enumerate(columns):
-        if k < 3:
+        if k < 3 and joints[i].kind != "coupled":
             axes[row] = joints[i].axis if joints[i].kind == "hinge" else np.eye(3)[k]
     segment_of = np.array([i for i, _ in columns], dtype=np.intp)
     shifts = np.array([row for row, (_, k) in enumerate(columns) if k > 2], dtype=np.intp)
@@ -108,6 +112,11 @@ def _layout(model: ChainModel) -> Layout:
         moves=below.T[:, segment_of],
         lower=lower,
         strictly_lower=np.tril(lower, -1),
+        coupled=tuple(
+            (i, c.start, CoupledCurve.through(j.path))
+            for i, (j, c) in enumerate(zip(joints, model.columns, strict=True))
+            if j.kind == "coupled"
+        ),
     )
 
 

@@ -5,7 +5,8 @@ Law: frozen data. Segments stand parents first. A segment's pose follows from it
 .. math:: R_i = R_p A_i, \qquad t_i = t_p + R_p\, c_p - R_i\, c_i
 
 where :math:`A_i` is all the joint may change: anything (``ball``), :math:`A_{rest}\exp(a\theta)`
-(``hinge``), anything and the origin, too (``free``). Axes and centers are metres in segment axes.
+(``hinge``), anything and the origin, too (``free``). Of a ``coupled`` joint one coordinate moves
+:math:`A_i` and :math:`c_p` along a path. Axes and centers are metres in segment axes.
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
 Array = NDArray[np.float64]
-JointKind = Literal["free", "ball", "hinge"]
-DEGREES_OF_FREEDOM: dict[JointKind, int] = {"free": 6, "ball": 3, "hinge": 1}
+JointKind = Literal["free", "ball", "hinge", "coupled"]
+DEGREES_OF_FREEDOM: dict[JointKind, int] = {"free": 6, "ball": 3, "hinge": 1, "coupled": 1}
+Sample = tuple[float, float, float, float, float, float, float, float]
 _ORIGIN: Vector = (0.0, 0.0, 0.0)
 _UNIT_TOLERANCE = 1e-6
+_FEWEST_SAMPLES = 4
 
 
 class ImpossibleModel(ValueError):  # noqa: N818 - named for what happened
@@ -53,7 +56,10 @@ class Joint:
     rest: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """q_parent_segment of a hinge at angle zero; of a ball, where a search without data begins."""
     limits: tuple[float, float] | None = None
-    """Lowest and highest angle of a hinge, rad; None: free to turn."""
+    """Lowest and highest angle of a hinge or coordinate of a coupled joint, rad; None: any."""
+    path: tuple[Sample, ...] = ()
+    """Of a coupled joint: coordinate, rad, q_parent_segment, and what it adds to
+    ``center_in_parent``, parent's axes, m; smooth in between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +191,7 @@ class ChainModel:
                 j,
                 center_in_parent=stretch(s.parent, j.center_in_parent),
                 center=stretch(s.name, j.center),
+                path=tuple((*at[:5], *stretch(s.parent, at[5:])) for at in j.path),
             )
 
         return replace(
@@ -224,6 +231,20 @@ def _wrong_joint(s: Segment) -> list[str]:
             wrong.append(f"{what} {values} is not of length 1")
     if j.limits is not None and not j.limits[0] < j.limits[1]:
         wrong.append(f"limits {j.limits} leave no angle")
+    return wrong + _wrong_path(j)
+
+
+def _wrong_path(j: Joint) -> list[str]:
+    if j.kind != "coupled":
+        return [f"a path, but its joint is {j.kind!r}"] if j.path else []
+    if len(j.path) < _FEWEST_SAMPLES:
+        return [f"a coupled joint needs a path of {_FEWEST_SAMPLES} samples, has {len(j.path)}"]
+    path = np.array(j.path)
+    if not np.isfinite(path).all():
+        return ["its path is not finite"]
+    wrong = [] if (np.diff(path[:, 0]) > 0.0).all() else ["the coordinate of its path must grow"]
+    if (np.abs(np.linalg.norm(path[:, 1:5], axis=1) - 1.0) > _UNIT_TOLERANCE).any():
+        wrong.append("a quaternion of its path is not of length 1")
     return wrong
 
 

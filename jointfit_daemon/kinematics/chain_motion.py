@@ -5,12 +5,13 @@ Law: everything has the instants first, shape (T, ...). A step moves a state on 
 .. math:: A_i \leftarrow A_i \exp(\delta_i), \qquad t_{root} \leftarrow t_{root} + \delta_t
 
 with :math:`\delta` in the columns `ChainModel.columns`: turns in the segment's own axes, rad, then
-for a free segment the shift of its origin in the world, m.
+for a free segment the shift of its origin in the world, m. A coupled joint's column is the step of
+its coordinate, which places the segment on its curve anew.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sin, sqrt
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ import numpy as np
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chain_layout import LEVI, Layout, layout_of
 from jointfit_daemon.kinematics.chain_model import Array, ChainModel, rest_rotations
+from jointfit_daemon.kinematics.coupled_joint import COLUMNS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,36 +38,54 @@ class ChainState:
     """A_i = R_parent_segment (R_world_segment without a parent), shape (T, S, 3, 3)."""
     origins: Array
     """World origins of the free segments, in their order, m, shape (T, F, 3)."""
+    couplings: Array | None = None
+    """Coordinates of the coupled joints, in their order, and what follows from them
+    (`CoupledCurve.at`), shape (T, C, 10); None: there are none."""
 
     def __len__(self) -> int:
         return len(self.rotations)
 
     def take(self, instants: NDArray[np.intp] | NDArray[np.bool_] | slice) -> ChainState:
         """Return the state at some instants."""
-        return ChainState(self.rotations[instants], self.origins[instants])
+        some = None if self.couplings is None else self.couplings[instants]
+        return ChainState(self.rotations[instants], self.origins[instants], some)
+
+    def put(self, instants: NDArray[np.intp], other: ChainState) -> None:
+        """Write another state over some instants, in place."""
+        self.rotations[instants], self.origins[instants] = other.rotations, other.origins
+        if self.couplings is not None:
+            self.couplings[instants] = other.couplings
+
+    def copy(self) -> ChainState:
+        """Return a state of its own arrays."""
+        return self.take(np.arange(len(self)))
 
 
 def rest_state(model: ChainModel, count: int = 1) -> ChainState:
     """Return the chain at rest, free origins in the world's, at `count` instants."""
     free = sum(s.joint.kind == "free" for s in model.segments)
     rest = np.broadcast_to(rest_rotations(model), (count, len(model.segments), 3, 3))
-    return ChainState(rest.copy(), np.zeros((count, free, 3)))
+    return placed(layout_of(model), rest.copy(), np.zeros((count, free, 3)), None)
 
 
 def segment_poses(model: ChainModel, state: ChainState) -> tuple[Array, Array]:
     """Return R_world_segment, shape (T, S, 3, 3), and world origins, m, shape (T, S, 3)."""
-    world = transforms(layout_of(model), state.rotations, state.origins)
+    world = transforms(layout_of(model), state)
     return world[..., :3, :3], world[..., :3, 3]
 
 
-def transforms(layout: Layout, rotations: Array, origins: Array) -> Array:
+def transforms(layout: Layout, state: ChainState) -> Array:
     """Return each segment's transform to the world, shape (T, S, 4, 4), one level at a time."""
+    rotations = state.rotations
     local = np.empty((*rotations.shape[:2], 4, 4))
     local[:] = layout.corners
     local[..., :3, :3] = rotations
     if layout.has_own_centers:
         local[..., :3, 3] -= (rotations @ layout.center[:, :, None])[..., 0]
-    local[..., :3, 3][:, layout.free] = origins
+    local[..., :3, 3][:, layout.free] = state.origins
+    if state.couplings is not None:
+        for c, (segment, _, _) in enumerate(layout.coupled):
+            local[:, segment, :3, 3] += state.couplings[:, c, 1:4]
     for level, parents in layout.levels:
         local[:, level] = local[:, parents] @ local[:, level]
     return local
@@ -79,16 +99,25 @@ def marker_positions(model: ChainModel, state: ChainState) -> Array:
     return placed
 
 
-def twists(layout: Layout, world: Array) -> Array:
+def twists(layout: Layout, world: Array, couplings: Array | None = None) -> Array:
     r"""Return what each degree of freedom does to points: shape (T, nq, 6).
 
     A point x moves by :math:`\alpha\times x + \beta`; the row is :math:`(\alpha, \beta)`. For a
-    turn about the world axis :math:`\alpha` through C it is :math:`\beta = C \times \alpha`.
+    turn about the world axis :math:`\alpha` through C it is :math:`\beta = C \times \alpha`; a
+    coupled joint slides besides.
     """
     found = np.empty((len(world), layout.nq, 6))
     turns = world[:, layout.segment_of, :3] @ layout.turns
+    if couplings is not None:
+        for c, (segment, column, _) in enumerate(layout.coupled):
+            own = world[:, segment, :3, :3]
+            turns[:, column, :, 0] = (own @ couplings[:, c, 4:7, None])[..., 0]
     found[..., :3] = turns[..., 0]
     found[..., 3:] = (skew(turns[..., 1]) @ turns[..., :1])[..., 0]
+    if couplings is not None:
+        for c, (segment, column, _) in enumerate(layout.coupled):
+            own = world[:, segment, :3, :3]
+            found[:, column, 3:] += (own @ couplings[:, c, 7:, None])[..., 0]
     found[:, layout.shifts] = layout.shift_twists
     return found
 
@@ -107,10 +136,10 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
     shifts of its root, zero else.
     """
     layout = layout_of(model)
-    world = transforms(layout, state.rotations, state.origins)
+    world = transforms(layout, state)
     s = model.marker_segments
     x = (world[:, s, :3, :3] @ model.positions[:, :, None])[..., 0] + world[..., :3, 3][:, s]
-    motion = twists(layout, world)
+    motion = twists(layout, world, state.couplings)
     # alpha x X + beta as one product: [skew(alpha), beta] times (X, 1)
     maps = np.empty((len(world), layout.nq, 3, 4))
     maps[..., :3] = skew(motion[..., :3])
@@ -123,15 +152,40 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
 
 def apply_step(model: ChainModel, state: ChainState, delta: Array) -> ChainState:
     """Return the state moved by `delta`, rad and m, shape (T, nq)."""
-    layout = layout_of(model)
-    return ChainState(
-        turned(layout, state.rotations, delta),
-        state.origins + delta[:, layout.shifts].reshape(len(delta), -1, 3),
-    )
+    return moved(layout_of(model), state, delta)
+
+
+def moved(layout: Layout, state: ChainState, delta: Array) -> ChainState:
+    """Return the state moved by `delta`, shape (T, nq)."""
+    rotations = turned(layout, state.rotations, delta)
+    origins = state.origins + delta[:, layout.shifts].reshape(len(delta), -1, 3)
+    if state.couplings is None:
+        return ChainState(rotations, origins)
+    columns = [column for _, column, _ in layout.coupled]
+    return placed(layout, rotations, origins, state.couplings[..., 0] + delta[:, columns])
+
+
+def placed(layout: Layout, rotations: Array, origins: Array, amounts: Array | None) -> ChainState:
+    """Return a state with the coupled joints where their coordinates say.
+
+    Parameters
+    ----------
+    rotations, origins
+        As in `ChainState`; rotations of coupled joints are overwritten in place.
+    amounts
+        rad, shape (T, C); None: at rest.
+    """
+    if not layout.coupled:
+        return ChainState(rotations, origins)
+    found = np.empty((len(rotations), len(layout.coupled), COLUMNS))
+    for c, (segment, _, curve) in enumerate(layout.coupled):
+        q = np.full(len(rotations), curve.home) if amounts is None else amounts[:, c]
+        rotations[:, segment], found[:, c] = curve.at(q)
+    return ChainState(rotations, origins, found)
 
 
 def turned(layout: Layout, rotations: Array, delta: Array) -> Array:
-    """Return A exp(delta) for all joints: rotations (T, S, 3, 3), delta (T, nq)."""
+    """Return A exp(delta) for all joints but coupled ones: (T, S, 3, 3) by (T, nq)."""
     vectors = (delta @ layout.spread).reshape(*rotations.shape[:2], 3)
     exp = exp_matrix if len(vectors) > 1 else _exp_of_few
     return rotations @ exp(vectors)
@@ -168,22 +222,41 @@ def _exp_of_few(r: Array) -> Array:
 def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
     """Return the step, shape (T, nq), that `apply_step` needs to go from a to b.
 
-    For turns it is log(A_a^T A_b), of a hinge the part about its axis: joint-angle differences.
+    For turns it is log(A_a^T A_b), of a hinge the part about its axis: joint-angle differences; of
+    a coupled joint the difference of its coordinate.
     """
     layout = layout_of(model)
     between = rotation.from_matrix(np.swapaxes(a.rotations, -1, -2) @ b.rotations)
     vectors = rotation.log(between).reshape(len(between), -1)
     step: Array = vectors @ layout.spread.T
+    between_coordinates(layout, a, b, step)
     step[:, layout.shifts] = (b.origins - a.origins).reshape(len(step), -1)
     return step
 
 
+def between_coordinates(layout: Layout, a: ChainState, b: ChainState, step: Array) -> None:
+    """Write how far coupled joints are in b from where they are in a into their columns."""
+    if a.couplings is not None and b.couplings is not None:
+        columns = [column for _, column, _ in layout.coupled]
+        step[:, columns] = b.couplings[..., 0] - a.couplings[..., 0]
+
+
 def hinge_angles(model: ChainModel, state: ChainState) -> dict[str, Array]:
     """Return the angle of every hinge from its rest, rad, by segment name, shape (T,) each."""
-    rest = rest_state(model, len(state))
-    step = step_between(model, ChainState(rest.rotations, state.origins), state)
+    rest = replace(rest_state(model, len(state)), origins=state.origins)
+    step = step_between(model, rest, state)
     return {
         s.name: step[:, columns.start]
         for s, columns in zip(model.segments, model.columns, strict=True)
         if s.joint.kind == "hinge"
+    }
+
+
+def coupled_coordinates(model: ChainModel, state: ChainState) -> dict[str, Array]:
+    """Return the coordinate of every coupled joint, rad, by segment name, shape (T,) each."""
+    if state.couplings is None:
+        return {}
+    return {
+        model.segment_names[segment]: state.couplings[:, c, 0]
+        for c, (segment, _, _) in enumerate(layout_of(model).coupled)
     }

@@ -2,7 +2,7 @@ r"""Where a search begins when nothing is known: each segment laid on its marker
 
 Law: from the world outwards, a segment takes the rotation that brings its markers, and the joint
 center its parent already has, nearest to where they are (Wahba's problem); a hinge keeps only the
-turn about its axis. A start need not be the optimum, but it must lie in its valley.
+turn about its axis, a coupled joint the nearest place on its curve. A start need not be the optimum, but it must lie in its valley.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.chain_model import rest_rotations
-from jointfit_daemon.kinematics.chain_motion import ChainState, exp_matrix
+from jointfit_daemon.kinematics.chain_motion import exp_matrix, placed, rest_state
 from jointfit_daemon.kinematics.marker_equations import Slots, slots_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.kinematics.chain_motion import ChainState
 
 _SQUARINGS = 10
 _THIN_M2 = 1e-4
@@ -43,19 +43,26 @@ def start_from_markers(
         Shape (T, S, K), zero where nothing was measured.
     """
     slots, count = slots_of(model), len(measured)
-    rest = rest_rotations(model)
+    home = rest_state(model)
+    rest = home.rotations[0]
+    curves = {segment: curve for segment, _, curve in slots.layout.coupled}
+    amounts = []
     world_R = np.empty((count, len(model.segments), 3, 3))
     world_t = np.empty((count, len(model.segments), 3))
     A = np.empty_like(world_R)
     guessed = np.zeros(count, dtype=np.bool_)
     for i, (segment, parent) in enumerate(zip(model.segments, model.parents, strict=True)):
         joint = segment.joint
-        own = np.asarray(joint.center)
+        own, corner = np.asarray(joint.center), np.asarray(joint.center_in_parent)
+        first = np.zeros(3)
+        if home.couplings is not None and i in curves:
+            first = home.couplings[0, len(amounts), 1:4]
+            corner = corner + first
         if parent < 0:
-            above_R, center = np.eye(3)[None], np.asarray(joint.center_in_parent)[None]
+            above_R, center = np.eye(3)[None], corner[None]
         else:
             above_R = world_R[:, parent]
-            center = world_t[:, parent] + above_R @ np.asarray(joint.center_in_parent)
+            center = world_t[:, parent] + above_R @ corner
         cloud = (
             np.broadcast_to(slots.points[i, :3], measured[:, i].shape),
             measured[:, i],
@@ -67,12 +74,17 @@ def start_from_markers(
         guessed |= (spans < _THIN_M2) & _has_markers(slots, i)
         turned = np.swapaxes(above_R, -1, -2) @ laid
         A[:, i] = _about_axis(rest[i], turned, joint.axis) if joint.kind == "hinge" else turned
+        if i in curves:
+            amounts.append(curves[i].nearest(turned))
+            A[:, i], coupling = curves[i].at(amounts[-1])
+            center = center + (above_R @ (coupling[:, 1:4] - first)[..., None])[..., 0]
         world_R[:, i] = above_R @ A[:, i]
         if joint.kind == "free":
             world_t[:, i] = middle
         else:
             world_t[:, i] = center - world_R[:, i] @ own
-    return ChainState(A, world_t[:, slots.layout.free]), guessed
+    found = np.stack(amounts, axis=1) if amounts else None
+    return placed(slots.layout, A, world_t[:, slots.layout.free], found), guessed
 
 
 def _with_center(

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.kinematics.chain_motion import ChainState
 from jointfit_daemon.kinematics.chain_start import start_from_markers
 from jointfit_daemon.kinematics.marker_equations import fit, normal_equations, slots_of
 from jointfit_daemon.kinematics.pose_search import Band, Problem, limits_of, search
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.kinematics.chain_motion import ChainState
 
 _TOGETHER = 4096
 """Degrees of freedom searched together: their arrays stay in the processor's cache."""
@@ -133,8 +133,7 @@ class _Solution:
     """What is being found, instant by instant; its arrays are written in place."""
 
     problem: Problem
-    rotations: Array
-    origins: Array
+    state: ChainState
     weights: Array
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
@@ -144,8 +143,7 @@ class _Solution:
         count = len(start)
         return cls(
             problem,
-            start.rotations.copy(),
-            start.origins.copy(),
+            start.copy(),
             problem.weights.copy(),
             np.zeros(count, dtype=np.bool_),
             np.zeros(count, dtype=np.intp),
@@ -154,9 +152,8 @@ class _Solution:
     def solve(self, instants: NDArray[np.intp], hold: Band | None = None) -> None:
         """Search at some instants from where they are."""
         part = self.problem.take(instants, hold)
-        found = search(part, ChainState(self.rotations[instants], self.origins[instants]))
-        self.rotations[instants] = found.state.rotations
-        self.origins[instants] = found.state.origins
+        found = search(part, self.state.take(instants))
+        self.state.put(instants, found.state)
         self.weights[instants] = found.weights
         self.converged[instants] = found.converged
         self.iterations[instants] += found.iterations
@@ -168,7 +165,7 @@ class _Solution:
         one degree of freedom when those after it are free to follow.
         """
         slots = slots_of(self.problem.model)
-        at = fit(slots, self.rotations, self.origins, self.problem.measured, self.weights)
+        at = fit(slots, self.state, self.problem.measured, self.weights)
         return open_instants(normal_equations(slots, at)[0] / self.problem.typical_weight)
 
     def follow(
@@ -180,19 +177,19 @@ class _Solution:
         together, then their second ones, and so on.
         """
         for instants, before in _waves(doubtful):
-            self.rotations[instants] = self.rotations[before]
-            self.origins[instants] = self.origins[before]
+            last = self.state.take(before)
+            self.state.put(instants, last)
             held: Array = hold_m2 * is_open[instants].astype(np.float64)
-            hold = Band.holding(self.problem.model, self.rotations[before], held)
+            hold = Band.holding(self.problem.model, last, held)
             self.solve(instants, hold)
 
     def result(self, seen: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> IkResult:
         slots = slots_of(self.problem.model)
-        at = fit(slots, self.rotations, self.origins, self.problem.measured, self.weights)
+        at = fit(slots, self.state, self.problem.measured, self.weights)
         residuals = slots.taken(at.errors)
         residuals[~seen] = np.nan
         return IkResult(
-            ChainState(self.rotations, self.origins),
+            self.state,
             at.world[..., :3, :3],
             at.world[..., :3, 3],
             residuals,

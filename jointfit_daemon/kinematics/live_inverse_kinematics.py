@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from jointfit_daemon.kinematics.chain_motion import ChainState, rest_state, turned
+from jointfit_daemon.kinematics.chain_motion import ChainState, moved, rest_state
 from jointfit_daemon.kinematics.inverse_kinematics import OPEN_M2, IkOptions, solve_frames
 from jointfit_daemon.kinematics.marker_equations import Fit, fit, lower_equations, slots_of
 from jointfit_daemon.kinematics.pose_search import Band
@@ -160,7 +160,7 @@ class LiveInverseKinematics:
             w = self._robust(place.at, weights)
             if w is not weights:
                 place = self._moved(place.state, None, measured, w)
-            equations = self._equations(place, last.rotations)
+            equations = self._equations(place, last)
             step, place = self._one_step(place, equations, measured, w)
             travelled = travelled + step
             if np.abs(step).max() < _LAST_STEP:
@@ -170,13 +170,9 @@ class LiveInverseKinematics:
     def _moved(
         self, state: ChainState, step: Array | None, measured: Array, weights: Array
     ) -> _Place:
-        layout = self._slots.layout
         if step is not None:
-            state = ChainState(
-                turned(layout, state.rotations, step[None]),
-                state.origins + step[layout.shifts].reshape(1, -1, 3),
-            )
-        at = fit(self._slots, state.rotations, state.origins, measured, weights)
+            state = moved(self._slots.layout, state, step[None])
+        at = fit(self._slots, state, measured, weights)
         return _Place(state, at, float(at.cost[0]))
 
     def _robust(self, at: Fit, weights: Array) -> Array:
@@ -186,7 +182,7 @@ class LiveInverseKinematics:
         size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
         return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
 
-    def _equations(self, place: _Place, reference: Array) -> _Equations:
+    def _equations(self, place: _Place, reference: ChainState) -> _Equations:
         """Return normal matrix and gradient, held to `reference` if the markers leave one open."""
         lower, gradient = lower_equations(self._slots, place.at)
         H, g = lower[0], gradient[0]
@@ -197,7 +193,7 @@ class LiveInverseKinematics:
         if is_open:
             weight = self._options.hold_m2 * self._typical
             hold = Band(reference, np.full((1, len(g)), weight), _ZERO, _ZERO)
-            g = g + weight * hold.excess(self._slots.layout, place.state.rotations)[0]
+            g = g + weight * hold.excess(self._slots.layout, place.state)[0]
             diagonal += weight
             factor, _ = lapack.dpotrf(H, lower=1)
         return _Equations(H, g, factor, is_open)
@@ -280,4 +276,4 @@ class _Place:
 def _straightened(state: ChainState) -> ChainState:
     """Return the state with what rounding bent taken out: one Newton step to A^T A = 1."""
     A = state.rotations
-    return ChainState(1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)), state.origins)
+    return replace(state, rotations=1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)))

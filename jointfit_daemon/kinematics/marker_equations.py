@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.kinematics.chain_motion import ChainState
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +94,8 @@ class Fit:
     """Rows x, y, z, 1 of each marker of the model, then its three errors; shape (T, S, 7, K)."""
     weighted: Array
     """The same times the weights."""
+    couplings: Array | None = None
+    """Of the state."""
 
     @property
     def errors(self) -> Array:
@@ -108,28 +111,29 @@ class Fit:
 
     def take(self, instants: NDArray[np.intp]) -> Fit:
         """Return the fit at some instants."""
-        return Fit(self.world[instants], self.cloud[instants], self.weighted[instants])
+        some = None if self.couplings is None else self.couplings[instants]
+        return Fit(self.world[instants], self.cloud[instants], self.weighted[instants], some)
 
 
-def fit(slots: Slots, rotations: Array, origins: Array, measured: Array, weights: Array) -> Fit:
+def fit(slots: Slots, state: ChainState, measured: Array, weights: Array) -> Fit:
     """Return the chain beside its markers.
 
     Parameters
     ----------
     slots
         Of the model.
-    rotations, origins
-        As in `ChainState`.
+    state
+        Of the chain.
     measured
         Shape (T, S, 3, K), m, finite.
     weights
         Shape (T, S, K), zero where nothing was measured.
     """
-    world = transforms(slots.layout, rotations, origins)
+    world = transforms(slots.layout, state)
     cloud = np.empty((*world.shape[:2], 7, slots.shape[1]))
     np.matmul(world, slots.points, out=cloud[..., :4, :])
     np.subtract(cloud[..., :3, :], measured, out=cloud[..., 4:, :])
-    return Fit(world, cloud, cloud * weights[:, :, None, :])
+    return Fit(world, cloud, cloud * weights[:, :, None, :], state.couplings)
 
 
 def _sums_to_inertia() -> Array:
@@ -166,7 +170,7 @@ def lower_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
     sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)
     beyond = layout.below @ sums.reshape(count, -1, 28)
     bodies = (beyond @ _INERTIA).reshape(count, -1, 6, 7)
-    motion = twists(layout, at.world)
+    motion = twists(layout, at.world, at.couplings)
     # by segment: gathering bodies for every degree of freedom would cost memory, and so time
     pushed = np.empty((*motion.shape[:2], 7))
     for s, columns in layout.columns:

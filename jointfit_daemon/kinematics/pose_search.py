@@ -17,8 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.kinematics.chain_layout import layout_of
-from jointfit_daemon.kinematics.chain_model import rest_rotations
-from jointfit_daemon.kinematics.chain_motion import ChainState, turned
+from jointfit_daemon.kinematics.chain_motion import (
+    ChainState,
+    between_coordinates,
+    moved,
+    rest_state,
+)
 from jointfit_daemon.kinematics.marker_equations import Fit, fit, normal_equations, slots_of
 
 if TYPE_CHECKING:
@@ -37,8 +41,8 @@ _STILL = 1e-8  # rad, m: steps below it are rounding
 class Band:
     """Where turns should be, and how much it costs to be elsewhere."""
 
-    reference: Array
-    """A_ref, shape (T, S, 3, 3)."""
+    reference: ChainState
+    """Holds A_ref; at T instants or one."""
     weights: Array
     """m^2/rad^2, shape (T, nq)."""
     low: Array
@@ -46,7 +50,7 @@ class Band:
     high: Array
 
     @classmethod
-    def holding(cls, model: ChainModel, reference: Array, weights: Array) -> Band:
+    def holding(cls, model: ChainModel, reference: ChainState, weights: Array) -> Band:
         """Return a band that holds all joints but free ones to `reference`; weights (T,)."""
         layout = layout_of(model)
         joint = np.array([s.joint.kind != "free" for s in model.segments])[layout.segment_of]
@@ -55,26 +59,29 @@ class Band:
 
     def take(self, instants: NDArray[np.intp]) -> Band:
         """Return the band at some instants."""
-        return replace(self, reference=self.reference[instants], weights=self.weights[instants])
+        return replace(self, reference=self.reference.take(instants), weights=self.weights[instants])
 
-    def excess(self, layout: Layout, rotations: Array) -> Array:
+    def excess(self, layout: Layout, state: ChainState) -> Array:
         """Return how far turns are outside, rad, shape (T, nq)."""
-        between = self.reference.swapaxes(-1, -2) @ rotations
+        between = self.reference.rotations.swapaxes(-1, -2) @ state.rotations
         v = log_matrix(between).reshape(len(between), -1) @ layout.spread.T
+        between_coordinates(layout, self.reference, state, v)
         return np.asarray(v - np.clip(v, self.low, self.high))
 
 
 def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
-    """Return the band of the model's hinge limits, none if it has none or they weigh nothing."""
+    """Return the band of the model's limits, none if it has none or they weigh nothing."""
     joints = [s.joint for s in model.segments]
     low, high = np.full(model.nq, -np.inf), np.full(model.nq, np.inf)
     for joint, columns in zip(joints, model.columns, strict=True):
-        if joint.kind == "hinge" and joint.limits is not None:
+        if joint.kind in ("hinge", "coupled") and joint.limits is not None:
             low[columns], high[columns] = joint.limits
+    for _, column, curve in layout_of(model).coupled:  # told from rest, as a hinge's are
+        low[column], high[column] = low[column] - curve.home, high[column] - curve.home
     limited = np.isfinite(low) | np.isfinite(high)
     if weight == 0.0 or not limited.any():
         return ()
-    return (Band(rest_rotations(model)[None], weight * limited[None], low, high),)
+    return (Band(rest_state(model), weight * limited[None], low, high),)
 
 
 def log_matrix(R: Array) -> Array:
@@ -127,12 +134,10 @@ class Problem:
 
     def at(self, state: ChainState) -> tuple[Fit, Array]:
         """Return the fit of a state and its cost, m^2, shape (T,)."""
-        found = fit(
-            slots_of(self.model), state.rotations, state.origins, self.measured, self.weights
-        )
+        found = fit(slots_of(self.model), state, self.measured, self.weights)
         cost = found.cost
         for band in self.bands:
-            excess = band.excess(layout_of(self.model), state.rotations)
+            excess = band.excess(layout_of(self.model), state)
             cost = cost + np.einsum("tk,tk->t", band.weights * excess, excess)
         return found, cost
 
@@ -140,7 +145,7 @@ class Problem:
         """Return the normal matrix, shape (T, nq, nq), and the gradient, shape (T, nq)."""
         H, g = normal_equations(slots_of(self.model), at)
         for band in self.bands:
-            excess = band.excess(layout_of(self.model), state.rotations)
+            excess = band.excess(layout_of(self.model), state)
             g = g + band.weights * excess
             diagonal = np.einsum("tkk->tk", H)
             diagonal += band.weights * ((excess != 0.0) | (band.low == band.high))
@@ -176,7 +181,7 @@ def search(problem: Problem, start: ChainState) -> Found:
 
 def _descend(problem: Problem, start: ChainState) -> Found:
     count = len(start)
-    rotations, origins = start.rotations.copy(), start.origins.copy()
+    found = start.copy()
     converged = np.zeros(count, dtype=np.bool_)
     iterations = np.zeros(count, dtype=np.intp)
     here = np.arange(count)
@@ -188,10 +193,7 @@ def _descend(problem: Problem, start: ChainState) -> Found:
         diagonal = np.einsum("tkk->tk", H)
         diagonal += damping[:, None] * diagonal + _RIDGE
         step = np.asarray(-np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
-        onward = ChainState(
-            turned(layout, state.rotations, step),
-            state.origins + step[:, layout.shifts].reshape(len(step), -1, 3),
-        )
+        onward = moved(layout, state, step)
         there, new_cost = part.at(onward)
         better = new_cost < cost
         done = better & (cost - new_cost < problem.tolerance * cost)
@@ -199,26 +201,35 @@ def _descend(problem: Problem, start: ChainState) -> Found:
         damping = np.where(better, _EASIER, _HARDER) * damping
         given_up = damping > _HOPELESS
         iterations[here] += 1
-        keep = better[:, None, None]
-        state = ChainState(
-            np.where(keep[..., None], onward.rotations, state.rotations),
-            np.where(keep, onward.origins, state.origins),
-        )
-        at = Fit(*(np.where(keep[..., None], n, o) for n, o in _pairs(there, at)))
+        state, at = _kept(better, (onward, there), (state, at))
         cost = np.where(better, new_cost, cost)
         ended = done | given_up
         if ended.any():
-            rotations[here[ended]] = state.rotations[ended]
-            origins[here[ended]] = state.origins[ended]
+            found.put(here[ended], state.take(ended))
             converged[here[ended]] = True
             going = np.flatnonzero(~ended)
             here, state, part = here[going], state.take(going), part.take(going)
             at, cost, damping = at.take(going), cost[going], damping[going]
             if not len(here):
                 break
-    rotations[here], origins[here] = state.rotations, state.origins
-    return Found(ChainState(rotations, origins), problem.weights, converged, iterations)
+    found.put(here, state)
+    return Found(found, problem.weights, converged, iterations)
 
 
-def _pairs(new: Fit, old: Fit) -> list[tuple[Array, Array]]:
-    return [(new.world, old.world), (new.cloud, old.cloud), (new.weighted, old.weighted)]
+def _kept(
+    better: NDArray[np.bool_], new: tuple[ChainState, Fit], old: tuple[ChainState, Fit]
+) -> tuple[ChainState, Fit]:
+    """Return the new where it is better."""
+    keep = better[:, None, None]
+    (onward, there), (state, at) = new, old
+    couplings = (
+        None
+        if onward.couplings is None or state.couplings is None
+        else np.where(keep, onward.couplings, state.couplings)
+    )
+    pairs = ((there.world, at.world), (there.cloud, at.cloud), (there.weighted, at.weighted))
+    return ChainState(
+        np.where(keep[..., None], onward.rotations, state.rotations),
+        np.where(keep, onward.origins, state.origins),
+        couplings,
+    ), Fit(*(np.where(keep[..., None], n, o) for n, o in pairs), couplings)

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from jointfit_daemon.calibration.marker_refinement.hinges import used_ranges
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
 from jointfit_daemon.files.marker_trial import UnknownMarker, read_marker_trial
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
@@ -51,24 +50,20 @@ def load(
     judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
     chain, remarks = _chain(asked)
     learned = [_motion(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
-    if asked.model.suffix.lower() == ".osim":
-        chain, remarks = _chain(asked, used_ranges(chain, learned))
     chain = _locked(chain, asked.unlock, hold=False)
     chain = _locked(chain, asked.lock, hold=True)
     judged = [_motion(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
     return chain, remarks, learned, judged
 
 
-def _chain(
-    asked: Asked, used: Mapping[str, tuple[float, float]] | None = None
-) -> tuple[ChainModel, tuple[str, ...]]:
-    """Return the chain; a joint of OpenSim's is nearest to its own over the ranges in use."""
+def _chain(asked: Asked) -> tuple[ChainModel, tuple[str, ...]]:
+    """Return the chain and the remarks of its import."""
     from jointfit_daemon.files.model_file import read_model
     from jointfit_daemon.files.osim import read_osim
 
     remarks: tuple[str, ...] = ()
     if asked.model.suffix.lower() == ".osim":
-        imported = read_osim(asked.model, used=used)
+        imported = read_osim(asked.model)
         chain, remarks = imported.model, imported.remarks
     else:
         chain = read_model(asked.model)

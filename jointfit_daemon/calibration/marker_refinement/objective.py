@@ -79,7 +79,7 @@ class Problem:
         """Return how far hinges are beyond their limits, rad, shape (T, nq); None: no limits."""
         for band in self.limits:
             return np.where(
-                band.weights > 0.0, band.excess(layout_of(self.model), state.rotations), 0.0
+                band.weights > 0.0, band.excess(layout_of(self.model), state), 0.0
             )
         return None
 

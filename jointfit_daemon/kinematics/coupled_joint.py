@@ -1,0 +1,84 @@
+r"""A joint whose turns and shifts all follow one coordinate, as a knee's do.
+
+Law: between samples of the pose each number p of (quaternion, shift) runs on a cubic spline, the
+quaternion brought to length 1 afterwards. Per unit of the coordinate q the segment turns and slides,
+in its own axes, by
+
+.. math:: \omega = 2\,vec(\bar p\, p') / |p|^2, \qquad v = R^T s'
+
+which are the exact derivatives of that curve. Beyond the samples p goes on straight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+_GUESSES = 91
+COLUMNS = 10
+"""Numbers of a coupling: q, shift (3), omega (3), v (3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoupledCurve:
+    """The pose of a segment in its parent as a function of one coordinate."""
+
+    knots: Array
+    """Shape (n,), growing."""
+    pieces: Array
+    """Cubic coefficients, highest first, of (w, x, y, z) and the shift; shape (4, n - 1, 7)."""
+
+    @classmethod
+    def through(cls, path: Sequence[Sequence[float]]) -> CoupledCurve:
+        """Return the curve through samples (q, w, x, y, z, shift), shape (n, 8), q growing."""
+        rows = np.array(path, dtype=np.float64)
+        q = rows[:, 1:5]
+        flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
+        rows[1:, 1:5] *= flips[:, None]  # q and -q are one rotation; a spline needs one of them
+        return cls(rows[:, 0], np.asarray(CubicSpline(rows[:, 0], rows[:, 1:]).c))
+
+    @property
+    def home(self) -> float:
+        """Where the joint is at rest: at zero, or as near as the samples go."""
+        return float(np.clip(0.0, self.knots[0], self.knots[-1]))
+
+    def at(self, amounts: Array) -> tuple[Array, Array]:
+        """Return rotations to the parent, shape (T, 3, 3), and couplings, shape (T, 10).
+
+        Parameters
+        ----------
+        amounts
+            The coordinate, rad, shape (T,).
+        """
+        inside = np.clip(amounts, self.knots[0], self.knots[-1])
+        piece = np.clip(np.searchsorted(self.knots, inside) - 1, 0, len(self.knots) - 2)
+        a, b, c, d = self.pieces[:, piece]
+        h = (inside - self.knots[piece])[:, None]
+        slope = (3.0 * a * h + 2.0 * b) * h + c
+        p = ((a * h + b) * h + c) * h + d + slope * (amounts - inside)[:, None]
+        square = (p[:, :4] ** 2).sum(axis=1, keepdims=True)
+        R = rotation.to_matrix(p[:, :4] / np.sqrt(square))
+        found = np.empty((len(p), COLUMNS))
+        found[:, 0], found[:, 1:4] = amounts, p[:, 4:]
+        w, v, dw, dv = p[:, :1], p[:, 1:4], slope[:, :1], slope[:, 1:4]
+        found[:, 4:7] = 2.0 * (w * dv - dw * v - np.cross(v, dv)) / square
+        found[:, 7:] = (slope[:, None, 4:] @ R)[:, 0]
+        return R, found
+
+    def nearest(self, turned: Array) -> Array:
+        """Return where on the curve rotations, shape (T, 3, 3), are nearest to it; shape (T,)."""
+        tried = np.linspace(self.knots[0], self.knots[-1], _GUESSES)
+        match = turned.reshape(-1, 9) @ self.at(tried)[0].reshape(-1, 9).T
+        return np.asarray(tried[match.argmax(axis=1)])
