@@ -28,7 +28,17 @@ if TYPE_CHECKING:
 _AXES = "xyz"
 _KEYS = {
     "model": {"name", "segment", "marker"},
-    "segment": {"name", "parent", "joint", "center_in_parent", "center", "axis", "rest", "limits", "path"},
+    "segment": {
+        "name",
+        "parent",
+        "joint",
+        "center_in_parent",
+        "center",
+        "axis",
+        "rest",
+        "limits",
+        "path",
+    },
     "marker": {"name", "segment", "position", "weight", "locked"},
 }
 _LENGTHS = {"center_in_parent": 3, "center": 3, "axis": 3, "rest": 4, "limits": 2, "position": 3}

@@ -1,8 +1,8 @@
 r"""The nearest of our joints to one of OpenSim's.
 
-Law: what moves about one coordinate becomes a hinge if it is one, else a coupled joint on samples of
-its motion; about two or three it becomes a ball. Axis and centers come nearest to the motion over
-the range of its coordinates:
+Law: what turns by one coordinate becomes a hinge if it is one, else a coupled joint on samples of
+its motion; what turns by two or three becomes a ball. Axis and centers are those that come nearest
+to the motion over the range of its coordinates:
 
 .. math:: A_i \approx A_{rest}\exp(a\varphi_i), \qquad
           \min_{c, C} \sum_i |t_i + A_i c - C|^2

@@ -155,14 +155,15 @@ def _through_points(element: Element) -> Function:
     """Return a curve through points, straight beyond them.
 
     A SimmSpline's ends follow the cubic through their four nearest points; here they follow the
-    cubic of the two nearest pieces, which differs in the end pieces only, by micrometres.
+    cubic of the two nearest pieces, which differs in the end pieces only, by micrometres. Despite
+    its name OpenSim makes a SimmSpline of a NaturalCubicSpline.
     """
     x, y = numbers_of(element, "x"), numbers_of(element, "y")
     if x.size != y.size or x.size <= 1 or not (np.diff(x) > 0.0).all():
         raise ValueError(f"{element.tag}: its x must grow and have a y each")
     if element.tag == "PiecewiseLinearFunction" or x.size < _CUBIC:
         return lambda q: np.asarray(np.interp(q, x, y))
-    spline = CubicSpline(x, y, bc_type="natural" if element.tag[0] == "N" else "not-a-knot")
+    spline = CubicSpline(x, y)
     slope = spline.derivative()
 
     def curve(q: Array) -> Array:

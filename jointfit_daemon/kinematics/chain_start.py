@@ -2,7 +2,8 @@ r"""Where a search begins when nothing is known: each segment laid on its marker
 
 Law: from the world outwards, a segment takes the rotation that brings its markers, and the joint
 center its parent already has, nearest to where they are (Wahba's problem); a hinge keeps only the
-turn about its axis, a coupled joint the nearest place on its curve. A start need not be the optimum, but it must lie in its valley.
+turn about its axis, a coupled joint the nearest place on its curve. A start need not be the
+optimum, but it must lie in its valley.
 """
 
 from __future__ import annotations
@@ -43,21 +44,19 @@ def start_from_markers(
         Shape (T, S, K), zero where nothing was measured.
     """
     slots, count = slots_of(model), len(measured)
-    home = rest_state(model)
-    rest = home.rotations[0]
+    rest = rest_state(model).rotations[0]
     curves = {segment: curve for segment, _, curve in slots.layout.coupled}
-    amounts = []
+    amounts: list[Array] = []
     world_R = np.empty((count, len(model.segments), 3, 3))
     world_t = np.empty((count, len(model.segments), 3))
     A = np.empty_like(world_R)
     guessed = np.zeros(count, dtype=np.bool_)
     for i, (segment, parent) in enumerate(zip(model.segments, model.parents, strict=True)):
         joint = segment.joint
+        curve = curves.get(i)
         own, corner = np.asarray(joint.center), np.asarray(joint.center_in_parent)
-        first = np.zeros(3)
-        if home.couplings is not None and i in curves:
-            first = home.couplings[0, len(amounts), 1:4]
-            corner = corner + first
+        if curve is not None:
+            corner = corner + curve.at(np.array([curve.home]))[1][0, 1:4]
         if parent < 0:
             above_R, center = np.eye(3)[None], corner[None]
         else:
@@ -74,10 +73,11 @@ def start_from_markers(
         guessed |= (spans < _THIN_M2) & _has_markers(slots, i)
         turned = np.swapaxes(above_R, -1, -2) @ laid
         A[:, i] = _about_axis(rest[i], turned, joint.axis) if joint.kind == "hinge" else turned
-        if i in curves:
-            amounts.append(curves[i].nearest(turned))
-            A[:, i], coupling = curves[i].at(amounts[-1])
-            center = center + (above_R @ (coupling[:, 1:4] - first)[..., None])[..., 0]
+        if curve is not None:
+            amounts.append(curve.nearest(turned))
+            A[:, i], coupling = curve.at(amounts[-1])
+            shifted = np.asarray(joint.center_in_parent) + coupling[:, 1:4] - corner
+            center = center + (above_R @ shifted[..., None])[..., 0]
         world_R[:, i] = above_R @ A[:, i]
         if joint.kind == "free":
             world_t[:, i] = middle

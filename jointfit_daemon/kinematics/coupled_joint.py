@@ -1,8 +1,8 @@
 r"""A joint whose turns and shifts all follow one coordinate, as a knee's do.
 
 Law: between samples of the pose each number p of (quaternion, shift) runs on a cubic spline, the
-quaternion brought to length 1 afterwards. Per unit of the coordinate q the segment turns and slides,
-in its own axes, by
+quaternion brought to length 1 afterwards. Per unit of the coordinate q the segment turns and
+slides, in its own axes, by
 
 .. math:: \omega = 2\,vec(\bar p\, p') / |p|^2, \qquad v = R^T s'
 

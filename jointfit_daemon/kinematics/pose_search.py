@@ -59,7 +59,9 @@ class Band:
 
     def take(self, instants: NDArray[np.intp]) -> Band:
         """Return the band at some instants."""
-        return replace(self, reference=self.reference.take(instants), weights=self.weights[instants])
+        return replace(
+            self, reference=self.reference.take(instants), weights=self.weights[instants]
+        )
 
     def excess(self, layout: Layout, state: ChainState) -> Array:
         """Return how far turns are outside, rad, shape (T, nq)."""
@@ -227,9 +229,11 @@ def _kept(
         if onward.couplings is None or state.couplings is None
         else np.where(keep, onward.couplings, state.couplings)
     )
-    pairs = ((there.world, at.world), (there.cloud, at.cloud), (there.weighted, at.weighted))
-    return ChainState(
+    state = ChainState(
         np.where(keep[..., None], onward.rotations, state.rotations),
         np.where(keep, onward.origins, state.origins),
         couplings,
-    ), Fit(*(np.where(keep[..., None], n, o) for n, o in pairs), couplings)
+    )
+    pairs = ((there.world, at.world), (there.cloud, at.cloud), (there.weighted, at.weighted))
+    world, cloud, weighted = (np.where(keep[..., None], n, o) for n, o in pairs)
+    return state, Fit(world, cloud, weighted, couplings)

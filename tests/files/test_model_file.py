@@ -26,12 +26,21 @@ kinds = st.sampled_from(["ball", "hinge"])
 
 
 @st.composite
+def paths(draw: st.DrawFn) -> tuple[tuple[float, ...], ...]:
+    amounts = sorted(draw(st.lists(numbers, min_size=4, max_size=6, unique=True)))
+    return tuple((q, *draw(turns), *draw(vectors)) for q in amounts)
+
+
+@st.composite
 def models(draw: st.DrawFn) -> ChainModel:
     names = draw(st.lists(words, min_size=1, max_size=4, unique=True))
     segments = [Segment(names[0])]
     for above, name in pairwise(names):
         joint = st.builds(Joint, kinds, vectors, vectors, unit, turns, limits)
-        segments.append(Segment(name, above, draw(joint)))
+        coupled = st.builds(
+            Joint, st.just("coupled"), vectors, vectors, limits=limits, path=paths()
+        )
+        segments.append(Segment(name, above, draw(joint | coupled)))
     lock = st.tuples(st.booleans(), st.booleans(), st.booleans())
     marker = st.builds(Marker, words, st.sampled_from(names), vectors, st.floats(0.0, 9.0), lock)
     markers = draw(st.lists(marker, max_size=5, unique_by=lambda m: m.name))

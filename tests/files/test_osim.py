@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from jointfit_daemon.files.osim import read_marker_set, read_osim, to_y_up, to_z
 from jointfit_daemon.files.text_table import Malformed
 from jointfit_daemon.kinematics.chain_motion import (
     apply_step,
+    coupled_coordinates,
     hinge_angles,
     marker_positions,
     rest_state,
@@ -147,31 +149,101 @@ def _their_residuals(
     return np.asarray(np.linalg.norm(at - placed, axis=-1))
 
 
-def knee_with(x: list[float], y: list[float], scale: float) -> Hung:
-    axes = [("knee", Z, LINEAR), ("", Y, ZERO), ("", X, ZERO), ("knee", X, spline(x, y, scale))]
-    axes += [("", Y, ZERO), ("", Z, ZERO)]
+BENDS = np.linspace(-2.0, 0.1, 9)
+COSINE = f"<x>{' '.join(map(str, BENDS))}</x><y>{' '.join(map(str, 0.02 * np.cos(BENDS)))}</y>"
+WAYS = {
+    "rolling": spline(BENDS.tolist(), (0.02 * np.sin(2.0 * BENDS)).tolist(), 1.5),
+    "polynomial": (
+        "<PolynomialFunction name='function'><coefficients>0.004 0.01 -0.02 0.003</coefficients>"
+        "</PolynomialFunction>"
+    ),
+    "natural": f"<NaturalCubicSpline name='function'>{COSINE}</NaturalCubicSpline>",
+    "piecewise": (
+        "<PiecewiseLinearFunction name='function'><x>-2 -1 0.1</x><y>0 0.01 0.03</y>"
+        "</PiecewiseLinearFunction>"
+    ),
+}
+
+
+def walker_knee(way: str) -> Hung:
+    """Return a knee that turns about all axes and shifts along two as one coordinate says."""
+    screw = spline(BENDS.tolist(), (0.1 * np.cos(BENDS)).tolist())
+    axes = [("knee", Z, LINEAR), ("knee", X, screw), ("knee", Y, screw)]
+    axes += [("knee", X, WAYS[way]), ("knee", Y, screw), ("", Z, ZERO)]
     return Hung(
-        "tibia", "femur", "CustomJoint", [("knee", -2.0, 0.0)], ((0, -0.4, 0), (0, 0, 0)), axes=axes
+        "tibia",
+        "femur",
+        "CustomJoint",
+        [("knee", -2.0, 0.1)],
+        ((0.0, -0.4, 0.01), (0.2, -0.1, 0.3)),
+        ((0.01, 0.0, 0.02), (0.1, 0.0, -0.2)),
+        axes,
     )
 
 
-def test_a_splined_knee_becomes_the_nearest_hinge_and_is_told(tmp_path: Path, opensim: Any) -> None:
-    angle = np.linspace(-2.0, 0.0, 9)
-    # a point 10 mm below the joint's frame that stays in place: a circle, exactly a hinge there
-    circle = (0.01 * np.sin(angle)).tolist()
-    knee = knee_with(angle.tolist(), circle, 1.5)
-    path = write_osim(tmp_path / "knee.osim", [ROOT, HIP, knee], MARKERS)
+@pytest.mark.parametrize("way", WAYS)
+def test_a_knee_of_functions_moves_as_opensim_moves_it(
+    tmp_path: Path, opensim: Any, way: str
+) -> None:
+    path = write_osim(tmp_path / "knee.osim", [ROOT, HIP, walker_knee(way)], MARKERS)
     imported = read_osim(path)
     joint = imported.model.segments[2].joint
-    assert joint.kind == "hinge"
-    assert joint.axis == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
-    assert joint.limits == pytest.approx((-2.0, 0.0))
+    assert joint.kind == "coupled"
+    assert joint.limits == pytest.approx((-2.0, 0.1))
     assert len(imported.remarks) == 1
-    assert "became a hinge" in imported.remarks[0]
-    _, placed = moved(
-        opensim, path, np.outer(np.ones(5), np.zeros(10)) + np.eye(10)[9] * angle[:5, None]
-    )
-    assert tracking_error(solve_frames(imported.model, to_z_up(placed)).residuals) < 0.004
+    assert imported.remarks[0].endswith("CustomJoint of knee became a coupled joint")
+    values = np.random.default_rng(4).uniform(-0.5, 0.5, (23, 10))
+    values[:, 9] = np.linspace(-1.99, 0.09, 23)
+    _, placed = moved(opensim, path, values)
+    found = solve_frames(imported.model, to_z_up(placed))
+    assert tracking_error(found.residuals) < 5e-6
+    knee = coupled_coordinates(imported.model, found.state)["tibia"]
+    np.testing.assert_allclose(knee, values[:, 9], atol=1e-4)
+
+
+def test_what_samples_cannot_follow_is_told(tmp_path: Path) -> None:
+    knee = walker_knee("rolling")
+    steps = "<PiecewiseLinearFunction name='function'><x>-2 -1 -0.9 0.1</x><y>0 0 0.2 0.2</y>"
+    knee.axes[3] = ("knee", X, f"{steps}</PiecewiseLinearFunction>")
+    remark = read_osim(write_osim(tmp_path / "m.osim", [ROOT, HIP, knee], MARKERS)).remarks[0]
+    found = re.search(r"off by ([\d.]+) mm and 0.0 degrees at most", remark)
+    assert found
+    assert 0.1 < float(found[1]) < 10.0
+
+
+def test_least_squares_on_a_knee_of_functions_are_those_of_opensim(
+    tmp_path: Path, opensim: Any
+) -> None:
+    path = write_osim(tmp_path / "knee.osim", [ROOT, HIP, walker_knee("rolling")], MARKERS)
+    values = np.outer(np.linspace(0.0, 1.0, 9), np.random.default_rng(1).uniform(-0.6, 0.6, 10))
+    values[:, 9] = np.linspace(-0.2, -1.6, 9)
+    names, placed = moved(opensim, path, values)
+    placed = placed + np.random.default_rng(2).normal(0.0, 0.008, placed.shape)
+    theirs = _their_residuals(opensim, path, names, placed, tmp_path)
+    ours = np.linalg.norm(solve_frames(read_osim(path).model, to_z_up(placed)).residuals, axis=-1)
+    np.testing.assert_allclose(ours, theirs, atol=5e-5)
+
+
+def test_a_custom_joint_that_is_a_hinge_becomes_one(tmp_path: Path) -> None:
+    axes = [("knee", Z, LINEAR), *[("", a, ZERO) for a in (Y, X, X, Y, Z)]]
+    place = ((0.0, -0.4, 0.0), (0.0, 0.0, 0.0))
+    knee = Hung("tibia", "femur", "CustomJoint", [("knee", -2.0, 0.0)], place, axes=axes)
+    imported = read_osim(write_osim(tmp_path / "knee.osim", [ROOT, HIP, knee], MARKERS))
+    assert imported.model.segments[2].joint.kind == "hinge"
+    assert imported.remarks == ()
+
+
+def test_a_coupled_joint_on_a_welded_body_moves_as_opensim_moves_it(
+    tmp_path: Path, opensim: Any
+) -> None:
+    plate = Hung("plate", "femur", "WeldJoint", [], ((0.05, -0.2, 0.0), (0.0, 0.3, 0.5)))
+    knee = walker_knee("rolling")
+    knee.parent = "plate"
+    path = write_osim(tmp_path / "knee.osim", [ROOT, HIP, plate, knee], MARKERS)
+    values = np.random.default_rng(5).uniform(-0.5, 0.0, (7, 10))
+    _, placed = moved(opensim, path, values)
+    found = solve_frames(read_osim(path).model, to_z_up(placed))
+    assert tracking_error(found.residuals) < 2e-6
 
 
 def test_welded_and_locked_bodies_become_part_of_their_parents(
@@ -292,7 +364,7 @@ def imported(folder: Path, name: str) -> tuple[ChainModel, str]:
 def test_the_published_models_are_read(shared_data: Path) -> None:
     gait, told = imported(shared_data / "opensim_gait2354", "subject01_simbody.osim")
     assert (len(gait.segments), len(gait.markers), gait.nq) == (10, 39, 21)
-    assert "knee_r: CustomJoint of knee_angle_r became a hinge" in told
+    assert "knee_r: CustomJoint of knee_angle_r became a coupled joint" in told
     cap, told = imported(shared_data / "opencap_subject4" / "models", "manually_scaled.osim")
     assert (len(cap.segments), len(cap.markers), cap.nq) == (16, 49, 31)
     assert "hand_r is fixed to radius_r" in told
@@ -314,3 +386,22 @@ def test_a_marker_set_replaces_the_markers_of_a_model(shared_data: Path) -> None
     )
     assert len(bare.model.markers) == 39
     assert bare.model.nq == 21
+
+
+def test_the_published_model_moves_its_markers_as_opensim_does(
+    shared_data: Path, opensim: Any
+) -> None:
+    path = shared_data / "opencap_subject4" / "models" / "manually_scaled.osim"
+    loaded = opensim.Model(str(path))  # kept: its coordinates live no longer than it does
+    coordinates = loaded.getCoordinateSet()
+    chosen = [coordinates.get(i) for i in range(coordinates.getSize())]
+    knees = np.array(["knee" in c.getName() for c in chosen])
+    left_out = np.array(["mtp" in c.getName() or "beta" in c.getName() for c in chosen])
+    low = np.maximum([c.getRangeMin() for c in chosen], -0.6) * ~left_out
+    high = np.minimum([c.getRangeMax() for c in chosen], np.where(knees, 1.8, 0.6)) * ~left_out
+    values = low + (high - low) * np.random.default_rng(6).random((10, len(chosen)))
+    names, placed = moved(opensim, path, values)
+    model = read_osim(path).model
+    ours = [names.index(name) for name in model.marker_names]
+    found = solve_frames(model, to_z_up(placed)[:, ours])
+    assert tracking_error(found.residuals) < 1e-5

@@ -13,6 +13,7 @@ from jointfit_daemon.kinematics.chain_model import (
     ImpossibleModel,
     Joint,
     Marker,
+    Sample,
     Segment,
 )
 from jointfit_daemon.kinematics.chain_motion import (
@@ -28,12 +29,20 @@ from jointfit_daemon.kinematics.chain_motion import (
 )
 
 
+def winding(rng: np.random.Generator, count: int = 12) -> tuple[Sample, ...]:
+    """Return samples of a segment that turns about all axes and shifts as one coordinate grows."""
+    amounts = np.linspace(-2.0, 2.5, count)
+    ways = rng.normal(0.0, 0.5, (6, 3)) @ np.array([amounts, np.sin(amounts), amounts**2 / 4.0])
+    turns = rotation.exp(ways[:3].T) * rng.choice([-1.0, 1.0], (count, 1))
+    return tuple(map(tuple, np.column_stack((amounts, turns, 0.1 * ways[3:].T)).tolist()))
+
+
 def random_chain(rng: np.random.Generator) -> ChainModel:
     """Return a tree of up to six segments with joints of all kinds, one or two roots."""
     segments: list[Segment] = []
     for i in range(int(rng.integers(1, 7))):
         axis = rng.normal(size=3)
-        kind = rng.choice(["ball", "hinge"]) if i else "free"
+        kind = rng.choice(["ball", "hinge", "coupled"]) if i else "free"
         if i == 3 and rng.random() < 0.3:
             kind = "free"
         joint = Joint(
@@ -42,6 +51,7 @@ def random_chain(rng: np.random.Generator) -> ChainModel:
             tuple(rng.normal(0.0, 0.1, 3).tolist()),
             tuple((axis / np.linalg.norm(axis)).tolist()),
             tuple(rotation.normalize(rng.normal(size=4)).tolist()),
+            path=winding(rng) if kind == "coupled" else (),
         )
         parent = None if kind == "free" else f"s{rng.integers(i)}"
         segments.append(Segment(f"s{i}", parent, joint))
@@ -76,17 +86,25 @@ def test_the_jacobian_is_the_slope_of_the_markers(seed: int) -> None:
         np.testing.assert_allclose(J[..., k], (ahead - behind) / (2 * h), atol=1e-8)
 
 
+def coupled_shifts(model: ChainModel, couplings: np.ndarray) -> dict[str, np.ndarray]:
+    coupled = [s.name for s in model.segments if s.joint.kind == "coupled"]
+    return {name: couplings[:, c, 1:4] for c, name in enumerate(coupled)}
+
+
 @given(seeds)
 @settings(max_examples=30)
 def test_a_joint_center_is_the_same_point_on_both_segments(seed: int) -> None:
     rng = np.random.default_rng(seed)
     model = random_chain(rng)
-    R, t = segment_poses(model, random_state(model, rng))
+    state = random_state(model, rng)
+    R, t = segment_poses(model, state)
+    shifts = {} if state.couplings is None else coupled_shifts(model, state.couplings)
     for i, segment in enumerate(model.segments):
         if segment.parent is None:
             continue
         p = model.parents[i]
-        above = t[:, p] + R[:, p] @ np.array(segment.joint.center_in_parent)
+        center = np.array(segment.joint.center_in_parent) + shifts.get(segment.name, 0.0)
+        above = t[:, p] + (R[:, p] @ np.broadcast_to(center, (3, 3))[..., None])[..., 0]
         own = t[:, i] + R[:, i] @ np.array(segment.joint.center)
         np.testing.assert_allclose(above, own, atol=1e-12)
 

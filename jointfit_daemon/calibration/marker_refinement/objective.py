@@ -78,9 +78,7 @@ class Problem:
     def excess(self, state: ChainState) -> Array | None:
         """Return how far hinges are beyond their limits, rad, shape (T, nq); None: no limits."""
         for band in self.limits:
-            return np.where(
-                band.weights > 0.0, band.excess(layout_of(self.model), state), 0.0
-            )
+            return np.where(band.weights > 0.0, band.excess(layout_of(self.model), state), 0.0)
         return None
 
     def overturning(self, state: ChainState) -> float:
