@@ -15,11 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.experiment import Experiment, Figure, near
-from bench.opensim_ik import OpenSimFollower
+from bench.opensim_ik import CONVERGED, OpenSimFollower, judge
 from bench.osim_trials import GAIT, OPENCAP, gait2354, opencap
 from jointfit_daemon.calibration.marker_refinement.motion import RefinementSettings
 from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
 from jointfit_daemon.calibration.marker_refinement.search import search
+from jointfit_daemon.files.osim import to_z_up
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    IkOptions,
+    solve_frames,
+    tracking_error,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -117,7 +123,24 @@ def walking_alone(data: Path) -> list[Figure]:
     return [
         Figure("walking1, learned from", _MM * after["walking1"].rms, 4.9, unit="mm"),
         *_compared(_untouched(data), after, {"squats1": 20, "STS1": 20}),
+        *_to_the_end(subject, found),
         Figure("joint angles turned, RMS", float(np.degrees(found.angle_change()[0])), inf),
+    ]
+
+
+def _to_the_end(subject: Subject, found: Refinement) -> list[Figure]:
+    """What OpenSim finds of the walk when its default accuracy does not stop it."""
+    walk = subject.judged["walking1"]
+    before = judge(subject.model, walk, accuracy=CONVERGED).rms
+    after = judge(subject.model, walk, found.model, CONVERGED).rms
+    within = IkOptions(limit_m2=PLAIN.limit_m2)
+    ones = np.ones(len(subject.names))
+    ours = solve_frames(found.model, to_z_up(walk.positions), ones, options=within)
+    off = abs(tracking_error(ours.residuals) - after)
+    return [
+        Figure("OpenSim to convergence: walking1 before", _MM * before, inf, unit="mm"),
+        Figure("OpenSim to convergence: walking1 after", _MM * after, inf, unit="mm"),
+        Figure("our own inverse kinematics from there, off by", _MM * off, 0.02, unit="mm"),
     ]
 
 

@@ -11,6 +11,7 @@ which are the exact derivatives of that curve. Beyond the samples p goes on stra
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _GUESSES = 91
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 COLUMNS = 10
 """Numbers of a coupling: q, shift (3), omega (3), v (3)."""
 
@@ -39,6 +41,10 @@ class CoupledCurve:
     """Shape (n,), growing."""
     pieces: Array
     """Cubic coefficients, highest first, of (w, x, y, z) and the shift; shape (4, n - 1, 7)."""
+    starts: list[float]
+    """The knots as plain numbers."""
+    rows: list[list[list[float]]]
+    """The coefficients as plain numbers: by piece, then by number."""
 
     @classmethod
     def through(cls, path: Sequence[Sequence[float]]) -> CoupledCurve:
@@ -47,7 +53,8 @@ class CoupledCurve:
         q = rows[:, 1:5]
         flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
         rows[1:, 1:5] *= flips[:, None]  # q and -q are one rotation; a spline needs one of them
-        return cls(rows[:, 0], np.asarray(CubicSpline(rows[:, 0], rows[:, 1:]).c))
+        pieces = np.asarray(CubicSpline(rows[:, 0], rows[:, 1:]).c)
+        return cls(rows[:, 0], pieces, rows[:, 0].tolist(), pieces.transpose(1, 2, 0).tolist())
 
     @property
     def home(self) -> float:
@@ -62,6 +69,8 @@ class CoupledCurve:
         amounts
             The coordinate, rad, shape (T,).
         """
+        if len(amounts) == 1:
+            return self._at_one(float(amounts[0]))
         inside = np.clip(amounts, self.knots[0], self.knots[-1])
         piece = np.clip(np.searchsorted(self.knots, inside) - 1, 0, len(self.knots) - 2)
         a, b, c, d = self.pieces[:, piece]
@@ -73,9 +82,39 @@ class CoupledCurve:
         found = np.empty((len(p), COLUMNS))
         found[:, 0], found[:, 1:4] = amounts, p[:, 4:]
         w, v, dw, dv = p[:, :1], p[:, 1:4], slope[:, :1], slope[:, 1:4]
-        found[:, 4:7] = 2.0 * (w * dv - dw * v - np.cross(v, dv)) / square
+        across = v[:, _NEXT] * dv[:, _LAST] - v[:, _LAST] * dv[:, _NEXT]
+        found[:, 4:7] = 2.0 * (w * dv - dw * v - across) / square
         found[:, 7:] = (slope[:, None, 4:] @ R)[:, 0]
         return R, found
+
+    def _at_one(self, amount: float) -> tuple[Array, Array]:
+        """Return the same for one instant: plain numbers are ten times faster there."""
+        starts = self.starts
+        inside = min(max(amount, starts[0]), starts[-1])
+        piece = min(max(bisect_left(starts, inside) - 1, 0), len(starts) - 2)
+        h, beyond = inside - starts[piece], amount - inside
+        p, slope = [], []
+        for a, b, c, d in self.rows[piece]:
+            s = (3.0 * a * h + 2.0 * b) * h + c
+            p.append(((a * h + b) * h + c) * h + d + s * beyond)
+            slope.append(s)
+        w, x, y, z, *shift = p
+        dw, dx, dy, dz, *ds = slope
+        n = 2.0 / (w * w + x * x + y * y + z * z)
+        xx, yy, zz, xy, xz, yz = n * x * x, n * y * y, n * z * z, n * x * y, n * x * z, n * y * z
+        wx, wy, wz = n * w * x, n * w * y, n * w * z
+        R = (
+            (1 - yy - zz, xy - wz, xz + wy),
+            (xy + wz, 1 - xx - zz, yz - wx),
+            (xz - wy, yz + wx, 1 - xx - yy),
+        )
+        turns = (
+            n * (w * dx - dw * x - y * dz + z * dy),
+            n * (w * dy - dw * y - z * dx + x * dz),
+            n * (w * dz - dw * z - x * dy + y * dx),
+        )
+        slides = [sum(R[i][j] * ds[i] for i in range(3)) for j in range(3)]
+        return np.array((R,)), np.array(((amount, *shift, *turns, *slides),))
 
     def nearest(self, turned: Array) -> Array:
         """Return where on the curve rotations, shape (T, 3, 3), are nearest to it; shape (T,)."""

@@ -99,6 +99,15 @@ def test_what_a_curve_says_of_its_motion_is_its_slope(amount: float) -> None:
     np.testing.assert_allclose(found[0, 7:], slid, atol=1e-5)
 
 
+@given(st.floats(-3.0, 5.0))
+@settings(max_examples=60)
+def test_one_instant_is_as_it_is_among_others(amount: float) -> None:
+    curve = CoupledCurve.through(samples())
+    alone, among = curve.at(np.array([amount])), curve.at(np.array([0.1, amount]))
+    np.testing.assert_allclose(alone[0][0], among[0][1], atol=1e-12)
+    np.testing.assert_allclose(alone[1][0], among[1][1], atol=1e-12)
+
+
 def test_the_signs_of_quaternions_do_not_matter() -> None:
     flipped = [
         (s[0], *(-x for x in s[1:5]), *s[5:]) if i % 3 else s for i, s in enumerate(samples())
