@@ -28,6 +28,8 @@ _SUPPORTS = 2  # points that every edge rests on
 _FINEST_NS = 1_000.0  # no cloud of points is taken to define its lower edge better
 _JAM_NS = 25_000_000.0  # higher up a starved host or a full queue was at work, and no jitter
 _LEAST = 5  # points that are not, to tell jitter by
+_LEAP, _LEAP_NS, _LEAP_LEAST = 20.0, 3_000_000.0, 4  # or one leap: chance makes it once in 400
+_LIKELY = 1e-3  # no clock that is read right is further off
 _TAIL = 14.0  # of the logarithm of the likelihood
 _PRIOR_TAIL = 6.0
 _WILDEST = 5e-3  # no clock's slope is beyond this
@@ -83,6 +85,10 @@ def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd
         What is known of the slope beforehand.
     """
     hull = lower_hull(points)
+    likely = max(_PRIOR_TAIL * prior_sd, _LIKELY)
+    on_time = _on_time(points, hull, prior - likely, prior + likely)
+    if len(on_time) < len(points):
+        points, hull = on_time, lower_hull(on_time)
     mean_u = sum(at for at, _ in points) / len(points)
     (ua, ya), (ub, yb) = straddling_edge(hull, mean_u)
     most = max(_PRIOR_TAIL * prior_sd, _WILDEST)  # else a burst read at once, y = A - u, is an edge
@@ -101,11 +107,50 @@ def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd
     return _moments(grid, scale, float(ya))
 
 
+def _on_time(
+    points: Sequence[Point], hull: Sequence[Point], near: float, far: float
+) -> Sequence[Point]:
+    """Return the points that no starved host held up: those tell neither height nor jitter.
+
+    Heights are above the hull, which goes on at a likely slope (`near` to `far`) where an edge of
+    it ends at what was late.
+    """
+    u0, tilt = points[0][0], _slope(points[0], points[-1])
+    rests = [y - tilt * (u - u0) for u, y in points]
+    if max(rests) - min(rests) < _LEAP_NS:  # as nearly always: nothing can have leapt
+        return points
+    first, last = 0, len(hull) - 1
+    while first < last and _slope(hull[first], hull[first + 1]) < near:
+        first += 1
+    while first < last and _slope(hull[last - 1], hull[last]) > far:
+        last -= 1
+    supports = hull[first : last + 1]
+    heights = [_height(point, supports, near, far) for point in points]
+    ranked = sorted(heights)
+    for k in range(_LEAP_LEAST, len(ranked)):
+        leaps = ranked[k] > max(_LEAP_NS, _LEAP * ranked[k - 1])
+        if leaps or (ranked[k] >= _JAM_NS and k >= _LEAST):
+            return [p for p, h in zip(points, heights, strict=True) if h < ranked[k]]
+    return points
+
+
+def _slope(left: Point, right: Point) -> float:
+    return (right[1] - left[1]) / (right[0] - left[0])
+
+
+def _height(point: Point, supports: Sequence[Point], near: float, far: float) -> float:
+    """Return how far a point lies above the chain of `supports`."""
+    u, y = point
+    if u <= supports[0][0]:
+        return y - supports[0][1] - near * (u - supports[0][0])
+    for left, right in pairwise(supports):
+        if u <= right[0]:
+            return y - left[1] - _slope(left, right) * (u - left[0])
+    return y - supports[-1][1] - far * (u - supports[-1][0])
+
+
 def _edge_scale(rests: list[float]) -> float:
     """Return 1/G, ns, from the heights of all points above the edge."""
-    low = [rest for rest in rests if rest < _JAM_NS]
-    if len(low) >= _LEAST:
-        rests = low
     rests.sort()
     # Half of the points lie within log(2) mean heights. The two that the edge rests on say nothing,
     # and a third is the price of not knowing the mean height beforehand.

@@ -142,8 +142,10 @@ class Hardware:
             self._push(time.monotonic_ns(), 0.4 * math.sin(0.03 * number), number)
 
     def _push(self, t_ns: int, half: float, number: int) -> None:
-        """All sensors of the thigh rest, those of the shank turn."""
-        rest, turned = (1.0, 0.0, 0.0, 0.0), (math.cos(half), 0.0, math.sin(half), 0.0)
+        """All sensors of the thigh rest but for their noise, those of the shank turn."""
+        noise = 1e-4 * math.sin(number)  # exactly the same again and again is a stuck sensor
+        rest = (math.cos(noise), math.sin(noise), 0.0, 0.0)
+        turned = (math.cos(half), 0.0, math.sin(half), 0.0)
         resting: list[XbusDevice | XcdiDevice] = [self.good, self.slow, *self.twins]
         for sensor in resting:
             sensor.push(t_ns, rest)
