@@ -46,9 +46,9 @@ class Spread:
 
     def at(self, ratio: float) -> tuple[float, float, float]:
         """Return the standard deviations about x, y and z of the segment, rad."""
+        (ax, ay, az), (bx, by, bz) = self.inside, self.outside
         r = max(min(ratio, FARTHEST) - WITHIN, 0.0)
-        a, b = self.inside, self.outside
-        return (sqrt(a[0] + b[0] * r), sqrt(a[1] + b[1] * r), sqrt(a[2] + b[2] * r))
+        return (sqrt(ax + bx * r), sqrt(ay + by * r), sqrt(az + bz * r))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""

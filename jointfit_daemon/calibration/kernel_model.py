@@ -96,15 +96,15 @@ class KernelModel(SegmentModel):
         u = features.relative_rotations_one(sensors, mean, q_other)
         a, ratio, b, b_ratio = self._tables.correct(u, features.tilts_one(mean))
         fade = 1.0 if ratio <= HULL else sqrt(HULL / ratio)
-        tilted = SHARE / max(b_ratio, 1.0)
+        tilted = SHARE / b_ratio if b_ratio > 1.0 else SHARE
         plain = fade * (1.0 - tilted)
-        x = plain * a[0] + tilted * b[0]
-        y = plain * a[1] + tilted * b[1]
-        z = plain * a[2] + tilted * b[2]
+        (ax, ay, az), (bx, by, bz) = a, b
+        c = (plain * ax + tilted * bx, plain * ay + tilted * by, plain * az + tilted * bz)
         far = max(ratio, b_ratio)
         sds = self.spread.at(far)
-        sd = sqrt((sds[0] ** 2 + sds[1] ** 2 + sds[2] ** 2) / 3.0)
-        return Prediction(multiply_one(mean, exp_one((x, y, z))), sd, far > OUTSIDE, sds)
+        x, y, z = sds
+        sd = sqrt((x * x + y * y + z * z) / 3.0)
+        return Prediction(multiply_one(mean, exp_one(c)), sd, far > OUTSIDE, sds)
 
     @override
     def to_dict(self) -> dict[str, Any]:

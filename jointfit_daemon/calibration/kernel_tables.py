@@ -1,12 +1,13 @@
-r"""Two experts as the frame loop wants them: everything of one frame in three matrix products.
+r"""Two experts as the frame loop wants them: everything of one frame in two matrix products.
 
-All bumps of both, and the static pose's own, come from one product and one exponential,
+All exponents of the bumps of both, of the static pose's own among them,
 
 .. math:: -\tfrac12 |x - z|^2 = [z / \ell, -\tfrac12 \ell^{-2}, -\tfrac12 |z|^2]
           \cdot [u, u^2, 1], \quad x = u / \ell
 
-since ``a_z(x)`` needs besides each bump only that about zero, whose coefficient is minus the sum of
-all. All smooth terms and both leverages come from another, leverages by their Cholesky roots.
+come from the first product, all smooth terms, and leverages by their Cholesky roots, along with
+them; one exponential and one square later the second adds them up. For ``a_z(x)`` needs besides
+each bump only that about zero, whose coefficient is minus the sum of all.
 """
 
 from __future__ import annotations
@@ -28,51 +29,59 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+_BENDS = 6
+"""Smooth terms before u itself."""
+
 
 @dataclass(frozen=True, slots=True)
 class Tables:
     """Arrays for single frames."""
 
-    exponents: Array
-    """Times [u, u^2, 1] they are the exponents of all bumps, shape (bumps, 2 width + 1)."""
-    of_bumps: Array
-    """Coefficients of both experts, shape (6, bumps)."""
-    of_smooth: Array
-    """Coefficients of both, then roots of their leverages, shape (6 + p + q, q)."""
-    rest: tuple[float, ...]
-    """What the constants of the bumps add, six numbers."""
-    first: int
-    """Where the root of the second expert begins."""
+    terms: Array
+    """Times [bends, u, u^2, 1] they are the exponents of all bumps, the roots of both leverages and
+    the smooth part of both corrections, shape (bumps + p + q + 6, 2 width + 7)."""
+    sums: Array
+    """Times bumps, squares of the roots, and the smooth part they are both corrections and both
+    leverages, shape (8, bumps + p + q + 6)."""
+    bumps: int
+    """How many of the terms are exponents."""
+    roots: int
+    """Where the roots end."""
 
     @staticmethod
     def of(plain: Expert, tilted: Expert, sensors: int) -> Tables:
         """Return the tables of two experts on a segment of so many sensors."""
         width = 3 * sensors + features.TILTS
-        p, q = len(plain.leverage), len(tilted.leverage)
-        parts = [_Part.of(expert, sensors, width, q) for expert in (plain, tilted)]
-        a, b = parts
-        none_a, none_b = np.zeros_like(a.of_bumps), np.zeros_like(b.of_bumps)
-        return Tables(
-            exponents=np.concatenate([a.exponents, b.exponents]),
-            of_bumps=np.block([[a.of_bumps, none_b], [none_a, b.of_bumps]]),
-            of_smooth=np.concatenate([a.of_smooth, b.of_smooth, a.root, b.root]),
-            rest=(*a.rest, *b.rest),
-            first=6 + p,
-        )
+        q = len(tilted.leverage)
+        a, b = (_Part.of(expert, sensors, width, q) for expert in (plain, tilted))
+        smooth = np.concatenate([a.root, b.root, a.of_smooth, b.of_smooth])
+        bumps, terms = len(a.exponents) + len(b.exponents), len(smooth)
+        table = np.zeros((bumps + terms, 2 * width + _BENDS + 1))
+        table[:bumps, _BENDS:] = np.concatenate([a.exponents, b.exponents])
+        table[bumps:, : smooth.shape[1]] = smooth
+        table[-6:, -1] = (*a.rest, *b.rest)
+        roots = bumps + terms - 6
+        sums = np.zeros((8, len(table)))
+        sums[:3, : len(a.exponents)] = a.of_bumps
+        sums[3:6, len(a.exponents) : bumps] = b.of_bumps
+        sums[:6, roots:] = np.eye(6)
+        sums[6, bumps : bumps + len(a.root)] = 1.0
+        sums[7, bumps + len(a.root) : roots] = 1.0
+        return Tables(table, sums, bumps, roots)
 
     def correct(
         self, u: Sequence[float], tilts: Sequence[float]
     ) -> tuple[Vector, float, Vector, float]:
         """Return correction, rad, and leverage over its quantile: of the plain, of the tilted."""
         seen = [*u, *tilts]
-        bumps = np.exp(self.exponents @ np.array([*seen, *[v * v for v in seen], 1.0]))
-        near = (self.of_bumps @ bumps).tolist()
-        smooth = (self.of_smooth @ np.array(features.smooth_terms_one(seen))).tolist()
-        c = [n + s + r for n, s, r in zip(near, smooth, self.rest, strict=False)]
+        smooth = features.smooth_terms_one(seen)
+        terms = self.terms.dot(np.array([*smooth, *[v * v for v in seen], 1.0]))
+        bumps, roots = terms[: self.bumps], terms[self.bumps : self.roots]
+        np.exp(bumps, bumps)
+        np.multiply(roots, roots, roots)
+        *c, plain, tilted = self.sums.dot(terms).tolist()
         if max(c) > LARGEST or min(c) < -LARGEST:
             c = [min(max(each, -LARGEST), LARGEST) for each in c]
-        plain = sum([far * far for far in smooth[6 : self.first]])
-        tilted = sum([far * far for far in smooth[self.first :]])
         return (c[0], c[1], c[2]), plain, (c[3], c[4], c[5]), tilted
 
 

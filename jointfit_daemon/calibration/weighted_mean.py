@@ -92,6 +92,10 @@ def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quatern
     p, q = sensors
     w1, w2 = weights
     d = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
+    if w1 == w2:  # then a = b
+        if d < 0.0:
+            return normalize_one((p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3]))
+        return normalize_one((p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3]))
     z = max(sqrt((w1 - w2) ** 2 + 4.0 * w1 * w2 * d * d), 1e-300)
     share = z * (w1 + w2 + z)
     a = sqrt(w1 * max(w1 - w2 + z, 0.0) / share)
