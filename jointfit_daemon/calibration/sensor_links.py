@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations, product
 from math import atan2, radians, sqrt
+from operator import mul
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -74,10 +75,13 @@ class SensorLink:
             return (0.0,) * len(self.weights), self.total + self.spread
         seen, stray = [], 0.0
         for value, low, high in zip(posture_one(up_a, up_near), self.low, self.high, strict=True):
+            if low <= value <= high:
+                seen.append(value)
+                continue
             kept = low if value < low else min(value, high)
             stray = max(stray, abs(value - kept) - STRAY * (high - low))
             seen.append(kept)
-        said = tuple([sum([w * g for w, g in zip(row, seen, strict=True)]) for row in self.weights])
+        said = tuple([sum(map(mul, row, seen)) for row in self.weights])
         return said, self.spread + min(1.0, 2.0 * stray) * self.total
 
     def to_dict(self) -> dict[str, Any]:

@@ -8,12 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from math import pi
-from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import JointAngles
-
-if TYPE_CHECKING:
-    from jointfit_daemon.model import JointState
 
 SPAN_NS = 50_000_000
 LONGEST_NS = 120_000_000
@@ -26,21 +22,26 @@ class AngleRates:
     def __init__(self) -> None:
         self._past: dict[str, deque[tuple[int, JointAngles]]] = {}
 
-    def rates(self, t_ns: int, joint: JointState, *, gimbal: bool) -> JointAngles | None:
+    def rates(
+        self, t_ns: int, joint: str, angles: JointAngles | None, *, gimbal: bool
+    ) -> JointAngles | None:
         """Return the rates of a joint's angles, rad/s; None while they are not known.
 
         Parameters
         ----------
         t_ns : int
             Instant of the frame; grows from call to call.
-        joint : JointState
-            The joint in this frame.
+        joint : str
+            Which one.
+        angles : JointAngles or None
+            In this frame; None: not known.
         gimbal : bool
             Whether flexion and rotation cannot be told apart: then there is no rate, nor for the
             next frames.
         """
-        past = self._past.setdefault(joint.name, deque())
-        angles = joint.angles
+        past = self._past.get(joint)
+        if past is None:
+            past = self._past[joint] = deque()
         if angles is None or gimbal:
             past.clear()
             return None

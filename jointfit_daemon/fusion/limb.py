@@ -5,7 +5,6 @@ Law: pure, in order of time, plain floats. Unknown is None; every degradation is
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
@@ -191,9 +190,9 @@ class LimbFuser:
                 continue
             if state.gimbal and "gimbal" not in flags:
                 flags.append("gimbal")
-            joint = JointState(name, position, sd, state.angles, state.inner, state.flexion_sd)
-            rates = self._rates.rates(t_ns, joint, gimbal=state.gimbal)
-            joints.append(joint if rates is None else replace(joint, rates=rates))
+            angles, inner, flexion_sd, gimbal = state
+            rates = self._rates.rates(t_ns, name, angles, gimbal=gimbal)
+            joints.append(JointState(name, position, sd, angles, inner, flexion_sd, rates))
         return tuple(joints)
 
     def _uncalibrated(self, t_ns: int, completed_ns: int, seq: int, sync: str) -> LimbState:
@@ -208,4 +207,4 @@ def _widened(one: Fused, more: float) -> Fused:
     if one.sd is None:
         return one
     flexion = None if one.flexion_sd is None else hypot(one.flexion_sd, more)
-    return replace(one, sd=hypot(one.sd, more), flexion_sd=flexion)
+    return one._replace(sd=hypot(one.sd, more), flexion_sd=flexion)

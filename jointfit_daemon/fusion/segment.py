@@ -9,9 +9,8 @@ what was said and what is now to be said fades over a quarter of a second.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import radians, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.calibration.redundancy import Prediction
 from jointfit_daemon.calibration.result import alive_key
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.result import SegmentCalibration
+    from jointfit_daemon.calibration.segment_model import SegmentModel
     from jointfit_daemon.model import Quaternion, Vector
 
 FLOOR_SD = 0.0005
@@ -46,10 +46,10 @@ HELD_RATE = 2.0
 
 Inputs = dict[str, "Quaternion"]
 """q_optical_segment by sensor: what each alive sensor alone says."""
+Names = tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Fused:
+class Fused(NamedTuple):
     """What is said of one segment in one frame."""
 
     q: Quaternion | None
@@ -78,9 +78,11 @@ class SegmentFuser:
         self._models = calibration.models
         widest = max((m.residual_sd for m in self._models.values()), default=UNREFERENCED_SD)
         self._untrained_sd = max(widest, FLOOR_SD)
+        self._chosen: dict[tuple[Names, Names], tuple[SegmentModel | None, Names]] = {}
+        """By sensors alive, here and on the neighbor: the model, and whom it looks at there."""
         self._since_ns: int | None = None
         self._last: tuple[int, Quaternion, float] | None = None
-        self._before: tuple[tuple[str, ...], tuple[str, ...], Inputs] | None = None
+        self._before: tuple[Names, Names, Inputs] | None = None
         self._fading: tuple[int, Vector] | None = None
 
     def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> Fused:
@@ -93,10 +95,10 @@ class SegmentFuser:
         neighbor : sequence of str
             Sensors of the segment whose movement the models look at.
         """
-        alive = tuple([s for s in self._sensors if s in inputs])
+        alive = _heard(self._sensors, inputs)
         if not alive:
             return self._hold(t_ns)
-        near = tuple([s for s in neighbor if s in inputs])
+        near = _heard(tuple(neighbor), inputs)
         said = self._say(alive, near, inputs)
         self._note_change(t_ns, alive, near, inputs, said.q)
         q = self._faded(t_ns, said.q)
@@ -122,27 +124,32 @@ class SegmentFuser:
         wide = sqrt(sd * sd + (HELD_RATE * age_s) ** 2)
         return Fused(q, wide, (), (f"held:{self._name}",))
 
-    def _say(self, alive: tuple[str, ...], near: tuple[str, ...], inputs: Inputs) -> Prediction:
+    def _say(self, alive: Names, near: Names, inputs: Inputs) -> Prediction:
         """Return what the model of this set says: with the neighbor, without, or the plain mean."""
+        chosen = self._chosen.get((alive, near))
+        if chosen is None:
+            chosen = self._chosen[alive, near] = self._choose(alive, near)
+        model, others = chosen
         sensors = [inputs[s] for s in alive]
-        if near:
-            model = self._models.get(alive_key(alive, "+".join(near)))
-            if model is not None:
-                q_other = mean_one([inputs[s] for s in near])
-                return model.predict_one(sensors, q_other)
-            model = self._models.get(alive_key(alive, near[0]))
-            if model is not None:
-                return model.predict_one(sensors, inputs[near[0]])
-        model = self._models.get(alive_key(alive, None))
-        if model is not None:
+        if model is None:
+            return Prediction(mean_one(sensors), self._untrained_sd, False)
+        if not others:
             return model.predict_one(sensors)
-        return Prediction(mean_one(sensors), self._untrained_sd, False)
+        return model.predict_one(sensors, mean_one([inputs[s] for s in others]))
+
+    def _choose(self, alive: Names, near: Names) -> tuple[SegmentModel | None, Names]:
+        """Return the model for a set, and which sensors of the neighbor it looks at."""
+        for others in (near, near[:1], ()):
+            model = self._models.get(alive_key(alive, "+".join(others) or None))
+            if model is not None:
+                return model, others
+        return None, ()
 
     def _note_change(
         self,
         t_ns: int,
-        alive: tuple[str, ...],
-        near: tuple[str, ...],
+        alive: Names,
+        near: Names,
         inputs: Inputs,
         target: Quaternion,
     ) -> None:
@@ -174,6 +181,14 @@ class SegmentFuser:
             self._fading = None
             return target
         return multiply_one(target, exp_one((left * x, left * y, left * z)))
+
+
+def _heard(names: Names, inputs: Inputs) -> Names:
+    """Return those who say something: mostly all, and then nothing is made anew."""
+    for name in names:
+        if name not in inputs:
+            return tuple([s for s in names if s in inputs])
+    return names
 
 
 def _claimed(said: Prediction, minutes: float) -> tuple[float | None, float]:

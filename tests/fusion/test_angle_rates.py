@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.fusion.angle_rates import AngleRates
-from jointfit_daemon.model import JointAngles, JointState
+from jointfit_daemon.model import JointAngles
 
 MS = 1_000_000
 
 
-def knee(*angles: float) -> JointState:
-    return JointState("knee", None, None, JointAngles(*angles))
+def angles(*found: float) -> JointAngles:
+    return JointAngles(*found)
 
 
 @pytest.mark.parametrize("step_ms", [2, 10, 20, 50])
@@ -22,7 +22,10 @@ def test_a_swing_has_the_rate_of_25_milliseconds_ago_or_half_a_frame(step_ms: in
     for t_ms in range(0, 2000, step_ms):
         t_s = t_ms * 1e-3
         found = follower.rates(
-            t_ms * MS, knee(np.sin(3 * t_s), 0.2 * np.sin(3 * t_s), -0.5 * t_s), gimbal=False
+            t_ms * MS,
+            "knee",
+            angles(np.sin(3 * t_s), 0.2 * np.sin(3 * t_s), -0.5 * t_s),
+            gimbal=False,
         )
         if t_ms >= 100:
             assert found is not None
@@ -34,17 +37,17 @@ def test_a_swing_has_the_rate_of_25_milliseconds_ago_or_half_a_frame(step_ms: in
 
 def test_flexion_and_rotation_run_through_half_a_turn() -> None:
     follower = AngleRates()
-    follower.rates(0, knee(np.pi - 0.01, 0.0, -np.pi + 0.02), gimbal=False)
-    found = follower.rates(10 * MS, knee(-np.pi + 0.01, 0.0, np.pi - 0.02), gimbal=False)
+    follower.rates(0, "knee", angles(np.pi - 0.01, 0.0, -np.pi + 0.02), gimbal=False)
+    found = follower.rates(10 * MS, "knee", angles(-np.pi + 0.01, 0.0, np.pi - 0.02), gimbal=False)
     assert found == pytest.approx((2.0, 0.0, -4.0))
 
 
 def test_the_first_frame_a_gap_a_lock_and_an_unknown_joint_have_no_rate() -> None:
     follower = AngleRates()
-    assert follower.rates(0, knee(0.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(200 * MS, knee(1.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(210 * MS, knee(1.0, 0.0, 0.0), gimbal=True) is None
-    assert follower.rates(220 * MS, knee(1.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(230 * MS, JointState("knee", None, None), gimbal=False) is None
-    assert follower.rates(240 * MS, knee(1.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(250 * MS, knee(1.01, 0.0, 0.0), gimbal=False) is not None
+    assert follower.rates(0, "knee", angles(0.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(200 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(210 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=True) is None
+    assert follower.rates(220 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(230 * MS, "knee", None, gimbal=False) is None
+    assert follower.rates(240 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.rates(250 * MS, "knee", angles(1.01, 0.0, 0.0), gimbal=False) is not None
