@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 State = Literal["absent", "ok", "lost", "stuck"]
 
+_SILENT: tuple[State, ...] = ("lost", "absent")
 LOST_NS = 200_000_000
 """Silence that is told as a loss."""
 BACK_NS = 2_000_000_000
@@ -92,9 +93,13 @@ class SensorWatch:
     @property
     def due_ns(self) -> int | None:
         """Return when silence of all sensors at once becomes news; None if it is, or none spoke."""
-        if self._heard_ns is None or all(one.told in ("lost", "absent") for _, one in self._items):
+        if self._heard_ns is None:
             return None
-        return self._heard_ns + LOST_NS
+        for _, one in self._items:  # mostly the first one decides
+            if one.told in _SILENT:
+                continue
+            return self._heard_ns + LOST_NS
+        return None
 
     def news(self, now_ns: int) -> list[SensorNews]:
         """Return what is worth telling at `now_ns`, each change once."""

@@ -314,7 +314,8 @@ class Core:
         if self._session.collecting:
             outputs += self._session.advance(now_ns)
         outputs += self._bulletin.due(now_ns)
-        outputs += sensor_notices(now_ns, self._fuser.news(now_ns))
+        if news := self._fuser.news(now_ns):
+            outputs += sensor_notices(now_ns, news)
         return outputs
 
     def _fuse(self, frame: AlignedFrame) -> LimbState:

@@ -7,7 +7,7 @@ counts what a wire did to them.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import (
     ClockEcho,
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock import Stamp
 
 _NS = 1_000_000_000
+_MEASUREMENTS = (ImuSample, MocapFrame)
 WITHHELD = ("unpublished", "duplicates", "late")
 """Counters a decoder may have of what it decoded and did not hand on."""
 
 
-@dataclass(frozen=True, slots=True)
-class Stamped:
+class Stamped(NamedTuple):
     """A measurement with the host instant it is true for."""
 
     measurement: ImuSample | MocapFrame
@@ -135,7 +135,7 @@ class SourceState:
         taken: list[Stamped | Corrupt | DeviceEvent] = []
         clock, tick_clock = self.clock, decoder.tick_clock
         for item in decoded:
-            if isinstance(item, ImuSample | MocapFrame):
+            if isinstance(item, _MEASUREMENTS):
                 stamped = self._stamped(item, tick_clock)
                 if clock.news:  # found by this sample, and so to be known before it
                     taken += self._told()

@@ -160,12 +160,18 @@ class FrameAligner:
     def _begin(self) -> bool:
         """Choose the next frame; skip those no stream can serve. False if there is none yet."""
         starts: list[int] = []
+        t_next, served = self._t_next, False
         for _, stream in self._items:
-            start = stream.serves_from(self._t_next)
+            if served and stream.waited_for:
+                continue  # one is enough, and this one has not ended
+            start = stream.serves_from(t_next)
             if start is None:
                 stream.settle()
             else:
                 starts.append(start)
+                served = served or start == t_next
+        if served:
+            return True
         if not starts:
             return False
         first = -(-min(starts) // self._period_ns)
@@ -184,9 +190,9 @@ class FrameAligner:
         """Return when the next frame is or was complete, or its deadline if it is not, ns."""
         t_k = (self._next or 0) * self._period_ns
         if self._fast:
-            ahead = (stream.due(t_k - stream.period_ns) for _, stream in self._items)
+            ahead = [stream.due(t_k - stream.period_ns) for _, stream in self._items]
             return max(t_k, *ahead)
-        return max(stream.due(t_k) for _, stream in self._items)
+        return max([stream.due(t_k) for _, stream in self._items])
 
     def _emit(self, due_ns: int) -> AlignedFrame | None:
         number = self._next or 0

@@ -80,9 +80,9 @@ class Stream:
     """Samples of one stream between their arrival and their verdict."""
 
     __slots__ = (
-        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_epoch", "_gap_ns", "_lost_after_ns",
-        "_patience_ns", "_reach_ns", "_received", "_samples", "_waited_for",
-        "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced",
+        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_due", "_epoch", "_gap_ns",
+        "_lost_after_ns", "_patience_ns", "_reach_ns", "_received", "_samples",
+        "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced", "waited_for",
     )  # fmt: skip
 
     def __init__(self, spec: StreamSpec) -> None:
@@ -96,7 +96,9 @@ class Stream:
         self._delay_ns: int | None = None  # usual arrival minus stamp
         self._samples: deque[_Sample] = deque()
         self._epoch: int | None = None
-        self._waited_for = False
+        self.waited_for = False
+        """Whether more is expected of it."""
+        self._due: tuple[int, int] | None = None  # what was asked last, and the answer
         self._received = 0
         self._counts = dict.fromkeys(Verdict, 0)
         self.newest_ns = self.newest_arrival_ns = 0
@@ -130,15 +132,16 @@ class Stream:
         if epoch != self._epoch:
             self.reset()
             self._epoch = epoch
-        samples = self._samples
+        samples, self._due = self._samples, None
         sample = _Sample(t_ns, arrival_ns, q, rate, synced)
         sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
             return self._insert(sample)
         self._learn_delay(arrival_ns - t_ns)
         samples.append(sample)
-        self.newest_ns, self._waited_for = t_ns, True
-        self.newest_arrival_ns = max(self.newest_arrival_ns, arrival_ns)
+        self.newest_ns, self.waited_for = t_ns, True
+        if arrival_ns > self.newest_arrival_ns:  # noqa: PLR1730 - max() costs more
+            self.newest_arrival_ns = arrival_ns
         if len(samples) > CAPACITY:
             self._leave(samples.popleft(), Verdict.DROPPED)
         return None
@@ -187,7 +190,13 @@ class Stream:
 
     def due(self, t_ns: int) -> int:
         """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
-        if not self._waited_for:
+        known = self._due
+        if known is None or known[0] != t_ns:
+            self._due = known = (t_ns, self._due_at(t_ns))
+        return known[1]
+
+    def _due_at(self, t_ns: int) -> int:
+        if not self.waited_for:
             return 0
         newest = self.newest_ns
         if newest < t_ns:
@@ -257,11 +266,11 @@ class Stream:
 
     def lose(self) -> None:
         """Stop waiting for this stream until a sample comes."""
-        self._waited_for = False
+        self.waited_for, self._due = False, None
 
     def settle(self) -> None:
         """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
-        if self._samples and not self._waited_for:
+        if self._samples and not self.waited_for:
             self.reset()
 
     def reset(self) -> None:
@@ -269,7 +278,7 @@ class Stream:
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), Verdict.DROPPED)
-        self._waited_for, self._epoch = False, None
+        self.waited_for, self._epoch, self._due = False, None, None
 
     def counts(self) -> dict[str, int]:
         """Return samples received, by verdict, and still pending."""
