@@ -15,6 +15,7 @@ from jointfit_drivers.xbus_raw import RAW, Message
 from jointfit_drivers.xbus_sync import describe
 from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item, Trigger, decode_item, split, world_of
+from jointfit_protocols.mtdata2_layout import Layout
 from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
 from jointfit_protocols.xbus import MAX_MESSAGE, MessageId, XbusDecoder, XbusMessage
 
@@ -61,6 +62,8 @@ class XbusEvents:
         self._wires = wires or {}
         self._raw = raw
         self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
+        self._layouts: dict[int, Layout | None] = {}
+        """How the first message of each length is laid out; a device sends one or two lengths."""
         self._xbus = XbusDecoder()
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
@@ -122,7 +125,13 @@ class XbusEvents:
 
     def _measurement(self, message: XbusMessage) -> list[Decoded]:
         """Return what an MTData2 holds, or what is wrong with it."""
-        items = split(message.data)
+        data = message.data
+        layout = self._layouts.get(len(data))
+        if layout is not None:
+            known = layout.read(data)
+            if known is not None:
+                return self._said(message, known, layout.world_id)
+        items = split(data)
         if items is None:
             return [self._refuse(message, "MTData2 items do not fill the message")]
         values: dict[int, Value] = {}
@@ -135,6 +144,8 @@ class XbusEvents:
                     return [self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
                 values[kind] = value
                 world_id = data_id if kind == _QUATERNION else world_id
+        if len(data) not in self._layouts:
+            self._layouts[len(data)] = Layout.of(items, self._wanted)
         return self._said(message, values, world_id)
 
     def _said(
