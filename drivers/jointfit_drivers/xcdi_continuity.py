@@ -60,6 +60,7 @@ class Continuity:
         self._period: float | None = None
         self._restarts: deque[bool] = deque(maxlen=_WINDOW)
         self._broken: deque[bool] = deque(maxlen=_WINDOW)
+        self._quiet = 0  # groups since one that restarted or was broken
         self.shared = False
 
     def group(self, ticks: int | None, counter: int | None, *, broken: bool) -> Step:
@@ -67,7 +68,10 @@ class Continuity:
         step = self._step(ticks, counter)
         self._restarts.append(step.restarted)
         self._broken.append(broken)
+        self._quiet = 0 if step.restarted or broken else self._quiet + 1
         was_shared = self.shared
+        if self._quiet >= _WINDOW and not was_shared:
+            return step  # as nearly always: both windows hold nothing
         contradictions = sum(self._restarts)
         if contradictions >= _RESTARTS or sum(self._broken) >= _BROKEN:
             self.shared = True

@@ -11,7 +11,7 @@ ended by themselves. It is trusted again after it has moved for a fifth of a sec
 from __future__ import annotations
 
 from math import radians, sin
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -40,23 +40,20 @@ _ROUNDING = 1e-12
 """Squared sine of half a turn that is rounding: 2e-6 rad."""
 
 
-class _Run(NamedTuple):
-    """Since when a sensor says the same, and what all sensors said then."""
-
-    t_ns: int
-    q: Quaternion
-    everyone: Orientations
-
-
 class _Sensor:
     __slots__ = (
-        "asleep", "awake_ns", "behind", "first_ns", "natural_ns", "partners", "run", "still",
-        "strangers",
+        "asleep", "awake_ns", "behind", "everyone", "first_ns", "natural_ns", "partners", "q",
+        "since_ns", "still", "strangers",
     )  # fmt: skip
 
     def __init__(self, partners: tuple[str, ...], strangers: tuple[str, ...]) -> None:
         self.partners, self.strangers = partners, strangers
-        self.run: _Run | None = None
+        self.since_ns: int | None = None
+        """Since when it says the same; None: it says nothing."""
+        self.q: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        """What it says since then."""
+        self.everyone: Orientations = {}
+        """What all sensors said then."""
         self.first_ns: int | None = None
         self.natural_ns = 0
         self.asleep = self.behind = self.still = False
@@ -65,22 +62,23 @@ class _Sensor:
 
     def take(self, t_ns: int, q: Quaternion, everyone: Orientations) -> bool:
         """Take one orientation; tell whether it is the one before again."""
-        run = self.run
-        if run is not None and _sine2(run.q, q) < _ROUNDING:
+        since_ns = self.since_ns
+        if since_ns is not None and _sine2(self.q, q) < _ROUNDING:
             self.awake_ns = t_ns
             return True
-        if run is None:
+        if since_ns is None:
             self.first_ns = t_ns
         elif not self.asleep:
-            self.natural_ns = min(max(self.natural_ns, t_ns - run.t_ns), NATURAL_MOST_NS)
+            if t_ns - since_ns > self.natural_ns:
+                self.natural_ns = min(t_ns - since_ns, NATURAL_MOST_NS)
         elif t_ns - self.awake_ns >= TRUSTED_NS:
             self.asleep = False
-        self.run = _Run(t_ns, q, everyone)
+        self.since_ns, self.q, self.everyone = t_ns, q, everyone
         return False
 
     def forget(self) -> None:
         """Take it that it says nothing: what it says next is not compared with what it said."""
-        self.run = None
+        self.since_ns = None
         self.asleep = self.behind = self.still = False
 
 
@@ -137,20 +135,20 @@ class FrozenWatch:
         self, one: _Sensor, t_ns: int, said: Orientations, repeating: Sequence[str]
     ) -> bool:
         """Tell whether others turned, or live on, while `one` repeats itself."""
-        run, first_ns = one.run, one.first_ns
-        if run is None or first_ns is None:
+        since_ns, first_ns = one.since_ns, one.first_ns
+        if since_ns is None or first_ns is None:
             return False
-        length_ns, usual_ns = t_ns - run.t_ns, NATURAL_FACTOR * one.natural_ns
+        length_ns, usual_ns = t_ns - since_ns, NATURAL_FACTOR * one.natural_ns
         if length_ns < max(REPEATS_NS, usual_ns):
             return False
-        then = run.everyone
+        then = one.everyone
         if any(_turned(name, then, said, PARTNER) for name in one.partners):
             return True
         if length_ns >= NEIGHBOR_NS and any(
             _turned(name, then, said, NEIGHBOR) for name in one.strangers
         ):
             return True
-        if length_ns < REPEATS_AT_REST_NS or run.t_ns - first_ns < KNOWN_NS:
+        if length_ns < REPEATS_AT_REST_NS or since_ns - first_ns < KNOWN_NS:
             return False
         return any(
             name in said and name not in repeating for name in (*one.partners, *one.strangers)

@@ -142,8 +142,10 @@ class LimbFuser:
             flags += one.flags
         joints = self._joints(t_ns, fused, optical_origin, flags)
         segments = tuple(
-            SegmentState(name, one.q, one.sd, one.used)
-            for name, one in zip(self._chain.segments, fused, strict=True)
+            [
+                SegmentState(name, one.q, one.sd, one.used)
+                for name, one in zip(self._chain.segments, fused, strict=True)
+            ]
         )
         if self.links is not None and (unseen := self.links.common_sd) > 0.0:
             segments, joints = widened_segments(segments, unseen), widened_joints(joints, unseen)

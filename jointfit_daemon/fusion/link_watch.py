@@ -176,11 +176,11 @@ class LinkWatch:
         return self._chain.segments[index]
 
     def _in_doubt(self, sensor: str) -> bool:
-        return any(
-            not pair.calm and sensor in (pair.link.a, pair.link.b)
-            for pairs in self._pairs
-            for pair in pairs
-        )
+        for pairs in self._pairs:
+            for pair in pairs:
+                if not pair.calm and sensor in (pair.link.a, pair.link.b):
+                    return True
+        return False
 
     # --- headings, once a second -------------------------------------------------------------
 
@@ -281,6 +281,8 @@ class LinkWatch:
 
     def news(self) -> list[SensorNews]:
         """Return what is worth telling, each change once."""
+        if not self._news:
+            return []
         told, self._news = self._news, []
         return told
 

@@ -85,6 +85,7 @@ class FrameAligner:
         self._fast = mode == "fast"
         self._active = active
         self._next: int | None = None  # number of the next frame; None until a stream begins
+        self._served: int | None = None  # number of a frame some stream is known to serve
         self._completed_ns = 0
         self._deadline_ns: int | None = None
         self._changed = True  # since `_deadline_ns` was worked out
@@ -128,6 +129,8 @@ class FrameAligner:
         if not self._active:
             return stream.idle()
         self._changed = True
+        if epoch != stream.epoch:  # its samples so far will be forgotten
+            self._served = None
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
         return stream.push(
             t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns, rate=rate
@@ -159,6 +162,21 @@ class FrameAligner:
 
     def _begin(self) -> bool:
         """Choose the next frame; skip those no stream can serve. False if there is none yet."""
+        if self._served is not None and self._served == self._next:
+            return True  # more samples change nothing about that
+        starts = self._starts()
+        if not starts:
+            return False
+        first = -(-min(starts) // self._period_ns)
+        if self._next is None:
+            self._next = first
+        elif first > self._next:
+            self.skipped_frames += first - self._next
+            self._next = first
+        return True
+
+    def _starts(self) -> list[int]:
+        """Return from when on streams can serve; settle those that cannot."""
         starts: list[int] = []
         t_next, served = self._t_next, False
         for _, stream in self._items:
@@ -171,16 +189,8 @@ class FrameAligner:
                 starts.append(start)
                 served = served or start == t_next
         if served:
-            return True
-        if not starts:
-            return False
-        first = -(-min(starts) // self._period_ns)
-        if self._next is None:
-            self._next = first
-        elif first > self._next:
-            self.skipped_frames += first - self._next
-            self._next = first
-        return True
+            self._served = self._next
+        return starts
 
     @property
     def _t_next(self) -> int | None:
@@ -238,20 +248,20 @@ class FrameAligner:
     def active(self, wanted: bool) -> None:
         if self._active and not wanted:
             self.close()
-        self._active, self._changed = wanted, True
+        self._active, self._changed, self._served = wanted, True, None
 
     def lose(self, name: str) -> None:
         """Take it that the stream has ended: do not wait for it until it returns."""
         self._streams[name].lose()
-        self._changed = True
+        self._changed, self._served = True, None
 
     def reset(self, name: str) -> None:
         """Forget the samples of a stream whose clock began anew."""
         self._streams[name].reset()
-        self._changed = True
+        self._changed, self._served = True, None
 
     def close(self) -> None:
         """Give every pending sample its verdict; the next sample begins anew."""
         for _, stream in self._items:
             stream.reset()
-        self._changed = True
+        self._changed, self._served = True, None

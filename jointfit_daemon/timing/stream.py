@@ -80,9 +80,10 @@ class Stream:
     """Samples of one stream between their arrival and their verdict."""
 
     __slots__ = (
-        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_due", "_epoch", "_gap_ns",
+        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_due", "_gap_ns",
         "_lost_after_ns", "_patience_ns", "_reach_ns", "_received", "_samples",
-        "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced", "waited_for",
+        "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced",
+        "waited_for",
     )  # fmt: skip
 
     def __init__(self, spec: StreamSpec) -> None:
@@ -95,7 +96,8 @@ class Stream:
         self._delay_step = max(1, period // _DELAY_STEP)
         self._delay_ns: int | None = None  # usual arrival minus stamp
         self._samples: deque[_Sample] = deque()
-        self._epoch: int | None = None
+        self.epoch: int | None = None
+        """Of the clock behind the samples."""
         self.waited_for = False
         """Whether more is expected of it."""
         self._due: tuple[int, int] | None = None  # what was asked last, and the answer
@@ -129,9 +131,9 @@ class Stream:
             return self._count(Verdict.DROPPED)
         if t_ns < arrival_ns - PAST_NS:
             return self._count(Verdict.LATE)
-        if epoch != self._epoch:
+        if epoch != self.epoch:
             self.reset()
-            self._epoch = epoch
+            self.epoch = epoch
         samples, self._due = self._samples, None
         sample = _Sample(t_ns, arrival_ns, q, rate, synced)
         sample.late = passed_ns is not None and t_ns <= passed_ns
@@ -278,7 +280,7 @@ class Stream:
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), Verdict.DROPPED)
-        self.waited_for, self._epoch, self._due = False, None, None
+        self.waited_for, self.epoch, self._due = False, None, None
 
     def counts(self) -> dict[str, int]:
         """Return samples received, by verdict, and still pending."""

@@ -65,7 +65,7 @@ def test_the_next_message_reads_as_item_by_item(data: st.DataObject, ids: list[i
 
 @given(st.binary(max_size=60), st.permutations([0x1020, 0x1060, 0x2010]))
 def test_another_order_or_size_is_not_read(noise: bytes, ids: list[int]) -> None:
-    usual = [(0x1020, 7), (0x1060, 8), (0x2010, (1.0, 0.0, 0.0, 0.0))]
+    usual: list[tuple[int, Value]] = [(0x1020, 7), (0x1060, 8), (0x2010, (1.0, 0.0, 0.0, 0.0))]
     values = dict(usual)
     known = b"".join(encode_item(data_id, value) for data_id, value in usual)
     layout = Layout.of(split(known) or [], WANTED)
