@@ -25,6 +25,7 @@ from jointfit_daemon.calibration.lags import (
     sensor_lags,
 )
 from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
+from jointfit_daemon.calibration.memory import evenly, pack
 from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
 from jointfit_daemon.calibration.refined_clusters import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.refused import CalibrationRefused
@@ -146,6 +147,7 @@ def fit_calibration(
         software=software,
         created_utc=created_utc,
         links=fit_links(chain, training.sensors, anatomy.q_static),
+        memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon import __version__
 from jointfit_daemon.calibration.alignment_phase import AlignedSensor, Alignment, fit_alignment
 from jointfit_daemon.calibration.fit import better, fit_calibration
+from jointfit_daemon.calibration.online_fit import learn
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only, with_new_static
@@ -24,10 +25,10 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     kind : str
-        ``align``, ``static`` or ``functional``.
+        ``align``, ``static``, ``functional`` or ``online``.
     payload : mapping
         ``chain`` and ``settings``; the trials ``trial`` (align), ``static``, ``functional``;
-        ``alignment`` and ``previous`` as dicts or None.
+        ``alignment`` and ``previous`` as dicts or None; ``fresh`` frames (online).
 
     Returns
     -------
@@ -117,4 +118,11 @@ def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-_JOBS = {"align": _align, "static": _static, "functional": _functional}
+def _online(payload: Mapping[str, Any]) -> dict[str, Any]:
+    previous = _previous(payload)
+    if previous is None:
+        raise CalibrationRefused("no calibration of this limb to go on from")
+    return learn(previous, payload["fresh"], payload["chain"], software=__version__)
+
+
+_JOBS = {"align": _align, "static": _static, "functional": _functional, "online": _online}

@@ -41,12 +41,19 @@ class LimbTraining:
     """q_optical_segment as each sensor says it through its bias, shape (n, 4)."""
     reference: Mapping[str, Array]
     """q_optical_segment by optics, shape (n, 4)."""
+    trials: NDArray[np.int64] | None = None
+    """Which kind of movement each frame belongs to, shape (n,); None: all to one."""
 
     def part(self, chosen: slice) -> LimbTraining:
         """Return a contiguous part."""
+        return self.rows(chosen)
+
+    def rows(self, chosen: slice | NDArray[np.int64] | NDArray[np.bool_]) -> LimbTraining:
+        """Return chosen frames."""
         return LimbTraining(
             {name: q[chosen] for name, q in self.sensors.items()},
             {name: q[chosen] for name, q in self.reference.items()},
+            None if self.trials is None else self.trials[chosen],
         )
 
     def __len__(self) -> int:
@@ -81,11 +88,11 @@ def fit_models(
         reference, models = training.reference[segment], {}
         for alive in alive_sets(chain.sensors[i]):
             x = [training.sensors[s] for s in alive]
-            alone = fit_segment(method, x, None, reference)
+            alone = fit_segment(method, x, None, reference, training.trials)
             models[alive_key(alive, None)] = alone
             for near in alive_sets(neighbor(chain, i)):
                 models[alive_key(alive, "+".join(near))] = (
-                    fit_segment(method, x, _mean(training, near), reference)
+                    fit_segment(method, x, mean_of(training, near), reference, training.trials)
                     if method == "anchored"
                     else alone
                 )
@@ -135,13 +142,15 @@ def _all_alive(
     model = fit_segment(
         method,
         [first.sensors[s] for s in sensors],
-        _mean(first, near) if near else None,
+        mean_of(first, near) if near else None,
         first.reference[segment],
+        first.trials,
     )
-    return model.predict([last.sensors[s] for s in sensors], _mean(last, near) if near else None)
+    return model.predict([last.sensors[s] for s in sensors], mean_of(last, near) if near else None)
 
 
-def _mean(training: LimbTraining, sensors: Sequence[str]) -> Array:
+def mean_of(training: LimbTraining, sensors: Sequence[str]) -> Array:
+    """Return the mean of some sensors of one segment, shape (n, 4)."""
     return fuse([training.sensors[s] for s in sensors], (1.0 / len(sensors),) * len(sensors))
 
 

@@ -103,6 +103,8 @@ class Calibration:
     created_utc: str = ""
     links: tuple[SensorLink, ...] = ()
     """What is expected between sensors; empty where no movement was seen."""
+    memory: str = ""
+    """Frames it was taught with, see `memory`; empty in calibrations of earlier versions."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
@@ -133,6 +135,7 @@ class Calibration:
             "software": self.software,
             "created_utc": self.created_utc,
             "links": [link.to_dict() for link in self.links],
+            "memory": self.memory,
         }
 
     @staticmethod
@@ -224,6 +227,7 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         software=data["software"],
         created_utc=data["created_utc"],
         links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
+        memory=str(data.get("memory", "")),
     )
 
 

@@ -288,6 +288,7 @@ def _calibration(table: CalibrationTable, mocap: Source | None) -> CalibrationSe
         center_target_m=table.center_target_mm / 1e3,
         holdout_share=table.holdout_share,
         refine_markers=table.refine_markers,
+        learn_online=table.learn_online,
         markers=dict(optical.markers) if optical is not None else {},
         rigid_bodies=dict(optical.rigid_body) if optical is not None else {},
         plate=optical.plate if optical is not None else None,

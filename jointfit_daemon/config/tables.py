@@ -89,6 +89,11 @@ class CalibrationTable(Settings):
         True,
         description="whether the movement refines where single markers sit on their body parts",
     )
+    learn_online: bool = Field(
+        False,
+        description="whether the models go on learning while the cameras see the limb; what is "
+        "learned is taken only if it is better on the newest movement",
+    )
 
 
 def is_this_host(host: str) -> bool:

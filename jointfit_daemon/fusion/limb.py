@@ -151,6 +151,14 @@ class LimbFuser:
             segments, joints = widened_segments(segments, unseen), widened_joints(joints, unseen)
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
+    def take_models(self, calibration: Calibration) -> None:
+        """Go over to the models of a calibration that is the same otherwise, without a jump."""
+        if self._calibration is None:
+            return
+        self._calibration = calibration
+        for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
+            fuser.take(calibration.segment[name].models)
+
     def news(self, now_ns: int) -> list[SensorNews]:
         """Return what is worth telling of the sensors at `now_ns`, each change once."""
         told = self.watch.news(now_ns)

@@ -24,7 +24,7 @@ from jointfit_daemon.kinematics.rotation_scalar import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.calibration.result import SegmentCalibration
     from jointfit_daemon.calibration.segment_model import SegmentModel
@@ -39,6 +39,8 @@ simulated people a minute after calibration). It hardly touches flexion."""
 HEADING_WANDER = radians(0.3)
 """How it goes on wandering, rad per root of a minute: after an hour the deviation has doubled."""
 BLEND_NS = 250_000_000
+LEARNED_NS = 1_000_000_000
+"""How long models that were learned while running take to replace those before them."""
 HOLD_NS = 200_000_000
 MINUTE_NS = 60_000_000_000
 HELD_RATE = 2.0
@@ -76,14 +78,25 @@ class SegmentFuser:
     def __init__(self, name: str, sensors: Sequence[str], calibration: SegmentCalibration) -> None:
         self._name, self._sensors = name, tuple(sensors)
         self._models = calibration.models
-        widest = max((m.residual_sd for m in self._models.values()), default=UNREFERENCED_SD)
-        self._untrained_sd = max(widest, FLOOR_SD)
+        self._models_before: Mapping[str, SegmentModel] | None = None
         self._chosen: dict[tuple[Names, Names], tuple[SegmentModel | None, Names]] = {}
         """By sensors alive, here and on the neighbor: the model, and whom it looks at there."""
+        self._use(self._models)
         self._since_ns: int | None = None
         self._last: tuple[int, Quaternion, float] | None = None
         self._before: tuple[Names, Names, Inputs] | None = None
-        self._fading: tuple[int, Vector] | None = None
+        self._fading: tuple[int, int, Vector] | None = None
+
+    def take(self, models: Mapping[str, SegmentModel]) -> None:
+        """Go over to other models of the same sensors: what they say otherwise comes slowly."""
+        if self._models_before is None:
+            self._models_before = self._models
+        self._use(models)
+
+    def _use(self, models: Mapping[str, SegmentModel]) -> None:
+        widest = max((m.residual_sd for m in models.values()), default=UNREFERENCED_SD)
+        self._models, self._untrained_sd = models, max(widest, FLOOR_SD)
+        self._chosen.clear()
 
     def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> Fused:
         """Say the orientation at `t_ns`.
@@ -99,6 +112,8 @@ class SegmentFuser:
         if not alive:
             return self._hold(t_ns)
         near = _heard(tuple(neighbor), inputs)
+        if self._models_before is not None:
+            self._go_over(t_ns, alive, near, inputs)
         said = self._say(alive, near, inputs)
         self._note_change(t_ns, alive, near, inputs, said.q)
         q = self._faded(t_ns, said.q)
@@ -145,6 +160,20 @@ class SegmentFuser:
                 return model, others
         return None, ()
 
+    def _go_over(self, t_ns: int, alive: Names, near: Names, inputs: Inputs) -> None:
+        """Begin to fade from what the models before would say of this frame."""
+        newer, older = self._models, self._models_before
+        self._models_before = None
+        if older is None or self._last is None or t_ns - self._last[0] > HOLD_NS:
+            return
+        self._use(older)
+        said = self._say(alive, near, inputs).q
+        self._note_change(t_ns, alive, near, inputs, said)
+        old = self._faded(t_ns, said)
+        self._use(newer)
+        offset = log_one(between_one(self._say(alive, near, inputs).q, old))
+        self._fading, self._before = (t_ns, LEARNED_NS, offset), (alive, near, inputs)
+
     def _note_change(
         self,
         t_ns: int,
@@ -170,13 +199,13 @@ class SegmentFuser:
             offset = log_one(between_one(then, self._last[1]))
         else:
             offset = log_one(between_one(target, self._last[1]))
-        self._fading = (t_ns, offset)
+        self._fading = (t_ns, BLEND_NS, offset)
 
     def _faded(self, t_ns: int, target: Quaternion) -> Quaternion:
         if self._fading is None:
             return target
-        began, (x, y, z) = self._fading
-        left = 1.0 - (t_ns - began) / BLEND_NS
+        began, length, (x, y, z) = self._fading
+        left = 1.0 - (t_ns - began) / length
         if left <= 0.0:
             self._fading = None
             return target

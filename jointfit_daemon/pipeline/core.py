@@ -29,6 +29,8 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_daemon.pipeline.health import health_of
 from jointfit_daemon.pipeline.lag_watch import LagWatch, known_lags
+from jointfit_daemon.pipeline.learned import models_only
+from jointfit_daemon.pipeline.online_learning import OnlineLearner
 from jointfit_daemon.pipeline.sensor_notices import sensor_notices
 from jointfit_daemon.pipeline.session import CalibrationSession
 from jointfit_daemon.pipeline.source import SourceState, Stamped
@@ -36,6 +38,7 @@ from jointfit_daemon.pipeline.sync_lines import SyncLines
 from jointfit_daemon.timing.align import FrameAligner, StreamSpec
 
 if TYPE_CHECKING:
+    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import LimbState, Vector
     from jointfit_daemon.pipeline.events import Event, Output
@@ -80,6 +83,7 @@ class Core:
         self._origin: Vector | None = None
         self._lag_ns: dict[str, int] = {}
         self._lags: LagWatch | None = None
+        self._learner: OnlineLearner
 
     # --- events ------------------------------------------------------------------------------
 
@@ -187,10 +191,11 @@ class Core:
             worn = calibration if calibration and calibration.fits(rig.chain) else None
             self._lags = LagWatch(rig.chain, worn, self._lags, known_lags(rig))
             self._session.lags = self._lags
-            if calibration is not None and calibration.fits(rig.chain):
-                self._optical_origin = OpticalOrigin(rig.chain, calibration)
+            if worn:
+                self._optical_origin = OpticalOrigin(rig.chain, worn)
             self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
             self._lag_ns |= self._lags.known_ns()
+            self._learner = OnlineLearner(rig.chain, worn, wanted=rig.calibration.learn_online)
 
     # --- sources -----------------------------------------------------------------------------
 
@@ -291,6 +296,7 @@ class Core:
             self._mocap_ns = self._now_ns
             if self._lags is not None and item.stamp.synced:
                 self._lags.add_mocap(item.stamp.t_ns, frame, item.stamp.epoch)
+                self._learner.add_mocap(item.stamp.t_ns, frame, item.stamp.epoch)
         wanted = frame.live and self._session.collecting
         if wanted:
             self._session.add_mocap(item.stamp.t_ns, frame)
@@ -313,6 +319,9 @@ class Core:
             outputs += self._lags.step(now_ns)
         if self._session.collecting:
             outputs += self._session.advance(now_ns)
+        elif outputs and self._session.may_learn:
+            fresh = self._learner.due(now_ns)
+            outputs += [] if fresh is None else self._session.learn(fresh)
         outputs += self._bulletin.due(now_ns)
         if news := self._fuser.news(now_ns):
             outputs += sensor_notices(now_ns, news)
@@ -321,7 +330,7 @@ class Core:
     def _fuse(self, frame: AlignedFrame) -> LimbState:
         self._seq += 1
         fresh = self._mocap_ns is not None and self._now_ns - self._mocap_ns < MOCAP_FRESH_NS
-        return self._fuser.fuse(
+        state = self._fuser.fuse(
             frame.t_ns,
             frame.completed_ns,
             self._seq,
@@ -331,12 +340,17 @@ class Core:
             sync="locked" if frame.synced else "settling",
             mode="imu+mocap" if fresh else "imu",
         )
+        self._learner.add_frame(frame, state.flags)
+        return state
 
     # --- calibration -------------------------------------------------------------------------
 
     def _request(self, event: Request) -> list[Output]:
         if event.command == "calibrate":
-            return self._session.request(event)
+            before = self._session.calibration
+            outputs = self._session.request(event)
+            self._took(before)
+            return outputs
         message = f"unknown request {event.command!r}; known: calibrate"
         error = {"key": "command", "message": message}
         return [Reply(event.command, event.transaction, "error", {}, error)]
@@ -344,9 +358,16 @@ class Core:
     def _job_finished(self, event: JobFinished) -> list[Output]:
         before = self._session.calibration
         outputs = self._session.job_finished(event)
-        if self._session.calibration is not before:
-            self._use_calibration()
+        self._took(before)
         return outputs
+
+    def _took(self, before: Calibration | None) -> None:
+        """Go on with what is in force now, if it is another."""
+        after = self._session.calibration
+        if before and after and after is not before and models_only(before, after):
+            self._fuser.take_models(after)
+        elif after is not before:
+            self._use_calibration()
 
 
 def _session(event: Configured) -> CalibrationSession:

@@ -26,12 +26,14 @@ from jointfit_daemon.pipeline.events import (
     Notice,
     Reply,
 )
+from jointfit_daemon.pipeline.learned import Learned
 from jointfit_daemon.pipeline.phase import TEXTS, Phase
 from jointfit_daemon.pipeline.recorder import LONGEST_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.calibration.online_fit import Fresh
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
@@ -86,17 +88,26 @@ class CalibrationSession:
         self._jobs = 0
         self._fitting: _Fit | None = None
         self._force = False
+        self._learned = Learned()
 
     def take_over(self, before: CalibrationSession, *, same_rig: bool) -> None:
         """Go on from the session before a reload: its worlds and pose, if they are still true."""
         self._jobs = before._jobs  # numbers are never used twice
         if same_rig:
             self._alignment, self._static = before._alignment, before._static
+            self._learned.paused = before._learned.paused
 
     @property
     def collecting(self) -> bool:
         """Whether measurements are wanted right now."""
         return self._phase is not None
+
+    @property
+    def may_learn(self) -> bool:
+        """Whether nothing is calibrated or learned right now, and there is something to improve."""
+        busy = self._phase is not None or self._fitting is not None
+        known = self.calibration is not None and not self._learned.paused
+        return known and not busy and self._learned.job is None
 
     @property
     def phase(self) -> str:
@@ -155,6 +166,8 @@ class CalibrationSession:
     def request(self, request: Request) -> list[Output]:
         """Begin or end a phase; the reply says ``accepted``, the rest is told as it happens."""
         wanted = str(request.arguments.get("phase", ""))
+        if wanted == "unlearn":
+            return self._unlearn(request)
         if wanted == "abort":
             outputs = self.abort(request.t_ns, "asked to")
             data = {"phase": self.phase}
@@ -172,6 +185,37 @@ class CalibrationSession:
             Reply(request.command, request.transaction, "accepted", {"phase": wanted}),
             *self._begin(request.t_ns, wanted, wanted_s or self._default_s(wanted)),
         ]
+
+    def _unlearn(self, request: Request) -> list[Output]:
+        """Go back to the models before online learning, and learn nothing until a new movement."""
+        now = self.calibration
+        before = None if now is None else self._learned.taken_back(now)
+        if before is None or self._fitting is not None:
+            error = {"key": "phase", "message": "nothing was learned since the daemon started"}
+            return [Reply(request.command, request.transaction, "error", {}, error)]
+        self.calibration, self.version = before, None
+        text = "what was learned while running is taken back; nothing more is, until calibrated"
+        return [
+            Reply(request.command, request.transaction, "ok", {"phase": self.phase}),
+            CalibrationReady(before),
+            self._tell(request.t_ns, self.phase, text),
+        ]
+
+    def learn(self, fresh: Fresh) -> list[Output]:
+        """Have the models fitted to what the cameras saw; call only while ``may_learn``."""
+        if self.calibration is None:
+            return []
+        self._jobs += 1
+        job = self._jobs, self.calibration, self._chain, self._settings, fresh
+        return [self._learned.ask(*job)]
+
+    def _learn(self, event: JobFinished, before: Calibration) -> list[Output]:
+        found, notice = self._learned.finished(event, before, self.version)
+        if found is None:
+            return [notice]
+        self.calibration, self.version = found, None
+        told = self._tell(event.t_ns, self.phase, notice.text)
+        return [notice, CalibrationReady(found), told]
 
     def _refusal(self, wanted: str) -> tuple[str, str] | None:
         if wanted not in COLLECTING:
@@ -246,6 +290,7 @@ class CalibrationSession:
         if self.lags is not None:
             payload |= {"lag_ns": self.lags.known_ns(), "tracked": self.lags.tracked()}
         self._jobs += 1
+        self._learned.job = None  # one worker: it leaves what it learns for this
         self._fitting = _Fit(self._jobs, phase.name, trial if phase.name == "static" else None)
         outputs: list[Output] = []
         if phase.overflowed:
@@ -262,6 +307,8 @@ class CalibrationSession:
     def job_finished(self, event: JobFinished) -> list[Output]:
         """Take what the worker made of the last phase. Results of cancelled jobs are ignored."""
         fit = self._fitting
+        if event.job == self._learned.job and self.calibration is not None:
+            return self._learn(event, self.calibration)
         if fit is None or event.job != fit.job:
             return []
         self._fitting = None
@@ -294,6 +341,8 @@ class CalibrationSession:
                 replace(self._tell(t_ns, self.phase, text), kept=str(keep)),
             ]
         self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
+        if kind == "functional":
+            self._learned = Learned()
         phase = "posed" if kind == "static" else "calibrated"
         text = "static pose taken: sensors re-seated" if kind == "static" else "calibrated"
         return [

@@ -35,8 +35,8 @@ class _Arguments(BaseModel):
 class CalibrateArguments(_Arguments):
     """``bridge/request/calibrate``."""
 
-    phase: Literal["align", "static", "functional", "abort"] = Field(
-        description="the phase to begin, or `abort`"
+    phase: Literal["align", "static", "functional", "abort", "unlearn"] = Field(
+        description="the phase to begin, or `abort`; `unlearn` takes back what was learned online"
     )
     seconds: float | None = Field(
         None, gt=0, le=600, description="length of the phase, s; default: as in rig.toml"

@@ -1,0 +1,94 @@
+"""What becomes of a refit while running: taken, kept away or taken back, and how it is told.
+
+Law: a state of its own beside the session's; the session asks it, and owns the calibration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.pipeline.events import FitJob, Notice
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.online_fit import Fresh
+    from jointfit_daemon.calibration.trial import CalibrationSettings
+    from jointfit_daemon.model import Chain
+    from jointfit_daemon.pipeline.events import JobFinished
+
+
+class Verdict(NamedTuple):
+    """What a refit came to."""
+
+    calibration: Calibration | None
+    """To be taken, or None."""
+    notice: Notice
+
+
+@dataclass(slots=True)
+class Learned:
+    """Refits of one session."""
+
+    job: int | None = None
+    """That runs."""
+    taught: Calibration | None = None
+    """As it was before the first refit that was taken: what can be gone back to."""
+    paused: bool = False
+    """Nothing is learned until the next functional phase: somebody took it back."""
+
+    def ask(
+        self,
+        job: int,
+        calibration: Calibration,
+        chain: Chain,
+        settings: CalibrationSettings,
+        fresh: Fresh,
+    ) -> FitJob:
+        """Return the work of a refit."""
+        self.job = job
+        payload = {"chain": chain, "settings": settings, "fresh": fresh}
+        return FitJob(job, "online", payload | {"previous": calibration.to_dict()})
+
+    def finished(self, event: JobFinished, before: Calibration, version: int | None) -> Verdict:
+        """Return what came of it."""
+        self.job = None
+        result = dict(event.result or {})
+        failure = event.error or result.get("refused") or (None if result else "no result")
+        if failure is not None:
+            text = f"nothing learned: {failure}"
+            return Verdict(None, Notice(event.t_ns, "calibration", "online", text, "warning"))
+        quality = result.get("quality", {})
+        data = {"online": quality.get("online", {})} if isinstance(quality, dict) else {}
+        if "calibration" not in result:
+            text = f"nothing learned: {result.get('kept')}"
+            return Verdict(None, Notice(event.t_ns, "calibration", "online", text, "info", data))
+        self.taught = self.taught or before
+        found = Calibration.from_dict(dict(result["calibration"]))  # type: ignore[call-overload]
+        online = {**found.quality["online"], "from_version": version}
+        found = replace(found, quality={**found.quality, "online": online})
+        text = f"learned from {online['frames']} frames in view of the cameras"
+        return Verdict(found, Notice(event.t_ns, "calibration", "online", text, "info", data))
+
+    def taken_back(self, calibration: Calibration) -> Calibration | None:
+        """Return the calibration with the models it had before; None where nothing was learned."""
+        old, self.taught = self.taught, None
+        if old is None:
+            return None
+        self.paused = True
+        quality = {key: value for key, value in calibration.quality.items() if key != "online"}
+        if "online" in old.quality:
+            quality["online"] = old.quality["online"]
+        segments = {
+            name: replace(item, models=old.segment[name].models)
+            for name, item in calibration.segment.items()
+        }
+        return replace(calibration, segment=segments, memory=old.memory, quality=quality)
+
+
+def models_only(before: Calibration, after: Calibration) -> bool:
+    """Tell whether two calibrations differ in models and figures alone."""
+    return (
+        replace(before, segment={}, quality={}, memory="", created_utc="", software="")
+        == replace(after, segment={}, quality={}, memory="", created_utc="", software="")
+    )  # fmt: skip

@@ -1,0 +1,79 @@
+"""Models that were learned while running take over without a jump."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.calibration.model_fit import fit_models
+from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, as_quaternion
+from tests.calibration.taught_limb import CHAIN, calibration, moving
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.model import LimbState, Quaternion
+
+MS = 1_000_000
+STEP_NS = 10 * MS
+HELD = moving(40, 1.2, 1)
+ROW = 25
+"""A far bend, where old and new models differ most."""
+
+
+@cache
+def learned() -> Calibration:
+    models = fit_models(CHAIN, moving(400, 1.2), "anchored")
+    old = calibration()
+    segments = {n: replace(item, models=models[n]) for n, item in old.segment.items()}
+    return replace(old, segment=segments)
+
+
+def said(fuser: LimbFuser, k: int, *, without: str = "") -> LimbState:
+    heard = {n: as_quaternion(q[ROW].tolist()) for n, q in HELD.sensors.items() if n != without}
+    return fuser.fuse(k * STEP_NS, k * STEP_NS, k, heard)
+
+
+def thigh(state: LimbState) -> Quaternion:
+    q = state.segments[0].q_world_segment
+    assert q is not None
+    return q
+
+
+def test_the_difference_comes_within_a_second_and_never_at_once() -> None:
+    fuser = LimbFuser(CHAIN, calibration())
+    states = [said(fuser, k) for k in range(10)]
+    fuser.take_models(learned())
+    states += [said(fuser, k) for k in range(10, 130)]
+    steps = [angle_between_one(thigh(a), thigh(b)) for a, b in pairwise(states)]
+    whole = angle_between_one(thigh(states[0]), thigh(states[-1]))
+    assert whole > np.deg2rad(0.5)  # there is something to fade
+    assert max(steps) < 0.012 * whole
+    fresh_start = LimbFuser(CHAIN, learned())
+    assert angle_between_one(thigh(said(fresh_start, 0)), thigh(states[-1])) < 1e-9
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_a_sensor_lost_in_the_same_moment_makes_no_jump_either(first: bool) -> None:
+    fuser, plain = LimbFuser(CHAIN, calibration()), LimbFuser(CHAIN, calibration())
+    for k in range(10):
+        said(fuser, k)
+        last = said(plain, k)
+    fuser.take_models(learned())
+    if first:
+        said(fuser, 10)
+        said(plain, 10)
+    now = said(fuser, 11, without="S2")
+    assert angle_between_one(thigh(now), thigh(last)) < np.deg2rad(0.5)
+
+
+def test_models_taken_before_the_first_frame_are_just_used() -> None:
+    fuser = LimbFuser(CHAIN, calibration())
+    fuser.take_models(learned())
+    right = thigh(said(LimbFuser(CHAIN, learned()), 0))
+    assert angle_between_one(thigh(said(fuser, 0)), right) < 1e-12
