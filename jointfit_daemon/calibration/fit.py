@@ -121,7 +121,6 @@ def fit_calibration(
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
     training, raw = _training(chain, functional, tracks, anatomy, sensors)
     models = fit_models(chain, training, settings.method)
-    flags = [*anatomy.flags, *(["headings_from_static"] if alignment is None else [])]
     notes = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns)]
     notes += _heading_notes(chain, raw, training) if alignment is None else []
     return Calibration(
@@ -133,7 +132,7 @@ def fit_calibration(
         segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
         clusters={name: stored_cluster(cluster) for name, cluster in refined.clusters.items()},
-        flags=tuple(flags),
+        flags=(*anatomy.flags, *(["headings_from_static"] if alignment is None else [])),
         notes=tuple(notes),
         quality={
             "static": pose.quality,

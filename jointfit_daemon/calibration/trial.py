@@ -74,5 +74,5 @@ class CalibrationSettings:
     """Last share of the functional trial, contiguous, that judges the fit."""
     refine_markers: bool = True
     """Whether the movement refines where markers sit on their body parts."""
-    learn_online: bool = False
+    learn_online: bool = True
     """Whether the models go on learning while cameras see the limb."""

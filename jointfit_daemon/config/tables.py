@@ -90,7 +90,7 @@ class CalibrationTable(Settings):
         description="whether the movement refines where single markers sit on their body parts",
     )
     learn_online: bool = Field(
-        False,
+        True,
         description="whether the models go on learning while the cameras see the limb; what is "
         "learned is taken only if it is better on the newest movement",
     )

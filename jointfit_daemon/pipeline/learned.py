@@ -5,13 +5,16 @@ Law: a state of its own beside the session's; the session asks it, and owns the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.pipeline.events import FitJob, Notice
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from jointfit_daemon.calibration.online_fit import Fresh
     from jointfit_daemon.calibration.trial import CalibrationSettings
     from jointfit_daemon.model import Chain
@@ -53,18 +56,17 @@ class Learned:
     def finished(self, event: JobFinished, before: Calibration, version: int | None) -> Verdict:
         """Return what came of it."""
         self.job = None
-        result = dict(event.result or {})
+        result: dict[str, Any] = dict(event.result or {})
         failure = event.error or result.get("refused") or (None if result else "no result")
         if failure is not None:
             text = f"nothing learned: {failure}"
             return Verdict(None, Notice(event.t_ns, "calibration", "online", text, "warning"))
-        quality = result.get("quality", {})
-        data = {"online": quality.get("online", {})} if isinstance(quality, dict) else {}
+        data = _shown(result.get("quality", {}).get("online", {}))
         if "calibration" not in result:
             text = f"nothing learned: {result.get('kept')}"
             return Verdict(None, Notice(event.t_ns, "calibration", "online", text, "info", data))
         self.taught = self.taught or before
-        found = Calibration.from_dict(dict(result["calibration"]))  # type: ignore[call-overload]
+        found = Calibration.from_dict(result["calibration"])
         online = {**found.quality["online"], "from_version": version}
         found = replace(found, quality={**found.quality, "online": online})
         text = f"learned from {online['frames']} frames in view of the cameras"
@@ -84,6 +86,15 @@ class Learned:
             for name, item in calibration.segment.items()
         }
         return replace(calibration, segment=segments, memory=old.memory, quality=quality)
+
+
+def _shown(figures: Mapping[str, Any]) -> dict[str, object]:
+    """Return what an event tells: degrees, to four digits."""
+    shown: dict[str, object] = {key: figures[key] for key in ("frames", "judged") if key in figures}
+    for when in ("before", "after"):
+        errors = figures.get(f"{when}_rad", {})
+        shown[f"{when}_deg"] = {n: float(f"{math.degrees(x):.4g}") for n, x in errors.items()}
+    return shown
 
 
 def models_only(before: Calibration, after: Calibration) -> bool:

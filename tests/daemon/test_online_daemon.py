@@ -20,6 +20,7 @@ from jointfit_daemon.pipeline.events import (
     CalibrationStored,
     Configured,
     FitJob,
+    JobFinished,
     SourceOpened,
 )
 from jointfit_daemon.pipeline.replay import replay_states
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event
 
-FRAMES, MORE = 3300, 300
+FRAMES, MORE = 1300, 200
 BENDING = moving(FRAMES + MORE, 1.2, 1, TWO_AND_TWO, rate_hz=100.0)
 
 
@@ -59,7 +60,7 @@ def opening(*, wanted: bool) -> list[Event]:
     table["mocap"] = table["mocap"] | {"up_axis": "z"}
     rig = parse_rig(table)
     assert rig.chain.sensors == TWO_AND_TWO.sensors
-    worn = replace(calibration(rig.chain, bodies=True))
+    worn = calibration(rig.chain, bodies=True)
     events: list[Event] = [Configured(BEGIN_NS, rig, worn, 3)]
     events += [SourceOpened(BEGIN_NS, source.id) for source in rig.sources]
     return events + core_feed.camera_hello(BEGIN_NS)
@@ -77,15 +78,18 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(core_feed, "orientation", orientation)
     monkeypatch.setattr(core_feed, "camera_bytes", camera_bytes)
     monkeypatch.setattr(online_learning, "ENOUGH", 260)
+    monkeypatch.setattr(online_learning, "EVERY_NS", 30_000_000)
+    monkeypatch.setattr(online_learning, "STILL_DOT", 2.0)
     monkeypatch.setattr(online_learning, "REST_NS", 100_000_000)
 
 
 async def answered(bench: Bench, job: FitJob) -> None:
-    """Have the worker do the job, and feed what it says, stamped as if it took no time."""
+    """Have the worker do the job, and feed what it says as if it had taken no time."""
     said: list[Event] = []
     async with asyncio.TaskGroup() as tasks:
         FitRunner(tasks, said.append).start(job)
     (event,) = said
+    assert isinstance(event, JobFinished)
     bench.feed([replace(event, t_ns=core_feed.arrival_ns(bench.fed[-1]))])
 
 

@@ -61,6 +61,7 @@ def test_the_difference_comes_within_a_second_and_never_at_once() -> None:
 @pytest.mark.parametrize("first", [False, True])
 def test_a_sensor_lost_in_the_same_moment_makes_no_jump_either(first: bool) -> None:
     fuser, plain = LimbFuser(CHAIN, calibration()), LimbFuser(CHAIN, calibration())
+    last = said(plain, 0)
     for k in range(10):
         said(fuser, k)
         last = said(plain, k)

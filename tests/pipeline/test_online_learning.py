@@ -189,7 +189,8 @@ def test_what_is_better_is_taken_told_and_stored_with_where_it_came_from() -> No
     assert status.quality["online"]["frames"] == 7
     (notice,) = only(out, Notice)
     assert "7 frames" in notice.text
-    assert models_only(calibration(), ready.calibration)
+    assert one.calibration is not None
+    assert models_only(calibration(), one.calibration)
     assert one.may_learn
 
 
