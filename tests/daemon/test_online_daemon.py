@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event
 
-FRAMES, MORE = 1300, 200
+FRAMES, MORE = 1615, 200
 BENDING = moving(FRAMES + MORE, 1.2, 1, TWO_AND_TWO, rate_hz=100.0)
 
 
@@ -77,7 +77,7 @@ def moved(first: int, last: int, *, cameras: bool = True) -> list[Event]:
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(core_feed, "orientation", orientation)
     monkeypatch.setattr(core_feed, "camera_bytes", camera_bytes)
-    monkeypatch.setattr(online_learning, "ENOUGH", 260)
+    monkeypatch.setattr(online_learning, "ENOUGH", 340)
     monkeypatch.setattr(online_learning, "EVERY_NS", 30_000_000)
     monkeypatch.setattr(online_learning, "STILL_DOT", 2.0)
     monkeypatch.setattr(online_learning, "REST_NS", 100_000_000)

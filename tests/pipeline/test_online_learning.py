@@ -166,7 +166,7 @@ def asked(one: CalibrationSession) -> FitJob:
 
 def better() -> dict[str, Any]:
     models = calibration().segment
-    swapped = {name: replace(item, models=dict(item.models)) for name, item in models.items()}
+    swapped = {name: replace(item, models={}) for name, item in models.items()}
     found = replace(calibration(), segment=swapped, quality={"online": {"frames": 7}}, memory="x")
     return {"calibration": found.to_dict(), "quality": dict(found.quality)}
 
