@@ -21,6 +21,7 @@ from jointfit_daemon.calibration.center.planar_estimate import (
     objection,
 )
 from jointfit_daemon.calibration.center.result import CenterEstimate
+from jointfit_daemon.calibration.center.sphere_solve import persistence
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -47,7 +48,8 @@ def geometric_estimate(
 
     with R_k the mean distance of marker k, or given. Several markers share the center; they gain
     much more than √k where they sit at different angles round the joint, because each one's weak
-    direction points elsewhere.
+    direction points elsewhere. Residuals of neighboring frames that are alike (correlation r at one
+    frame) widen the covariance by (1 + r)/(1 - r), as of the other circles.
 
     Parameters
     ----------
@@ -155,7 +157,9 @@ def _told(
     if not np.linalg.eigvalsh(H)[0] > 0.0:
         reason = "noise hides the arc: move the joint further, or bring the cameras closer"
         return nothing(METHOD, (float(c[0]), float(c[1])), frames, reason)
-    C = np.asarray(variance * np.linalg.inv(H))
+    alike = persistence(e, seen)  # of residuals from frame to frame: skin moves slowly
+    wider = (1.0 + alike) / (1.0 - alike)
+    C = np.asarray(wider * variance * np.linalg.inv(H))
     distance = np.linalg.norm(x - c, axis=-1)
     R = np.array([float(distance[s, k].mean()) if s.any() else 0.0 for k, s in enumerate(seen.T)])
     radius = float(np.median(R[R > 0.0]))
@@ -174,7 +178,7 @@ def _told(
         bound=sd,
         conditioning=T,
         frames=frames,
-        effective_frames=float(frames),
+        effective_frames=frames / wider,
         within95=ellipse_scale(float(count), T),
         refused=objection(radius, max(shown), T, sd, limits),
     )
