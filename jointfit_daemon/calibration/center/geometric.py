@@ -152,13 +152,12 @@ def _told(
     across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
         "tk,tka,tkb->ab", seen / u2**2, x - c, x - c
     )
-    H = H - variance * across
+    H -= variance * across
     frames = int(seen.any(axis=1).sum())
     if not np.linalg.eigvalsh(H)[0] > 0.0:
         reason = "noise hides the arc: move the joint further, or bring the cameras closer"
         return nothing(METHOD, (float(c[0]), float(c[1])), frames, reason)
-    alike = persistence(e, seen)  # of residuals from frame to frame: skin moves slowly
-    wider = (1.0 + alike) / (1.0 - alike)
+    wider = _wider(persistence(e, seen))
     C = np.asarray(wider * variance * np.linalg.inv(H))
     distance = np.linalg.norm(x - c, axis=-1)
     R = np.array([float(distance[s, k].mean()) if s.any() else 0.0 for k, s in enumerate(seen.T)])
@@ -182,6 +181,11 @@ def _told(
         within95=ellipse_scale(float(count), T),
         refused=objection(radius, max(shown), T, sd, limits),
     )
+
+
+def _wider(alike: float) -> float:
+    """Return by how much a correlation from frame to frame widens: skin moves slowly."""
+    return (1.0 + alike) / (1.0 - alike)
 
 
 def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
