@@ -144,8 +144,7 @@ def _told(
     free = 2 + (x.shape[1] if known is None else 0)
     # Huber's variance: mean of squared pull over squared share of points that pull freely
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
-    share = float((w[seen] >= 1.0).mean())
-    variance = pull / max(share, 0.1) ** 2
+    variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     H = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
     # noise turns directions, too: what it adds to H is no information
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
@@ -165,7 +164,7 @@ def _told(
     largest = float(np.linalg.eigvalsh(C)[-1])
     T = radius / sqrt(largest) if largest > 0.0 else inf
     shown = [arc_about(np.where(s[:, None], x[:, k], np.nan), c) for k, s in enumerate(seen.T)]
-    sd = float(np.sqrt(np.trace(C)))
+    sd = sqrt(float(np.trace(C)))
     return CenterEstimate(
         method=METHOD,
         center=c,
