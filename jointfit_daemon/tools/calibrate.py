@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 MISUSE, NOT_TAKEN = 2, 3
 LONGEST_S = 600.0
 ORDER = ("align", "static", "functional")
+AT_ONCE = {
+    "abort": "aborted; in force: ",
+    "unlearn": "what was learned while running is taken back; in force: ",
+}
 SAYS = {
     "align": "Fix all sensors on the plate and turn it by hand about all axes.",
     "static": "Put everything on. Stand still and upright.",
@@ -43,7 +47,7 @@ def calibrate(
     phase: Annotated[
         list[str] | None,
         typer.Option(
-            help="align, static, functional or abort; may be given several times. "
+            help="align, static, functional, abort or unlearn; may be given several times. "
             "Default: static, then functional where there is motion capture."
         ),
     ] = None,
@@ -67,9 +71,9 @@ def calibrate(
     from jointfit_daemon.outputs.mqtt_client import NoAnswer
     from jointfit_daemon.tools.calibration_guide import PhaseAborted, RequestRefused
 
-    wrong = [name for name in phase or () if name not in (*ORDER, "abort")]
+    wrong = [name for name in phase or () if name not in (*ORDER, *AT_ONCE)]
     if wrong:
-        typer.echo(f"--phase {wrong[0]}: expected one of {', '.join(ORDER)}, abort", err=True)
+        typer.echo(f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *AT_ONCE))}", err=True)
         raise typer.Exit(MISUSE)
     try:
         rig = load_rig(config)
@@ -136,8 +140,8 @@ async def _phase(
     answer = await client.request("calibrate", arguments)
     if answer.get("status") == "error":
         raise RequestRefused(str((answer.get("error") or {}).get("message")))
-    if name == "abort":
-        return {"text": "aborted; in force: " + str(answer.get("data", {}).get("phase"))}
+    if name in AT_ONCE:
+        return {"text": AT_ONCE[name] + str(answer.get("data", {}).get("phase"))}
     try:
         ended = await watch.ended(name)
     except asyncio.CancelledError:  # Ctrl-C: a phase that nobody leads must not run on
