@@ -21,7 +21,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -52,14 +52,7 @@ def segments(trial: KneeTrial) -> tuple[Segment, Segment]:
 
 def fit(method: str, trials: Sequence[KneeTrial]) -> Predict:
     """Return the method, trained; what it returns gives both orientations, shape (n, 4) each."""
-    labels = np.repeat(np.arange(len(trials)), [len(trial) for trial in trials])
-    fitted = []
-    for parts in zip(*(segments(trial) for trial in trials), strict=True):
-        sensors = [np.concatenate([part.sensors[i] for part in parts]) for i in (0, 1)]
-        other = np.concatenate([part.other for part in parts])
-        bone = np.concatenate([part.bone for part in parts])
-        fitted.append(_segment(method, SegmentTraining.of(sensors, other, bone, labels)))
-    first, second = fitted
+    first, second = (_segment(method, training) for training in _training(trials))
 
     def predict(trial: KneeTrial) -> tuple[Array, Array]:
         thigh, shank = segments(trial)
@@ -70,14 +63,17 @@ def fit(method: str, trials: Sequence[KneeTrial]) -> Predict:
 
 def models(trials: Sequence[KneeTrial], method: str = "anchored") -> tuple[SegmentModel, ...]:
     """Return the segment models of a method that has some, thigh and shank."""
+    return tuple(_model(method, training) for training in _training(trials))
+
+
+def _training(trials: Sequence[KneeTrial]) -> Iterator[SegmentTraining]:
+    """Give thigh's and shank's frames of all trials, one trial after the other."""
     labels = np.repeat(np.arange(len(trials)), [len(trial) for trial in trials])
-    found = []
     for parts in zip(*(segments(trial) for trial in trials), strict=True):
         sensors = [np.concatenate([part.sensors[i] for part in parts]) for i in (0, 1)]
         other = np.concatenate([part.other for part in parts])
         bone = np.concatenate([part.bone for part in parts])
-        found.append(_model(method, SegmentTraining.of(sensors, other, bone, labels)))
-    return tuple(found)
+        yield SegmentTraining.of(sensors, other, bone, labels)
 
 
 def axis_deviations(model: SegmentModel, segment: Segment) -> Array:
