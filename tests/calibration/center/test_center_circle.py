@@ -13,6 +13,7 @@ from scipy.linalg import eig
 from scipy.stats import f, norm
 
 from jointfit_daemon.calibration.center.circle import fit_circle, fit_circles, persistence
+from jointfit_daemon.calibration.center.geometric import geometric_estimate
 from jointfit_daemon.calibration.center.moments import (
     GATE,
     ellipse_scale,
@@ -220,9 +221,11 @@ def test_correlated_residuals_widen_the_claim() -> None:
     for k in range(1, 400):
         wander[k] = 0.9 * wander[k - 1] + rng.normal(0, 0.001, 2)
     p = swing(noise=0.0) + wander
-    found, plain = circle_estimate(p), circle_estimate(rng.permutation(p))
-    assert found.effective_frames < 100
-    assert found.sd > 2.0 * plain.sd
+    shuffled = rng.permutation(p)
+    for estimate in (circle_estimate, geometric_estimate):
+        found, plain = estimate(p), estimate(shuffled)
+        assert found.effective_frames < 100
+        assert found.sd > 2.0 * plain.sd
     assert persistence(np.array([nan, -1.0, 0.5])) == pytest.approx([1.0, 1.0, 3.0])
 
 
