@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.config.checks import drifting, headings
-from jointfit_daemon.fusion import LimbFuser, OpticalOrigin, SensorWatch
+from jointfit_daemon.fusion import LimbFuser, SensorWatch
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline.bulletin import Bulletin, unix_time_set
+from jointfit_daemon.pipeline.camera_use import CameraUse
 from jointfit_daemon.pipeline.events import (
     CalibrationStored,
     ChunkArrived,
@@ -27,6 +28,7 @@ from jointfit_daemon.pipeline.events import (
     Tick,
     UnixOffset,
 )
+from jointfit_daemon.pipeline.frame_grid import FrameGrid
 from jointfit_daemon.pipeline.health import health_of
 from jointfit_daemon.pipeline.lag_watch import LagWatch, known_lags
 from jointfit_daemon.pipeline.learned import models_only
@@ -35,24 +37,20 @@ from jointfit_daemon.pipeline.sensor_notices import sensor_notices
 from jointfit_daemon.pipeline.session import CalibrationSession
 from jointfit_daemon.pipeline.source import SourceState, Stamped
 from jointfit_daemon.pipeline.sync_lines import SyncLines
-from jointfit_daemon.timing.align import FrameAligner, StreamSpec
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.model import LimbState, Vector
+    from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event, Output
-    from jointfit_daemon.timing.align import AlignedFrame
+    from jointfit_daemon.timing.align import AlignedFrame, FrameAligner
     from jointfit_daemon.timing.clock import Stamp
 
-_NS = 1_000_000_000
 _CLOSED: dict[str, Literal["info", "warning", "error"]] = {
     "removed": "info",
     "lost": "warning",
     "misconfigured": "error",
 }
-MOCAP_FRESH_NS = 200_000_000
-"""A rig whose cameras gave a live frame within this time runs in mode ``imu+mocap``."""
 
 
 class Core:
@@ -69,18 +67,13 @@ class Core:
         self._unix_offset_ns: int | None = None
         self._now_ns = 0
         self._seq = 0
-        self._verdicts: dict[str, dict[str, int]] = {}
-        """Counts of aligners that a reload replaced."""
-        self._mocap_ns: int | None = None
-        self._mocap_used = self._mocap_idle = 0
+        self._cameras = CameraUse()
         self._bulletin = Bulletin()
         self._session: CalibrationSession
+        self._grid: FrameGrid | None = None
         self._aligner: FrameAligner
-        self._aligned: tuple[str, ...] = ()
         self._fuser: LimbFuser
         self._watch: SensorWatch | None = None
-        self._optical_origin: OpticalOrigin | None = None
-        self._origin: Vector | None = None
         self._lag_ns: dict[str, int] = {}
         self._lags: LagWatch | None = None
         self._learner: OnlineLearner
@@ -124,20 +117,14 @@ class Core:
 
     def health(self, now_ns: int) -> dict[str, object]:
         """Return counters and clocks of every device: the part of ``bridge/health`` known here."""
-        if self._rig is None:
+        if self._grid is None:
             return {"devices": {}, "frames": {}, "calibration": {}}
-        mocap = {"used": self._mocap_used, "idle": self._mocap_idle}
-        verdicts = {"mocap": mocap} | {name: self._counts(name) for name in self._aligned}
+        verdicts = {"mocap": self._cameras.verdicts()} | self._grid.verdicts()
         lags = {} if self._lags is None else self._lags.health()
         return health_of(self._sources, verdicts, self._session, self._fuser, now_ns) | {
             "lags": lags,
             "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames},
         }
-
-    def _counts(self, name: str) -> dict[str, int]:
-        """Return the verdicts on a sensor's samples since the daemon started."""
-        counts = self._aligner.counts(name)
-        return {key: n + self._verdicts.get(name, {}).get(key, 0) for key, n in counts.items()}
 
     # --- configuration -----------------------------------------------------------------------
 
@@ -155,15 +142,18 @@ class Core:
         }
         self._tell_unix_offset()
         if all(source.kind != "mocap" for source in rig.sources):
-            self._mocap_used = self._mocap_idle = 0
+            self._cameras.begin_again()
         outputs: list[Output] = []
         session = _session(event)
         if before is not None:
             outputs += self._session.abort(event.t_ns, "the rig was reloaded")
             outputs.append(Notice(event.t_ns, "reload", rig.name, "configuration reloaded"))
             session.take_over(self._session, same_rig=_worn(before) == _worn(rig))
-        if before is None or _frame_layout(before) != _frame_layout(rig):
-            self._replace_aligner(rig)
+        if self._grid is None:
+            self._grid = FrameGrid(rig)
+        else:
+            self._grid.follow(rig)
+        self._aligner = self._grid.aligner
         if before is None or before.chain != rig.chain:
             self._watch = SensorWatch(rig.chain)
         self._session = session
@@ -173,26 +163,14 @@ class Core:
         text = "stored calibration loaded" if event.calibration else "no calibration stored yet"
         return [*outputs, session.status(event.t_ns, text)]
 
-    def _replace_aligner(self, rig: Rig) -> None:
-        """Begin a new grid of frames; samples that waited get their verdict, counts go on."""
-        if self._aligned:
-            self._aligner.close()
-        known = {name: self._counts(name) for name in self._aligned}
-        self._aligner = _aligner(rig)
-        self._aligned = tuple(source.id for source in rig.sources if source.kind == "imu")
-        # one that is gone takes its counts along: it may come back, and begins at nothing then
-        self._verdicts = {name: known[name] for name in self._aligned if name in known}
-
     def _use_calibration(self) -> None:
         rig, calibration = self._rig, self._session.calibration
         if rig is not None:
             self._fuser = LimbFuser(rig.chain, calibration, self._watch, drifting(rig.sources))
-            self._optical_origin, self._origin = None, None
             worn = calibration if calibration and calibration.fits(rig.chain) else None
             self._lags = LagWatch(rig.chain, worn, self._lags, known_lags(rig))
             self._session.lags = self._lags
-            if worn:
-                self._optical_origin = OpticalOrigin(rig.chain, worn)
+            self._cameras.wear(rig.chain, worn)
             self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
             self._lag_ns |= self._lags.known_ns()
             self._learner = OnlineLearner(rig.chain, worn, wanted=rig.calibration.learn_online)
@@ -289,24 +267,7 @@ class Core:
         return []
 
     def _mocap_frame(self, item: Stamped) -> None:
-        frame = item.measurement
-        if isinstance(frame, ImuSample):
-            return
-        if frame.live:
-            self._mocap_ns = self._now_ns
-            if self._lags is not None and item.stamp.synced:
-                self._lags.add_mocap(item.stamp.t_ns, frame, item.stamp.epoch)
-                self._learner.add_mocap(item.stamp.t_ns, frame, item.stamp.epoch)
-        wanted = frame.live and self._session.collecting
-        if wanted:
-            self._session.add_mocap(item.stamp.t_ns, frame)
-        if frame.live and self._optical_origin is not None:
-            wanted = True
-            self._origin = self._optical_origin.locate(frame)
-        if wanted:
-            self._mocap_used += 1
-        else:
-            self._mocap_idle += 1
+        self._cameras.take(self._now_ns, item, self._session, self._lags, self._learner)
 
     # --- time --------------------------------------------------------------------------------
 
@@ -329,14 +290,14 @@ class Core:
 
     def _fuse(self, frame: AlignedFrame) -> LimbState:
         self._seq += 1
-        fresh = self._mocap_ns is not None and self._now_ns - self._mocap_ns < MOCAP_FRESH_NS
+        fresh = self._cameras.fresh(self._now_ns)
         state = self._fuser.fuse(
             frame.t_ns,
             frame.completed_ns,
             self._seq,
             frame.orientations,
             extrapolated=frame.extrapolated,
-            optical_origin=self._origin if fresh else None,
+            optical_origin=self._cameras.origin if fresh else None,
             sync="locked" if frame.synced else "settling",
             mode="imu+mocap" if fresh else "imu",
         )
@@ -384,17 +345,3 @@ def _session(event: Configured) -> CalibrationSession:
 def _worn(rig: Rig) -> tuple[object, ...]:
     """Return all that a pose or an alignment taken before a reload depends on."""
     return rig.chain, rig.calibration, rig.sources
-
-
-def _frame_layout(rig: Rig) -> tuple[object, ...]:
-    imus = tuple((s.id, s.rate_hz) for s in rig.sources if s.kind == "imu")
-    return rig.output_rate_hz, rig.align_mode, imus
-
-
-def _aligner(rig: Rig) -> FrameAligner:
-    streams = {
-        source.id: StreamSpec(round(_NS / source.rate_hz))
-        for source in rig.sources
-        if source.kind == "imu"
-    }
-    return FrameAligner(streams, round(_NS / rig.output_rate_hz), mode=rig.align_mode)
