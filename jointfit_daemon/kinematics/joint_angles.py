@@ -54,7 +54,7 @@ def patent_angles(q_joint: ArrayLike) -> AngleSequence:
               \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
 
     The patent's joint angle is pi - abs(alpha), which is right only for pure flexion about x:
-    ``inner_angle`` is the one to publish.
+    ``inner_angle`` is right for all. One frame of plain tuples: ``read_patent``.
     """
     w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
     alpha = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -231,6 +231,35 @@ def read_joint(
     side = -1.0 if left else 1.0
     angles = JointAngles(flexion_sign * phi, side * theta, side * psi)
     return JointReading(angles, pi - atan2(hypot(r02, minus_r12), r22), gimbal)
+
+
+class PatentReading(NamedTuple):
+    """A joint's angles as the patent has them, in one frame; see ``patent_angles``."""
+
+    alpha: float
+    """rad, about x."""
+    beta: float
+    """rad, about y."""
+    gamma: float
+    """rad, about z; 0 where it cannot be told from alpha."""
+    joint: float
+    """pi - abs(alpha), rad: the patent's joint angle."""
+    gimbal: bool
+    """Whether beta is so near 90 degrees that alpha took all of the turn."""
+
+
+def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
+    """Return the patent's angles of one frame of plain tuples: those of ``patent_angles``."""
+    w, x, y, z = between_one(q_proximal, q_distal)
+    sine = 2.0 * (w * y - z * x)
+    gimbal = abs(sine) > GIMBAL_SINE
+    if gimbal:
+        alpha, gamma = _wrapped_one(2.0 * atan2(x, w)), 0.0
+    else:
+        alpha = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        gamma = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    beta = asin(min(max(sine, -1.0), 1.0))
+    return PatentReading(alpha, beta, gamma, pi - abs(alpha), gimbal)
 
 
 def _wrapped(angle: Array) -> Array:

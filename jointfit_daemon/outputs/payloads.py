@@ -11,15 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import orjson
 
+from jointfit_daemon.kinematics.joint_angles import read_patent
 from jointfit_daemon.outputs.mqtt import PAYLOAD_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from jointfit_daemon.model import JointState, LimbState, SegmentState
+    from jointfit_daemon.model import LimbState, SegmentState
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_NON_STR_KEYS
 _NS_PER_US, _NS_PER_MS = 1_000, 1_000_000
+_DEGREES = 180.0 / math.pi
+_NO_ANGLES = (None, None, None)
+_NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
+    ("alpha_deg", "beta_deg", "gamma_deg", "joint_deg", "gimbal")
+)
 
 
 def encode(payload: Mapping[str, Any]) -> bytes:
@@ -51,22 +57,30 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
             "sync": state.sync,
             "flags": state.flags,
             "segments": {segment.name: _segment(segment) for segment in state.segments},
-            "joints": {
-                joint.name: _joint(joint, inner=0 < i < len(state.joints) - 1)
-                for i, joint in enumerate(state.joints)
-            },
+            "joints": {joint.name: _joint(state, i) for i, joint in enumerate(state.joints)},
         }
     )
 
 
-def encode_joint(joint: JointState, t_us: int, *, inner: bool = False) -> bytes:
+def encode_joint(state: LimbState, number: int, t_us: int) -> bytes:
     """Return the payload of ``joint/NAME``: scalars only, for plain dashboards.
 
-    A joint between two segments (`inner`) has angles even while they are unknown.
+    Parameters
+    ----------
+    state
+        One frame.
+    number
+        Of the joint in it; one between two segments has angles even while they are unknown.
+    t_us
+        UNIX time of the frame.
     """
-    scalars: dict[str, Any] = {"v": PAYLOAD_VERSION, "t_us": t_us, **_joint(joint, inner=inner)}
+    scalars = _joint(state, number)
     position = scalars.pop("p_m") or (None, None, None)
-    return encode(scalars | dict(zip(("x_m", "y_m", "z_m"), position, strict=True)))
+    if "patent" in scalars:
+        patent = scalars.pop("patent") or _NO_PATENT
+        scalars |= {f"patent_{key}": value for key, value in patent.items()}
+    scalars |= zip(("x_m", "y_m", "z_m"), position, strict=True)
+    return encode({"v": PAYLOAD_VERSION, "t_us": t_us} | scalars)
 
 
 def _segment(segment: SegmentState) -> dict[str, Any]:
@@ -77,15 +91,17 @@ def _segment(segment: SegmentState) -> dict[str, Any]:
     }
 
 
-def _joint(joint: JointState, *, inner: bool) -> dict[str, Any]:
+def _joint(state: LimbState, number: int) -> dict[str, Any]:
+    joint = state.joints[number]
     shown: dict[str, Any] = {
         "p_m": _rounded(joint.position, 4),
         "sd_m": None if joint.position_sd is None else round(joint.position_sd, 4),
     }
-    if not inner and joint.angles is None and joint.inner is None:
+    inner = 0 < number < len(state.joints) - 1
+    if not inner and joint.angles is None:
         return shown  # an end of the chain has no angles
-    flexion, adduction, rotation = joint.angles or (None, None, None)
-    rates = joint.rates or (None, None, None)
+    flexion, adduction, rotation = joint.angles or _NO_ANGLES
+    rates = joint.rates or _NO_ANGLES
     return shown | {
         "flexion_deg": _degrees(flexion),
         "adduction_deg": _degrees(adduction),
@@ -95,11 +111,32 @@ def _joint(joint: JointState, *, inner: bool) -> dict[str, Any]:
         "flexion_deg_s": _degrees(rates[0]),
         "adduction_deg_s": _degrees(rates[1]),
         "rotation_deg_s": _degrees(rates[2]),
+        "patent": _patent(state, number) if inner else None,
+    }
+
+
+def _patent(state: LimbState, number: int) -> dict[str, float | bool | None] | None:
+    """Return the patent's angles of a joint; None while one of its segments is not known."""
+    if number >= len(state.segments):
+        return None
+    above, below = (
+        state.segments[number - 1].q_world_segment,
+        state.segments[number].q_world_segment,
+    )
+    if above is None or below is None:
+        return None
+    alpha, beta, gamma, joint, gimbal = read_patent(above, below)
+    return {
+        "alpha_deg": round(alpha * _DEGREES, 2),
+        "beta_deg": round(beta * _DEGREES, 2),
+        "gamma_deg": round(gamma * _DEGREES, 2),
+        "joint_deg": round(joint * _DEGREES, 2),
+        "gimbal": gimbal,
     }
 
 
 def _degrees(angle: float | None) -> float | None:
-    return None if angle is None else round(math.degrees(angle), 2)
+    return None if angle is None else round(angle * _DEGREES, 2)
 
 
 def _rounded(values: Iterable[float] | None, digits: int) -> list[float] | None:

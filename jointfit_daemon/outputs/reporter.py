@@ -110,8 +110,7 @@ class Reporter:
         if self._joints.due(state.t_ns):
             t_us = (state.t_ns + offset_ns) // 1000
             for i, joint in enumerate(state.joints):
-                inner = 0 < i < len(state.joints) - 1
-                payload = encode_joint(joint, t_us, inner=inner)
+                payload = encode_joint(state, i, t_us)
                 self._outbox.stream(f"{self._base}/joint/{joint.name}", payload)
 
     def event(self, notice: Notice, level: str | None = None) -> None:

@@ -53,5 +53,5 @@ def test_a_knee_that_is_unknown_keeps_its_keys_and_a_hip_has_none() -> None:
     nothing = {"p_m": None, "sd_m": None}
     names = ("flexion", "adduction", "rotation")
     keys = [*(f"{name}_deg" for name in (*names, "inner", "sd")), *(f"{n}_deg_s" for n in names)]
-    angles = dict.fromkeys(keys, None)
+    angles = dict.fromkeys([*keys, "patent"], None)
     assert joints == {"hip": nothing, "knee": nothing | angles, "ankle": nothing}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import orjson
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import JointAngles, JointState, LimbState, SegmentState
@@ -55,6 +57,17 @@ STATE = LimbState(
 )
 
 
+def bent(alpha_deg: float, beta_deg: float, gamma_deg: float) -> LimbState:
+    """Return the state with a shank turned against the thigh by Rz(gamma) Ry(beta) Rx(alpha)."""
+    turn = Rotation.from_euler("ZYX", [gamma_deg, beta_deg, alpha_deg], degrees=True)
+    thigh = Rotation.from_quat([0.0094, -0.0251, 0.1276, 0.9914])
+    q = [tuple(r.as_quat(scalar_first=True).tolist()) for r in (thigh, thigh * turn)]
+    segments = tuple(
+        replace(one, q_world_segment=turned) for one, turned in zip(STATE.segments, q, strict=True)
+    )
+    return replace(STATE, segments=segments)
+
+
 def test_a_pose_is_this_text() -> None:
     pose = encode_pose(STATE, 1_795_250_055_351_700_000, 5_007_523_000)
     assert json.loads(pose) == {
@@ -84,6 +97,7 @@ def test_a_pose_is_this_text() -> None:
                 "flexion_deg_s": 120.0,
                 "adduction_deg_s": -3.0,
                 "rotation_deg_s": 0.0,
+                "patent": None,  # the shank is unknown
             },
             "ankle": {"p_m": None, "sd_m": None},
         },
@@ -91,15 +105,43 @@ def test_a_pose_is_this_text() -> None:
 
 
 def test_a_joint_is_scalars_only() -> None:
-    assert json.loads(encode_joint(KNEE, 7)) == {
+    assert json.loads(encode_joint(bent(-30.0, 0.0, 0.0), 1, 7)) == {
         "v": 1, "t_us": 7, "x_m": 0.021, "y_m": 0.104, "z_m": 0.481, "sd_m": 0.0051,
         "flexion_deg": 28.31, "adduction_deg": -1.92, "rotation_deg": 3.4, "inner_deg": 151.7,
         "sd_deg": 1.4, "flexion_deg_s": 120.0, "adduction_deg_s": -3.0, "rotation_deg_s": 0.0,
+        "patent_alpha_deg": -30.0, "patent_beta_deg": 0.0, "patent_gamma_deg": 0.0,
+        "patent_joint_deg": 150.0, "patent_gimbal": False,
+    }  # fmt: skip
+
+
+def test_a_joint_keeps_its_keys_while_its_angles_are_unknown() -> None:
+    known = json.loads(encode_joint(bent(-30.0, 0.0, 0.0), 1, 7))
+    unknown = json.loads(encode_joint(STATE, 1, 7))
+    assert list(known) == list(unknown)
+    assert [key for key, value in unknown.items() if value is None] == [
+        "patent_alpha_deg", "patent_beta_deg", "patent_gamma_deg", "patent_joint_deg",
+        "patent_gimbal",
+    ]  # fmt: skip
+
+
+def test_the_patents_angles_stand_beside_ours() -> None:
+    joints = json.loads(encode_pose(bent(-50.0, 12.0, 7.0), 0, 0))["joints"]
+    assert joints["knee"]["patent"] == {
+        "alpha_deg": -50.0, "beta_deg": 12.0, "gamma_deg": 7.0, "joint_deg": 130.0, "gimbal": False,
+    }  # fmt: skip
+    assert "patent" not in joints["hip"]
+    assert "patent" not in joints["ankle"]
+
+
+def test_where_the_patents_outer_angles_lock_alpha_takes_all_and_the_block_says_so() -> None:
+    found = json.loads(encode_pose(bent(-20.0, 90.0, 15.0), 0, 0))["joints"]["knee"]["patent"]
+    assert found == {
+        "alpha_deg": -35.0, "beta_deg": 90.0, "gamma_deg": 0.0, "joint_deg": 145.0, "gimbal": True,
     }  # fmt: skip
 
 
 def test_an_unknown_joint_is_null_not_zero() -> None:
-    assert json.loads(encode_joint(JointState("ankle", None, None), 7)) == {
+    assert json.loads(encode_joint(STATE, 2, 7)) == {
         "v": 1, "t_us": 7, "x_m": None, "y_m": None, "z_m": None, "sd_m": None,
     }  # fmt: skip
 

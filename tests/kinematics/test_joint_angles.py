@@ -22,6 +22,7 @@ from jointfit_daemon.kinematics.joint_angles import (
     patent_angles,
     rates_matrix,
     read_joint,
+    read_patent,
     swing_twist,
 )
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 DEG = math.pi / 180.0
+LOCKED = np.array([[0.4, math.pi / 2, 0.9], [-0.4, -math.pi / 2, 0.2], [0.1, math.pi / 2, 3.0]])
+"""z, y, x: where the patent's outer angles turn about one line."""
 
 
 def random_rotations(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -126,6 +129,19 @@ def test_one_frame_reads_as_the_arrays_do(left: bool) -> None:
         )
         assert one.angles == pytest.approx(tuple(expected[i]), abs=1e-12)
         assert one.inner == pytest.approx(float(inner_angle(q[i])), abs=1e-12)
+
+
+def test_one_frame_reads_the_patents_angles_as_the_arrays_do() -> None:
+    proximal = random_rotations(300, 1)
+    turns = np.vstack((random_rotations(297, 2), from_sequence("ZYX", LOCKED)))
+    distal = rot.multiply(proximal, turns)
+    expected = patent_angles(joint_rotation(proximal, distal))
+    assert expected.gimbal.sum() == len(LOCKED)
+    for i in range(300):
+        one = read_patent(as_quaternion(proximal[i]), as_quaternion(distal[i]))
+        assert one[:3] == pytest.approx(tuple(expected.angles[i]), abs=1e-9)
+        assert one.joint == pytest.approx(math.pi - abs(expected.angles[i, 0]), abs=1e-9)
+        assert one.gimbal == expected.gimbal[i]
 
 
 def test_swing_and_twist_make_the_rotation_and_swing_does_not_twist() -> None:
