@@ -72,7 +72,7 @@ def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
 
 def _figure(figures: Mapping[str, Any], name: str, method: str) -> float | None:
     value = figures.get(name, {}).get(method)
-    return None if value is None else float(value)
+    return float(value) if isinstance(value, int | float) else None
 
 
 def _worse_joints(new: Calibration, old: Calibration) -> list[str]:

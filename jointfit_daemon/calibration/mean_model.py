@@ -73,6 +73,22 @@ def plain_mean(training: SegmentTraining) -> MeanModel:
     return MeanModel(weights, float(np.sqrt(np.mean(angles**2) / 3.0)))
 
 
+def best_single(training: SegmentTraining) -> MeanModel:
+    """Return the sensor that is nearest to the reference in training, alone: weight 1, others 0."""
+
+    def best(part: SegmentTraining) -> int:
+        errors = [rotation.angle_between(q, part.q_reference) for q in part.sensors]
+        return int(np.argmin([np.mean(error**2) for error in errors]))
+
+    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
+        chosen = best(part)
+        return lambda test: test.sensors[chosen]
+
+    chosen = best(training)
+    weights = tuple(float(k == chosen) for k in range(len(training.sensors)))
+    return MeanModel(weights, cross_validated_sd(training, fit))
+
+
 def fit_mean(training: SegmentTraining) -> MeanModel:
     """Return the mean weighted by each sensor's own error against the reference."""
 

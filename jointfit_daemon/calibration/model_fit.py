@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from jointfit_daemon.calibration.anatomy import flexion_sign
 from jointfit_daemon.calibration.redundancy import SegmentModel, fit_segment
 from jointfit_daemon.calibration.result import alive_key
+from jointfit_daemon.calibration.trial import Method
 from jointfit_daemon.calibration.weighted_mean import fuse
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.model import Chain
 
 Array = NDArray[np.float64]
 
-METHODS: tuple[Method, ...] = ("anchored", "patent12", "patent6", "mean")
+METHODS: tuple[Method, ...] = get_args(Method)
 MAX_SUBSET_SENSORS = 3
 """With more sensors on a segment only all, all but one and each alone are trained."""
 
@@ -80,7 +80,7 @@ def fit_models(
 ) -> dict[str, dict[str, SegmentModel]]:
     """Fit, per segment, a model for every alive set with every one of its neighbor, and without.
 
-    Without the neighbor only the weighted mean is possible for ``anchored``; the patent's methods
+    Without the neighbor only the weighted mean is possible for ``anchored``; the other methods
     never look at it, so each alive set has one model under every key.
     """
     out: dict[str, dict[str, SegmentModel]] = {}
@@ -107,14 +107,14 @@ def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
     -------
     dict
         ``frames``, ``share``; ``segments``: per segment and method the RMS orientation error, rad,
-        and under ``single`` that of each sensor; ``flexion``: the same per inner joint.
+        and under ``sensors`` that of each alone; ``flexion``: the same per inner joint.
     """
     cut = round(len(training) * (1.0 - share))
     first, last = training.part(slice(None, cut)), training.part(slice(cut, None))
     said: dict[str, dict[str, Array]] = {}
     for method in METHODS:
         said[method] = {
-            segment: _all_alive(chain, i, method, first, last)
+            segment: all_alive(chain, i, method, first, last)
             for i, segment in enumerate(chain.segments)
         }
     return {
@@ -123,7 +123,7 @@ def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
         "segments": {
             segment: {
                 **{m: _rms_angle(said[m][segment], last.reference[segment]) for m in METHODS},
-                "single": {
+                "sensors": {
                     s: _rms_angle(last.sensors[s], last.reference[segment])
                     for s in chain.sensors[i]
                 },
@@ -134,9 +134,10 @@ def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
     }
 
 
-def _all_alive(
+def all_alive(
     chain: Chain, i: int, method: Method, first: LimbTraining, last: LimbTraining
 ) -> Array:
+    """Return what one segment's model for all sensors, fitted to `first`, says of `last`."""
     segment, sensors = chain.segments[i], chain.sensors[i]
     near = neighbor(chain, i)
     model = fit_segment(
@@ -165,7 +166,7 @@ def _flexions(
         out[joint] = {
             m: _rms_wrapped(sign * flexion(said[m][above], said[m][below]) - truth) for m in METHODS
         }
-        out[joint]["single"] = {
+        out[joint]["sensors"] = {
             f"{a}+{b}": _rms_wrapped(sign * flexion(last.sensors[a], last.sensors[b]) - truth)
             for a, b in zip(chain.sensors[i], chain.sensors[i + 1], strict=False)
         }

@@ -14,17 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.anatomy import flexion_sign
-from jointfit_daemon.calibration.model_fit import METHODS, alive_sets, neighbor
-from jointfit_daemon.calibration.mount import fit_alignment
-from jointfit_daemon.calibration.redundancy import fit_segment
+from jointfit_daemon.calibration.markers import visible
+from jointfit_daemon.calibration.model_fit import (
+    METHODS,
+    LimbTraining,
+    all_alive,
+    fit_models,
+    neighbor,
+)
+from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.result import (
     Calibration,
     JointCalibration,
     SegmentCalibration,
     SensorCalibration,
-    alive_key,
     quaternion,
 )
+from jointfit_daemon.calibration.segment_model import FEWEST_FRAMES
 from jointfit_daemon.calibration.sensor_links import fit_links
 from jointfit_daemon.calibration.static import RobustMean, static_bias
 from jointfit_daemon.kinematics import rotation
@@ -33,18 +39,15 @@ from jointfit_daemon.kinematics.joint_angles import functional_axis, joint_rotat
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from jointfit_daemon.calibration.segment_model import SegmentModel
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.model import Chain
 
 Array = NDArray[np.float64]
 
+COMPARED: tuple[Method, ...] = tuple(method for method in METHODS if method != "single")
+"""Beside each sensor alone, of which ``single`` would be one again."""
 MAX_TRAINING_FRAMES = 2000
 """Of one trial; of a longer one every n-th frame is taken."""
-MISALIGNED = np.deg2rad(25.0)
-"""A heading that differs by more is no matter of skin."""
-HEADING_SEPARABLE = 0.98
-"""Above this ratio of singular values heading and mount cannot be told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +80,7 @@ class Judged:
     method: str
     """A method of `METHODS`, or ``single S1+S3``: the first sensor of each segment alone."""
     frames: int
+    """That judged: all sensors and the reference were there."""
     segments: Mapping[str, float]
     """RMS angle to the reference, rad."""
     joints: Mapping[str, float]
@@ -92,6 +96,8 @@ class Judgement:
     rows: tuple[Judged, ...]
     reference: Mapping[str, Mapping[str, Array]]
     """Flexion by the reference, rad: by trial, then joint."""
+    t_s: Mapping[str, Array]
+    """Instants of all that was judged, by trial, s."""
     held_out: str
     """What was left out, in words."""
 
@@ -131,10 +137,12 @@ def fit_offline(
 
     Raises
     ------
-    ValueError
-        Fewer than 30 complete frames.
+    CalibrationRefused
+        Fewer than 30 complete frames of a segment.
     """
-    training = _Training.of(chain, trials, mounts)
+    training = _training(chain, trials, mounts)
+    _refuse_few(chain, training, "what is fitted to")
+    models = fit_models(chain, training, method)
     return Calibration(
         method=method,
         joints=chain.joints,
@@ -149,9 +157,9 @@ def fit_offline(
         },
         segment={
             segment: SegmentCalibration(
-                quaternion(rotation.IDENTITY.tolist()), None, None, training.models(i, method)
+                quaternion(rotation.IDENTITY.tolist()), None, None, models[segment]
             )
-            for i, segment in enumerate(chain.segments)
+            for segment in chain.segments
         },
         joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
         notes=notes,
@@ -167,7 +175,7 @@ def evaluate(
     trials: Sequence[OfflineTrial],
     mounts: Mapping[str, Array] | None = None,
     *,
-    methods: Sequence[Method] = METHODS,
+    methods: Sequence[Method] = COMPARED,
     holdout: float = 0.4,
 ) -> Judgement:
     """Judge every method where it was not fitted: leave one trial out, or the end of the only one.
@@ -178,6 +186,11 @@ def evaluate(
         ``q_sensor_segment`` per sensor; None: from the reference of the training part.
     holdout : float
         Share of a single trial that judges.
+
+    Raises
+    ------
+    CalibrationRefused
+        Fewer than 30 complete frames of a segment, of those that are fitted to or that judge.
     """
     if len(trials) == 1:
         cut = round(len(trials[0].t_s) * (1.0 - holdout))
@@ -187,84 +200,54 @@ def evaluate(
         folds = [([t for t in trials if t is not left], left) for left in trials]
         said = "one trial after the other, fitted to the others"
     rows: list[Judged] = []
-    reference = {}
+    reference, t_s = {}, {}
     for training, test in folds:
         judge = _Judge.of(chain, training, test, mounts)
         rows += judge.singles()
         rows += [judge.method(method) for method in reversed(methods)]
-        reference[test.name] = judge.truth
-    return Judgement(tuple(rows), reference, said)
+        reference[test.name], t_s[test.name] = judge.truth, test.t_s
+    return Judgement(tuple(rows), reference, t_s, said)
 
 
-def turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> dict[str, float]:
-    """Return sensors whose world is turned about the vertical against the reference's, rad.
+def _training(
+    chain: Chain, trials: Sequence[OfflineTrial], mounts: Mapping[str, Array]
+) -> LimbTraining:
+    """Return bone-aligned frames of several trials, one after the other."""
+    thin = [t.part(slice(None, None, -(-len(t.t_s) // MAX_TRAINING_FRAMES))) for t in trials]
+    return LimbTraining(
+        {
+            name: np.concatenate([rotation.multiply(t.sensors[name], mount) for t in thin])
+            for name, mount in mounts.items()
+        },
+        {s: np.concatenate([t.reference[s] for t in thin]) for s in chain.segments},
+        np.repeat(np.arange(len(thin)), [len(t.t_s) for t in thin]),
+    )
 
-    Only clear cases: the movement must tell heading and mount apart.
-    """
-    found = {}
+
+def _refuse_few(chain: Chain, frames: LimbTraining, what: str) -> None:
+    """Refuse what no fit or judgement can be made of, segment by segment."""
     for i, segment in enumerate(chain.segments):
-        reference = np.concatenate([trial.reference[segment] for trial in trials])
-        for sensor in chain.sensors[i]:
-            q = np.concatenate([trial.sensors[sensor] for trial in trials])
-            alignment = fit_alignment("heading", q, reference)
-            angle = float(rotation.heading_of(alignment.q_world))
-            if alignment.kappa <= HEADING_SEPARABLE and abs(angle) > MISALIGNED:
-                found[sensor] = angle
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class _Training:
-    """Bone-aligned frames of several trials, one after the other."""
-
-    chain: Chain
-    sensors: Mapping[str, Array]
-    reference: Mapping[str, Array]
-    labels: NDArray[np.int64]
-
-    @staticmethod
-    def of(chain: Chain, trials: Sequence[OfflineTrial], mounts: Mapping[str, Array]) -> _Training:
-        thin = [t.part(slice(None, None, -(-len(t.t_s) // MAX_TRAINING_FRAMES))) for t in trials]
-        return _Training(
-            chain,
-            {
-                name: np.concatenate([rotation.multiply(t.sensors[name], mount) for t in thin])
-                for name, mount in mounts.items()
-            },
-            {s: np.concatenate([t.reference[s] for t in thin]) for s in chain.segments},
-            np.repeat(np.arange(len(thin)), [len(t.t_s) for t in thin]),
-        )
-
-    def model(
-        self, i: int, method: Method, alive: Sequence[str], other: str | None
-    ) -> SegmentModel:
-        """Fit one model of segment `i`."""
-        return fit_segment(
-            method,
-            [self.sensors[name] for name in alive],
-            None if other is None else self.sensors[other],
-            self.reference[self.chain.segments[i]],
-            self.labels,
-        )
-
-    def models(self, i: int, method: Method) -> dict[str, SegmentModel]:
-        """Fit a model for every set of sensors of segment `i` that may be alive."""
-        others = (*neighbor(self.chain, i), None)
-        return {
-            alive_key(alive, other): self.model(i, method, alive, other)
-            for alive in alive_sets(self.chain.sensors[i])
-            for other in others
-        }
+        needed = [frames.sensors[s] for s in (*chain.sensors[i], *neighbor(chain, i))]
+        known = [visible(q) for q in (*needed, frames.reference[segment])]
+        count = int(np.count_nonzero(np.all(known, axis=0)))
+        if count < FEWEST_FRAMES:
+            seen = int(np.count_nonzero(known[-1]))
+            raise CalibrationRefused(
+                f"{segment}: {count} complete frames in {what}, at least {FEWEST_FRAMES} are "
+                f"needed (its reference alone is there in {seen}): take a trial whose sensors and "
+                "reference are there together, or another --holdout"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class _Judge:
     """What was fitted to, what judges, and the flexion axes of the former."""
 
-    training: _Training
+    chain: Chain
+    training: LimbTraining
     test: OfflineTrial
-    sensors: Mapping[str, Array]
-    """Of the test, bone-aligned."""
+    aligned: LimbTraining
+    """The test, bone-aligned."""
     axes: Mapping[str, Array]
     """Flexion of each inner joint is positive about it: `functional_axis`, and a knee's turned."""
     truth: Mapping[str, Array]
@@ -278,41 +261,48 @@ class _Judge:
     ) -> _Judge:
         if mounts is None:
             mounts = {name: mean.q for name, mean in mounts_of(chain, training).items()}
-        known = _Training.of(chain, training, mounts)
+        known = _training(chain, training, mounts)
+        _refuse_few(chain, known, f"what is fitted to, to judge {test.name},")
         axes, truth = {}, {}
         for joint, above, below in _inner(chain):
             q = joint_rotation(known.reference[above], known.reference[below])
             axis = functional_axis(q[np.isfinite(q).all(axis=1)])
             axes[joint] = flexion_sign(joint) * axis
             truth[joint] = _flexion(test.reference[above], test.reference[below], axes[joint])
-        aligned = {name: rotation.multiply(test.sensors[name], m) for name, m in mounts.items()}
-        return _Judge(known, test, aligned, axes, truth)
+        sensors = {name: rotation.multiply(test.sensors[name], m) for name, m in mounts.items()}
+        aligned = LimbTraining(sensors, test.reference)
+        _refuse_few(chain, aligned, f"the part of {test.name} that judges")
+        return _Judge(chain, known, test, aligned, axes, truth)
 
     def method(self, method: Method) -> Judged:
-        """Judge one method with all sensors alive."""
-        chain, said = self.training.chain, {}
-        for i, segment in enumerate(chain.segments):
-            other = next(iter(neighbor(chain, i)), None)
-            model = self.training.model(i, method, chain.sensors[i], other)
-            said[segment] = model.predict(
-                [self.sensors[name] for name in chain.sensors[i]],
-                None if other is None else self.sensors[other],
-            )
-        return self._judged(method, said)
+        """Judge one method with all sensors alive, as the daemon would use it."""
+        return self._judged(
+            method,
+            {
+                segment: all_alive(self.chain, i, method, self.training, self.aligned)
+                for i, segment in enumerate(self.chain.segments)
+            },
+        )
+
+    @property
+    def frames(self) -> int:
+        known = [
+            visible(q) for q in (*self.aligned.sensors.values(), *self.test.reference.values())
+        ]
+        return int(np.count_nonzero(np.all(known, axis=0)))
 
     def singles(self) -> list[Judged]:
-        """Judge the first sensor of each segment alone, then the second, as far as all have one."""
-        chain = self.training.chain
-        return [
-            self._judged(
-                f"single {'+'.join(names)}",
-                dict(zip(chain.segments, (self.sensors[name] for name in names), strict=True)),
-            )
-            for names in zip(*chain.sensors, strict=False)
-        ]
+        """Judge the first sensor of each segment alone, then the second; who has no more, again."""
+        chain = self.chain
+        found = []
+        for k in range(max(map(len, chain.sensors))):
+            names = [group[min(k, len(group) - 1)] for group in chain.sensors]
+            said = dict(zip(chain.segments, (self.aligned.sensors[n] for n in names), strict=True))
+            found.append(self._judged(f"single {'+'.join(names)}", said))
+        return found
 
     def _judged(self, method: str, said: Mapping[str, Array]) -> Judged:
-        chain, reference = self.training.chain, self.test.reference
+        chain, reference = self.chain, self.test.reference
         flexion = {
             joint: _flexion(said[above], said[below], self.axes[joint])
             for joint, above, below in _inner(chain)
@@ -321,7 +311,7 @@ class _Judge:
         return Judged(
             self.test.name,
             method,
-            len(self.test.t_s),
+            self.frames,
             {s: _rms(rotation.angle_between(said[s], reference[s])) for s in chain.segments},
             {j: _rms(np.arctan2(np.sin(angle), np.cos(angle))) for j, angle in off.items()},
             flexion,

@@ -6,26 +6,27 @@ reference; what is trained for one set of sensors is used for exactly that set.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from jointfit_daemon.calibration.aligned_mean import AlignedModel, fit_aligned
 from jointfit_daemon.calibration.anchored import AnchoredModel
 from jointfit_daemon.calibration.kernel_model import KernelModel, fit_kernel
-from jointfit_daemon.calibration.mean_model import MeanModel, fit_mean, plain_mean
+from jointfit_daemon.calibration.mean_model import MeanModel, best_single, fit_mean, plain_mean
 from jointfit_daemon.calibration.patent import PatentModel, fit_patent
 from jointfit_daemon.calibration.segment_model import (
     Prediction,
     SegmentModel,
     SegmentTraining,
 )
+from jointfit_daemon.calibration.trial import Method
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike
 
-    from jointfit_daemon.calibration.trial import Method
-
 __all__ = [
+    "AlignedModel",
     "AnchoredModel",
     "KernelModel",
     "MeanModel",
@@ -48,9 +49,10 @@ def fit_segment(
 
     Parameters
     ----------
-    method : {"anchored", "patent12", "patent6", "mean"}
+    method : {"anchored", "patent12", "patent6", "markley", "mean", "single"}
         ``anchored`` without a neighbour gives the weighted mean: it has nothing else to look at.
-        ``mean`` weighs all sensors alike.
+        ``markley`` turns each sensor by a heading and a mount of its own, and weighs them by what
+        they err; ``mean`` weighs all sensors alike; ``single`` takes the best one alone.
     sensors : sequence of array_like, shape (n, 4)
         q_world_segment as each sensor says it through its static mount. Any number: means
         weigh each, the regressions have a column for each, ``anchored`` a difference for each.
@@ -76,4 +78,8 @@ def fit_segment(
         return fit_mean(training)
     if method == "mean":
         return plain_mean(training)
-    raise ValueError(f"method {method!r}; known: anchored, patent12, patent6, mean")
+    if method == "markley":
+        return fit_aligned(training)
+    if method == "single":
+        return best_single(training)
+    raise ValueError(f"method {method!r}; known: {', '.join(get_args(Method))}")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-Method = Literal["anchored", "patent12", "patent6", "mean"]
+Method = Literal["anchored", "patent12", "patent6", "markley", "mean", "single"]
 
 
 @dataclass(frozen=True, slots=True)

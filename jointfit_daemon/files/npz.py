@@ -64,17 +64,19 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     Raises
     ------
     Malformed
-        No ``t``, or no sensor at all.
+        No ``t``, or neither a sensor nor a bone.
     """
     with np.load(path, allow_pickle=False) as found:
         arrays = {name: found[name] for name in found.files}
     names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]
-    if "t" not in arrays or not names:
-        raise Malformed(f"{path}: expected arrays t and ID_quat, found {', '.join(arrays)}")
+    bones = [n.removeprefix(_BONE) for n in arrays if n.startswith(_BONE)]
+    if "t" not in arrays or not (names or bones):
+        raise Malformed(
+            f"{path}: expected arrays t and ID_quat or q_BONE, found {', '.join(arrays)}"
+        )
     z_up = "up" in arrays and str(arrays["up"]) == "z"
     turn = _unit if z_up else quaternions_z_up
     move = _plain if z_up else vectors_z_up
-    bones = [n.removeprefix(_BONE) for n in arrays if n.startswith(_BONE)]
     return OrientationTrial(
         np.asarray(arrays["t"], dtype=np.float64),
         {name: turn(arrays[name + _SENSOR]) for name in names},
@@ -85,7 +87,8 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
 
 def _unit(quaternions: ArrayLike) -> NDArray[np.float64]:
     found = np.asarray(quaternions, dtype=np.float64)
-    unit: NDArray[np.float64] = found / np.linalg.norm(found, axis=-1, keepdims=True)
+    norms = np.linalg.norm(found, axis=-1, keepdims=True)
+    unit: NDArray[np.float64] = found / np.where(norms > 0.0, norms, np.nan)  # 0 0 0 0: missing
     return unit
 
 

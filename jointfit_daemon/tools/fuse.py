@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.fuse_trial import Limb
 
 MISUSE = 2
+UNTAUGHT = ("mean", "single")
+"""Methods that need no movement."""
 
 app = typer.Typer(
     name="fuse",
@@ -49,8 +51,8 @@ Static = Annotated[
     str | None,
     typer.Option(
         "--static",
-        help="Still trial SENSORS[=REFERENCE], or a .json of mounts. Without it mounts are learned "
-        "from the movement.",
+        help="Still trial SENSORS[=REFERENCE]; a .json of mounts may stand for SENSORS. Without it "
+        "mounts are learned from the movement.",
     ),
 ]
 Markers = Annotated[
@@ -86,6 +88,7 @@ def evaluate(
         limb, read, mounts, doubts = _inputs(
             trials, segment, joints, static, markers=markers, up=up
         )
+        _refuse_unmoved(limb, read)
         found = offline.evaluate(limb.chain, read, mounts, holdout=holdout)
         _warn(doubts)
         if json:
@@ -106,7 +109,7 @@ def fit(
     segment: Segments,
     out: Annotated[Path, typer.Option("--out", help="Model file to write, .json.")],
     method: Annotated[
-        str, typer.Option("--method", help="anchored, patent12, patent6 or mean.")
+        str, typer.Option("--method", help="anchored, patent12, patent6, markley, mean or single.")
     ] = "anchored",
     joints: Joints = None,
     static: Static = None,
@@ -125,13 +128,15 @@ def fit(
         limb, read, mounts, doubts = _inputs(
             trials, segment, joints, static, markers=markers, up=up
         )
+        if (chosen := _method(method)) not in UNTAUGHT:
+            _refuse_unmoved(limb, read)
         if mounts is None:
             mounts = {s: mean.q for s, mean in offline.mounts_of(limb.chain, read).items()}
         calibration = offline.fit_offline(
             limb.chain,
             read,
             mounts,
-            _method(method),
+            chosen,
             notes=tuple(doubts),
             software=__version__,
             created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -153,6 +158,10 @@ def apply(
     out: Annotated[
         Path, typer.Option("--out", help="Orientations and joint angles: .sto, .npz or .csv.")
     ],
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", help="A sensor not to use, as if it were unplugged."),
+    ] = None,
     left: Annotated[bool, typer.Option("--left", help="A left limb: signs of two angles.")] = False,
     up: Up = "z",
     json: Json = False,
@@ -160,13 +169,15 @@ def apply(
     """Fuse the sensors of a trial as the daemon would live, with its uncertainty."""
     with _told():
         from jointfit_daemon.tools import fuse_output, fuse_report
-        from jointfit_daemon.tools.fuse_trial import Unusable, read_sensors
+        from jointfit_daemon.tools.fuse_tables import Unusable
+        from jointfit_daemon.tools.fuse_trial import read_worn
 
         if out.suffix.lower() not in fuse_output.ENDINGS:
             raise Unusable(f"--out {out}: expected a name that ends in .sto, .npz or .csv")
         axis = _axis(up)
         calibration = _read_model(model)
-        table = read_sensors(sensors, fuse_output.chain_of(calibration, left=left), axis)
+        chain = fuse_output.chain_of(calibration, left=left)
+        table = read_worn(sensors, chain, axis, without or ())
         found = fuse_output.fuse_trial(calibration, table, left=left)
         files = fuse_output.write_fused(out, found, table, axis)
         if json:
@@ -202,33 +213,21 @@ def _inputs(
     up: str,
 ) -> tuple[Limb, list[OfflineTrial], dict[str, Any] | None, list[str]]:
     """Return limb, trials, mounts (None: to be learned) and what to doubt."""
-    from jointfit_daemon.calibration.offline import turned_worlds
+    from jointfit_daemon.calibration.offline_checks import doubts
     from jointfit_daemon.tools import fuse_trial
 
     limb = fuse_trial.read_limb(segments, joints, markers or (), _axis(up))
     mounts, still = None, None
-    if static is not None and static.lower().endswith(".json"):
-        mounts = fuse_trial.read_mounts(Path(static), limb.chain)
-    elif static is not None:
+    if static is not None:
         mounts, still = fuse_trial.read_static(*_pair(static), limb)
     read = [fuse_trial.read_trial(*_pair(text), limb, still) for text in trials]
-    doubts = list(_turned(turned_worlds(limb.chain, read)))
+    told = doubts(limb.chain, read, mounts)
     if mounts is None:
-        doubts.append(
+        told.append(
             "no --static: mounts are means over the movement and learn from the reference; "
             "figures hold for this wearing only"
         )
-    return limb, read, mounts, doubts
-
-
-def _turned(worlds: dict[str, float]) -> Iterator[str]:
-    from math import degrees
-
-    for sensor, angle in worlds.items():
-        yield (
-            f"{sensor}: its world seems turned by {degrees(angle):.0f}° about the vertical against "
-            "the reference's: bring both into one world first, or check --up"
-        )
+    return limb, read, mounts, told
 
 
 def _pair(text: str) -> tuple[Path, Path | None]:
@@ -276,6 +275,13 @@ def _echo_json(said: dict[str, Any]) -> None:
     import orjson
 
     typer.echo(orjson.dumps(said))
+
+
+def _refuse_unmoved(limb: Limb, trials: Sequence[OfflineTrial]) -> None:
+    from jointfit_daemon.calibration.offline_checks import unmoved
+
+    if why := unmoved(limb.chain, trials):
+        raise ValueError(why)
 
 
 def _warn(doubts: Sequence[str]) -> None:

@@ -14,33 +14,45 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.offline import Judged, Judgement
 
+ROW_INCHES = 3.2
+
 
 def draw_judgement(path: Path, found: Judgement) -> None:
-    """Write one figure, a row a trial; its format is the ending of the name."""
-    trials = list(found.reference)
-    figure = new_figure(12.0, 3.2 * len(trials) + 0.6)
+    """Write one figure, a row for each joint of each trial; its format is the name's ending."""
+    joints = [*found.rows[0].joints] or [""]
+    lines = [(trial, joint) for trial in found.reference for joint in joints]
+    figure = new_figure(13.0, ROW_INCHES * len(lines) + 0.6)
     figure.suptitle(f"judged on {found.held_out}")
-    for line, trial in zip(
-        figure.subplots(len(trials), 2, squeeze=False, width_ratios=(3, 2)), trials, strict=True
-    ):
+    axes = figure.subplots(len(lines), 2, squeeze=False, width_ratios=(3, 2))
+    for (left, right), (trial, joint) in zip(axes, lines, strict=True):
         rows = [row for row in found.rows if row.trial == trial]
-        _bars(line[1], rows)
-        joint = next(iter(found.reference[trial]), None)
-        if joint is None:
-            line[0].set_axis_off()
-            continue
-        truth = np.rad2deg(found.reference[trial][joint])
-        for row in rows:
-            if not row.method.startswith("single"):
-                line[0].plot(np.rad2deg(row.flexion[joint]), linewidth=0.8, label=row.method)
-        line[0].plot(truth, "k", linewidth=1.2, label="reference")
-        line[0].set_title(f"{trial}: {joint} flexion", fontsize=10)
-        line[0].set_xlabel("frame")
-        line[0].set_ylabel("deg")
-        line[0].grid(alpha=0.3)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
+        if joint:
+            _flexions(left, found, rows, joint)
+        else:  # a lone segment has no joint between two
+            left.set_axis_off()
+        if joint == joints[0]:
+            _bars(right, rows)
+        else:
+            right.set_axis_off()
+    handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=120)
+
+
+def _flexions(axes: Any, found: Judgement, rows: Sequence[Judged], joint: str) -> None:
+    trial = rows[0].trial
+    t_s = found.t_s[trial]
+    for row in rows:
+        alone = row.method.startswith("single")
+        width, style = (0.6, ":") if alone else (0.9, "-")
+        angle = np.rad2deg(row.flexion[joint])
+        axes.plot(t_s, angle, style, linewidth=width, label=row.method)
+    truth = np.rad2deg(found.reference[trial][joint])
+    axes.plot(t_s, truth, "k", linewidth=1.2, label="reference")
+    axes.set_title(f"{trial}: {joint} flexion", fontsize=10)
+    axes.set_xlabel("s")
+    axes.set_ylabel("deg")
+    axes.grid(alpha=0.3)
 
 
 def _bars(axes: Any, rows: Sequence[Judged]) -> None:
@@ -53,5 +65,6 @@ def _bars(axes: Any, rows: Sequence[Judged]) -> None:
         np.arange(len(rows)) + 0.4 - width / 2, [row.method for row in rows], fontsize=7
     )
     axes.invert_yaxis()
-    axes.set_xlabel("RMS error, deg")
-    axes.legend(fontsize=7)
+    axes.set_title(f"{rows[0].trial}: RMS error", fontsize=10)
+    axes.set_xlabel("deg")
+    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 0.75))

@@ -1,46 +1,56 @@
 """Trials of `jointfit fuse` from files: orientations of sensors, and a reference of the segments.
 
-Law: whatever the files' axes are, what leaves here has z up and one time axis, the sensors'. What
-looks like other units is refused with what to change, never converted on a guess.
+Law: what leaves here has z up and one time axis, the sensors'.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jointfit_daemon.calibration.markers import static_cluster, track_cluster
+from jointfit_daemon.calibration.markers import (
+    MIN_MARKERS,
+    static_cluster,
+    track_cluster,
+    visible,
+)
 from jointfit_daemon.calibration.offline import OfflineTrial, mounts_of
 from jointfit_daemon.calibration.sampling import orientations_at
+from jointfit_daemon.calibration.static import robust_mean
 from jointfit_daemon.calibration.trial import CalibrationSettings, OpticalTrack
 from jointfit_daemon.files.marker_trial import read_marker_trial
-from jointfit_daemon.files.npz import quaternions_z_up, read_orientations_npz
-from jointfit_daemon.files.sto import read_orientations_sto
+from jointfit_daemon.files.npz import quaternions_z_up
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chain
+from jointfit_daemon.tools.fuse_tables import (
+    FEWEST,
+    Table,
+    Unusable,
+    bones_of,
+    read_table,
+    refuse_other_units,
+    sensors_of,
+    unknown,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from jointfit_daemon.calibration.markers import Cluster
+    from jointfit_daemon.calibration.static import RobustMean
     from jointfit_daemon.files.marker_trial import Axis
 
 Array = NDArray[np.float64]
 
 MARKER_FILES = (".trc", ".c3d")
-SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0
-NORM_SLACK = 0.05
-FEWEST = 30
-"""Instants that sensors and reference must share."""
-
-
-class Unusable(ValueError):  # noqa: N818 - named for what happened
-    """A file that is not what was asked for; the message says what to change."""
+SMALLEST_M, LARGEST_M = 0.01, 2.0
+"""Extent of the markers of one segment."""
+STILL = np.deg2rad(3.0)
+"""Robust scatter of a sensor in a trial that may be called still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,15 +64,6 @@ class Limb:
     """Markers of each segment, for marker files."""
     up: Axis
     """Upward axis of STO files."""
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Orientations over time by name, z up."""
-
-    t_s: Array
-    q: Mapping[str, Array]
-    """Shape (n, 4) each; NaN where missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +109,7 @@ def _markers(texts: Sequence[str], segments: Sequence[str]) -> dict[str, tuple[s
     for text in texts:
         name, _, rest = text.partition("=")
         if name not in segments:
-            raise Unusable(f"--markers {text!r}: {_unknown('segment', name, segments)}")
+            raise Unusable(f"--markers {text!r}: {unknown('segment', name, segments)}")
         found[name] = tuple(part.strip() for part in rest.split(",") if part.strip())
     return found
 
@@ -125,11 +126,11 @@ def read_trial(
         common.
     """
     table = read_table(sensors, limb.up)
-    q = _chosen(table, [s for group in limb.chain.sensors for s in group], "sensor", sensors)
+    q = sensors_of(table, [s for group in limb.chain.sensors for s in group], sensors)
     if reference is None or reference.suffix.lower() not in MARKER_FILES:
         found = table if reference is None else read_table(reference, limb.up)
         where = sensors if reference is None else reference
-        bones = _chosen(found, list(limb.bones.values()), "segment", where)
+        bones = bones_of(found, list(limb.bones.values()), where)
         by_segment = {segment: bones[bone] for segment, bone in limb.bones.items()}
         t_s = found.t_s
     else:
@@ -143,9 +144,28 @@ def read_trial(
 def read_sensors(path: Path, chain: Chain, up: Axis) -> Table:
     """Return the orientations of a chain's sensors; `Unusable` as `read_trial`."""
     table = read_table(path, up)
-    return Table(
-        table.t_s, _chosen(table, [s for group in chain.sensors for s in group], "sensor", path)
-    )
+    q = sensors_of(table, [s for group in chain.sensors for s in group], path)
+    return Table(table.t_s, q, table.bones)
+
+
+def read_worn(path: Path, chain: Chain, up: Axis, without: Sequence[str]) -> Table:
+    """Return what of a chain's sensors there is, to be fused around what is not.
+
+    Raises
+    ------
+    Unusable
+        A sensor that is not in the file and not in `without` either, or nobody in either.
+    """
+    everyone = [s for group in chain.sensors for s in group]
+    if strange := [name for name in without if name not in everyone]:
+        told = "; ".join(unknown("sensor", name, everyone) for name in strange)
+        raise Unusable(f"--without: the model has {told}")
+    table = read_table(path, up)
+    wanted = [name for name in everyone if name not in without]
+    if missing := [name for name in wanted if name not in table.q]:
+        told = "; ".join(unknown("sensor", name, table.q) for name in missing)
+        raise Unusable(f"{path}: {told}; --without {missing[0]} goes on without it")
+    return Table(table.t_s, {name: table.q[name] for name in wanted}, table.bones)
 
 
 def read_static(
@@ -153,23 +173,48 @@ def read_static(
 ) -> tuple[dict[str, Array], StaticMarkers | None]:
     """Return the mounts of all sensors from a still trial, and where the markers are on it.
 
-    With markers, or without any reference, segment axes are the world's in that pose.
+    With markers, or without any reference, segment axes are the world's in that pose. Mounts of a
+    JSON file stand for a still trial of the sensors.
+
+    Raises
+    ------
+    Unusable
+        As `read_trial`, or somebody moved.
     """
+    by_markers = reference is not None and reference.suffix.lower() in MARKER_FILES
+    markers = _static_markers(reference, limb) if reference is not None and by_markers else None
+    if sensors.suffix.lower() == ".json":
+        return read_mounts(sensors, limb.chain), markers
     table = read_sensors(sensors, limb.chain, limb.up)
-    clusters = None
-    if reference is not None and reference.suffix.lower() in MARKER_FILES:
-        track, settings = _optical(reference, limb)
-        clusters = {s: static_cluster(track, s, settings) for s in limb.chain.segments}
-    if reference is not None and clusters is None:
+    if reference is not None and not by_markers:
         trial = read_trial(sensors, reference, limb, None)
-    elif clusters is None and set(limb.bones.values()) <= set(read_table(sensors, limb.up).q):
+    elif not by_markers and set(limb.bones.values()) <= set(table.bones):
         trial = read_trial(sensors, None, limb, None)
     else:
         upright = np.tile(rotation.IDENTITY, (len(table.t_s), 1))
         axes = dict.fromkeys(limb.chain.segments, upright)
         trial = OfflineTrial(sensors.stem, table.t_s, table.q, axes)
-    mounts = {name: mean.q for name, mean in mounts_of(limb.chain, [trial]).items()}
-    return mounts, None if clusters is None else StaticMarkers(clusters)
+    found = mounts_of(limb.chain, [trial])
+    _refuse_moving(sensors, found)
+    return {name: mean.q for name, mean in found.items()}, markers
+
+
+def _static_markers(path: Path, limb: Limb) -> StaticMarkers:
+    track, settings = _optical(path, limb)
+    clusters = {s: static_cluster(track, s, settings) for s in limb.chain.segments}
+    turns = {name: track_cluster(track, cluster).q for name, cluster in clusters.items()}
+    _refuse_moving(path, {name: robust_mean(q) for name, q in turns.items()})
+    return StaticMarkers(clusters)
+
+
+def _refuse_moving(path: Path, found: Mapping[str, RobustMean]) -> None:
+    moved = {name: mean.spread for name, mean in found.items() if mean.spread > STILL}
+    if moved:
+        told = ", ".join(f"{name} by {np.rad2deg(angle):.0f} deg" for name, angle in moved.items())
+        raise Unusable(
+            f"{path}: a still trial is wanted, and here somebody moves: {told} (robust scatter); "
+            "cut out the part in which the person stands still, or leave out --static"
+        )
 
 
 def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
@@ -186,75 +231,11 @@ def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
     found = {}
     for name in (s for group in chain.sensors for s in group):
         if name not in mounts:
-            raise Unusable(f"{path}: {_unknown('sensor', name, mounts)}")
+            raise Unusable(f"{path}: {unknown('sensor', name, mounts)}")
         q = np.asarray(mounts[name], dtype=np.float64)
-        _refuse_other_units(path, name, q[None])
+        refuse_other_units(path, name, q[None])
         found[name] = rotation.normalize(q) if said.get("up") == "z" else quaternions_z_up(q)
     return found
-
-
-def read_table(path: Path, up: Axis) -> Table:
-    """Return all orientations of an NPZ or STO file, z up."""
-    kind = path.suffix.lower()
-    if kind == ".npz":
-        trial = read_orientations_npz(path)
-        _refuse_npz_units(path)
-        table = Table(trial.t_s, {**trial.bones, **trial.sensors})
-    elif kind == ".sto":
-        said = read_orientations_sto(path)
-        columns = {name: said.quaternions[:, k] for k, name in enumerate(said.names)}
-        for name, q in columns.items():
-            _refuse_other_units(path, name, q)
-        turn = quaternions_z_up if up == "y" else rotation.normalize
-        table = Table(said.t_s, {name: turn(q) for name, q in columns.items()})
-    else:
-        raise Unusable(f"{path}: expected orientations in a file that ends in .npz or .sto")
-    _refuse_other_times(path, table.t_s)
-    return table
-
-
-def _refuse_npz_units(path: Path) -> None:
-    with np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            if name.endswith("_quat") or name.startswith("q_"):
-                _refuse_other_units(path, name, np.asarray(arrays[name], dtype=np.float64))
-
-
-def _refuse_other_units(path: Path, name: str, q: Array) -> None:
-    norms = np.linalg.norm(q, axis=-1)
-    known = norms[np.isfinite(norms)]
-    if known.size and abs(float(np.median(known)) - 1.0) > NORM_SLACK:
-        raise Unusable(
-            f"{path}: {name}: its four numbers have norm {float(np.median(known)):.3g}, not 1: "
-            "expected unit quaternions w, x, y, z, not angles in degrees or radians"
-        )
-
-
-def _refuse_other_times(path: Path, t_s: Array) -> None:
-    steps = np.diff(t_s)
-    if len(t_s) < FEWEST or not np.isfinite(t_s).all() or (steps <= 0.0).any():
-        raise Unusable(
-            f"{path}: expected at least {FEWEST} rows whose times grow, found {len(t_s)}"
-        )
-    rate_hz = 1.0 / float(np.median(steps))
-    if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-        raise Unusable(
-            f"{path}: times {float(np.median(steps)):g} apart would be {rate_hz:.3g} Hz: expected "
-            "seconds; are they milliseconds, or frame numbers?"
-        )
-
-
-def _chosen(table: Table, names: Sequence[str], what: str, path: Path) -> dict[str, Array]:
-    if missing := [name for name in names if name not in table.q]:
-        raise Unusable(f"{path}: {'; '.join(_unknown(what, name, table.q) for name in missing)}")
-    return {name: table.q[name] for name in names}
-
-
-def _unknown(what: str, name: str, known: Sequence[str] | Mapping[str, object]) -> str:
-    folded = {other.casefold(): other for other in known}
-    near = get_close_matches(name.casefold(), list(folded), n=1)
-    hint = f"did you mean {folded[near[0]]!r}? " if near else ""
-    return f"no {what} {name!r}; {hint}there are: {', '.join(known) or 'none'}"
 
 
 def _ns(t_s: Array) -> NDArray[np.int64]:
@@ -277,6 +258,7 @@ def _optical(path: Path, limb: Limb) -> tuple[OpticalTrack, CalibrationSettings]
     trial = read_marker_trial(path)
     names = tuple(dict.fromkeys(name for group in limb.markers.values() for name in group))
     positions = trial.points(names)  # all unknown names at once
+    _refuse_other_sizes(path, limb, names, positions)
     empty = np.empty((len(positions), 0, 3))
     track = OpticalTrack(
         _ns(trial.trajectories.t_s), names, positions, (), empty, np.empty((len(positions), 0, 4))
@@ -293,8 +275,32 @@ def _by_markers(
             "--static SENSORS=MARKERS"
         )
     track, _ = _optical(path, limb)
-    turned = {name: track_cluster(track, cluster).q for name, cluster in static.clusters.items()}
+    turned = {}
+    for name, cluster in static.clusters.items():
+        turned[name] = track_cluster(track, cluster).q
+        places = track.positions[:, [track.markers.index(marker) for marker in cluster.markers]]
+        seen = np.count_nonzero(visible(places).sum(axis=1) >= MIN_MARKERS)
+        if seen >= FEWEST > np.count_nonzero(visible(turned[name])):
+            raise Unusable(
+                f"{path}: the markers of {name} do not lie to each other as in the still trial: "
+                "are names swapped, is it another person, or are units others than the file says?"
+            )
     return np.asarray(track.t_ns / 1e9), turned
+
+
+def _refuse_other_sizes(path: Path, limb: Limb, names: Sequence[str], positions: Array) -> None:
+    """Refuse markers of a segment that are too far from each other, or too near, for metres."""
+    for segment in limb.chain.segments:
+        seen = positions[:, [names.index(name) for name in limb.markers[segment]]]
+        seen = seen[visible(seen).all(axis=1)]
+        if not len(seen):
+            continue
+        widest = float(np.median(np.ptp(seen, axis=1).max(axis=-1)))
+        if not SMALLEST_M <= widest <= LARGEST_M:
+            raise Unusable(
+                f"{path}: the markers of {segment} spread over {widest:.3g} m: does the file name "
+                "its units rightly (m, mm)?"
+            )
 
 
 def _refuse_too_little(
@@ -302,10 +308,17 @@ def _refuse_too_little(
 ) -> None:
     for segment, q in trial.reference.items():
         seen = int(np.isfinite(q).all(axis=1).sum())
-        if seen < FEWEST:
-            raise Unusable(
-                f"{sensors}: {segment} has {seen} instants in common with its reference "
-                f"{reference or sensors}, at least {FEWEST} are needed: sensors "
-                f"{trial.t_s[0]:.2f} to {trial.t_s[-1]:.2f} s, reference {t_s[0]:.2f} to "
-                f"{t_s[-1]:.2f} s; do both clocks begin at the same instant?"
+        if seen >= FEWEST:
+            continue
+        apart = trial.t_s[-1] < t_s[0] or t_s[-1] < trial.t_s[0]
+        raise Unusable(
+            f"{sensors}: {segment} has {seen} instants in common with its reference "
+            f"{reference or sensors}, at least {FEWEST} are needed: sensors "
+            f"{trial.t_s[0]:.2f} to {trial.t_s[-1]:.2f} s, reference {t_s[0]:.2f} to "
+            f"{t_s[-1]:.2f} s; "
+            + (
+                "do both clocks begin at the same instant?"
+                if apart
+                else "the reference is all gaps there: leave out the trial"
             )
+        )

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from jointfit_daemon.calibration.alignment_phase import fit_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.judgement import better
+from jointfit_daemon.calibration.model_fit import METHODS
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.result import Calibration, UnknownSchema
 from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only, with_new_static
@@ -107,7 +108,7 @@ def test_the_correction_beats_the_mean_on_worn_sensors_in_three_seconds() -> Non
     figures = found.quality["holdout"]
     for segment in CHAIN.segments:
         of = figures["segments"][segment]
-        assert set(of) == {"anchored", "patent12", "patent6", "mean", "single"}
+        assert set(of) == {*METHODS, "sensors"}
         assert of["anchored"] < 0.85 * of["mean"]
         assert np.rad2deg(of["anchored"]) < 5.0
     assert np.rad2deg(figures["flexion"]["knee"]["anchored"]) < 3.0

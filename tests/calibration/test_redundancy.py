@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import pytest
 
 from jointfit_daemon.calibration.anchored import AnchoredModel, fit_anchored
 from jointfit_daemon.calibration.redundancy import (
+    AlignedModel,
     KernelModel,
     MeanModel,
     PatentModel,
@@ -17,17 +18,16 @@ from jointfit_daemon.calibration.redundancy import (
     SegmentTraining,
     fit_segment,
 )
+from jointfit_daemon.calibration.trial import Method
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from jointfit_daemon.calibration.trial import Method
-
     Array = NDArray[np.float64]
 
-METHODS: tuple[Method, ...] = ("anchored", "patent12", "patent6", "mean")
+METHODS: tuple[Method, ...] = get_args(Method)
 DEG = np.deg2rad(1.0)
 N = 600
 
@@ -102,6 +102,33 @@ def test_the_mean_weighs_sensors_alike_however_bad_one_is() -> None:
     assert limb.fit("mean").residual_sd * np.sqrt(3) == pytest.approx(learned)
 
 
+def test_the_single_is_the_sensor_that_was_nearest_in_training_bit_for_bit() -> None:
+    limb = Limb(sensors=3)
+    limb.sensors[0] = rot.multiply(limb.sensors[0], rot.exp(np.array([0.3, 0.0, 0.0])))
+    errors = [float(np.mean(rot.angle_between(q, limb.segment)[:360] ** 2)) for q in limb.sensors]
+    best = int(np.argmin(errors))
+    assert best != 0
+    said = limb.fit("single").predict(limb.sensors)
+    assert np.max(rot.angle_between(said, limb.sensors[best])) < 1e-12
+
+
+def test_markley_takes_out_constant_worlds_and_mounts_and_weighs_what_is_left() -> None:
+    """An oracle by construction: constants in, constants out, whatever the signs."""
+    rng = np.random.default_rng(3)
+    limb = Limb()
+    free = [rot.multiply(limb.segment, rot.exp(s * rng.normal(size=(N, 3)))) for s in (0.01, 0.03)]
+    for k, q in enumerate(free):
+        world = rot.heading(np.array(0.4 - k))
+        mount = rot.exp(np.array([0.2, -0.3 * k, 0.1]))
+        limb.sensors[k] = rot.multiply(rot.multiply(world, q), mount) * rng.choice([-1, 1], (N, 1))
+    model = limb.fit("markley")
+    assert isinstance(model, AlignedModel)
+    assert model.weights[0] == pytest.approx(0.9, abs=0.02)
+    expected = rot.average(np.stack(free, axis=1), np.broadcast_to([0.9, 0.1], (N, 2)))
+    assert np.max(rot.angle_between(model.predict(limb.sensors), expected)) < 0.3 * DEG
+    assert limb.error(limb.fit("mean")) > 10 * limb.error(model)
+
+
 def test_corrections_beat_the_mean_on_movement_they_did_not_see() -> None:
     limb = Limb()
     mean = limb.error(limb.fit("mean"))
@@ -109,7 +136,7 @@ def test_corrections_beat_the_mean_on_movement_they_did_not_see() -> None:
     assert limb.error(limb.fit("patent12")) < 0.8 * mean
 
 
-@pytest.mark.parametrize("method", ["anchored", "mean"])
+@pytest.mark.parametrize("method", ["anchored", "mean", "single"])
 @pytest.mark.parametrize("turn", [0.2, 1.5, 3.1])
 def test_a_turned_world_turns_the_answer_and_nothing_else(method: Method, turn: float) -> None:
     limb = Limb()

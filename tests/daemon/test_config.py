@@ -113,8 +113,8 @@ def test_ten_mistakes_are_told_at_once(
         "did you mean 'fake'?",
         "imu[S1].can = 'can1': no table [can.can1]; known: can0; did you mean 'can0'?",
         "imu: no sensor is on segment 'thigh'",
-        "calibration.method = 'patent21': expected 'anchored', 'patent12', 'patent6' or 'mean'; "
-        "did you mean 'patent12'?",
+        "calibration.method = 'patent21': expected 'anchored', 'patent12', 'patent6', 'markley', "
+        "'mean' or 'single'; did you mean 'patent12'?",
         "mqtt.hots = 'broker': no such key",
         "did you mean 'host'?",
         "mocap.markers.thigh = ['T1', 'T1']: expected at least three different markers",

@@ -29,14 +29,14 @@ def test_the_tables_of_the_holdout_get_the_unit_they_lack() -> None:
         "method": "anchored",
         "frames": 697,
         "share": 0.4,
-        "segments": {"thigh": {"anchored": math.radians(2.5), "single": {"S1": math.radians(5)}}},
+        "segments": {"thigh": {"anchored": math.radians(2.5), "sensors": {"S1": math.radians(5)}}},
         "flexion": {"knee": {"mean": np.float64(math.radians(3))}},
     }
     assert shown({"holdout": holdout})["holdout"] == {
         "method": "anchored",
         "frames": 697,
         "share": 0.4,
-        "segments_deg": {"thigh": {"anchored": 2.5, "single": {"S1": 5.0}}},
+        "segments_deg": {"thigh": {"anchored": 2.5, "sensors": {"S1": 5.0}}},
         "flexion_deg": {"knee": {"mean": 3.0}},
     }
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from jointfit_daemon.calibration.model_fit import METHODS
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.files.npz import (
     OrientationTrial,
@@ -27,9 +27,21 @@ from jointfit_daemon.files.sto import (
     read_sto,
     write_orientations_sto,
 )
-from jointfit_daemon.files.trc import MarkerTrajectories, write_trc
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.tools.__main__ import app
+from tests.tools.fuse_files import (
+    LIMB,
+    MARKER_OPTIONS,
+    RATE_HZ,
+    N,
+    as_trc,
+    movement,
+    rows,
+    run,
+    said,
+    still,
+    trials,
+    write_trials,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,81 +50,13 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-N = 200
-RATE_HZ = 50.0
-LIMB = ["--segment", "thigh=A,B", "--segment", "shank=C,D", "--joints", "hip,knee,ankle"]
-MARKERS = {
-    "thigh": np.array([(0.0, 0.1, 0.3), (0.05, -0.05, 0.2), (-0.06, 0.02, 0.1)]),
-    "shank": np.array([(0.0, 0.1, -0.1), (0.05, -0.05, -0.2), (-0.06, 0.02, -0.3)]),
-}
-
-
-def run(*arguments: object) -> Any:
-    return CliRunner().invoke(app, ["fuse", *map(str, arguments)], catch_exceptions=False)
-
-
-def said(result: Any) -> str:
-    """Return what went to stderr of a refused command, on one line."""
-    assert result.exit_code == 2, result.output
-    return " ".join(result.stderr.split())
-
-
-def limb(k: int) -> tuple[Array, Array]:
-    """Return thigh and shank of movement `k`, shape (N, 4); both upright in the first frame."""
-    t = np.arange(N) / RATE_HZ
-    swing = (0.4 + 0.1 * k) * np.sin((1.0 + 0.3 * k) * t)
-    bend = -(0.5 + 0.2 * k) * (1.0 - np.cos((1.4 + 0.2 * k) * t))
-    zero = np.zeros(N)
-    thigh = rotation.exp(np.stack((swing, 0.05 * np.sin(2 * t), zero), axis=1))
-    return thigh, rotation.multiply(thigh, rotation.exp(np.stack((bend, zero, zero), axis=1)))
-
-
-def movement(k: int = 0, *, tissue: float = 0.1) -> OrientationTrial:
-    """Return a trial whose sensors ride on skin that moves with the knee."""
-    thigh, shank = limb(k)
-    rng = np.random.default_rng(k)
-    joint = rotation.log(rotation.multiply(rotation.conjugate(thigh), shank))
-    sensors = {}
-    for number, name in enumerate("ABCD"):
-        bone = thigh if name in "AB" else shank
-        skin = rotation.exp(tissue * (1 + number) / 4 * joint + 0.005 * rng.normal(size=(N, 3)))
-        mount = rotation.exp(np.array((0.3 * number, -0.2, 0.1)))
-        sensors[name] = rotation.multiply(rotation.multiply(bone, skin), rotation.conjugate(mount))
-    return OrientationTrial(np.arange(N) / RATE_HZ, sensors, {"thigh": thigh, "shank": shank}, {})
-
-
-def still() -> OrientationTrial:
-    moving = movement()
-    upright = np.tile(rotation.IDENTITY, (N, 1))
-    return OrientationTrial(
-        moving.t_s,
-        {name: np.tile(q[0], (N, 1)) for name, q in moving.sensors.items()},
-        {"thigh": upright, "shank": upright},
-        {},
-    )
-
-
-def write_trials(folder: Path) -> Path:
-    for k in range(3):
-        write_orientations_npz(folder / f"m{k}.npz", movement(k))
-    write_orientations_npz(folder / "still.npz", still())
-    return folder
-
-
-def trials(files: Path, count: int = 3) -> list[Path]:
-    return [files / f"m{k}.npz" for k in range(count)]
-
-
-def rows(result: Any) -> dict[tuple[str, str], dict[str, Any]]:
-    found = json.loads(result.stdout)["rows"]
-    return {(row["trial"], row["method"]): row for row in found}
-
 
 def test_every_method_is_judged_on_every_trial_left_out(files: Path) -> None:
     result = run("evaluate", *trials(files), *LIMB, "--static", files / "still.npz", "--json")
     found = rows(result)
     methods = {method for _, method in found}
-    assert {"anchored", "patent12", "patent6", "mean", "single A+C", "single B+D"} <= methods
+    learned = {"anchored", "patent12", "patent6", "markley"}
+    assert methods == learned | {"mean", "single A+C", "single B+D"}
     assert {trial for trial, _ in found} == {"m0", "m1", "m2"}
     for trial in ("m0", "m1", "m2"):
         best, mean = found[trial, "anchored"], found[trial, "mean"]
@@ -204,8 +148,8 @@ def test_a_model_is_a_calibration_with_a_model_for_every_set_of_sensors(
     assert calibration.chain_sensors == (("A", "B"), ("C", "D"))
     for segment, others in (("thigh", "CD"), ("shank", "AB")):
         keys = set(calibration.segment[segment].models)
-        assert len(keys) == 9
-        assert {key.partition("|")[2] for key in keys} == {"", *others}
+        assert len(keys) == 12
+        assert {key.partition("|")[2] for key in keys} == {"", "+".join(others), *others}
 
 
 def test_a_fitted_model_applied_is_nearer_to_the_bones_than_the_mean(
@@ -220,6 +164,15 @@ def test_a_fitted_model_applied_is_nearer_to_the_bones_than_the_mean(
         found = read_orientations_npz(files / "out.npz").bones["shank"]
         errors[method] = float(np.mean(rotation.angle_between(found, truth.bones["shank"])))
     assert errors["anchored"] < 0.4 * errors["mean"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_may_be_fitted_and_applied(
+    files: Path, fitted: Callable[..., Path], method: str
+) -> None:
+    result = run("apply", fitted(method), files / "m1.npz", "--out", files / "out.npz")
+    assert result.exit_code == 0, result.output
+    assert "shank: known in 100 %" in result.stdout
 
 
 def test_the_three_formats_say_the_same(files: Path, fitted: Callable[..., Path]) -> None:
@@ -279,33 +232,11 @@ def test_orientations_and_their_reference_may_be_two_sto_files(files: Path, up: 
         assert rows(result)[key]["segments_rms"] == pytest.approx(row["segments_rms"], abs=1e-5)
 
 
-def as_trc(path: Path, trial: OrientationTrial, rate_hz: float = 100.0) -> None:
-    """Write markers on the bones, sampled at another rate, y up."""
-    t_s = np.arange(0.0, trial.t_s[-1], 1.0 / rate_hz)
-    names, positions = [], []
-    for segment, places in MARKERS.items():
-        at = np.clip(np.searchsorted(trial.t_s, t_s, side="right") - 1, 0, N - 2)
-        q = trial.bones[segment]
-        share = (t_s - trial.t_s[at]) * RATE_HZ
-        q = rotation.interpolate(q[at], q[at + 1], share)
-        names += [f"{segment}{k}" for k in range(3)]
-        moved = rotation.rotate(q[:, None], places) + np.array((1.0, 2.0, 1.0))
-        positions.append(moved[..., [1, 2, 0]])  # z up to y up: (x, y, z) was (z, x, y)
-    frames = np.arange(1, len(t_s) + 1)
-    seen = np.concatenate(positions, axis=1)
-    write_trc(path, MarkerTrajectories(tuple(names), t_s, frames, seen, rate_hz))
-
-
 def test_markers_at_another_rate_serve_as_the_reference(files: Path) -> None:
     for name, trial in (("m0", movement(0)), ("m1", movement(1)), ("still", still())):
         as_trc(files / f"{name}.trc", trial)
     pairs = [f"{files}/{name}.npz={files}/{name}.trc" for name in ("m0", "m1", "still")]
-    names = [
-        option
-        for segment in MARKERS
-        for option in ("--markers", f"{segment}=" + ",".join(f"{segment}{k}" for k in range(3)))
-    ]
-    result = run("evaluate", *pairs[:2], *LIMB, *names, "--static", pairs[2], "--json")
+    result = run("evaluate", *pairs[:2], *LIMB, *MARKER_OPTIONS, "--static", pairs[2], "--json")
     assert result.exit_code == 0, result.output
     direct = run("evaluate", *trials(files, 2), *LIMB, "--static", files / "still.npz", "--json")
     for key, row in rows(direct).items():
@@ -367,7 +298,7 @@ def rewritten(files: Path, **arrays: Any) -> Path:
         ({"A_quat": lambda q: 57.3 * q}, "not angles in degrees"),
         ({"q_shank": lambda q: 0.01 * q}, "q_shank: its four numbers have norm 0.01"),
         ({"t": lambda t: 1000.0 * t}, "are they milliseconds"),
-        ({"t": lambda t: t[::-1]}, "whose times grow"),
+        ({"t": lambda t: t[::-1]}, "times must grow from row to row, and row 2 has 3.96 s after"),
     ],
 )
 def test_other_units_are_refused_with_what_they_look_like(
