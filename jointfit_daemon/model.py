@@ -190,8 +190,7 @@ class JointAngles(NamedTuple):
     rotation: float
 
 
-@dataclass(frozen=True, slots=True)
-class SegmentState:
+class SegmentState(NamedTuple):
     """One segment at one instant."""
 
     name: str
@@ -202,8 +201,7 @@ class SegmentState:
     """Sensors that took part."""
 
 
-@dataclass(frozen=True, slots=True)
-class JointState:
+class JointState(NamedTuple):
     """One joint at one instant. End joints of the chain have a position but no angles."""
 
     name: str
@@ -219,8 +217,7 @@ class JointState:
     """How fast the angles change, over the last 50 ms, rad/s."""
 
 
-@dataclass(frozen=True, slots=True)
-class LimbState:
+class LimbState(NamedTuple):
     """The limb at instant ``t_ns``: one of these a frame, whatever sensors are alive."""
 
     seq: int

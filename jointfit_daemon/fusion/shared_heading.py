@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ def widened_segments(segments: tuple[SegmentState, ...], sd: float) -> tuple[Seg
     It is an error about one axis of three, and `SegmentState.sd` is per axis.
     """
     return tuple(
-        one if one.sd is None else replace(one, sd=hypot(one.sd, sd / sqrt(3.0)))
+        one if one.sd is None else one._replace(sd=hypot(one.sd, sd / sqrt(3.0)))
         for one in segments
     )
 
@@ -32,8 +31,7 @@ def widened_joints(joints: tuple[JointState, ...], sd: float) -> tuple[JointStat
     return tuple(
         one
         if first is None or one.position is None or one.position_sd is None
-        else replace(
-            one,
+        else one._replace(
             position_sd=hypot(
                 one.position_sd,
                 sd / sqrt(3.0) * hypot(one.position[0] - first[0], one.position[1] - first[1]),

@@ -21,7 +21,7 @@ import orjson
 from jointfit_daemon import __version__
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.model import Chunk
+from jointfit_daemon.model import Chunk, JointState, LimbState, SegmentState
 from jointfit_daemon.pipeline.events import (
     CalibrationStored,
     ChunkArrived,
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event
 
 log = logging.getLogger(__name__)
@@ -49,6 +48,8 @@ PENDING_BYTES = 64 * 1024 * 1024
 """What may wait for a slow disk: minutes of four IMUs and a mocap system."""
 
 _STATE = b'{"state":'
+_NAMED = (LimbState, SegmentState, JointState)
+"""What is written with the names of its fields."""
 
 
 def encode_state(state: LimbState) -> bytes:
@@ -131,6 +132,8 @@ _KINDS: dict[str, Any] = {
 
 
 def _exact(value: object) -> object:
+    if isinstance(value, _NAMED):
+        return value._asdict()
     if isinstance(value, tuple):  # named tuples; orjson writes only plain ones
         return list(value)
     if hasattr(value, "items"):

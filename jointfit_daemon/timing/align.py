@@ -15,8 +15,7 @@ between is extrapolated: frames leave one period earlier, never before t_k itsel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from jointfit_daemon.timing.stream import Stream, StreamSpec, Verdict
 
@@ -31,8 +30,7 @@ Mode = Literal["smooth", "fast"]
 """``smooth`` waits for samples and interpolates; ``fast`` extrapolates by a period at most."""
 
 
-@dataclass(frozen=True, slots=True)
-class AlignedFrame:
+class AlignedFrame(NamedTuple):
     """All streams at one instant."""
 
     t_ns: int
