@@ -200,7 +200,12 @@ class FrameAligner:
         if self._fast:
             ahead = [stream.due(t_k - stream.period_ns) for _, stream in self._items]
             return max(t_k, *ahead)
-        return max([stream.due(t_k) for _, stream in self._items])
+        latest = 0
+        for _, stream in self._items:
+            due_ns = stream.due(t_k)
+            if due_ns > latest:  # noqa: PLR1730 - max() costs more, and this runs after every sample
+                latest = due_ns
+        return latest
 
     def _emit(self, due_ns: int) -> AlignedFrame | None:
         number = self._next or 0

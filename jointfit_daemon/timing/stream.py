@@ -80,7 +80,7 @@ class Stream:
     """Samples of one stream between their arrival and their verdict."""
 
     __slots__ = (
-        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_due", "_gap_ns",
+        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_due_for", "_due_ns", "_gap_ns",
         "_lost_after_ns", "_patience_ns", "_reach_ns", "_received", "_samples",
         "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced",
         "waited_for",
@@ -100,7 +100,8 @@ class Stream:
         """Of the clock behind the samples."""
         self.waited_for = False
         """Whether more is expected of it."""
-        self._due: tuple[int, int] | None = None  # what was asked last, and the answer
+        self._due_for: int | None = None  # what was asked last, and the answer
+        self._due_ns = 0
         self._received = 0
         self._counts = dict.fromkeys(Verdict, 0)
         self.newest_ns = self.newest_arrival_ns = 0
@@ -134,7 +135,7 @@ class Stream:
         if epoch != self.epoch:
             self.reset()
             self.epoch = epoch
-        samples, self._due = self._samples, None
+        samples, self._due_for = self._samples, None
         sample = _Sample(t_ns, arrival_ns, q, rate, synced)
         sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
@@ -163,12 +164,10 @@ class Stream:
 
     def _learn_delay(self, delay_ns: int) -> None:
         usual, step = self._delay_ns, self._delay_step
-        if usual is None:
-            self._delay_ns = delay_ns
-        elif delay_ns > usual:
-            self._delay_ns = min(delay_ns, usual + _DELAY_UP * step)
-        else:
-            self._delay_ns = max(delay_ns, usual - step)
+        if usual is not None:
+            least, most = usual - step, usual + _DELAY_UP * step
+            delay_ns = least if delay_ns < least else min(delay_ns, most)
+        self._delay_ns = delay_ns
 
     # --- out ---------------------------------------------------------------------------------
 
@@ -192,10 +191,9 @@ class Stream:
 
     def due(self, t_ns: int) -> int:
         """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
-        known = self._due
-        if known is None or known[0] != t_ns:
-            self._due = known = (t_ns, self._due_at(t_ns))
-        return known[1]
+        if self._due_for != t_ns:
+            self._due_for, self._due_ns = t_ns, self._due_at(t_ns)
+        return self._due_ns
 
     def _due_at(self, t_ns: int) -> int:
         if not self.waited_for:
@@ -219,15 +217,16 @@ class Stream:
             self._leave(samples.popleft(), Verdict.DECIMATED)
         if not samples or samples[0].t_ns > t_ns:
             return None
-        last = 0
-        while last + 1 < len(samples) and samples[last + 1].t_ns <= t_ns:
-            last += 1
+        after, count = 1, len(samples)
+        while after < count and samples[after].t_ns <= t_ns:
+            after += 1
+        last = after - 1
         a = samples[last]
         if a.t_ns == t_ns:
             a.used, self.synced = True, a.synced
             return a.q
-        if last + 1 < len(samples):
-            b = samples[last + 1]
+        if after < count:
+            b = samples[after]
             if b.t_ns - a.t_ns <= self._gap_ns:
                 return self._between(self._before(last), a, b, t_ns)
         if t_ns - a.t_ns > self._reach_ns:
@@ -268,7 +267,7 @@ class Stream:
 
     def lose(self) -> None:
         """Stop waiting for this stream until a sample comes."""
-        self.waited_for, self._due = False, None
+        self.waited_for, self._due_for = False, None
 
     def settle(self) -> None:
         """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
@@ -280,7 +279,7 @@ class Stream:
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), Verdict.DROPPED)
-        self.waited_for, self.epoch, self._due = False, None, None
+        self.waited_for, self.epoch, self._due_for = False, None, None
 
     def counts(self) -> dict[str, int]:
         """Return samples received, by verdict, and still pending."""
