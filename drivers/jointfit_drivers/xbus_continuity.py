@@ -36,6 +36,9 @@ class Step(NamedTuple):
     restarted: bool
 
 
+_GOES_ON = Step(0, restarted=False)
+
+
 class Continuity:
     """Follows one device.
 
@@ -62,7 +65,8 @@ class Continuity:
             return
         step = (counter - last) % _COUNTS
         self._since += step
-        self._lost += max(step - 1, 0)
+        if step > 1:
+            self._lost += step - 1
 
     def orientation(self, ticks: int | None) -> Step:
         """Take the time of a message with an orientation, its counter having been taken."""
@@ -82,7 +86,7 @@ class Continuity:
             return Step(0, restarted=True)
         self._sum_ticks += step
         self._sum_counts += since
-        return Step(lost, restarted=False)
+        return Step(lost, restarted=False) if lost else _GOES_ON
 
     def forget(self) -> None:
         """Begin anew: the device said itself that it restarted."""

@@ -7,7 +7,7 @@ where bytes take no time, that of the chunk.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.xbus_continuity import Continuity
@@ -68,15 +68,19 @@ class XbusEvents:
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
         self._continuity = Continuity(rate_hz)
+        self._tick_clock = TickClock(setup.TICK_NS, setup.WRAP_32_BIT)
         self._gate = OrientationGate()
         self._last_ns = self._arrival_ns = 0
         self._refused = self._refused_bytes = 0
-        self._measuring = self._warned = False
+        self._measuring = self._judged = False
 
     @property
     def tick_clock(self) -> TickClock:
         """100 us ticks; the modulus follows the model, or the first wrap seen."""
-        return TickClock(setup.TICK_NS, self._continuity.modulus or setup.WRAP_32_BIT)
+        modulus = self._continuity.modulus or setup.WRAP_32_BIT
+        if modulus != self._tick_clock.modulus:  # asked for after every chunk, and changes once
+            self._tick_clock = TickClock(setup.TICK_NS, modulus)
+        return self._tick_clock
 
     @property
     def messages(self) -> int:
@@ -149,40 +153,41 @@ class XbusEvents:
         return self._said(message, values, world_id)
 
     def _said(
-        self, message: XbusMessage, values: Mapping[int, Value], world_id: int
+        self, message: XbusMessage, values: Mapping[int, Any], world_id: int
     ) -> list[Decoded]:
         """Return the sample of the items of an MTData2, after what its counter and time say."""
-        counter = cast("int | None", values.get(_COUNTER))
+        counter: int | None = values.get(_COUNTER)
         if counter is not None:
             self._continuity.message(counter)
         pulses = self._pulses(message, values) if self._wires else []
         if self._raw is not None:
             return pulses + self._felt(message, values, self._raw)
-        native = cast("Quaternion | None", values.get(_QUATERNION))
+        native: Quaternion | None = values.get(_QUATERNION)
         if native is None:
             return pulses
         self._measuring = True
-        ticks = cast("int | None", values.get(_TIME))
-        status = cast("int | None", values.get(_STATUS_WORD, values.get(_STATUS_BYTE)))
-        out = self._continued(ticks) + pulses
+        ticks: int | None = values.get(_TIME)
+        status: int | None = values.get(_STATUS_WORD, values.get(_STATUS_BYTE))
+        out = self._continued(ticks)
+        out += pulses
         q = self._gate.admit(canonical(native, world_of(world_id) or "ENU"))
         if q is None:
             out.append(self._refuse(message, "quaternion norm is not 1"))
         else:
             out.append(ImuSample(self._arrived(message), q, native, ticks, counter, status))
-        return out if self._warned else out + self._judged()
+        if not self._judged:
+            out += self._judge()
+        return out
 
-    def _felt(
-        self, message: XbusMessage, values: Mapping[int, object], raw: XbusRaw
-    ) -> list[Decoded]:
+    def _felt(self, message: XbusMessage, values: Mapping[int, Any], raw: XbusRaw) -> list[Decoded]:
         """Return what raw readings give; nothing for a message without, as of a receiver."""
-        ticks = cast("int | None", values.get(_TIME))
+        ticks: int | None = values.get(_TIME)
         if ticks is None or not raw.is_complete(values):
             return []
         self._measuring = True
         out = self._continued(ticks)
-        counter = cast("int | None", values.get(_COUNTER))
-        status = cast("int | None", values.get(_STATUS_WORD))
+        counter: int | None = values.get(_COUNTER)
+        status: int | None = values.get(_STATUS_WORD)
         said = Message(self._arrived(message), ticks, counter, status)
         found = raw.samples(said, values, self.tick_clock.modulus or setup.WRAP_32_BIT)
         if found is None:
@@ -213,12 +218,11 @@ class XbusEvents:
         if self._raw is not None:
             self._raw.forget()
 
-    def _judged(self) -> list[Decoded]:
+    def _judge(self) -> list[Decoded]:
         """Return one warning where hardly any quaternion has norm 1."""
-        norm = self._gate.misconfigured_norm
+        self._judged, norm = self._gate.judged, self._gate.misconfigured_norm
         if norm is None:
             return []
-        self._warned = True
         text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
         return [DeviceEvent("warning", text, {"median_norm": norm})]
 

@@ -40,6 +40,9 @@ class Step(NamedTuple):
     """Two sensors speak: this group may be a mixture."""
 
 
+_GOES_ON = Step()
+
+
 class Continuity:
     """Follows the groups of one sensor.
 
@@ -137,4 +140,4 @@ class Continuity:
         if ticks is not None:
             self._ticks, self._groups = ticks, 0
             self._counted = counter is not None
-        return Step(lost)
+        return Step(lost) if lost else _GOES_ON

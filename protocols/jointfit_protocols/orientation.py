@@ -99,6 +99,11 @@ class OrientationGate:
             self._norms.append(sqrt(square))
 
     @property
+    def judged(self) -> bool:
+        """Whether ``misconfigured_norm`` has become what it will stay."""
+        return self._judged >= _JUDGED
+
+    @property
     def misconfigured_norm(self) -> float | None:
         """Median norm, once more than 90 of the first 100 samples failed; else None.
 

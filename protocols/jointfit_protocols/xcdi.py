@@ -173,6 +173,10 @@ class XcdiError(NamedTuple):
 XcdiMessage = XcdiGroup | XcdiError | Corrupt
 
 
+_QUATERNION, _SAMPLE_TIME = DataId.QUATERNION, DataId.SAMPLE_TIME
+_GROUP_COUNTER, _ERROR = DataId.GROUP_COUNTER, DataId.ERROR
+
+
 class XcdiDecoder:
     """Frames of one sensor in, groups out; never raises.
 
@@ -206,27 +210,27 @@ class XcdiDecoder:
 
     def feed(self, frame: CanFrame) -> XcdiMessage | None:
         """Return what `frame` completed, or None."""
-        data_id = self._by_id.get((frame.can_id, frame.extended))
-        if data_id is None or frame.error or frame.remote:
+        t_ns, can_id, data, extended, error, remote = frame
+        data_id = self._by_id.get((can_id, extended))
+        if data_id is None or error or remote:
             self.foreign += 1
             return None
         message = self._messages[data_id]
-        data = frame.data
         if len(data) != message.size:
             size = f"{len(data)} data bytes instead of {message.size}"
             return Corrupt(len(data), f"{data_id.name}: {size}")
         self.messages += 1
         counts = message.unpack(data)
-        if data_id is DataId.QUATERNION:
-            return self._complete(frame.t_ns, counts)
-        if data_id is DataId.ERROR:
-            return XcdiError(frame.t_ns, counts[0])
-        if data_id is DataId.SAMPLE_TIME:
-            self._open(frame.t_ns, counts[0])
-        elif data_id is DataId.GROUP_COUNTER:
+        if data_id is _QUATERNION:
+            return self._complete(t_ns, counts)
+        if data_id is _SAMPLE_TIME:
+            self._open(t_ns, counts[0])
+        elif data_id is _GROUP_COUNTER:
             if self._counter is not None:
-                self._open(frame.t_ns, None)  # its SampleTime was lost
+                self._open(t_ns, None)  # its SampleTime was lost
             self._counter = counts[0]
+        elif data_id is _ERROR:
+            return XcdiError(t_ns, counts[0])
         else:
             self._status = counts[0]
         return None
