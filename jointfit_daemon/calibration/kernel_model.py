@@ -16,6 +16,7 @@ with the distance from training that either expert sees.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from math import sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -188,5 +189,6 @@ def _sd(residuals: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)) / 3.0))
 
 
+@cache
 def _equal(count: int) -> tuple[float, ...]:
     return (1.0 / count,) * count

@@ -62,4 +62,6 @@ class AngleRates:
 
 
 def _wrapped(angle: float) -> float:
+    if -pi < angle < pi:
+        return angle
     return angle - 2.0 * pi * round(angle / (2.0 * pi))

@@ -61,7 +61,7 @@ class LimbFuser:
             self._standing = ("uncalibrated", "other_chain")
         self._fusers: list[SegmentFuser] = []
         self._reaches: list[Reach] = []
-        self._mounts: dict[str, tuple[Quaternion, Quaternion]] = {}
+        self._mounts: list[tuple[str, Quaternion, Quaternion]] = []
         self.links: LinkWatch | None = None
         self._rates = AngleRates()
         if self._calibration is not None:
@@ -71,10 +71,10 @@ class LimbFuser:
         chain = self._chain
         self._standing = calibration.flags
         self.links = LinkWatch(chain, calibration, self._drifting)
-        self._mounts = {
-            name: (item.q_optical_world, item.q_sensor_segment)
+        self._mounts = [
+            (name, item.q_optical_world, item.q_sensor_segment)
             for name, item in calibration.sensor.items()
-        }
+        ]
         for i, segment in enumerate(chain.segments):
             stored = calibration.segment[segment]
             self._fusers.append(SegmentFuser(segment, chain.sensors[i], stored))
@@ -126,8 +126,8 @@ class LimbFuser:
         if self._calibration is None:
             return self._uncalibrated(t_ns, completed_ns, seq, sync)
         inputs = {
-            name: multiply_one(multiply_one(mount[0], orientations[name]), mount[1])
-            for name, mount in self._mounts.items()
+            name: multiply_one(multiply_one(q_world, orientations[name]), q_mount)
+            for name, q_world, q_mount in self._mounts
             if name in orientations
         }
         fused, doubts = self._fused(t_ns, inputs)
@@ -136,7 +136,8 @@ class LimbFuser:
             flags.append("extrapolating")
         if optical_origin is None and mode == "imu+mocap":
             flags.append("origin_fixed")
-        flags += [f"stuck:{name}" for name in stuck]
+        if stuck:
+            flags += [f"stuck:{name}" for name in stuck]
         flags += doubts
         for one in fused:
             flags += one.flags
@@ -162,7 +163,9 @@ class LimbFuser:
     def news(self, now_ns: int) -> list[SensorNews]:
         """Return what is worth telling of the sensors at `now_ns`, each change once."""
         told = self.watch.news(now_ns)
-        return told if self.links is None else told + self.links.news()
+        if self.links is not None:
+            told += self.links.news()
+        return told
 
     def _fused(self, t_ns: int, inputs: Inputs) -> tuple[list[Fused], tuple[str, ...]]:
         """Return the segments, and flags of sensors that contradict each other."""

@@ -38,6 +38,7 @@ turn about the vertical, common to a segment's pair, that no training frame show
 simulated people a minute after calibration). It hardly touches flexion."""
 HEADING_WANDER = radians(0.3)
 """How it goes on wandering, rad per root of a minute: after an hour the deviation has doubled."""
+_HEADING_VAR, _WANDER_VAR = HEADING_SD * HEADING_SD, HEADING_WANDER * HEADING_WANDER
 BLEND_NS = 250_000_000
 LEARNED_NS = 1_000_000_000
 """How long models that were learned while running take to replace those before them."""
@@ -227,7 +228,7 @@ def _claimed(said: Prediction, minutes: float) -> tuple[float | None, float]:
     calibration, with its static pose, has been in use.
     """
     sd = max(said.sd, FLOOR_SD)
-    heading = HEADING_SD * HEADING_SD + HEADING_WANDER * HEADING_WANDER * max(minutes, 0.0)
+    heading = _HEADING_VAR + _WANDER_VAR * max(minutes, 0.0)
     sd = sqrt(sd * sd + heading / 3.0)
     return None if said.axis_sd is None else max(said.axis_sd[0], FLOOR_SD), sd
 
@@ -238,10 +239,10 @@ def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:
     Sum of the quaternions on the first one's side, normalised: for two it is the eigenvector mean
     (Markley et al. 2007) exactly, for more it differs in the third order of their distances.
     """
-    first = orientations[0]
-    w, x, y, z = first
-    for q in orientations[1:]:
-        same = q[0] * first[0] + q[1] * first[1] + q[2] * first[2] + q[3] * first[3] >= 0.0
-        sign = 1.0 if same else -1.0
-        w, x, y, z = w + sign * q[0], x + sign * q[1], y + sign * q[2], z + sign * q[3]
+    w, x, y, z = a, b, c, d = orientations[0]
+    for p, i, j, k in orientations[1:]:
+        if p * a + i * b + j * c + k * d >= 0.0:
+            w, x, y, z = w + p, x + i, y + j, z + k
+        else:
+            w, x, y, z = w - p, x - i, y - j, z - k
     return normalize_one((w, x, y, z))

@@ -65,6 +65,8 @@ class SensorWatch:
         self._items = tuple(self._sensors.items())
         self._frozen = FrozenWatch(chain.sensors)
         self._heard_ns: int | None = None
+        self._untold = False
+        """Whether any state is another than what was told."""
 
     def look(
         self, t_ns: int, now_ns: int, said: Mapping[str, Quaternion]
@@ -83,7 +85,7 @@ class SensorWatch:
         for name, one in self._items:
             state: State = "lost" if name not in said else "stuck" if name in stuck else "ok"
             if state != one.state and not (state == "lost" and one.state == "absent"):
-                one.state, one.since_ns = state, now_ns
+                one.state, one.since_ns, self._untold = state, now_ns, True
                 if one.told == "absent":  # that it streams is told already
                     one.told = "ok"
         if not stuck:
@@ -106,12 +108,16 @@ class SensorWatch:
         if self._heard_ns is not None and now_ns - self._heard_ns >= LOST_NS:
             for _, one in self._items:
                 if one.state in ("ok", "stuck"):
-                    one.state, one.since_ns = "lost", self._heard_ns
-        return [
+                    one.state, one.since_ns, self._untold = "lost", self._heard_ns, True
+        if not self._untold:
+            return []
+        told = [
             self._tell(name, one)
             for name, one in self._items
             if one.state != one.told and now_ns - one.since_ns >= _patience_ns(one)
         ]
+        self._untold = any(one.state != one.told for _, one in self._items)
+        return told
 
     def health(self, name: str) -> State:
         """Return the state of one sensor."""

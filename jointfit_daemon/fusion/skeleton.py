@@ -10,7 +10,7 @@ from math import cos, hypot
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.joint_angles import read_joint
-from jointfit_daemon.kinematics.rotation_scalar import rotate_one
+from jointfit_daemon.kinematics.rotation_scalar import along_z_one
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,7 +57,7 @@ def joint_positions(
             out.append((None, None))
             continue
         length = reach.length
-        dx, dy, dz = rotate_one(one.q, (0.0, 0.0, -length))
+        dx, dy, dz = along_z_one(one.q, -length)
         place = (place[0] + dx, place[1] + dy, place[2] + dz)
         trace += 2.0 * (length * one.sd) ** 2 + reach.sd**2
         out.append((place, trace / 3.0))

@@ -63,6 +63,13 @@ def rotate_one(q: Quaternion, v: Vector) -> Vector:
     )
 
 
+def along_z_one(q: Quaternion, length: float) -> Vector:
+    """Return ``rotate_one(q, (0, 0, length))``, as bones need it, for less."""
+    w, x, y, z = q
+    tx, ty = 2.0 * (y * length), -2.0 * (x * length)
+    return (w * tx - z * ty, w * ty + z * tx, length + x * ty - y * tx)
+
+
 def exp_one(r: Vector) -> Quaternion:
     """Return the quaternion of a rotation vector, rad."""
     x, y, z = r
