@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations, product
 from math import atan2, radians, sqrt
-from operator import mul
+from operator import le, mul
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -73,16 +73,19 @@ class SensorLink:
         """
         if up_near is None:
             return (0.0,) * len(self.weights), self.total + self.spread
-        seen, stray = [], 0.0
-        for value, low, high in zip(posture_one(up_a, up_near), self.low, self.high, strict=True):
-            if low <= value <= high:
-                seen.append(value)
-                continue
-            kept = low if value < low else min(value, high)
-            stray = max(stray, abs(value - kept) - STRAY * (high - low))
-            seen.append(kept)
+        seen, stray = posture_one(up_a, up_near), 0.0
+        if not (all(map(le, self.low, seen)) and all(map(le, seen, self.high))):
+            seen, stray = self._kept(seen)
         said = tuple([sum(map(mul, row, seen)) for row in self.weights])
         return said, self.spread + min(1.0, 2.0 * stray) * self.total
+
+    def _kept(self, posture: tuple[float, ...]) -> tuple[tuple[float, ...], float]:
+        """Return a posture kept within what was seen, and how far it strays from there."""
+        kept, stray = [], 0.0
+        for value, low, high in zip(posture, self.low, self.high, strict=True):
+            kept.append(low if value < low else min(value, high))
+            stray = max(stray, abs(value - kept[-1]) - STRAY * (high - low))
+        return tuple(kept), stray
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""

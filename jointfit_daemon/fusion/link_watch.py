@@ -104,6 +104,8 @@ class LinkWatch:
         """Heading errors that are taken out of the sensors, rad."""
         self._along = [0.0] * len(chain.segments)
         """The part of them that all sensors of a segment have in common, rad."""
+        self._restless: set[PairWatch] = set()
+        """Pairs that contradict each other, or begin to: mostly none."""
         self._backs: dict[str, tuple[float, float]] = {}
         """cos and sin of half the turn back, of sensors that are corrected."""
         self._next_ns = 0
@@ -151,6 +153,10 @@ class LinkWatch:
         # a posture told by a sensor that slipped would put the blame on this segment, too
         near = None if teller is None or self._in_doubt(teller) else ups[teller]
         pair.look(t_ns, a, b, ups[link.a], near)
+        if pair.calm:
+            self._restless.discard(pair)
+        else:
+            self._restless.add(pair)
         drift = self._within.get((link.a, link.b))
         if drift is not None and pair.calm and near is not None:
             drift.look(pair.turned + self._turns[link.b] - self._turns[link.a])
@@ -176,11 +182,8 @@ class LinkWatch:
         return self._chain.segments[index]
 
     def _in_doubt(self, sensor: str) -> bool:
-        for pairs in self._pairs:
-            for pair in pairs:
-                if not pair.calm and sensor in (pair.link.a, pair.link.b):
-                    return True
-        return False
+        restless = self._restless
+        return bool(restless) and any(sensor in (p.link.a, p.link.b) for p in restless)
 
     # --- headings, once a second -------------------------------------------------------------
 
@@ -259,7 +262,8 @@ class LinkWatch:
 
     def _odd_one(self, i: int, inputs: Inputs) -> str | None:
         """Return the one sensor that contradicts all others of its segment, who agree."""
-        here = [name for name in self._chain.sensors[i] if name in inputs]
+        group = self._chain.sensors[i]
+        here = [name for name in group if name in inputs] if len(group) >= MAJORITY else []
         if len(here) < MAJORITY:
             return None
         against = [
