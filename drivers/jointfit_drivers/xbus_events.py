@@ -170,7 +170,8 @@ class XbusEvents:
         status: int | None = values.get(_STATUS_WORD, values.get(_STATUS_BYTE))
         out = self._continued(ticks)
         out += pulses
-        q = self._gate.admit(canonical(native, world_of(world_id) or "ENU"))
+        world = world_of(world_id) or "ENU"
+        q = self._gate.admit(native if world == "ENU" else canonical(native, world))
         if q is None:
             out.append(self._refuse(message, "quaternion norm is not 1"))
         else:

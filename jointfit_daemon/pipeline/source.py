@@ -154,12 +154,13 @@ class SourceState:
 
     def _stamped(self, item: ImuSample | MocapFrame, tick_clock: TickClock | None) -> Stamped:
         self.counts.received += 1
-        clock, now_ns = self.clock, self.last_arrival_ns or 0
+        clock = self.clock
         if isinstance(item, ImuSample):
-            if item.arrival_ns > now_ns:  # a stamp of kernel or adapter that is simply wrong
-                item = item._replace(arrival_ns=now_ns)
+            now_ns, arrival_ns = self.last_arrival_ns or 0, item.arrival_ns
+            if arrival_ns > now_ns:  # a stamp of kernel or adapter that is simply wrong
+                item, arrival_ns = item._replace(arrival_ns=now_ns), now_ns
             return Stamped(
-                item, clock.feed_sample(item.ticks, item.counter, item.arrival_ns, tick_clock)
+                item, clock.feed_sample(item.ticks, item.counter, arrival_ns, tick_clock)
             )
         stamp = clock.feed_sample(item.ticks, item.number, item.arrival_ns, tick_clock)
         number = getattr(self.source.settings, "sync_line", None)

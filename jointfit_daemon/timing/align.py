@@ -202,7 +202,7 @@ class FrameAligner:
             return max(t_k, *ahead)
         latest = 0
         for _, stream in self._items:
-            due_ns = stream.due(t_k)
+            due_ns = stream.due_ns if stream.due_for == t_k else stream.due(t_k)
             if due_ns > latest:  # noqa: PLR1730 - max() costs more, and this runs after every sample
                 latest = due_ns
         return latest

@@ -80,10 +80,10 @@ class Stream:
     """Samples of one stream between their arrival and their verdict."""
 
     __slots__ = (
-        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_due_for", "_due_ns", "_gap_ns",
+        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_gap_ns",
         "_lost_after_ns", "_patience_ns", "_reach_ns", "_received", "_samples",
-        "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns", "synced",
-        "waited_for",
+        "due_for", "due_ns", "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns",
+        "synced", "waited_for",
     )  # fmt: skip
 
     def __init__(self, spec: StreamSpec) -> None:
@@ -100,8 +100,9 @@ class Stream:
         """Of the clock behind the samples."""
         self.waited_for = False
         """Whether more is expected of it."""
-        self._due_for: int | None = None  # what was asked last, and the answer
-        self._due_ns = 0
+        self.due_for: int | None = None
+        """For which instant ``due`` was asked last, if its answer still holds: ``due_ns``."""
+        self.due_ns = 0
         self._received = 0
         self._counts = dict.fromkeys(Verdict, 0)
         self.newest_ns = self.newest_arrival_ns = 0
@@ -135,7 +136,7 @@ class Stream:
         if epoch != self.epoch:
             self.reset()
             self.epoch = epoch
-        samples, self._due_for = self._samples, None
+        samples, self.due_for = self._samples, None
         sample = _Sample(t_ns, arrival_ns, q, rate, synced)
         sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
@@ -191,9 +192,9 @@ class Stream:
 
     def due(self, t_ns: int) -> int:
         """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
-        if self._due_for != t_ns:
-            self._due_for, self._due_ns = t_ns, self._due_at(t_ns)
-        return self._due_ns
+        if self.due_for != t_ns:
+            self.due_for, self.due_ns = t_ns, self._due_at(t_ns)
+        return self.due_ns
 
     def _due_at(self, t_ns: int) -> int:
         if not self.waited_for:
@@ -267,7 +268,7 @@ class Stream:
 
     def lose(self) -> None:
         """Stop waiting for this stream until a sample comes."""
-        self.waited_for, self._due_for = False, None
+        self.waited_for, self.due_for = False, None
 
     def settle(self) -> None:
         """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
@@ -279,7 +280,7 @@ class Stream:
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), Verdict.DROPPED)
-        self.waited_for, self.epoch, self._due_for = False, None, None
+        self.waited_for, self.epoch, self.due_for = False, None, None
 
     def counts(self) -> dict[str, int]:
         """Return samples received, by verdict, and still pending."""

@@ -151,7 +151,8 @@ class XbusDecoder:
                 break
             reason = _fault(buffer, at, size)
             if not reason:
-                self._end_run(found)
+                if self._run:
+                    self._end_run(found)
                 found.append(_message(buffer, at, size, base + at + size))
                 self.messages += 1
                 at += size
