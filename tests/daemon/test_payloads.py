@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,9 +62,9 @@ def bent(alpha_deg: float, beta_deg: float, gamma_deg: float) -> LimbState:
     thigh = Rotation.from_quat([0.0094, -0.0251, 0.1276, 0.9914])
     q = [tuple(r.as_quat(scalar_first=True).tolist()) for r in (thigh, thigh * turn)]
     segments = tuple(
-        replace(one, q_world_segment=turned) for one, turned in zip(STATE.segments, q, strict=True)
+        one._replace(q_world_segment=turned) for one, turned in zip(STATE.segments, q, strict=True)
     )
-    return replace(STATE, segments=segments)
+    return STATE._replace(segments=segments)
 
 
 def test_a_pose_is_this_text() -> None:

@@ -55,6 +55,11 @@ def test_a_vector_turns_as_scipy_turns_it(q: Quaternion, v: Vector) -> None:
     assert np.allclose(rot.to_matrix(q) @ np.array(v), expected, atol=1e-12)
 
 
+@given(quaternions, components)
+def test_a_bone_turns_as_any_vector_does(q: Quaternion, length: float) -> None:
+    assert one.along_z_one(q, length) == one.rotate_one(q, (0.0, 0.0, length))
+
+
 @given(quaternions)
 def test_log_is_the_rotation_vector_and_exp_its_inverse(q: Quaternion) -> None:
     vector = rot.log(q)
