@@ -74,8 +74,8 @@ def messages(felt: Sequence[Array]) -> list[bytes]:
     ]
 
 
-def decoder(*, magnetometer: bool) -> Decoder:
-    """Return a fresh decoder of the driver as rig.toml would set it."""
+def decoder(*, magnetometer: bool, settle_s: float = 0.0) -> Decoder:
+    """Return a fresh decoder of the driver as rig.toml would set it, from the start by default."""
     driver = find_driver("xbus")
     settings = driver.Settings(
         id="S1",
@@ -86,13 +86,14 @@ def decoder(*, magnetometer: bool) -> Decoder:
         rate_hz=RATE_HZ,
         orientation="gateway",
         magnetometer=magnetometer,
+        settle_s=settle_s,
     )
     return driver(settings).decoder()
 
 
-def through_driver(felt: Sequence[Array], *, magnetometer: bool) -> Array:
+def through_driver(felt: Sequence[Array], *, magnetometer: bool, settle_s: float = 0.0) -> Array:
     """Return q_world_sensor as the driver gives it, shape (n, 4)."""
-    path = decoder(magnetometer=magnetometer)
+    path = decoder(magnetometer=magnetometer, settle_s=settle_s)
     said = [
         item.q_world_sensor
         for k, data in enumerate(messages(felt))

@@ -14,6 +14,11 @@ rates are scaled so that every step turns by what really passed:
 Up to three missing readings are interpolated. After a longer gap the filter begins anew: it keeps
 the gyroscope's bias and, without a magnetometer, goes on at the heading it had, which is a guess.
 
+A filter that has just begun takes one reading of the accelerometer for the vertical: in fast motion
+20 degrees are wrong with that in the first second, 4 in the next two, then no more than ever
+(``bench/fusion.py E-2``). So nothing is given out before it has settled: found rest, or worked for
+`SETTLE_S`.
+
 Source: Laidig and Seel 2023, Information Fusion 91, 187-204, and their package ``vqf``.
 """
 
@@ -35,6 +40,8 @@ PACKAGE_MISSING = (
 )
 MOST_MISSING = 3
 """Readings in a row that are interpolated; more begin the filter anew."""
+SETTLE_S = 3.0
+"""Time constant of the filter's accelerometer: its vertical is a mean over as long."""
 FASTEST = 200.0
 """No gyroscope reads more, rad/s: 11 000 degrees a second."""
 HARDEST = 5000.0
@@ -68,7 +75,8 @@ class FilterStep(NamedTuple):
     """What one reading gave."""
 
     oriented: tuple[Oriented, ...]
-    """None for the very first reading, which waits for the second; then two; then one each."""
+    """None while the filter settles; then one a reading. Where it need not settle, none for the
+    very first reading, which waits for the second; then two; then one each."""
     missing: int = 0
     """Readings that did not come in between."""
     began_anew: bool = False
@@ -111,10 +119,14 @@ class GatewayOrientation:
         Nominal rate: only how many readings are missing before the second depends on it.
     magnetometer
         Whether heading comes from the magnetometer (9D) or drifts freely (6D).
+    settle_s
+        For how long at most nothing is given out after the filter has begun, s.
     """
 
-    def __init__(self, rate_hz: float, *, magnetometer: bool) -> None:
+    def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
         self._nominal_ns = 1e9 / rate_hz
+        self._settle_ns = round(settle_s * _NS)
+        self._began_ns: int | None = None  # None: it has settled
         self._magnetic = magnetometer
         self._filter: Any = None
         self._last: Reading | None = None
@@ -128,6 +140,11 @@ class GatewayOrientation:
     def period_ns(self) -> float:
         """Mean interval of the readings so far, ns; the nominal one before the second."""
         return self._passed_ns / self._steps if self._steps else self._nominal_ns
+
+    @property
+    def settling(self) -> bool:
+        """Whether the filter has begun and is not to be believed yet."""
+        return self._began_ns is not None
 
     @property
     def state(self) -> FilterState | None:
@@ -152,23 +169,40 @@ class GatewayOrientation:
             self._steps += steps
         first: tuple[Oriented, ...] = ()
         if self._filter is None:
-            self._begin(self.period_ns)
+            self._begin(self.period_ns, last.t_ns)
             first = (self._update(last),)
         if not followed:
-            self._begin_anew()
-            return FilterStep((*first, self._update(reading, follows=False)), steps - 1, True)
+            self._begin_anew(reading.t_ns)
+            return self._step((self._update(reading, follows=False),), reading, steps - 1, True)
         for k in range(1, steps):
             self._update(_between(last, reading, k / steps))
-        return FilterStep((*first, self._update(reading)), steps - 1)
+        return self._step((*first, self._update(reading)), reading, steps - 1)
 
-    def _begin(self, period_ns: float) -> None:
+    def _step(
+        self,
+        oriented: tuple[Oriented, ...],
+        reading: Reading,
+        missing: int,
+        began_anew: bool = False,
+    ) -> FilterStep:
+        """Return what is given out: nothing before the filter has settled."""
+        if self._began_ns is None:
+            return FilterStep(oriented, missing, began_anew)
+        waited_ns = reading.t_ns - self._began_ns
+        if waited_ns < self._settle_ns and not self._filter.getRestDetected():
+            return FilterStep((), missing, began_anew)
+        self._began_ns = None
+        return FilterStep(oriented[-1:], missing, began_anew)
+
+    def _begin(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns
+        self._began_ns = t_ns if self._settle_ns else None
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
 
-    def _begin_anew(self) -> None:
+    def _begin_anew(self, t_ns: int) -> None:
         """Forget the inclination; keep the bias, which is the sensor's own."""
         bias, sd = self._filter.getBiasEstimate()
-        self._begin(self._period_ns)
+        self._begin(self._period_ns, t_ns)
         self._filter.setBiasEstimate(bias, sd)
 
     def _update(self, reading: Reading, *, follows: bool = True) -> Oriented:

@@ -38,7 +38,11 @@ class XbusImu:
         baud = settings.baud if settings.transport == "uart" else None
         raw = None
         if settings.orientation == "gateway":
-            raw = XbusRaw(settings.rate_hz, magnetometer=settings.magnetometer)
+            raw = XbusRaw(
+                settings.rate_hz,
+                magnetometer=settings.magnetometer,
+                settle_s=settings.settle_s,
+            )
         return XbusEvents(baud, settings.rate_hz, wires(settings.sync or ()), raw)
 
     async def run(self, emit: Emit) -> None:

@@ -2,8 +2,8 @@
 
 Law: a function of the messages fed. Rates come as RateOfTurn or DeltaQ, specific force as
 Acceleration or DeltaV, all three vectors in the axes of the housing; increments are divided by the
-mean interval of the device's own clock. One sample leaves for each complete message, but the first
-waits for the second, which tells how long an interval is.
+mean interval of the device's own clock. One sample leaves for each complete message once the filter
+has settled.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import (
+    SETTLE_S,
     GatewayOrientation,
     Oriented,
     Reading,
@@ -33,6 +34,8 @@ RAW = frozenset((*RATES, *FORCES, FIELD))
 _TELL_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
 """How often the filter's state is told, and how soon after that where it changed."""
 _TINY = 1e-12
+FAST = 5.0
+"""Slower rates than this, rad/s, are within the range of every gyroscope."""
 _NEW_HEADING = (
     "orientation by gyroscope and accelerometer begins: its heading is another than before; "
     "repeat the static pose"
@@ -57,21 +60,27 @@ class XbusRaw:
         Nominal rate.
     magnetometer
         Whether heading comes from the magnetometer.
+    settle_s
+        For how long at most a filter that has begun gives nothing out, s.
     """
 
-    def __init__(self, rate_hz: float, *, magnetometer: bool) -> None:
-        self._made = (rate_hz, magnetometer)
-        self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer)
+    def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
+        self._made = (rate_hz, magnetometer, settle_s)
+        self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
         self._waiting: tuple[Message, Reading] | None = None
         self._ticks: int | None = None
         self._t_ns = 0
         self._told_ns, self._told = -_TELL_NS, (False, False)
         self._clipped_ns = -_TELL_NS
+        self._rate: Vector = (0.0, 0.0, 0.0)
         self._begun = False
 
     def forget(self) -> None:
         """Begin anew: the device restarted, its clock with it."""
-        self.__init__(self._made[0], magnetometer=self._made[1])  # type: ignore[misc] # as if new
+        rate_hz, magnetometer, settle_s = self._made
+        self.__init__(  # type: ignore[misc] # as if new
+            rate_hz, magnetometer=magnetometer, settle_s=settle_s
+        )
 
     def is_complete(self, values: Mapping[int, object]) -> bool:
         """Return whether a message holds a rate and a specific force."""
@@ -88,7 +97,7 @@ class XbusRaw:
             return None
         self._ticks, self._t_ns = message.ticks, reading.t_ns
         step = self._filter.take(reading)
-        out = self._doubts(message, began_anew=step.began_anew, missing=step.missing)
+        out = self._doubts(message, values, began_anew=step.began_anew, missing=step.missing)
         first, self._waiting = self._waiting, (message, reading)
         if len(step.oriented) > 1 and first is not None:
             out.append(_sample(*first, step.oriented[0]))
@@ -114,18 +123,32 @@ class XbusRaw:
             cast("Vector | None", field),
         )
 
-    def _doubts(self, message: Message, *, began_anew: bool, missing: int) -> list[Decoded]:
+    def _doubts(
+        self, message: Message, values: Mapping[int, object], *, began_anew: bool, missing: int
+    ) -> list[Decoded]:
         """Return warnings of what makes an orientation doubtful."""
         out: list[Decoded] = []
         if began_anew:
             text = f"{missing} readings missing: the orientation began anew, its heading is a guess"
             out.append(DeviceEvent("warning", text, {"missing": missing}))
         clipped = message.status is not None and bool(message.status & CLIPPING)
+        clipped |= self._saturated(values)
         if clipped and self._t_ns - self._clipped_ns >= _TELL_NS:
             self._clipped_ns = self._t_ns
             text = "a reading was out of range: heading is lost until the next static pose"
             out.append(DeviceEvent("warning", text, {"status": message.status}))
         return out
+
+    def _saturated(self, values: Mapping[int, object]) -> bool:
+        """Tell whether a fast rate repeats itself to the last bit: it is at the end of its range.
+
+        Devices need not send their status; and noise sees to it that no two rates are the same.
+        """
+        before, rate = self._rate, cast("Vector | None", values.get(RATES[0]))
+        self._rate = rate or (0.0, 0.0, 0.0)
+        return any(
+            now == then and abs(now) > FAST for now, then in zip(self._rate, before, strict=True)
+        )
 
     def _news(self) -> list[Decoded]:
         """Return the filter's state where it is due."""
@@ -147,6 +170,7 @@ class XbusRaw:
             "bias_sd_rad_s": round(state.bias_sd, 7),
             "magnetometer": self._made[1],
             "disturbed": state.disturbed,
+            "settled": not self._filter.settling,
             "period_ms": round(self._filter.period_ns * 1e-6, 6),
         }
         out.append(DeviceEvent("info", "orientation filter", {"orientation_filter": data}))

@@ -48,6 +48,13 @@ class XbusSettings(ImuSettings):
         description='with `orientation = "gateway"`: heading by magnetometer, which the device '
         "must then send at `rate_hz`, too; left out it drifts freely. The same for all IMUs",
     )
+    settle_s: float = Field(
+        gateway_orientation.SETTLE_S,
+        ge=0,
+        le=60,
+        description='with `orientation = "gateway"`: longest time, s, after the start (or a gap) '
+        "for which nothing is given out while the filter finds the vertical; at rest half of it",
+    )
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"
     )

@@ -39,7 +39,7 @@ TICKS = 100  # at 100 Hz
 
 
 def setup(rate_hz: int = 100, **more: Any) -> XbusSettings:
-    table: dict[str, Any] = {"orientation": "gateway"} | more
+    table: dict[str, Any] = {"orientation": "gateway", "settle_s": 0.0} | more
     return XbusSettings(
         id="S1", segment="thigh", driver="xbus", port="p", baud=921_600, rate_hz=rate_hz, **table
     )
@@ -109,9 +109,9 @@ def test_the_interval_is_that_of_the_device_clock_and_not_the_nominal_one() -> N
     assert turned > 1.005 * 10.0
 
 
-def test_ticks_too_coarse_for_one_interval_do_not_change_the_turn() -> None:
+def testicks_too_coarse_for_one_interval_do_not_change_the_turn() -> None:
     """60 Hz is 166.67 ticks; the first interval alone would be wrong by 0.4 %."""
-    orientation = GatewayOrientation(60.0, magnetometer=False)
+    orientation = GatewayOrientation(60.0, magnetometer=False, settle_s=0.0)
     turned, before = 0.0, None
     for k in range(1201):
         t_ns = k * 500 // 3 * 100_000
@@ -168,6 +168,62 @@ def test_increments_serve_as_well_as_rates() -> None:
     by_increments = decoded([message(k, 100 * k, *items) for k in range(500)])
     by_rates = decoded([message(k, 100 * k, *rates) for k, rates in enumerate(turning(500))])
     assert rotation.angle_between(orientations(by_increments), orientations(by_rates)).max() < 1e-4
+
+
+def tumbling(n: int) -> list[tuple[tuple[int, Any], ...]]:
+    """Return raw items of a sensor that never rests."""
+    return [
+        (
+            (Item.RATE_OF_TURN, (sin(0.1 * k), cos(0.07 * k), 0.5)),
+            (Item.ACCELERATION, (2.0 * sin(0.2 * k), 1.0, 9.0)),
+        )
+        for k in range(n)
+    ]
+
+
+@pytest.mark.parametrize(("contents", "first_s"), [(tumbling(600), 3.0), (turning(600, 0.1), 3.0)])
+def test_nothing_is_given_out_before_the_filter_has_settled(
+    contents: list[tuple[tuple[int, Any], ...]], first_s: float
+) -> None:
+    wires = [message(k, 100 * k, *items) for k, items in enumerate(contents)]
+    settled, at_once = samples(decoded(wires, settle_s=3.0)), samples(decoded(wires))
+    assert settled[0].ticks == round(first_s * 100) * TICKS
+    assert settled == at_once[-len(settled) :]  # what comes is what would have come anyway
+
+
+def test_a_filter_at_rest_settles_sooner() -> None:
+    wires = [
+        message(k, 100 * k, (Item.RATE_OF_TURN, STILL), (Item.ACCELERATION, UP)) for k in range(400)
+    ]
+    first = samples(decoded(wires, settle_s=3.0))[0]
+    assert first.ticks is not None
+    assert 1.4 < first.ticks * 1e-4 < 1.6
+
+
+def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settled() -> None:
+    contents = tumbling(1200)
+    wires = [message(k, 100 * k, *items) for k, items in enumerate(contents)]
+    events = decoded(wires[:600] + wires[620:], settle_s=3.0)
+    ticks = [sample.ticks for sample in samples(events)]
+    assert ticks[-1] == 1199 * TICKS
+    gap = [(a, b) for a, b in pairwise(ticks) if a is not None and b is not None and b - a > TICKS]
+    assert gap == [(599 * TICKS, 920 * TICKS)]
+    assert sum(isinstance(e, DeviceEvent) and "began anew" in e.text for e in events) == 1
+
+
+def test_a_fast_rate_that_repeats_itself_is_at_the_end_of_its_range() -> None:
+    """Without a status word, too; a slow rate may repeat, a fast one never does."""
+    fast = [(7.85398, 0.0, 0.0)] * 3 + [(7.0 + 0.01 * k, 0.1, 0.2) for k in range(30)]
+    slow = [(1.0, 0.0, 0.0)] * 30
+    for rates, expected in ((fast, 1), (slow, 0), (fast[3:], 0)):
+        wires = [
+            message(k, 100 * k, (Item.RATE_OF_TURN, rate), (Item.ACCELERATION, UP))
+            for k, rate in enumerate(rates)
+        ]
+        told = [
+            e for e in decoded(wires) if isinstance(e, DeviceEvent) and "out of range" in e.text
+        ]
+        assert len(told) == expected
 
 
 @pytest.mark.parametrize("precision", list(Precision))

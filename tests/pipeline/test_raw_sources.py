@@ -63,5 +63,6 @@ def test_rest_and_bias_are_part_of_the_health_of_a_raw_source() -> None:
     said = devices["S1"]["orientation_filter"]
     assert said["rest"] is True
     assert said["bias_rad_s"] == pytest.approx([0.01, 0.0, 0.0], abs=1e-3)
-    assert devices["S1"]["received"] == 1500
+    assert said["settled"] is True
+    assert devices["S1"]["received"] == 1500 - 149  # at rest, the filter settles for 1.5 s
     assert "orientation_filter" not in devices["S3"]
