@@ -85,6 +85,7 @@ class CalibrationSession:
         self._phase: Phase | None = None
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
+        self._pose_s = settings.static_s  # how long a pose was asked for, not what rig.toml has
         self._jobs = 0
         self._fitting: _Fit | None = None
         self._force = False
@@ -95,6 +96,7 @@ class CalibrationSession:
         self._jobs = before._jobs  # numbers are never used twice
         if same_rig:
             self._alignment, self._static = before._alignment, before._static
+            self._pose_s = before._pose_s
             self._learned.paused = before._learned.paused
 
     @property
@@ -282,11 +284,11 @@ class CalibrationSession:
         else:
             stored = None if self.calibration is None else self.calibration.to_dict()
             payload |= {"alignment": self._alignment, "previous": stored, phase.name: trial}
-        if phase.name == "static":  # a pose is as long as was asked for, not as rig.toml has it
-            settings = replace(settings, static_s=phase.wanted_s)
+        if phase.name == "static":
+            self._pose_s = phase.wanted_s
         elif phase.name == "functional":
             payload["static"] = self._static
-        payload["settings"] = settings
+        payload["settings"] = replace(settings, static_s=self._pose_s)
         if self.lags is not None:
             payload |= {"lag_ns": self.lags.known_ns(), "tracked": self.lags.tracked()}
         self._jobs += 1

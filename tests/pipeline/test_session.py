@@ -262,6 +262,21 @@ def test_the_pose_is_judged_by_the_length_that_was_asked_for() -> None:
     assert settings.static_s == 1.5
 
 
+def test_the_movement_after_a_short_pose_judges_it_by_that_length_too() -> None:
+    """A pose that was accepted must not be refused a minute later."""
+    one = session()
+    ask(one, 0, "static", seconds=1.5)
+    (job,) = only(wear(one, 0, 5), FitJob)
+    done(one, job, quality={})
+    reloaded = session()
+    reloaded.take_over(one, same_rig=True)
+    for after in (one, reloaded):
+        ask(after, 5 * SECOND, "functional")
+        (job,) = only(wear(after, 5, 12), FitJob)
+        settings: Any = job.payload["settings"]
+        assert settings.static_s == 1.5
+
+
 # --- what is left over ----------------------------------------------------------------------------
 
 

@@ -1,0 +1,123 @@
+"""Three segments with three, two and one sensors, live: calibrated, followed, put on anew."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.tools.demo_truth import TruthReader
+from jointfit_simulators.programme import parse_programme
+from jointfit_simulators.rig_file import RigOptions
+from jointfit_simulators.scene import Scene, SceneOptions
+from jointfit_simulators.settings import Knobs, perfect, turn
+from jointfit_simulators.wearer import Wearer
+from tests.system.station import BASE, Station, listening
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from tests.broker_fixture import MosquittoBroker
+    from tests.system.station import Listener
+
+pytestmark = pytest.mark.system
+
+SENSORS = {
+    "S1": "thigh", "S2": "thigh", "S5": "thigh", "S3": "shank", "S4": "shank", "S6": "foot",
+}  # fmt: skip
+WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi", "S5": "xcdi", "S6": "xbus"}
+SETTINGS = (
+    "mount_deg=20", "soft_tissue_common_deg=3", "soft_tissue_sensor_deg=2", "occlusion=0",
+    "transition_s=0.5", "seed=5",
+)  # fmt: skip
+SETTLE_S = 0.7
+CHAIN = (
+    ('joints = ["hip", "knee", "ankle"]', 'joints = ["hip", "knee", "ankle", "toe"]'),
+    ('segments = ["thigh", "shank"]', 'segments = ["thigh", "shank", "foot"]'),
+    ('distal = "foot"', "lengths_m = { foot = 0.15 }"),
+)
+
+
+@contextlib.asynccontextmanager
+async def played(folder: Path, port: int) -> AsyncIterator[Scene]:
+    knobs = turn(perfect(Knobs()), SETTINGS)
+    rig = RigOptions(mqtt_port=port, mqtt_base=BASE, axes="static")  # the truth's axes
+    options = SceneOptions(folder, wires=WIRES, rig=rig)
+    subject = Wearer(knobs, parse_programme("stand"), sensors=SENSORS)
+    scene = Scene(knobs, subject, options, now_ns=time.monotonic_ns())
+    ready = asyncio.Event()
+    task = asyncio.create_task(scene.run(lambda _: ready.set()), name="scene")
+    try:
+        await ready.wait()
+        yield scene
+    finally:
+        scene.stop()
+        await asyncio.wait([task])
+        task.result()
+
+
+async def taken(scene: Scene, listener: Listener, motion: str, *phase: Any) -> Any:
+    scene.command(f"play {motion}")
+    await asyncio.sleep(SETTLE_S)
+    return await listener.phase(*phase, force=True)
+
+
+async def errors_deg(scene: Scene, listener: Listener, folder: Path) -> dict[str, float]:
+    """Return the RMS error of each segment over a second of squats."""
+    scene.command("play squat")
+    await asyncio.sleep(SETTLE_S)
+    poses = await listener.more_poses(120)
+    await asyncio.sleep(0.3)
+    truth = TruthReader(folder / "truth.jsonl")
+    truth.read()
+    truth.close()
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    off: dict[str, list[float]] = {"thigh": [], "shank": [], "foot": []}
+    for pose in poses:
+        known = truth.track.at(pose["t_us"] * 1000 - offset_ns)
+        for name, angles in off.items():
+            said = pose["segments"][name]["q"]
+            if known is not None and said is not None:
+                angles.append(float(rotation.angle_between(said, known.orientations[name])))
+    assert min(map(len, off.values())) > 90
+    return {n: math.degrees(np.sqrt(np.mean(np.square(angles)))) for n, angles in off.items()}
+
+
+@pytest.mark.timeout(120)
+async def test_a_chain_of_three_with_six_sensors_is_calibrated_followed_and_put_on_anew(
+    tmp_path: Path, mosquitto: MosquittoBroker
+) -> None:
+    station = Station(tmp_path, mosquitto.port)
+    async with played(tmp_path, mosquitto.port) as scene:
+        station.write_rig(*CHAIN)
+        async with station.daemon(), listening(station.port) as listener:
+            await listener.connected({*SENSORS, "mocap"})
+            await taken(scene, listener, "stand", "static", 2.0)
+            status = await taken(scene, listener, "functional", "functional", 8.0)
+            assert status["phase"] == "calibrated", status
+            worn = await errors_deg(scene, listener, tmp_path)
+            pose = listener.poses[-1]
+            used = [len(pose["segments"][name]["used"]) for name in ("thigh", "shank", "foot")]
+            assert used == [3, 2, 1]
+            for joint in ("knee", "ankle"):
+                assert pose["joints"][joint]["flexion_deg"] is not None
+                assert pose["joints"][joint]["flexion_deg_s"] is not None
+            for name in SENSORS:
+                scene.command(f"slip {name} 15")
+            slipped = await errors_deg(scene, listener, tmp_path)
+            status = await taken(scene, listener, "stand", "static", 2.0)
+            assert status["phase"] == "posed", status
+            again = await errors_deg(scene, listener, tmp_path)
+            assert not [flag for flag in listener.poses[-1]["flags"] if "disagree" in flag]
+    for name in ("thigh", "shank", "foot"):
+        assert worn[name] < 5.0, worn
+        assert slipped[name] > worn[name] + 5.0, slipped
+        assert again[name] < worn[name] + 1.5, again
+    assert "Traceback" not in station.log
