@@ -1,16 +1,18 @@
 r"""The recommended model: a soft-tissue correction that turns with the subject.
 
-.. math:: \hat q = \bar q \otimes \exp(\eta_a c_a + \tfrac12 \eta_b (c_b - \eta_a c_a))
+.. math:: \hat q = \bar q \otimes \exp\bigl(\tfrac12 [\eta_a c_a + (1 - \eta_a) T_a]
+          + \tfrac12 [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
 
 with the mean :math:`\bar q` of the segment's sensors and two experts of `kernel_expert` on
 :math:`\rho = \log(\bar q^* \otimes q_{ref})`: a, who looks at relative rotations alone and carries
 over to other movements, and b, who looks at the tilt of the segment, too, and knows the trained
-movements better. Inside training they count alike.
+movements better. Inside training they count alike. Outside, their corrections fade (eta) into the
+trend T of `kernel_trend`, which carries over best, that of b at once, that of a farther off. About
+the long axis there is no trend: there b gives way to a, and a to the mean.
 
-Law: nothing is corrected in the static pose; a person's heading changes nothing; outside the hull
-of training the corrections fade (eta) instead of growing, that of b at once, that of a far outside.
-What the model is worth is measured on frames that its fit has not seen, axis by axis, and grows
-with the distance from training that either expert sees.
+Law: in the static pose, which lies inside, nothing is corrected; a heading changes nothing. What
+the model is worth is measured on frames that its fit has not seen, axis by axis, and grows with
+the distance from training that either expert sees.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from jointfit_daemon.calibration import kernel_features as features
 from jointfit_daemon.calibration.held_out_spread import Spread, measure_spread
 from jointfit_daemon.calibration.kernel_expert import Expert, fit_expert
 from jointfit_daemon.calibration.kernel_tables import Tables
+from jointfit_daemon.calibration.kernel_trend import fit_trend, trend, unseen_trend
 from jointfit_daemon.calibration.segment_model import Prediction, SegmentModel, SegmentTraining
 from jointfit_daemon.calibration.weighted_mean import fuse, fuse_one
 from jointfit_daemon.kinematics import rotation
@@ -41,7 +44,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-HULL = 10.0
+HULL = 3.0
 """The correction of a fades where its leverage exceeds this many times its quantile over training:
 root of the ratio. That of b fades from the quantile itself, with the ratio."""
 OUTSIDE = 3.0
@@ -63,6 +66,8 @@ class KernelModel(SegmentModel):
     """a."""
     tilted: Expert
     """b."""
+    trend: tuple[tuple[float, ...], tuple[float, ...]]
+    """T about x and y: coefficients over [1, relative rotations, tilts]."""
     spread: Spread
     residual_sd: float
     mean_sd: float
@@ -71,7 +76,7 @@ class KernelModel(SegmentModel):
 
     def __post_init__(self) -> None:
         """Keep the tables as arrays beside: the frame loop multiplies by them."""
-        object.__setattr__(self, "_tables", Tables.of(self.plain, self.tilted, self.sensors))
+        object.__setattr__(self, "_tables", Tables.of(self.plain, self.tilted, self.trend))
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
@@ -83,7 +88,7 @@ class KernelModel(SegmentModel):
         u = _seen(inputs, mean, np.asarray(q_other, dtype=np.float64))
         a, a_ratio = self.plain.correct(u, self.sensors)
         b, b_ratio = self.tilted.correct(u, self.sensors)
-        correction = _mixed(a, a_ratio, b, b_ratio)
+        correction = _mixed(trend(self.trend, u), a, a_ratio, b, b_ratio)
         return rotation.multiply(mean, rotation.exp(correction))
 
     @override
@@ -95,12 +100,16 @@ class KernelModel(SegmentModel):
         if q_other is None:
             return Prediction(mean, self.mean_sd, False)
         u = features.relative_rotations_one(sensors, mean, q_other)
-        a, ratio, b, b_ratio = self._tables.correct(u, features.tilts_one(mean))
-        fade = 1.0 if ratio <= HULL else sqrt(HULL / ratio)
-        tilted = SHARE / b_ratio if b_ratio > 1.0 else SHARE
-        plain = fade * (1.0 - tilted)
+        a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, features.tilts_one(mean))
+        p = 1.0 - SHARE if ratio <= HULL else (1.0 - SHARE) * sqrt(HULL / ratio)
+        s = SHARE / b_ratio if b_ratio > 1.0 else SHARE
         (ax, ay, az), (bx, by, bz) = a, b
-        c = (plain * ax + tilted * bx, plain * ay + tilted * by, plain * az + tilted * bz)
+        rest, along = 1.0 - p - s, p / (1.0 - SHARE)
+        c = (
+            p * ax + s * bx + rest * tx,
+            p * ay + s * by + rest * ty,
+            along * (1.0 - s) * az + s * bz,
+        )
         far = max(ratio, b_ratio)
         sds = self.spread.at(far)
         x, y, z = sds
@@ -115,6 +124,7 @@ class KernelModel(SegmentModel):
             "sensors": self.sensors,
             "plain": self.plain.to_dict(),
             "tilted": self.tilted.to_dict(),
+            "trend": [list(row) for row in self.trend],
             "spread": self.spread.to_dict(),
             "residual_sd": self.residual_sd,
             "mean_sd": self.mean_sd,
@@ -128,6 +138,7 @@ class KernelModel(SegmentModel):
             sensors=data["sensors"],
             plain=Expert.read(data["plain"]),
             tilted=Expert.read(data["tilted"]),
+            trend=_read_trend(data),
             spread=Spread.read(data["spread"]),
             residual_sd=data["residual_sd"],
             mean_sd=data["mean_sd"],
@@ -155,18 +166,16 @@ def fit_kernel(training: SegmentTraining) -> KernelModel:
         ways.append([training.trials == label for label in np.unique(training.trials)])
     plain = fit_expert(u, rho, count, ways, tilted=False)
     tilted = fit_expert(u, rho, count, ways, tilted=True)
-    distances = list(zip(plain.ratios, tilted.ratios, strict=True))
-    residuals = [
-        rho - _mixed(a, a_ratio, b, b_ratio)
-        for a, a_ratio, b, b_ratio in zip(
-            plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True
-        )
-    ]
+    lines = [unseen_trend(u, rho, groups) for groups in ways]
+    unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
+    residuals = [rho - _mixed(*each) for each in unseen]
+    distances = [np.maximum(a_ratio, b_ratio) for _, _, a_ratio, _, b_ratio in unseen]
     return KernelModel(
         sensors=count,
         plain=plain.expert,
         tilted=tilted.expert,
-        spread=measure_spread([np.maximum(a, b) for a, b in distances], residuals),
+        trend=fit_trend(u, rho),
+        spread=measure_spread(distances, residuals),
         residual_sd=_sd(residuals[-1]),
         mean_sd=_sd(rho),
     )
@@ -177,11 +186,14 @@ def _seen(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:
     return np.concatenate([u, features.tilts(mean)], axis=1)
 
 
-def _mixed(a: Array, a_ratio: Array, b: Array, b_ratio: Array) -> Array:
-    """Return the correction that both experts make together, rad, shape (n, 3)."""
-    faded = a / np.sqrt(np.maximum(a_ratio / HULL, 1.0))[:, None]
-    share = SHARE / np.maximum(b_ratio, 1.0)
-    mixed: Array = faded + share[:, None] * (b - faded)
+def _mixed(line: Array, a: Array, a_ratio: Array, b: Array, b_ratio: Array) -> Array:
+    """Return the correction by both experts and the trend together, rad, shape (n, 3)."""
+    inside_a = 1.0 / np.sqrt(np.maximum(a_ratio / HULL, 1.0))[:, None]
+    inside_b = 1.0 / np.maximum(b_ratio, 1.0)[:, None]
+    plain = inside_a * a + (1.0 - inside_a) * line
+    instead_of_b = np.concatenate([line[:, :2], plain[:, 2:]], axis=1)
+    tilted = inside_b * b + (1.0 - inside_b) * instead_of_b
+    mixed: Array = (1.0 - SHARE) * plain + SHARE * tilted
     return mixed
 
 
@@ -192,3 +204,10 @@ def _sd(residuals: Array) -> float:
 @cache
 def _equal(count: int) -> tuple[float, ...]:
     return (1.0 / count,) * count
+
+
+def _read_trend(data: Mapping[str, Any]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the trend; a model of an earlier version has none."""
+    none = [0.0] * (1 + 3 * data["sensors"] + features.TILTS)
+    x, y = data.get("trend", (none, none))
+    return tuple(x), tuple(y)

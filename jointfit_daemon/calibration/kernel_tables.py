@@ -1,4 +1,4 @@
-r"""Two experts as the frame loop wants them: everything of one frame in two matrix products.
+r"""Two experts and the trend as the frame loop wants them: one frame in two matrix products.
 
 All exponents of the bumps of both, of the static pose's own among them,
 
@@ -38,41 +38,42 @@ class Tables:
     """Arrays for single frames."""
 
     terms: Array
-    """Times [bends, u, u^2, 1] they are the exponents of all bumps, the roots of both leverages and
-    the smooth part of both corrections, shape (bumps + p + q + 6, 2 width + 7)."""
+    """Times [bends, u, u^2, 1] they are the exponents of all bumps, the roots of both leverages,
+    smooth parts of both corrections and the trend, shape (bumps + p + q + 8, 2 width + 7)."""
     sums: Array
-    """Times bumps, squares of the roots, and the smooth part they are both corrections and both
-    leverages, shape (8, bumps + p + q + 6)."""
+    """Times bumps, squares of the roots, smooth parts and trend they are both corrections, the
+    trend and both leverages, shape (10, bumps + p + q + 8)."""
     bumps: int
     """How many of the terms are exponents."""
     roots: int
     """Where the roots end."""
 
     @staticmethod
-    def of(plain: Expert, tilted: Expert, sensors: int) -> Tables:
-        """Return the tables of two experts on a segment of so many sensors."""
-        width = 3 * sensors + features.TILTS
-        q = len(tilted.leverage)
+    def of(plain: Expert, tilted: Expert, trend: Sequence[Sequence[float]]) -> Tables:
+        """Return the tables of two experts and the trend about x and y."""
+        width = len(trend[0]) - 1
+        sensors, q = (width - features.TILTS) // 3, len(tilted.leverage)
         a, b = (_Part.of(expert, sensors, width, q) for expert in (plain, tilted))
         smooth = np.concatenate([a.root, b.root, a.of_smooth, b.of_smooth])
-        bumps, terms = len(a.exponents) + len(b.exponents), len(smooth)
-        table = np.zeros((bumps + terms, 2 * width + _BENDS + 1))
+        bumps, roots = len(a.exponents) + len(b.exponents), len(a.root) + len(b.root)
+        table = np.zeros((bumps + len(smooth) + 2, 2 * width + _BENDS + 1))
         table[:bumps, _BENDS:] = np.concatenate([a.exponents, b.exponents])
-        table[bumps:, : smooth.shape[1]] = smooth
-        table[-6:, -1] = (*a.rest, *b.rest)
-        roots = bumps + terms - 6
-        sums = np.zeros((8, len(table)))
+        table[bumps:-2, : smooth.shape[1]] = smooth
+        table[-8:-2, -1] = (*a.rest, *b.rest)
+        line = np.array(trend)
+        table[-2:, -1], table[-2:, _BENDS : _BENDS + width] = line[:, 0], line[:, 1:]
+        sums = np.zeros((10, len(table)))
         sums[:3, : len(a.exponents)] = a.of_bumps
         sums[3:6, len(a.exponents) : bumps] = b.of_bumps
-        sums[:6, roots:] = np.eye(6)
-        sums[6, bumps : bumps + len(a.root)] = 1.0
-        sums[7, bumps + len(a.root) : roots] = 1.0
-        return Tables(table, sums, bumps, roots)
+        sums[:8, bumps + roots :] = np.eye(8)
+        sums[8, bumps : bumps + len(a.root)] = 1.0
+        sums[9, bumps + len(a.root) : bumps + roots] = 1.0
+        return Tables(table, sums, bumps, bumps + roots)
 
     def correct(
         self, u: Sequence[float], tilts: Sequence[float]
-    ) -> tuple[Vector, float, Vector, float]:
-        """Return correction, rad, and leverage over its quantile: of the plain, of the tilted."""
+    ) -> tuple[Vector, float, Vector, float, tuple[float, float]]:
+        """Return correction, rad, and leverage ratio, of a and of b; then T_x and T_y, rad."""
         seen = [*u, *tilts]
         smooth = features.smooth_terms_one(seen)
         terms = self.terms.dot(np.array([*smooth, *[v * v for v in seen], 1.0]))
@@ -82,7 +83,7 @@ class Tables:
         *c, plain, tilted = self.sums.dot(terms).tolist()
         if max(c) > LARGEST or min(c) < -LARGEST:
             c = [min(max(each, -LARGEST), LARGEST) for each in c]
-        return (c[0], c[1], c[2]), plain, (c[3], c[4], c[5]), tilted
+        return (c[0], c[1], c[2]), plain, (c[3], c[4], c[5]), tilted, (c[6], c[7])
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,15 @@ from bench.experiment import DATA, Experiment, Figure, find_experiments, near
 TABLES = ("accuracy", "timing", "markers", "fusion")
 EXPERIMENTS = {name: find_experiments(f"{name}_rows") for name in TABLES}
 PROMISED = {
-    "accuracy": {f"B-{k}" for k in (1, 2, 3, 4, 5, 6, 7, 12, 13, 15, 16)},
+    "accuracy": {f"B-{k}" for k in range(1, 17)},
     "timing": {"T1", "T2", "T3", "T4", "T5", "T6", "T7", "T8", "T9", "T10-clock", "T10-lag"},
     "markers": {f"D-{k}" for k in range(1, 14)},
-    "fusion": {f"F-{k}" for k in range(1, 7)} | {"E-1"},
+    "fusion": {f"F-{k}" for k in range(1, 10)} | {"E-1"},
 }
 OPEN = {
     "F-2": {"walking1, anchored: flexion"},
-    "F-5": {"all together: flexion within 1 sd"},
+    "F-8": {"right, walking1: flexion", "left, walking1: flexion", "left, DJ1: flexion"},
+    "F-9": {"later parts: flexion within 1 sd", "later parts: flexion within 1.96 sd"},
 }
 """Goals that are missed, and told: one more turns this red, and so does one that is kept by now."""
 SHORT = [(name, row) for name, rows in EXPERIMENTS.items() for row in rows if not row.long]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.calibration.held_out_spread import measure_spread
-from jointfit_daemon.calibration.kernel_model import fit_kernel
+from jointfit_daemon.calibration.kernel_model import KernelModel, fit_kernel
 from jointfit_daemon.calibration.kernel_ridge import stacked
+from jointfit_daemon.calibration.kernel_trend import LARGEST, fit_trend, trend
 from jointfit_daemon.calibration.segment_model import SegmentTraining
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
@@ -44,7 +45,7 @@ class Knee:
             [q[frames] for q in self.sensors], self.other[frames], self.bone[frames]
         )
 
-    def error(self, said: Array, frames: slice = slice(None)) -> float:
+    def error(self, said: Array, frames: slice | NDArray[np.bool_] = slice(None)) -> float:
         return float(np.sqrt(np.mean(rot.angle_between(said, self.bone[frames]) ** 2)))
 
 
@@ -163,3 +164,47 @@ def test_one_frame_is_that_of_many_wherever_it_lies() -> None:
             as_quaternion(knee.other[i].tolist()),
         )
         assert rot.angle_between(one.q, many[i]) < 1e-9
+
+
+def test_what_always_holds_is_kept_far_outside_of_the_training() -> None:
+    """Sensors that stood 4 deg off the bone all the time do so in a bend nobody trained, too."""
+    off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
+    near, far = Knee(bend=0.6), Knee(bend=2.4)
+    for knee in (near, far):
+        knee.sensors = [rot.multiply(knee.bone, off) for _ in knee.sensors]
+    model = fit_kernel(near.training())
+    deep = np.abs(rot.log(rot.multiply(rot.conjugate(far.bone), far.other))[:, 0]) > 1.6
+    assert deep.sum() > 100
+    said = model.predict([q[deep] for q in far.sensors], far.other[deep])
+    assert far.error(said, deep) < 2.0 * DEG
+    assert far.error(far.sensors[0][deep], deep) > 4.5 * DEG
+
+
+def test_a_trend_of_constant_and_weights_is_found_and_bounded() -> None:
+    rng = np.random.default_rng(5)
+    u = rng.normal(0, 0.3, (400, 9))
+    u[:, 6:] = rng.normal(0, 0.01, (400, 3))
+    rho = np.zeros((400, 3))
+    rho[:, 0] = 0.05 + 0.4 * u[:, 3]
+    rho[:, 1] = -0.02 - 0.3 * u[:, 4]
+    rho[:, 2] = 0.3
+    rho[::10] += rng.normal(0, 0.5, (40, 3))
+    rows = fit_trend(u, rho)
+    clean = np.ones(400, dtype=bool)
+    clean[::10] = False
+    found = trend(rows, u)
+    assert np.max(np.abs(found - rho)[clean, :2]) < 0.012
+    assert np.all(found[:, 2] == 0.0)
+    assert np.max(np.abs(trend(rows, 100.0 * u))) == LARGEST
+
+
+def test_a_model_of_an_earlier_version_has_no_trend_and_still_works() -> None:
+    knee = Knee()
+    model = fit_kernel(knee.training())
+    data = model.to_dict()
+    again = KernelModel.read(data)
+    assert again == model
+    del data["trend"]
+    old = KernelModel.read(data)
+    inside = old.predict(knee.sensors, knee.other)
+    assert knee.error(inside) < 1.2 * knee.error(model.predict(knee.sensors, knee.other))

@@ -1,0 +1,111 @@
+"""Rows F-7 to F-9: sit-to-stand, every movement left out, and what is claimed, on both legs.
+
+Trials of `skin_knee`: the same subject as rows F-1 to F-5, made anew with poses of our own inverse
+kinematics, the left leg and sit-to-stand besides.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench import methods
+from bench.experiment import Experiment, Figure
+from bench.fusion_rows.a_recorded import DEFAULT, NAMES, NOTHING, TOLERANCE, flexion_scores
+from bench.semireal import FOLDER, Judge, training_frames
+from bench.skin_knee import MOVEMENTS, SUBJECT, skin_knee
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bench.semireal import KneeTrial
+
+    Errors = tuple[float, float, float]
+
+SIDES = {"right": "r", "left": "l"}
+RIVALS = ("mean", "patent12", "linear", DEFAULT)
+
+
+def sit_to_stand(data: Path) -> list[Figure]:
+    """F-7: trained on 60 % of the squats, walking and the jump, judged on sit-to-stand.
+
+    The default must be worse in nothing than the mean of two or patent12.
+    """
+    figures = []
+    for side, trials in _both(data).items():
+        squats = trials["squats1"]
+        begin = squats.part(slice(0, training_frames(squats)))
+        taught = [begin, trials["walking1"], trials["DJ1"]]
+        found = _errors(Judge.of(begin), taught, trials["STS1"])
+        for method, errors in found.items():
+            goals = _best(found) if method == DEFAULT else (NOTHING,) * 3
+            figures += [
+                Figure(f"{side}, {method}: {name}", error, goal)
+                for name, error, goal in zip(NAMES, errors, goals, strict=True)
+            ]
+    return figures
+
+
+def left_out(data: Path) -> list[Figure]:
+    """F-8: each of four movements judged by what the other three have taught."""
+    figures = []
+    for side, trials in _both(data).items():
+        squats = trials["squats1"]
+        judge = Judge.of(squats.part(slice(0, training_frames(squats))))
+        for movement, trial in trials.items():
+            others = [other for name, other in trials.items() if name != movement]
+            found = _errors(judge, others, trial)
+            figures += [
+                Figure(f"{side}, {movement}: {name}", error, goal)
+                for name, error, goal in zip(NAMES, found[DEFAULT], _best(found), strict=True)
+            ]
+    return figures
+
+
+def coverage(data: Path) -> list[Figure]:
+    """F-9: how often errors of flexion lie within what is claimed, both legs and all movements.
+
+    Movements left out, and the last 40 % of each where the first 60 % of all four have taught.
+    """
+    unseen, later = [], []
+    for trials in _both(data).values():
+        begun = [trial.part(slice(0, training_frames(trial))) for trial in trials.values()]
+        for movement, trial in trials.items():
+            others = [other for name, other in trials.items() if name != movement]
+            unseen.append(flexion_scores(others, trial))
+            later.append(flexion_scores(begun, trial.part(slice(training_frames(trial), None))))
+    return [
+        Figure(
+            f"{label}: flexion within {within:g} sd",
+            float(np.mean(np.abs(np.concatenate(scores)) < within)),
+            round(share + TOLERANCE, 9),
+            least=round(share - TOLERANCE, 9),
+            unit="",
+        )
+        for label, scores in (("movements left out", unseen), ("later parts", later))
+        for share, within in ((0.68, 1.0), (0.95, 1.96))
+    ]
+
+
+def _both(data: Path) -> dict[str, dict[str, KneeTrial]]:
+    return {
+        side: {movement: skin_knee(data, movement, letter) for movement in MOVEMENTS}
+        for side, letter in SIDES.items()
+    }
+
+
+def _errors(judge: Judge, taught: list[KneeTrial], trial: KneeTrial) -> dict[str, Errors]:
+    return {m: judge.errors(methods.fit(m, taught)(trial), trial) for m in RIVALS}
+
+
+def _best(found: dict[str, Errors]) -> tuple[float, ...]:
+    return tuple(round(min(pair), 3) for pair in zip(found["mean"], found["patent12"], strict=True))
+
+
+_DATA = (FOLDER, SUBJECT)
+EXPERIMENTS = (
+    Experiment("F-7", "sit-to-stand, trained on three others", sit_to_stand, _DATA),
+    Experiment("F-8", "each of four movements left out, default", left_out, _DATA),
+    Experiment("F-9", "flexion within its claimed deviation, both legs", coverage, _DATA),
+)

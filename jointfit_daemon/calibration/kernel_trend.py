@@ -1,0 +1,96 @@
+r"""What a correction falls back to outside of its training: a straight line, a few numbers an axis.
+
+.. math:: T_j = c_j + \sum_i \beta_{ij} d_{ij} + \gamma_j v_{o(j)}, \qquad T_z = 0
+
+about the axes j = x, y, which are level in the static pose: a constant, the disagreement d of each
+further sensor about the same axis (that is, other weights of the sensors), and the tilt that turns
+about it. It is the mean of two fits, one without tilt and one with it: where movements are few, the
+bend of a joint and the tilt of a segment come together, and neither fit alone carries over.
+
+Law: relative rotations and tilt only, so headings change nothing. About z, the long axis of the
+segment, no sensor can tell a constant from a heading: there is no trend.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.kernel_features import TILTS
+from jointfit_daemon.calibration.robust import huber_weights, robust_scale
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+    Row = tuple[float, ...]
+
+PENALTY = 1e-2
+PASSES = 4
+SMALLEST_SCALE = 0.02
+"""What hardly moved in training is not blown up, rad."""
+LARGEST = 0.4
+"""No component of a trend exceeds this, rad."""
+LEVEL_AXES = (0, 1)
+
+
+def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
+    """Return the coefficients about x and y, each over ``[1, u]``, rad per unit.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n, 3 m + 3)
+        Relative rotations of m sensors, then tilts.
+    rho : ndarray, shape (n, 3)
+        What is to be corrected, rad.
+    """
+    x, y = (_axis(u, rho[:, axis], axis) for axis in LEVEL_AXES)
+    return x, y
+
+
+def trend(rows: tuple[Row, Row], u: Array) -> Array:
+    """Return T of every frame, rad, shape (n, 3)."""
+    found = np.zeros((len(u), 3))
+    table = np.array(rows)
+    found[:, LEVEL_AXES] = table[:, 0] + u @ table[:, 1:].T
+    return np.clip(found, -LARGEST, LARGEST)
+
+
+def unseen_trend(u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
+    """Return T of every frame by a fit to all groups but its own, rad, shape (n, 3)."""
+    found = np.empty_like(rho)
+    for held in groups:
+        found[held] = trend(fit_trend(u[~held], rho[~held]), u[held])
+    return found
+
+
+def _axis(u: Array, y: Array, axis: int) -> Row:
+    """Return the coefficients of one axis: the mean of both fits."""
+    width = u.shape[1]
+    # of each further sensor the same axis, after the three columns of the joint
+    pairs = list(range(3 + axis, width - TILTS, 3))
+    # the vertical as seen from the segment leans along y when it turns about x, and the other way
+    tilt = width - TILTS + (1 - axis)
+    row = np.zeros(1 + width)
+    for columns in (pairs, [*pairs, tilt]):
+        found = _ridge(np.concatenate([np.ones((len(u), 1)), u[:, columns]], axis=1), y)
+        row[[0, *(1 + column for column in columns)]] += 0.5 * found
+    return tuple(row.tolist())
+
+
+def _ridge(phi: Array, y: Array) -> Array:
+    """Return coefficients of ridge regression with Huber weights, shape (p,)."""
+    scales = np.sqrt(np.mean(phi**2, axis=0)) + SMALLEST_SCALE
+    g = phi / scales
+    weights, found = np.ones(len(y)), np.zeros(g.shape[1])
+    for _ in range(PASSES):
+        weighted = g * weights[:, None]
+        H = weighted.T @ g + PENALTY * len(y) * np.eye(g.shape[1])
+        found = np.linalg.solve(H, weighted.T @ y)
+        sizes = np.abs(y - g @ found)
+        weights = huber_weights(sizes, robust_scale(sizes))
+    back: Array = found / scales
+    return back
