@@ -24,6 +24,7 @@ from jointfit_daemon.calibration.lags import (
     segment_lags,
     sensor_lags,
 )
+from jointfit_daemon.calibration.limb_training import MIN_FRAMES, limb_training
 from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
 from jointfit_daemon.calibration.memory import evenly, pack
 from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
@@ -37,7 +38,6 @@ from jointfit_daemon.calibration.result import (
     quaternion,
     vector,
 )
-from jointfit_daemon.calibration.sampling import sensor_at
 from jointfit_daemon.calibration.sensor_links import fit_links
 from jointfit_daemon.calibration.static_pose import (
     StaticPose,
@@ -60,9 +60,6 @@ __all__ = ["better", "fit_calibration"]
 
 Array = NDArray[np.float64]
 
-MAX_FRAMES = 2000
-"""More frames than this of one movement repeat themselves; the fit takes every n-th."""
-MIN_FRAMES = 300
 MIN_SEEN = 0.5
 PLATE_SD_NS = 500_000.0
 """Of a lag from the align phase that came without its standard deviation."""
@@ -119,9 +116,9 @@ def fit_calibration(
     used |= {name: known_lag(lag) for name, lag in (lag_ns or {}).items()}
     used_ns = {name: item.lag_ns for name, item in used.items()}
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
-    training, raw = _training(chain, functional, tracks, anatomy, sensors)
+    training, raw, taught_notes = limb_training(chain, functional, tracks, anatomy, sensors)
     models = fit_models(chain, training, settings.method)
-    notes = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns)]
+    notes = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *taught_notes]
     notes += _heading_notes(chain, raw, training) if alignment is None else []
     return Calibration(
         method=settings.method,
@@ -277,38 +274,6 @@ def _sensors(
             world: Quaternion = (1.0, 0.0, 0.0, 0.0) if alignment is None else alignment.world(s)
             out[s] = sensor_calibration(pose.sensors[s], world, q_static, lag_ns.get(s, 0))
     return out
-
-
-def _training(
-    chain: Chain,
-    functional: CalibrationTrial,
-    tracks: Mapping[str, ClusterTrack],
-    anatomy: Anatomy,
-    sensors: Mapping[str, SensorCalibration],
-) -> tuple[LimbTraining, dict[str, Array]]:
-    """Return what models are fitted to, and the raw sensor orientations at the same instants."""
-    t_ns = next(iter(tracks.values())).t_ns
-    raw = {s: sensor_at(functional.sensors[s], t_ns, item.lag_ns) for s, item in sensors.items()}
-    reference = {
-        name: rotation.multiply(tracks[name].q, anatomy.q_static[name]) for name in chain.segments
-    }
-    whole = np.all([visible(q) for q in (*raw.values(), *reference.values())], axis=0)
-    rows = np.flatnonzero(whole)
-    if rows.size < MIN_FRAMES:
-        counts = {name: int(visible(q).sum()) for name, q in (raw | reference).items()}
-        raise CalibrationRefused(
-            f"functional: all sensors and segments together in {rows.size} frames, at least "
-            f"{MIN_FRAMES} are needed; seen of each: {counts}"
-        )
-    rows = rows[:: -(-rows.size // MAX_FRAMES)]
-    said = {
-        s: rotation.multiply(
-            rotation.multiply(item.q_optical_world, raw[s][rows]), item.q_sensor_segment
-        )
-        for s, item in sensors.items()
-    }
-    training = LimbTraining(said, {name: q[rows] for name, q in reference.items()})
-    return training, {s: q[rows] for s, q in raw.items()}
 
 
 def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTraining) -> list[str]:

@@ -5,12 +5,12 @@ Law: pure. Only clear cases, each with the thing and the remedy; what skin can d
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.calibration.limb_training import twins
 from jointfit_daemon.calibration.mount import fit_alignment
 from jointfit_daemon.calibration.static import robust_mean
 from jointfit_daemon.kinematics import rotation
@@ -32,8 +32,6 @@ FAR = np.deg2rad(45.0)
 """Median distance of a sensor on its mount from the reference that no skin explains."""
 LEAST_TURN = np.deg2rad(5.0)
 """A joint that turns by less in 95 % of the frames teaches nothing."""
-TWINS = np.deg2rad(0.01)
-"""Two real sensors never keep to each other so closely."""
 
 
 def unmoved(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
@@ -55,10 +53,12 @@ def doubts(
     chain: Chain, trials: Sequence[OfflineTrial], mounts: Mapping[str, Array] | None
 ) -> list[str]:
     """Return what people should look at before they believe figures of these trials."""
+    worn = [name for group in chain.sensors for name in group]
+    sensors = {name: np.concatenate([t.sensors[name] for t in trials]) for name in worn}
     return [
         *([] if mounts is None else _far_sensors(chain, trials, mounts)),
         *_turned_worlds(chain, trials),
-        *_twins(chain, trials),
+        *twins(chain, sensors),
     ]
 
 
@@ -98,22 +98,6 @@ def _turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str
                 f"{sensor}: its world seems turned by {np.rad2deg(angle):.0f}° about the vertical "
                 "against the reference's: bring both into one world first, or check --up"
             )
-
-
-def _twins(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str]:
-    for group in chain.sensors:
-        for a, b in combinations(group, 2):
-            q_a, q_b = (np.concatenate([t.sensors[name] for t in trials]) for name in (a, b))
-            between = rotation.multiply(rotation.conjugate(q_a), q_b)
-            between = between[np.isfinite(between).all(axis=1)]
-            if not len(between):
-                continue
-            apart = rotation.angle_between(between[0], between)
-            if float(np.max(apart)) < TWINS:
-                yield (
-                    f"{a} and {b} say the same in every frame: one recording under two names? "
-                    "What a second sensor wins is not seen here"
-                )
 
 
 def _streams(

@@ -24,6 +24,23 @@ from jointfit_daemon.model import Chunk, Decoded, ImuSample, TickClock
 if TYPE_CHECKING:
     from pathlib import Path
 
+SMALLEST_RIG = """
+[rig]
+name = "bench"
+[chain]
+joints = ["hip", "knee"]
+segments = ["thigh"]
+[[imu]]
+id = "S1"
+segment = "thigh"
+driver = "fake"
+port = "a"
+[mqtt]
+host = "127.0.0.1"
+port = {port}
+"""
+"""One sensor on one segment; ends in the table of the broker."""
+
 NAMES = {"fake": "FakeImu", "fakecan": "FakeCanImu", "fakemocap": "FakeMocap"}
 
 

@@ -21,21 +21,6 @@ PROJECT = Path(__file__).resolve().parents[2]
 LISTENS = "0A"
 """State of a listening socket, as in linux/net/tcp_states.h."""
 LOOPBACK = {"0100007F", "00000000000000000000000001000000"}
-RIG = """
-[rig]
-name = "bench"
-[chain]
-joints = ["hip", "knee"]
-segments = ["thigh"]
-[[imu]]
-id = "S1"
-segment = "thigh"
-driver = "fake"
-port = "a"
-[mqtt]
-host = "127.0.0.1"
-port = {port}
-"""
 
 pytestmark = pytest.mark.system
 
@@ -72,7 +57,7 @@ def test_a_listening_socket_is_found() -> None:
 
 def test_the_daemon_listens_on_no_tcp_port(tmp_path: Path, mosquitto: MosquittoBroker) -> None:
     rig = tmp_path / "rig.toml"
-    rig.write_text(RIG.format(port=mosquitto.port))
+    rig.write_text(fake_drivers.SMALLEST_RIG.format(port=mosquitto.port))
     fake_drivers.install(tmp_path / "site")
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), str(PROJECT)]),

@@ -29,25 +29,15 @@ if TYPE_CHECKING:
 
 PROJECT = Path(__file__).resolve().parents[2]
 PASSWORD, KEY = "correct-horse-battery", "b7f3c1d92e85a640b7f3c1d92e85a640"
-RIG = """
-[rig]
-name = "bench"
-[chain]
-joints = ["hip", "knee"]
-segments = ["thigh"]
-[[imu]]
-id = "S1"
-segment = "thigh"
-driver = "fake"
-port = "a"
-[mqtt]
-host = "127.0.0.1"
-port = {port}
+RIG = (
+    fake_drivers.SMALLEST_RIG
+    + """\
 username = "jointfitd"
 password_file = "password"
 request_key_file = "key"
 [recording]
 """
+)
 
 
 @pytest.fixture

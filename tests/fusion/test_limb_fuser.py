@@ -12,8 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.model import Chain, Quaternion
@@ -26,10 +24,9 @@ from tests.calibration.synthetic_limb import (
     Motion,
     Subject,
     motion,
-    plate_trial,
     record,
-    static_and_functional,
 )
+from tests.fusion.worn_limb import calibrated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -44,9 +41,7 @@ SUBJECT = Subject(21, flaws=Imperfections(sensor_deg=0.2, tissue_deg=4.0, skin_m
 
 @pytest.fixture(scope="module")
 def worn() -> Calibration:
-    static, functional, _ = static_and_functional(SUBJECT, 30.0)
-    alignment = fit_alignment(plate_trial(SUBJECT), SETTINGS)
-    return fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
+    return calibrated(SUBJECT)
 
 
 @pytest.fixture(scope="module")
@@ -238,6 +233,27 @@ def test_the_same_frames_give_the_same_states(
     first = play(LimbFuser(CHAIN, worn), walk[1][:200], lambda k: EVERYONE if k % 3 else {"S2"})
     again = play(LimbFuser(CHAIN, worn), walk[1][:200], lambda k: EVERYONE if k % 3 else {"S2"})
     assert first == again
+
+
+def test_q_and_minus_q_mixed_at_random_change_nothing(
+    worn: Calibration, walk: tuple[Motion, Frames]
+) -> None:
+    """Nothing slips, drifts or jumps because a sensor changes its sign."""
+    rng = np.random.default_rng(4)
+    mixed: Frames = []
+    for t, said in walk[1][:600]:
+        signs = rng.choice([-1.0, 1.0], len(said))
+        turned = {n: tuple(s * x for x in q) for s, (n, q) in zip(signs, said.items(), strict=True)}
+        mixed.append((t, turned))
+    plain, other = LimbFuser(CHAIN, worn), LimbFuser(CHAIN, worn)
+    for straight, state in zip(play(plain, walk[1][:600]), play(other, mixed), strict=True):
+        assert state.flags == straight.flags
+        for a, b in zip(state.joints, straight.joints, strict=True):
+            assert a.position == pytest.approx(b.position, abs=1e-9)
+            assert a.angle_sd == pytest.approx(b.angle_sd, abs=1e-9)
+            if a.angles is not None and b.angles is not None:
+                assert tuple(a.angles) == pytest.approx(tuple(b.angles), abs=1e-9)
+    assert other.news(10**12) == plain.news(10**12)
 
 
 @pytest.mark.parametrize("count", [1, 3])

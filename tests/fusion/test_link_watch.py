@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
 from jointfit_daemon.fusion import LimbFuser
@@ -21,10 +19,9 @@ from tests.calibration.synthetic_limb import (
     Imperfections,
     Subject,
     motion,
-    plate_trial,
     record,
-    static_and_functional,
 )
+from tests.fusion.worn_limb import calibrated
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,9 +35,7 @@ SEGMENT = {"S1": 0, "S2": 0, "S3": 1, "S4": 1}
 
 @pytest.fixture(scope="module")
 def worn() -> Calibration:
-    static, functional, _ = static_and_functional(SUBJECT, 30.0)
-    alignment = fit_alignment(plate_trial(SUBJECT), SETTINGS)
-    return fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
+    return calibrated(SUBJECT)
 
 
 @pytest.fixture(scope="module")

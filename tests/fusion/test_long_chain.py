@@ -9,21 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.model import Chain
 from tests.calibration import synthetic_limb
 from tests.calibration.synthetic_limb import (
-    SETTINGS,
     Imperfections,
     Motion,
     Subject,
     motion,
-    plate_trial,
     record,
-    static_and_functional,
 )
+from tests.fusion.worn_limb import calibrated
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,10 +47,7 @@ def six_sensors() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def fuser() -> LimbFuser:
-    static, functional, _ = static_and_functional(SUBJECT, 30.0)
-    alignment = fit_alignment(plate_trial(SUBJECT), SETTINGS)
-    calibration = fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
-    return LimbFuser(CHAIN, calibration)
+    return LimbFuser(CHAIN, calibrated(SUBJECT, CHAIN))
 
 
 @pytest.fixture(scope="module")

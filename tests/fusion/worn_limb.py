@@ -1,0 +1,26 @@
+"""A synthetic wearer, calibrated as the daemon would, for tests of fusion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from tests.calibration.synthetic_limb import (
+    CHAIN,
+    SETTINGS,
+    plate_trial,
+    static_and_functional,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.model import Chain
+    from tests.calibration.synthetic_limb import Subject
+
+
+def calibrated(subject: Subject, chain: Chain = CHAIN) -> Calibration:
+    """Return what the align phase, a static pose and half a minute of movement give."""
+    static, functional, _ = static_and_functional(subject, 30.0)
+    alignment = fit_alignment(plate_trial(subject), SETTINGS)
+    return fit_calibration(static, functional, alignment, SETTINGS, chain)
