@@ -113,7 +113,7 @@ def _states(calibration: Calibration, live: Live) -> list[LimbState]:
     ]
 
 
-def _errors(calibration: Calibration, live: Live) -> Errors:
+def errors_of(calibration: Calibration, live: Live) -> Errors:
     states = _states(calibration, live)
     knee = [state.joints[1] for state in states]
     flexion = np.array([joint.angles.flexion if joint.angles else np.nan for joint in knee])
@@ -160,7 +160,7 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
         for method in METHODS:
             settings = replace(rig.calibration, method=method)
             calibration = fit_calibration(pose, trials.functional, alignment, settings, rig.chain)
-            found[method].append(_errors(calibration, live))
+            found[method].append(errors_of(calibration, live))
     return found
 
 

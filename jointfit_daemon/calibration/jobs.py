@@ -13,6 +13,7 @@ from jointfit_daemon.calibration.fit import better, fit_calibration
 from jointfit_daemon.calibration.online_fit import learn
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration.static import redonning_problems
 from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only, with_new_static
 
 if TYPE_CHECKING:
@@ -34,7 +35,8 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
     -------
     dict
         ``quality`` and what the kind gives: ``alignment``, ``calibration`` (dicts), ``worse`` (why
-        the stored calibration is better); or ``refused`` with the reason alone.
+        the stored calibration is better), ``notes`` (how sensors were put on anew);
+        or ``refused`` with the reason alone.
     """
     try:
         return _JOBS[kind](payload)
@@ -91,6 +93,12 @@ def _static(payload: Mapping[str, Any]) -> dict[str, Any]:
     previous, markers = _previous(payload), bool(settings.markers or settings.rigid_bodies)
     if previous is not None:
         calibration = with_new_static(previous, pose, _newer_worlds(payload, previous))
+        before, after = (
+            {name: item.q_sensor_segment for name, item in one.sensor.items()}
+            for one in (previous, calibration)
+        )
+        groups = dict(zip(chain.segments, chain.sensors, strict=True))
+        result["notes"] = list(redonning_problems(before, after, groups))
     elif not markers:  # no cameras: a static pose is all there will ever be
         calibration = fit_static_only(pose, _alignment(payload), chain, software=__version__)
     else:
@@ -108,6 +116,7 @@ def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
         software=__version__,
         lag_ns=payload.get("lag_ns"),
         tracked=payload.get("tracked"),
+        previous=_previous(payload),
     )
     result: dict[str, Any] = {"quality": dict(found.quality), "calibration": found.to_dict()}
     previous = _previous(payload)

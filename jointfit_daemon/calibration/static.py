@@ -159,7 +159,7 @@ def redonning_problems(
             if apart > limits.disagreement:
                 found.append(
                     f"{segment}: {known[0]} and {sensor} differ by {np.rad2deg(apart):.1f} deg in "
-                    "how they changed since the last static pose: one was moved; if both were "
-                    "taken off and put on again, this is expected"
+                    "how they changed since the last static pose: one was moved, or its heading "
+                    "drifted; if both were taken off and put on again, this is expected"
                 )
     return tuple(found)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from jointfit_daemon.calibration.alignment_phase import PLATE
 from jointfit_daemon.calibration.movement_guide import MovementGuide
@@ -31,7 +31,7 @@ from jointfit_daemon.pipeline.phase import TEXTS, Phase
 from jointfit_daemon.pipeline.recorder import LONGEST_S
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.calibration.online_fit import Fresh
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
@@ -349,6 +349,7 @@ class CalibrationSession:
         text = "static pose taken: sensors re-seated" if kind == "static" else "calibrated"
         return [
             *(_notes(t_ns, kind, self.calibration.notes) if kind == "functional" else ()),
+            *_notes(t_ns, kind, result.get("notes", ()), "info"),
             CalibrationReady(self.calibration),
             self._tell(t_ns, phase, text, quality),
         ]
@@ -389,6 +390,8 @@ def _seconds(value: object) -> float | None:
     return float(str(value)) if usable else math.nan
 
 
-def _notes(t_ns: int, kind: str, notes: tuple[str, ...] | list[str]) -> list[Output]:
+def _notes(
+    t_ns: int, kind: str, notes: Sequence[str], level: Literal["info", "warning"] = "warning"
+) -> list[Output]:
     """Return what the wearer should know besides the figures."""
-    return [Notice(t_ns, "calibration", kind, note, "warning") for note in notes]
+    return [Notice(t_ns, "calibration", kind, note, level) for note in notes]

@@ -108,3 +108,39 @@ def test_a_sensor_that_is_silent_on_the_plate_is_named_at_once() -> None:
     heard = {name: track for name, track in trial.sensors.items() if name != "S3"}
     payload = {"chain": CHAIN, "settings": SETTINGS, "trial": CalibrationTrial(heard, None)}
     assert "S3" in run_job("align", payload)["refused"]
+
+
+def test_a_sensor_that_alone_was_moved_is_told_when_a_new_pose_is_taken() -> None:
+    room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
+    before = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), room, CHAIN)
+    moved = {**worn, "S4": rotation.multiply(worn["S4"], rotation.exp(np.array([0.2, 0.0, 0.0])))}
+    notes: list[str] = []
+    for trial, expected in ((standing(room, worn), []), (standing(room, moved), ["shank"])):
+        payload = {
+            "chain": CHAIN, "settings": SETTINGS, "static": trial, "alignment": None,
+            "previous": before.to_dict(),
+        }  # fmt: skip
+        notes = run_job("static", payload)["notes"]
+        assert [note.partition(":")[0] for note in notes] == expected
+    assert "S3 and S4 differ by 11.5 deg" in notes[0]
+
+
+def test_a_movement_is_given_the_lags_of_the_calibration_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
+    before = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), None, CHAIN)
+    given: dict[str, Any] = {}
+
+    def fit(*_: object, **options: object) -> Calibration:
+        given.update(options)
+        return before
+
+    monkeypatch.setattr("jointfit_daemon.calibration.jobs.fit_calibration", fit)
+    trial = standing(room, worn)
+    payload = {
+        "chain": CHAIN, "settings": SETTINGS, "static": trial, "functional": trial,
+        "alignment": None, "previous": before.to_dict(),
+    }  # fmt: skip
+    run_job("functional", payload)
+    assert given["previous"] == before
