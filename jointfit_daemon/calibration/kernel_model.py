@@ -33,7 +33,7 @@ from jointfit_daemon.calibration.kernel_trend import fit_trend, trend, unseen_tr
 from jointfit_daemon.calibration.segment_model import Prediction, SegmentModel, SegmentTraining
 from jointfit_daemon.calibration.weighted_mean import fuse, fuse_one
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.rotation_scalar import exp_one, multiply_one
+from jointfit_daemon.kinematics.rotation_scalar import turned_one
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -114,7 +114,7 @@ class KernelModel(SegmentModel):
         sds = self.spread.at(far)
         x, y, z = sds
         sd = sqrt((x * x + y * y + z * z) / 3.0)
-        return Prediction(multiply_one(mean, exp_one(c)), sd, far > OUTSIDE, sds)
+        return Prediction(turned_one(mean, c), sd, far > OUTSIDE, sds)
 
     @override
     def to_dict(self) -> dict[str, Any]:

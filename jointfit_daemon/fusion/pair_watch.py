@@ -10,7 +10,7 @@ from math import exp, radians, sqrt
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.sensor_links import SensorLink, length_one
-from jointfit_daemon.kinematics.rotation_scalar import between_one, log_one
+from jointfit_daemon.kinematics.rotation_scalar import turn_one
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
@@ -79,7 +79,7 @@ class PairWatch:
             The vertical in the frames of `a` and of the neighboring segment.
         """
         (ex, ey, ez), sd = self.link.expected(up_a, up_near)
-        dx, dy, dz = log_one(between_one(a, b))
+        dx, dy, dz = turn_one(a, b)
         rx, ry, rz = dx - ex, dy - ey, dz - ez
         usual = sqrt(3.0) * sd
         self.turned = rx * up_a[0] + ry * up_a[1] + rz * up_a[2]

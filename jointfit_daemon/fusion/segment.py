@@ -15,13 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from jointfit_daemon.calibration.redundancy import Prediction
 from jointfit_daemon.calibration.result import alive_key
 from jointfit_daemon.calibration.static_pose import UNREFERENCED_SD
-from jointfit_daemon.kinematics.rotation_scalar import (
-    between_one,
-    exp_one,
-    log_one,
-    multiply_one,
-    normalize_one,
-)
+from jointfit_daemon.kinematics.rotation_scalar import normalize_one, turn_one, turned_one
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -172,7 +166,7 @@ class SegmentFuser:
         self._note_change(t_ns, alive, near, inputs, said)
         old = self._faded(t_ns, said)
         self._use(newer)
-        offset = log_one(between_one(self._say(alive, near, inputs).q, old))
+        offset = turn_one(self._say(alive, near, inputs).q, old)
         self._fading, self._before = (t_ns, LEARNED_NS, offset), (alive, near, inputs)
 
     def _note_change(
@@ -193,13 +187,13 @@ class SegmentFuser:
         if all(s in inputs for s in (*was_alive, *was_near)):
             # the old set still speaks: what would it have said now?
             old = self._faded(t_ns, self._say(was_alive, was_near, inputs).q)
-            offset = log_one(between_one(target, old))
+            offset = turn_one(target, old)
         elif all(s in was_inputs for s in (*alive, *near)):
             # the new set spoke before: what would it have said then?
             then = self._say(alive, near, was_inputs).q
-            offset = log_one(between_one(then, self._last[1]))
+            offset = turn_one(then, self._last[1])
         else:
-            offset = log_one(between_one(target, self._last[1]))
+            offset = turn_one(target, self._last[1])
         self._fading = (t_ns, BLEND_NS, offset)
 
     def _faded(self, t_ns: int, target: Quaternion) -> Quaternion:
@@ -210,7 +204,7 @@ class SegmentFuser:
         if left <= 0.0:
             self._fading = None
             return target
-        return multiply_one(target, exp_one((left * x, left * y, left * z)))
+        return turned_one(target, (left * x, left * y, left * z))
 
 
 def _heard(names: Names, inputs: Inputs) -> Names:

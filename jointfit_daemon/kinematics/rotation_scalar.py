@@ -88,6 +88,36 @@ def log_one(q: Quaternion) -> Vector:
     return (scale * x, scale * y, scale * z)
 
 
+def turn_one(a: Quaternion, b: Quaternion) -> Vector:
+    """Return ``log_one(between_one(a, b))``, the turn from a to b, rad, by one call."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    w = aw * bw + ax * bx + ay * by + az * bz
+    x = aw * bx - ax * bw - ay * bz + az * by
+    y = aw * by + ax * bz - ay * bw - az * bx
+    z = aw * bz - ax * by + ay * bx - az * bw
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = sqrt(x * x + y * y + z * z)
+    scale = 2.0 if sine < _SMALL_SINE else 2.0 * atan2(sine, w) / sine
+    return (scale * x, scale * y, scale * z)
+
+
+def turned_one(q: Quaternion, r: Vector) -> Quaternion:
+    """Return ``multiply_one(q, exp_one(r))``, q turned by r in its own frame, by one call."""
+    pw, px, py, pz = q
+    x, y, z = r
+    angle = sqrt(x * x + y * y + z * z)
+    scale = 0.5 - angle * angle / 48.0 if angle < _SMALL_ANGLE else sin(0.5 * angle) / angle
+    w, x, y, z = cos(0.5 * angle), scale * x, scale * y, scale * z
+    return (
+        pw * w - px * x - py * y - pz * z,
+        pw * x + px * w + py * z - pz * y,
+        pw * y - px * z + py * w + pz * x,
+        pw * z + px * y - py * x + pz * w,
+    )
+
+
 def angle_between_one(a: Quaternion, b: Quaternion) -> float:
     """Return the angle of the rotation from a to b, rad in [0, pi]."""
     w, x, y, z = between_one(a, b)
@@ -109,8 +139,8 @@ def normalize_one(q: Sequence[float]) -> Quaternion:
 
 def interpolate_one(q0: Quaternion, q1: Quaternion, a: float) -> Quaternion:
     """Go the share `a` of the short way from q0 to q1."""
-    x, y, z = log_one(between_one(q0, q1))
-    return multiply_one(q0, exp_one((a * x, a * y, a * z)))
+    x, y, z = turn_one(q0, q1)
+    return turned_one(q0, (a * x, a * y, a * z))
 
 
 def as_quaternion(q: Iterable[float]) -> Quaternion:

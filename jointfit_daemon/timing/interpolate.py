@@ -13,12 +13,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import TYPE_CHECKING, Protocol
 
-from jointfit_daemon.kinematics.rotation_scalar import (
-    between_one,
-    exp_one,
-    log_one,
-    multiply_one,
-)
+from jointfit_daemon.kinematics.rotation_scalar import turn_one, turned_one
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
@@ -59,7 +54,7 @@ def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
         Instant in ``[a.t_ns, b.t_ns]``.
     """
     x, h = (t_ns - a.t_ns) * _NS, (b.t_ns - a.t_ns) * _NS
-    turn = log_one(between_one(a.q, b.q))
+    turn = turn_one(a.q, b.q)
     if a.rate is not None and b.rate is not None and _agree(a.rate, b.rate, turn, h):
         r = _hermite(a.rate, b.rate, turn, x, h)
     elif before is not None:
@@ -68,12 +63,12 @@ def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
             x * (x + h0) / (h * (h0 + h)),
             turn,
             x * (x - h) / (h0 * (h0 + h)),
-            log_one(between_one(a.q, before.q)),
+            turn_one(a.q, before.q),
         )
     else:
         share = x / h
         r = (share * turn[0], share * turn[1], share * turn[2])
-    return multiply_one(a.q, exp_one(r))
+    return turned_one(a.q, r)
 
 
 def beyond(earlier: Known | None, before: Known, a: Known, t_ns: int) -> Quaternion:
@@ -97,7 +92,7 @@ def beyond(earlier: Known | None, before: Known, a: Known, t_ns: int) -> Quatern
     """
     x, h0 = (t_ns - a.t_ns) * _NS, (a.t_ns - before.t_ns) * _NS
     x_c = min(x, h0)
-    back = log_one(between_one(a.q, before.q))
+    back = turn_one(a.q, before.q)
     turn = (-back[0], -back[1], -back[2])
     if a.rate is not None and before.rate is not None and _agree(before.rate, a.rate, turn, h0):
         bend = x_c * (x - 0.5 * x_c) / h0
@@ -106,12 +101,12 @@ def beyond(earlier: Known | None, before: Known, a: Known, t_ns: int) -> Quatern
         r = _combine(x / h0, turn, 0.0, turn)
         if earlier is not None:
             h1 = (before.t_ns - earlier.t_ns) * _NS
-            first = log_one(between_one(a.q, earlier.q))
+            first = turn_one(a.q, earlier.q)
             # in the tangent space of `a`: earlier at `first`, before at -turn, a at 0
             weight = BEND * (x_c * (x_c + h0) + (2.0 * x_c + h0) * (x - x_c)) / (h0 + h1)
             bent = _combine(weight * (1.0 / h0 + 1.0 / h1), turn, weight / h1, first)
             r = (r[0] + bent[0], r[1] + bent[1], r[2] + bent[2])
-    return multiply_one(a.q, exp_one(r))
+    return turned_one(a.q, r)
 
 
 def _combine(m: float, u: Vector, n: float, v: Vector) -> Vector:

@@ -214,19 +214,20 @@ class Stream:
         """Return the orientation at `t_ns`, which grows from call to call; None: missing."""
         self.extrapolated = False
         samples = self._samples
-        while len(samples) > _BEHIND and samples[_BEHIND].t_ns <= t_ns:
-            self._leave(samples.popleft(), Verdict.DECIMATED)
-        if not samples or samples[0].t_ns > t_ns:
+        after = len(samples)  # as a place: of the first sample after `t_ns`, one of the newest
+        while after and samples[after - 1].t_ns > t_ns:
+            after -= 1
+        if not after:
             return None
-        after, count = 1, len(samples)
-        while after < count and samples[after].t_ns <= t_ns:
-            after += 1
+        while after > _BEHIND:
+            self._leave(samples.popleft(), Verdict.DECIMATED)
+            after -= 1
         last = after - 1
         a = samples[last]
         if a.t_ns == t_ns:
             a.used, self.synced = True, a.synced
             return a.q
-        if after < count:
+        if after < len(samples):
             b = samples[after]
             if b.t_ns - a.t_ns <= self._gap_ns:
                 return self._between(self._before(last), a, b, t_ns)
