@@ -166,6 +166,7 @@ class _Sample:
     t_ns: int
     q: Quaternion
     rate: Vector | None = None
+    turn: Vector | None = None
 
 
 def _ahead_rms(

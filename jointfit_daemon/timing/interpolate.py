@@ -32,6 +32,9 @@ class Known(Protocol):
     q: Quaternion
     rate: Vector | None
     """Angular rate in the sensor's own frame at ``t_ns``, rad/s; None: not measured."""
+    turn: Vector | None
+    """From the sample before it, rad, kept here once it is worked out; None where that is not yet
+    so, and again when another sample comes between them."""
 
 
 def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
@@ -54,17 +57,13 @@ def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
         Instant in ``[a.t_ns, b.t_ns]``.
     """
     x, h = (t_ns - a.t_ns) * _NS, (b.t_ns - a.t_ns) * _NS
-    turn = turn_one(a.q, b.q)
+    turn = _turn_to(b, a)
     if a.rate is not None and b.rate is not None and _agree(a.rate, b.rate, turn, h):
         r = _hermite(a.rate, b.rate, turn, x, h)
     elif before is not None:
         h0 = (a.t_ns - before.t_ns) * _NS
-        r = _combine(
-            x * (x + h0) / (h * (h0 + h)),
-            turn,
-            x * (x - h) / (h0 * (h0 + h)),
-            turn_one(a.q, before.q),
-        )
+        m, n = x * (x + h0) / (h * (h0 + h)), x * (h - x) / (h0 * (h0 + h))
+        r = _combine(m, turn, n, _turn_to(a, before))  # seen from `a`, `before` is at minus that
     else:
         share = x / h
         r = (share * turn[0], share * turn[1], share * turn[2])
@@ -92,8 +91,7 @@ def beyond(earlier: Known | None, before: Known, a: Known, t_ns: int) -> Quatern
     """
     x, h0 = (t_ns - a.t_ns) * _NS, (a.t_ns - before.t_ns) * _NS
     x_c = min(x, h0)
-    back = turn_one(a.q, before.q)
-    turn = (-back[0], -back[1], -back[2])
+    turn = _turn_to(a, before)
     if a.rate is not None and before.rate is not None and _agree(before.rate, a.rate, turn, h0):
         bend = x_c * (x - 0.5 * x_c) / h0
         r = _combine(x + bend, a.rate, -bend, before.rate)
@@ -107,6 +105,13 @@ def beyond(earlier: Known | None, before: Known, a: Known, t_ns: int) -> Quatern
             bent = _combine(weight * (1.0 / h0 + 1.0 / h1), turn, weight / h1, first)
             r = (r[0] + bent[0], r[1] + bent[1], r[2] + bent[2])
     return turned_one(a.q, r)
+
+
+def _turn_to(sample: Known, before: Known) -> Vector:
+    """Return the turn from the sample before, which the next interval asks for, too."""
+    if sample.turn is None:
+        sample.turn = turn_one(before.q, sample.q)
+    return sample.turn
 
 
 def _combine(m: float, u: Vector, n: float, v: Vector) -> Vector:

@@ -66,7 +66,7 @@ class Verdict(StrEnum):
 
 
 class _Sample:
-    __slots__ = ("arrival_ns", "late", "q", "rate", "synced", "t_ns", "used")
+    __slots__ = ("arrival_ns", "late", "q", "rate", "synced", "t_ns", "turn", "used")
 
     def __init__(
         self, t_ns: int, arrival_ns: int, q: Quaternion, rate: Vector | None, synced: bool
@@ -74,6 +74,7 @@ class _Sample:
         self.t_ns, self.arrival_ns, self.q, self.rate = t_ns, arrival_ns, q, rate
         self.synced = synced
         self.late = self.used = False
+        self.turn: Vector | None = None
 
 
 class Stream:
@@ -160,6 +161,7 @@ class Stream:
             return self._count(Verdict.DUPLICATE)
         if sample.late or at == 0 or len(samples) >= CAPACITY:
             return self._count(Verdict.LATE)
+        samples[at].turn = None
         samples.insert(at, sample)
         return None
 

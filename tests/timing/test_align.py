@@ -202,6 +202,19 @@ def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
     assert a.push("A", T0 + 15 * MS, T0 + 41 * MS, IDENTITY) is Verdict.LATE
 
 
+def test_a_frame_does_not_remember_neighbors_that_a_reordered_sample_parted() -> None:
+    found = []
+    for frames_before in (3, 0):  # at 0, 10 and 20 ms: the last two between 0 and 29 ms
+        a = aligner(A=10 * MS)
+        for t, rate in ((0, 2.0), (29, 2.0), (22, 9.0), (39, 2.0)):
+            if t == 22:
+                assert len(a.advance(T0 + 29 * MS if frames_before else T0 - 1)) == frames_before
+            a.push("A", T0 + t * MS, T0 + max(t, 29) * MS, turned(T0 + t * MS, rate))
+        found.append(a.advance(T0 + 39 * MS)[-1])
+    assert found[0].t_ns == T0 + 30 * MS
+    assert found[0].orientations == found[1].orientations
+
+
 def test_a_long_silence_of_all_skips_frames() -> None:
     a = aligner(A=10 * MS)
     month = 30 * 86_400_000 * MS  # too many frames to count one by one

@@ -35,6 +35,7 @@ class Sample:
     t_ns: int
     q: Quaternion
     rate: Vector | None = None
+    turn: Vector | None = None
 
 
 def negated(sample: Sample) -> Sample:
