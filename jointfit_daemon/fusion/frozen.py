@@ -63,7 +63,7 @@ class _Sensor:
     def take(self, t_ns: int, q: Quaternion, everyone: Orientations) -> bool:
         """Take one orientation; tell whether it is the one before again."""
         since_ns = self.since_ns
-        if since_ns is not None and _sine2(self.q, q) < _ROUNDING:
+        if since_ns is not None and _repeats(self.q, q):
             self.awake_ns = t_ns
             return True
         if since_ns is None:
@@ -161,6 +161,14 @@ class FrozenWatch:
                 known = name in then and name in said
                 before, one.still = one.still, known and not _turned(name, then, said, SHARE * FAR)
                 one.behind = before and one.still
+
+
+def _repeats(a: Quaternion, b: Quaternion) -> bool:
+    """Tell whether two orientations differ by rounding; mostly one component denies it."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    x = aw * bx - ax * bw - ay * bz + az * by
+    return x * x < _ROUNDING and _sine2(a, b) < _ROUNDING
 
 
 def _sine2(a: Quaternion, b: Quaternion) -> float:

@@ -352,7 +352,8 @@ class DeviceClock:
             delay, sigma = float(arrival_ns - target), echo.sigma_ns(target)
             return target, -echo.slope, True, sigma, delay
         delay = abs(envelope.feed(u, arrival_ns - u))
-        target, sigma = u + envelope.offset_ns(u) - self.latency_ns, envelope.sigma_ns(u)
+        offset, sigma = envelope.at(u)
+        target = u + offset - self.latency_ns
         if self._kind == _ARRIVAL:
             sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
         settled = envelope.settled and (echo is None or not echo.expects_more(arrival_ns))

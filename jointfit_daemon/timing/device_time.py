@@ -115,6 +115,8 @@ class TickTime:
         if counter is None or before is None or step == 0:
             return False
         counts, usual = counter - before, self._step
+        if counts == 1 and step == usual:
+            return False  # as nearly always
         if usual is not None and step > _GAP * usual:
             expected = round(step / usual)
             slack = _SLACK + expected // 100

@@ -84,14 +84,19 @@ class Envelope:
 
     def offset_ns(self, u: int) -> int:
         """Return the height of the line at `u`, ns: host time minus device time, plus D_min."""
-        return self._y0 + round(self._c + self.skew * (u - self._ref))
+        return self.at(u)[0]
 
     def sigma_ns(self, u: int) -> float:
         """Return the standard deviation of the line at `u`, ns; inf before the third bucket."""
-        height, both, slope = self._variance
+        return self.at(u)[1]
+
+    def at(self, u: int) -> tuple[int, float]:
+        """Return ``offset_ns`` and ``sigma_ns`` together, as every sample needs them."""
         ahead = u - self._ref
+        height, both, slope = self._variance
         spread = height + ahead * (2.0 * both + ahead * slope)
-        return sqrt(_FLOOR_VAR + spread) if spread > 0.0 else FLOOR_NS
+        sigma = sqrt(_FLOOR_VAR + spread) if spread > 0.0 else FLOOR_NS
+        return self._y0 + round(self._c + self.skew * ahead), sigma
 
     def feed(self, u: int, y: int) -> float:
         """Take a point with increasing `u`; return how far above the line it was, ns.
