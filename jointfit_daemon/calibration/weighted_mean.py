@@ -89,17 +89,15 @@ def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quatern
         return normalize_one(sensors[0])
     if len(sensors) > 2:
         return as_quaternion(rotation.average(np.array(sensors), np.array(weights)).tolist())
-    p, q = sensors
+    (pw, px, py, pz), (qw, qx, qy, qz) = sensors
     w1, w2 = weights
-    d = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
+    d = pw * qw + px * qx + py * qy + pz * qz
     if w1 == w2:  # then a = b
         if d < 0.0:
-            return normalize_one((p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3]))
-        return normalize_one((p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3]))
+            return normalize_one((pw - qw, px - qx, py - qy, pz - qz))
+        return normalize_one((pw + qw, px + qx, py + qy, pz + qz))
     z = max(sqrt((w1 - w2) ** 2 + 4.0 * w1 * w2 * d * d), 1e-300)
     share = z * (w1 + w2 + z)
     a = sqrt(w1 * max(w1 - w2 + z, 0.0) / share)
     b = copysign(sqrt(w2 * max(w2 - w1 + z, 0.0) / share), d)
-    return normalize_one(
-        (a * p[0] + b * q[0], a * p[1] + b * q[1], a * p[2] + b * q[2], a * p[3] + b * q[3])
-    )
+    return normalize_one((a * pw + b * qw, a * px + b * qx, a * py + b * qy, a * pz + b * qz))

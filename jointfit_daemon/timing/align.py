@@ -87,6 +87,8 @@ class FrameAligner:
         self._completed_ns = 0
         self._deadline_ns: int | None = None
         self._changed = True  # since `_deadline_ns` was worked out
+        self._dues: dict[str, int] = {}
+        """When each stream is ready for the next frame; empty until that is asked."""
         self.emitted_frames = 0
         self.skipped_frames = 0
         """Frames never emitted because no stream had anything near them."""
@@ -130,9 +132,12 @@ class FrameAligner:
         if epoch != stream.epoch:  # its samples so far will be forgotten
             self._served = None
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
-        return stream.push(
+        verdict = stream.push(
             t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns, rate=rate
         )
+        if self._dues:  # of the others nothing has changed
+            self._dues[name] = self._due_of(stream)
+        return verdict
 
     def counts(self, name: str) -> dict[str, int]:
         """Return ``received`` and what became of it: the verdicts and ``pending`` add up to it."""
@@ -162,6 +167,7 @@ class FrameAligner:
         """Choose the next frame; skip those no stream can serve. False if there is none yet."""
         if self._served is not None and self._served == self._next:
             return True  # more samples change nothing about that
+        self._dues.clear()
         starts = self._starts()
         if not starts:
             return False
@@ -196,16 +202,14 @@ class FrameAligner:
 
     def _due(self) -> int:
         """Return when the next frame is or was complete, or its deadline if it is not, ns."""
+        if not self._dues:
+            self._dues = {name: self._due_of(stream) for name, stream in self._items}
+        latest = max(self._dues.values())
+        return max((self._next or 0) * self._period_ns, latest) if self._fast else latest
+
+    def _due_of(self, stream: Stream) -> int:
         t_k = (self._next or 0) * self._period_ns
-        if self._fast:
-            ahead = [stream.due(t_k - stream.period_ns) for _, stream in self._items]
-            return max(t_k, *ahead)
-        latest = 0
-        for _, stream in self._items:
-            due_ns = stream.due_ns if stream.due_for == t_k else stream.due(t_k)
-            if due_ns > latest:  # noqa: PLR1730 - max() costs more, and this runs after every sample
-                latest = due_ns
-        return latest
+        return stream.due(t_k - stream.period_ns if self._fast else t_k)
 
     def _emit(self, due_ns: int) -> AlignedFrame | None:
         number = self._next or 0

@@ -83,7 +83,7 @@ class Stream:
     __slots__ = (
         "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_gap_ns",
         "_lost_after_ns", "_patience_ns", "_reach_ns", "_received", "_samples",
-        "due_for", "due_ns", "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns",
+        "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns",
         "synced", "waited_for",
     )  # fmt: skip
 
@@ -101,9 +101,6 @@ class Stream:
         """Of the clock behind the samples."""
         self.waited_for = False
         """Whether more is expected of it."""
-        self.due_for: int | None = None
-        """For which instant ``due`` was asked last, if its answer still holds: ``due_ns``."""
-        self.due_ns = 0
         self._received = 0
         self._counts = dict.fromkeys(Verdict, 0)
         self.newest_ns = self.newest_arrival_ns = 0
@@ -137,7 +134,7 @@ class Stream:
         if epoch != self.epoch:
             self.reset()
             self.epoch = epoch
-        samples, self.due_for = self._samples, None
+        samples = self._samples
         sample = _Sample(t_ns, arrival_ns, q, rate, synced)
         sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
@@ -194,11 +191,6 @@ class Stream:
 
     def due(self, t_ns: int) -> int:
         """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
-        if self.due_for != t_ns:
-            self.due_for, self.due_ns = t_ns, self._due_at(t_ns)
-        return self.due_ns
-
-    def _due_at(self, t_ns: int) -> int:
         if not self.waited_for:
             return 0
         newest = self.newest_ns
@@ -271,7 +263,7 @@ class Stream:
 
     def lose(self) -> None:
         """Stop waiting for this stream until a sample comes."""
-        self.waited_for, self.due_for = False, None
+        self.waited_for = False
 
     def settle(self) -> None:
         """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
@@ -283,7 +275,7 @@ class Stream:
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), Verdict.DROPPED)
-        self.waited_for, self.epoch, self.due_for = False, None, None
+        self.waited_for, self.epoch = False, None
 
     def counts(self) -> dict[str, int]:
         """Return samples received, by verdict, and still pending."""
