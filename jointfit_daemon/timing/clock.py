@@ -353,11 +353,10 @@ class DeviceClock:
             return target, -echo.slope, True, sigma, delay
         delay = abs(envelope.feed(u, arrival_ns - u))
         offset, sigma = envelope.at(u)
-        target = u + offset - self.latency_ns
         if self._kind == _ARRIVAL:
             sigma = max(sigma, _ARRIVAL_SIGMA * self._period_ns)
         settled = envelope.settled and (echo is None or not echo.expects_more(arrival_ns))
-        return target, envelope.skew, settled, sigma, delay
+        return u + offset - self.latency_ns, envelope.skew, settled, sigma, delay
 
     def _directed(self, u: int, estimate: Estimate, direct: Direct) -> Estimate:
         """Return what `direct` says, unless `estimate` contradicts it."""
