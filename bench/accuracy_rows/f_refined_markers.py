@@ -69,7 +69,9 @@ def refined(_: Path) -> list[Figure]:
     return [
         Figure("people", float(len(worn)), NOTHING, unit=""),
         Figure("markers off a rigid part, static places", float(before), NOTHING, unit="mm"),
-        Figure("markers off a rigid part, refined", float(after), float(before), unit="mm"),
+        Figure(
+            "markers off a rigid part, refined", float(after), round(float(before), 2), unit="mm"
+        ),
         *_changes("as worn", worn, COSTS_NOTHING_DEG),
         *_changes(f"a marker each knocked off, {len(knocked)} people", knocked, 0.0),
     ]
