@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.calibration.anchored import fit_anchored
+from jointfit_daemon.calibration.joint_correlation import error_correlation
 from jointfit_daemon.calibration.kernel_model import fit_kernel
 from jointfit_daemon.calibration.mount import fit_alignment
 from jointfit_daemon.calibration.redundancy import fit_segment
@@ -64,6 +65,11 @@ def fit(method: str, trials: Sequence[KneeTrial]) -> Predict:
 def models(trials: Sequence[KneeTrial], method: str = "anchored") -> tuple[SegmentModel, ...]:
     """Return the segment models of a method that has some, thigh and shank."""
     return tuple(_model(method, training) for training in _training(trials))
+
+
+def correlation(trials: Sequence[KneeTrial]) -> float:
+    """Return how far the default's errors of thigh and shank about their x are alike."""
+    return error_correlation(*_training(trials))
 
 
 def _training(trials: Sequence[KneeTrial]) -> Iterator[SegmentTraining]:

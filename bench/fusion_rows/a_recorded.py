@@ -157,11 +157,15 @@ def flexion_scores(
     taught: list[KneeTrial], judged: KneeTrial, method: str = DEFAULT
 ) -> NDArray[np.float64]:
     """Return errors of flexion over their claimed deviations, shape (n,)."""
-    found = methods.models(taught, method)
-    said, variance = [], np.zeros(len(judged))
-    for model, segment in zip(found, methods.segments(judged), strict=True):
+    said, claimed = [], []
+    for model, segment in zip(
+        methods.models(taught, method), methods.segments(judged), strict=True
+    ):
         said.append(model.predict(segment.sensors, segment.other))
-        variance += methods.axis_deviations(model, segment)[:, 0] ** 2
+        claimed.append(methods.axis_deviations(model, segment)[:, 0])
+    alike = methods.correlation(taught) if method == DEFAULT else 0.0
+    first, second = claimed
+    variance = first**2 + second**2 - 2.0 * alike * first * second
     q = rotation.multiply(rotation.conjugate(said[0]), said[1])
     truth = rotation.multiply(rotation.conjugate(judged.thigh), judged.shank)
     off = rotation.log(rotation.multiply(rotation.conjugate(q), truth))[:, 0]

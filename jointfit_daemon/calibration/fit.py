@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jointfit_daemon.calibration import mount
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, Anatomy, JointFound, find_anatomy
 from jointfit_daemon.calibration.digest import trials_digest
+from jointfit_daemon.calibration.joint_correlation import error_correlations
 from jointfit_daemon.calibration.judgement import better
 from jointfit_daemon.calibration.lags import (
     NO_LAG,
@@ -143,6 +144,7 @@ def fit_calibration(
         software=software,
         created_utc=created_utc,
         links=fit_links(chain, training.sensors, anatomy.q_static),
+        correlations=error_correlations(chain, training, settings.method),
         memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
     )
 

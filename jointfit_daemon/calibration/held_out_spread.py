@@ -25,7 +25,7 @@ FARTHEST = 30.0
 """Leverage ratios beyond tell nothing more."""
 WITHIN = 0.5
 """Leverage ratios up to this are the heart of the training: there errors do not grow."""
-FAR, FAR_FACTOR, FAR_SHARE = 1.5, 3.0, 0.2
+FAR, FAR_FACTOR, FAR_SHARE = 1.5, 3.0, 0.1
 """Beforehand, at this ratio errors are taken to be so many times larger, and this counts as much as
 so many parts of the trials: training shows little of what lies far outside of it."""
 LEAST = 0.15

@@ -146,9 +146,21 @@ class KernelModel(SegmentModel):
 
 
 def fit_kernel(training: SegmentTraining) -> KernelModel:
+    """Return the model alone, see `learn_kernel`."""
+    return learn_kernel(training)[0]
+
+
+def learn_kernel(training: SegmentTraining) -> tuple[KernelModel, Array]:
     """Fit both experts; all that is chosen, and the claimed variance, come from held-out groups.
 
     Groups are blocks in time and, where several trials train, whole trials as well.
+
+    Returns
+    -------
+    model : KernelModel
+    residuals : ndarray, shape (w n, 3)
+        What is left over of every frame when its group is left out, rad in the axes of the segment;
+        one way of leaving out after the other.
 
     Raises
     ------
@@ -170,7 +182,7 @@ def fit_kernel(training: SegmentTraining) -> KernelModel:
     unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
     residuals = [rho - _mixed(*each) for each in unseen]
     distances = [np.maximum(a_ratio, b_ratio) for _, _, a_ratio, _, b_ratio in unseen]
-    return KernelModel(
+    model = KernelModel(
         sensors=count,
         plain=plain.expert,
         tilted=tilted.expert,
@@ -179,6 +191,7 @@ def fit_kernel(training: SegmentTraining) -> KernelModel:
         residual_sd=_sd(residuals[-1]),
         mean_sd=_sd(rho),
     )
+    return model, np.concatenate(residuals)
 
 
 def _seen(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.anatomy import flexion_sign
+from jointfit_daemon.calibration.joint_correlation import error_correlations
 from jointfit_daemon.calibration.markers import visible
 from jointfit_daemon.calibration.model_fit import (
     METHODS,
@@ -167,6 +168,7 @@ def fit_offline(
         software=software,
         created_utc=created_utc,
         links=fit_links(chain, training.sensors, dict.fromkeys(chain.segments, rotation.IDENTITY)),
+        correlations=error_correlations(chain, training, method),
     )
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jointfit_daemon.calibration.joint_correlation import error_correlations
 from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.calibration.memory import evenly, joined, pack, unpack
 from jointfit_daemon.calibration.model_fit import (
@@ -128,6 +129,7 @@ def learn(
     found = replace(
         calibration,
         segment=segments,
+        correlations=error_correlations(chain, whole, calibration.method),
         memory=pack(chain, whole),
         quality={**calibration.quality, "online": figures},
     )

@@ -103,6 +103,8 @@ class Calibration:
     created_utc: str = ""
     links: tuple[SensorLink, ...] = ()
     """What is expected between sensors; empty where no movement was seen."""
+    correlations: Mapping[str, float] = field(default_factory=dict)
+    """How far the errors of both segments of an inner joint are alike, see `joint_correlation`."""
     memory: str = ""
     """Frames it was taught with, see `memory`; empty in calibrations of earlier versions."""
 
@@ -135,6 +137,7 @@ class Calibration:
             "software": self.software,
             "created_utc": self.created_utc,
             "links": [link.to_dict() for link in self.links],
+            "correlations": dict(self.correlations),
             "memory": self.memory,
         }
 
@@ -227,6 +230,7 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         software=data["software"],
         created_utc=data["created_utc"],
         links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
+        correlations={name: float(rho) for name, rho in data.get("correlations", {}).items()},
         memory=str(data.get("memory", "")),
     )
 

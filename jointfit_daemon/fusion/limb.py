@@ -84,6 +84,11 @@ class LimbFuser:
             self._reaches.append(Reach(length, sd or 0.0))
         self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
+        self._take_correlations(calibration)
+
+    def _take_correlations(self, calibration: Calibration) -> None:
+        known = calibration.correlations
+        self._alike = [known.get(joint, 0.0) for joint in self._chain.joints]
 
     def fuse(
         self,
@@ -157,6 +162,7 @@ class LimbFuser:
         if self._calibration is None:
             return
         self._calibration = calibration
+        self._take_correlations(calibration)
         for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
             fuser.take(calibration.segment[name].models)
 
@@ -197,7 +203,9 @@ class LimbFuser:
             state = None
             if 0 < i < len(fused):
                 above, below = fused[i - 1], fused[i]
-                state = read_angles(above, below, sign=self._signs[i], left=chain.left_side)
+                state = read_angles(
+                    above, below, sign=self._signs[i], left=chain.left_side, alike=self._alike[i]
+                )
             if state is None:
                 joints.append(JointState(name, position, sd))
                 continue

@@ -6,7 +6,7 @@ position's covariance is its trace, which is all that a LimbState carries.
 
 from __future__ import annotations
 
-from math import cos, hypot
+from math import cos, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.joint_angles import read_joint
@@ -64,19 +64,23 @@ def joint_positions(
     return out
 
 
-def read_angles(above: Fused, below: Fused, *, sign: float, left: bool) -> AngleState | None:
+def read_angles(
+    above: Fused, below: Fused, *, sign: float, left: bool, alike: float = 0.0
+) -> AngleState | None:
     r"""Return the angles of one joint, or None where a segment's orientation is unknown.
 
     With isotropic errors :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, whose
     first entry is :math:`1 / \cos^2\theta` times the sum: the deviation of flexion, to first order
     (E: rates of Grood and Suntay's angles to angular velocity). It is None where the axes lock.
     Where a segment's deviation about its x is known apart, that stands for its sigma: flexion
-    hardly feels the others.
+    hardly feels the others. `alike` is the correlation of both errors about it; it takes
+    :math:`2 \rho \sigma_1 \sigma_2` from the sum.
     """
     if above.q is None or below.q is None or above.sd is None or below.sd is None:
         return None
     angles, inner, gimbal = read_joint(above.q, below.q, flexion_sign=sign, left=left)
     first = above.sd if above.flexion_sd is None else above.flexion_sd
     second = below.sd if below.flexion_sd is None else below.flexion_sd
-    sd = None if gimbal else hypot(first, second) / cos(angles.adduction)
+    total = first * first + second * second - 2.0 * alike * first * second
+    sd = None if gimbal else sqrt(total) / cos(angles.adduction)
     return AngleState(angles, inner, sd, gimbal)

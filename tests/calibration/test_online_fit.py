@@ -46,7 +46,7 @@ def test_far_bends_are_learned_and_small_ones_are_not_forgotten(learned: dict[st
 
 def test_only_models_memory_and_figures_change(learned: dict[str, Any]) -> None:
     before, after = calibration(), Calibration.from_dict(learned["calibration"])
-    blank: dict[str, Any] = {"segment": {}, "quality": {}, "memory": ""}
+    blank: dict[str, Any] = {"segment": {}, "quality": {}, "memory": "", "correlations": {}}
     assert replace(before, **blank) == replace(after, **blank)
     assert {n: s.length for n, s in before.segment.items()} == {
         n: s.length for n, s in after.segment.items()
