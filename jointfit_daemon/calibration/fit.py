@@ -131,7 +131,7 @@ def fit_calibration(
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
         clusters={name: stored_cluster(cluster) for name, cluster in refined.clusters.items()},
         flags=(*anatomy.flags, *(["headings_from_static"] if alignment is None else [])),
-        notes=tuple(notes),
+        notes=(*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *headings),
         quality={
             "static": pose.quality,
             "alignment": None if alignment is None else alignment.quality,
