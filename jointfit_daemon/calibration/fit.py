@@ -119,8 +119,8 @@ def fit_calibration(
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
     training, raw, taught_notes = limb_training(chain, functional, tracks, anatomy, sensors)
     models = fit_models(chain, training, settings.method)
-    notes = [*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *taught_notes]
-    notes += _heading_notes(chain, raw, training) if alignment is None else []
+    headings = _heading_notes(chain, raw, training) if alignment is None else []
+    notes = (*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *taught_notes, *headings)
     return Calibration(
         method=settings.method,
         joints=chain.joints,
@@ -131,7 +131,7 @@ def fit_calibration(
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
         clusters={name: stored_cluster(cluster) for name, cluster in refined.clusters.items()},
         flags=(*anatomy.flags, *(["headings_from_static"] if alignment is None else [])),
-        notes=(*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *headings),
+        notes=notes,
         quality={
             "static": pose.quality,
             "alignment": None if alignment is None else alignment.quality,
