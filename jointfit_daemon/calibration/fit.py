@@ -113,8 +113,7 @@ def fit_calibration(
     refined, tracks = _refined(_tracks(pose, functional, chain), pose, functional, settings)
     anatomy = find_anatomy(chain, tracks)
     lags = _lags(chain, functional, tracks, lag_ns or {})
-    used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}))
-    used |= {name: known_lag(lag) for name, lag in (lag_ns or {}).items()}
+    used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}), lag_ns or {})
     used_ns = {name: item.lag_ns for name, item in used.items()}
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
     training, raw, taught_notes = limb_training(chain, functional, tracks, anatomy, sensors)
@@ -219,8 +218,9 @@ def _chosen_lags(
     moving: Mapping[str, LagEstimate],
     alignment: Alignment | None,
     earlier: Mapping[str, ChosenLag],
+    known: Mapping[str, int],
 ) -> dict[str, ChosenLag]:
-    """Return the lag of every sensor, of this movement and the plate together, else an earlier."""
+    """Return what is known, else the lag of this movement and the plate together, else earlier."""
     lags = dict(earlier)
     plate = {} if alignment is None else alignment.sensors
     prior = {
@@ -236,7 +236,7 @@ def _chosen_lags(
             {name: moving[name] for name in group if name in moving},
             {name: prior[name] for name in group if name in prior},
         )
-    return lags
+    return lags | {name: known_lag(lag) for name, lag in known.items()}
 
 
 def _earlier(
