@@ -166,6 +166,22 @@ class LimbFuser:
         for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
             fuser.take(calibration.segment[name].models)
 
+    def take_over(self, before: LimbFuser) -> None:
+        """Go on where the fuser before a reload was, if the same sensors are worn as then.
+
+        What drifted stays taken out, what is doubted stays doubted, and what fades goes on fading:
+        a reload moves nobody's leg.
+        """
+        was, now = before._calibration, self._calibration
+        if was is None or now is None or not _worn_alike(was, now):
+            return
+        if set(before._drifting) != set(self._drifting):
+            return
+        self.links, self._rates, self._fusers = before.links, before._rates, before._fusers
+        for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
+            if was.segment[name].models != now.segment[name].models:
+                fuser.take(now.segment[name].models)
+
     def news(self, now_ns: int) -> list[SensorNews]:
         """Return what is worth telling of the sensors at `now_ns`, each change once."""
         told = self.watch.news(now_ns)
@@ -221,6 +237,18 @@ class LimbFuser:
         joints = tuple(JointState(name, None, None) for name in self._chain.joints)
         mode = "uncalibrated"
         return LimbState(seq, t_ns, completed_ns, mode, sync, self._standing, segments, joints)
+
+
+def _worn_alike(was: Calibration, now: Calibration) -> bool:
+    """Tell whether two calibrations are of the same limb, wearing and links."""
+    if (was.joints, was.segments, was.chain_sensors) != (
+        now.joints,
+        now.segments,
+        now.chain_sensors,
+    ):
+        return False
+    poses = all(was.segment[name].q_static == now.segment[name].q_static for name in now.segments)
+    return poses and was.sensor == now.sensor and was.links == now.links
 
 
 def _widened(one: Fused, more: float) -> Fused:

@@ -157,7 +157,10 @@ class Core:
         if before is None or before.chain != rig.chain:
             self._watch = SensorWatch(rig.chain)
         self._session = session
+        fuser = None if before is None else self._fuser
         self._use_calibration()
+        if fuser is not None:
+            self._fuser.take_over(fuser)
         if (doubt := headings(rig.sources)) is not None:
             outputs.append(Notice(event.t_ns, "device", rig.name, doubt, "warning"))
         text = "stored calibration loaded" if event.calibration else "no calibration stored yet"

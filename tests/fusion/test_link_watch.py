@@ -188,6 +188,36 @@ def test_a_drifting_heading_is_taken_out(
     assert without > healthy + 2.0
 
 
+def test_a_reload_forgets_no_drift_and_moves_nobodys_leg(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    t_s, said, _ = walk
+    rates = {"S3": 10.0, "S4": 10.0}
+    spoilt = said | {s: drifting(t_s, said[s], rate) for s, rate in rates.items()}
+    half, rest = slice(None, 25 * 90), slice(25 * 90, 25 * 92)
+    fuser, same = LimbFuser(CHAIN, worn), LimbFuser(CHAIN, worn)
+    for each in (fuser, same):
+        play(each, t_s[half], {name: q[half] for name, q in spoilt.items()})
+    stored = Calibration.from_dict(worn.to_dict())  # as read from the store again
+    reloaded, fresh = LimbFuser(CHAIN, stored), LimbFuser(CHAIN, stored)
+    reloaded.take_over(fuser)
+    left = {name: q[rest] for name, q in spoilt.items()}
+    gone_on, _ = play(same, t_s[rest], left)
+    after, _ = play(reloaded, t_s[rest], left)
+    begun, _ = play(fresh, t_s[rest], left)
+    assert [s.segments for s in after] == [s.segments for s in gone_on]
+    assert np.max(rotation.angle_between(oriented(begun, 1), oriented(gone_on, 1))) > 0.05
+
+
+def test_a_new_static_pose_begins_with_fresh_headings(worn: Calibration) -> None:
+    turned = replace(worn.sensor["S1"], q_sensor_segment=(0.0, 1.0, 0.0, 0.0))
+    moved = replace(worn, sensor={**worn.sensor, "S1": turned})
+    before, after = LimbFuser(CHAIN, worn), LimbFuser(CHAIN, moved)
+    links = after.links
+    after.take_over(before)
+    assert after.links is links
+
+
 def test_a_joint_that_is_no_hinge_tells_nothing_of_headings(
     worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
 ) -> None:

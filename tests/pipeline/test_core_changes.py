@@ -166,6 +166,23 @@ def test_limbs_of_any_shape_are_calibrated_by_standing_still(worn: dict[str, str
     accounted(bench)
 
 
+def test_a_reload_goes_on_with_the_same_watch_of_a_limb_that_is_worn_alike() -> None:
+    worn = {"S1": "thigh", "S2": "thigh", "S3": "shank"}
+    bench, calibration = calibrated_by_standing(shaped(worn))
+    watched = bench.core._fuser.links
+    assert watched is not None
+    bench.feed(
+        [
+            Configured(
+                at(721),
+                parse_rig(shaped(worn) | {"rig": {"name": "r", "output_rate_hz": 50}}),
+                calibration,
+            )
+        ]
+    )
+    assert bench.core._fuser.links is watched
+
+
 def test_a_sensor_that_comes_back_is_said_to_need_a_new_pose() -> None:
     bench, _ = calibrated_by_standing(shaped({"S1": "thigh", "S3": "shank"}))
     told = len(bench.out)
