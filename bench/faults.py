@@ -40,6 +40,8 @@ BEGIN_S = 100.0
 MOVES = ("walk", "squat", "sit_to_stand", "stand")
 MOVE_S = 15.0
 SEGMENTS = ("thigh", "shank")
+PULL_S, STAY_S = 5.0, 30.0
+"""A magnetic disturbance: how long it takes to come and to go, and how long it lasts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +121,24 @@ def drifting(person: Worn, names: Sequence[str], rate_rad_s: float) -> Worn:
         turn = rotation.heading(rate_rad_s * person.t_s)
         person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
     return person
+
+
+def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) -> Worn:
+    """Return the person near iron: some headings are pulled away, stay for 30 s, and come back.
+
+    It takes :data:`PULL_S` either way, as a filter of a few seconds lets in a magnetic field.
+    """
+    begin, end = (person.t_s - at_s) / PULL_S, (person.t_s - at_s - PULL_S - STAY_S) / PULL_S
+    turn = rotation.heading(angle_rad * (_smooth(begin) - _smooth(end)))
+    for name in names:
+        person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
+    return person
+
+
+def _smooth(share: Array) -> Array:
+    """Return a step from 0 to 1 while `share` goes there, without a kink."""
+    x = np.clip(share, 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
 
 
 def play(fuser: LimbFuser, person: Worn) -> tuple[list[LimbState], list[tuple[float, SensorNews]]]:

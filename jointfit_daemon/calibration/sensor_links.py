@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations, product
-from math import atan2, radians, sqrt
+from math import atan2, radians
 from operator import le, mul
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import ArrayLike
 
@@ -229,7 +229,7 @@ def _fit(
         weights=tuple(tuple(row) for row in _ridge(shown, wanted).T.tolist()),
         low=tuple(shown.min(axis=0).tolist()),
         high=tuple(shown.max(axis=0).tolist()),
-        spread=max(spread, LEAST_SPREAD),
+        spread=float(max(spread, LEAST_SPREAD)),
         total=float(np.sqrt(np.mean(wanted**2))),
     )
 
@@ -259,8 +259,3 @@ def _axis_headings(q_a: Array, q_b: Array) -> Array:
 def _wrapped(angle: Array) -> Array:
     wrapped: Array = np.arctan2(np.sin(angle), np.cos(angle))
     return wrapped
-
-
-def length_one(r: Sequence[float]) -> float:
-    """Return the length of a vector."""
-    return sqrt(sum([value * value for value in r]))

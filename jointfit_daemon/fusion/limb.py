@@ -196,6 +196,7 @@ class LimbFuser:
         if self.links is not None:
             inputs = self.links.correct(inputs)
             spread, slipped, flags = self.links.look(t_ns, inputs)
+            inputs = self.links.brought_together(inputs)
             if slipped:
                 inputs = {name: q for name, q in inputs.items() if name not in slipped}
         fused = [

@@ -137,6 +137,83 @@ def test_a_slip_that_is_set_right_is_told_to_be_over(
     assert states[-1].flags == ()
 
 
+def pulled(t_s: Array, q: Array, degrees: float) -> Array:
+    """Return a sensor near iron from 8 to 20 s: its heading takes 3 s either way."""
+    away = np.clip((t_s - 8.0) / 3.0, 0.0, 1.0) - np.clip((t_s - 20.0) / 3.0, 0.0, 1.0)
+    return rotation.multiply(rotation.heading(np.radians(degrees) * away), q)
+
+
+def half_minute(
+    walk: tuple[Array, dict[str, Array], dict[str, Array]],
+) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    t_s, said, bones = walk
+    part = slice(0, 25 * 30)
+    return (
+        t_s[part],
+        {name: q[part] for name, q in said.items()},
+        {name: q[part] for name, q in bones.items()},
+    )
+
+
+@pytest.mark.parametrize(("name", "degrees"), [("S2", 30.0), ("S3", -40.0)])
+def test_a_heading_that_iron_pulls_away_is_told_put_right_and_told_to_be_over(
+    worn: Calibration,
+    walk: tuple[Array, dict[str, Array], dict[str, Array]],
+    name: str,
+    degrees: float,
+) -> None:
+    t_s, said, bones = half_minute(walk)
+    fuser, segment = LimbFuser(CHAIN, worn), CHAIN.segments[SEGMENT[name]]
+    healthy = play(LimbFuser(CHAIN, worn), t_s, said)[0]
+    states, told = play(fuser, t_s, said | {name: pulled(t_s, said[name], degrees)})
+    assert [(who, what) for _, who, what in told] == [
+        (segment, "pair_disagrees"), (segment, "agrees"),
+    ]  # fmt: skip
+    assert 8.0 < told[0][0] < 11.0
+    assert 20.0 < told[1][0] < 28.0
+    lasting = (t_s > 11.0) & (t_s < 20.0)
+    with_iron, without = (
+        np.sqrt(np.mean(joint_error(x, bones)[lasting] ** 2)) for x in (states, healthy)
+    )
+    assert with_iron < without + 1.0
+    assert states[-1].flags == ()
+
+
+def test_the_sensor_whose_heading_turned_is_named(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    t_s, said, _ = walk
+    fuser, news = LimbFuser(CHAIN, worn), []
+    spoilt = said | {"S1": pulled(t_s, said["S1"], 35.0)}
+    for k, t in enumerate(t_s[:300]):
+        t_ns = round(t * 1e9)
+        fuser.fuse(t_ns, t_ns, k, {name: tuple(q[k].tolist()) for name, q in spoilt.items()})
+        news += fuser.news(t_ns)
+    assert news[0].data["turned"] == "S1"
+    assert "heading of S1" in news[0].text
+
+
+def test_two_headings_of_one_segment_keep_the_angles_and_make_the_headings_doubtful(
+    worn: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
+) -> None:
+    t_s, said, bones = half_minute(walk)
+    spoilt = said | {name: pulled(t_s, said[name], 30.0) for name in ("S3", "S4")}
+    states, told = play(LimbFuser(CHAIN, worn), t_s, spoilt)
+    assert [(who, what) for _, who, what in told] == [
+        ("shank", "heading_disagrees"), ("shank", "agrees"),
+    ]  # fmt: skip
+    assert 8.0 < told[0][0] < 11.0
+    lasting = (t_s > 12.0) & (t_s < 20.0)
+    assert np.sqrt(np.mean(joint_error(states, bones)[lasting] ** 2)) < 5.0
+    during = [state for state, now in zip(states, lasting, strict=True) if now]
+    assert all("heading_disagrees:knee" in state.flags for state in during)
+    for i, name in enumerate(CHAIN.segments):
+        claimed = np.sqrt(3.0) * np.array([s.segments[i].sd for s in states], dtype=float)
+        error = rotation.angle_between(oriented(states, i), bones[name])
+        assert np.mean((error < 1.61 * claimed)[lasting]) > 0.95
+    assert states[-1].flags == ()
+
+
 def test_of_three_sensors_the_one_that_slipped_is_known_and_left_out() -> None:
     chain = replace(CHAIN, sensors=(("S1", "S2", "S3"), ("S4",)))
     rng = np.random.default_rng(5)
