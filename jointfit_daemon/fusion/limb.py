@@ -166,6 +166,11 @@ class LimbFuser:
         for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
             fuser.take(calibration.segment[name].models)
 
+    def worn_since(self, t_ns: int) -> None:
+        """Take it that the calibration is as old as that: headings have wandered since."""
+        for fuser in self._fusers:
+            fuser.worn_since(t_ns)
+
     def take_over(self, before: LimbFuser) -> None:
         """Go on where the fuser before a reload was, if the same sensors are worn as then.
 

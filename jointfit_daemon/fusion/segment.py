@@ -88,6 +88,10 @@ class SegmentFuser:
             self._models_before = self._models
         self._use(models)
 
+    def worn_since(self, t_ns: int) -> None:
+        """Count the wandering of headings from `t_ns` on, and not from the first frame."""
+        self._since_ns = t_ns
+
     def _use(self, models: Mapping[str, SegmentModel]) -> None:
         widest = max((m.residual_sd for m in models.values()), default=UNREFERENCED_SD)
         self._models, self._untrained_sd = models, max(widest, FLOOR_SD)
@@ -218,8 +222,8 @@ def _heard(names: Names, inputs: Inputs) -> Names:
 def _claimed(said: Prediction, minutes: float) -> tuple[float | None, float]:
     """Return the standard deviations about x and overall, with what no training can show.
 
-    A heading wanders about the vertical, one axis of three; `minutes` is for how long this
-    calibration, with its static pose, has been in use.
+    A heading wanders about the vertical, one axis of three; `minutes` is the age of the
+    calibration with its static pose.
     """
     sd = max(said.sd, FLOOR_SD)
     heading = _HEADING_VAR + _WANDER_VAR * max(minutes, 0.0)

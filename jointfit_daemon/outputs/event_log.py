@@ -71,11 +71,12 @@ def _described(event: Event) -> dict[str, Any]:  # noqa: C901, PLR0911 - one ret
     match event:
         case Tick(t_ns):
             return {"e": "tick", "t_ns": t_ns}
-        case Configured(t_ns, rig, calibration, version):
+        case Configured(t_ns, rig, calibration, version, age_s):
             stored = None if calibration is None else calibration.to_dict()
             return {"e": "configured", "t_ns": t_ns, "table": rig.table} | {
                 "calibration": stored,
                 "calibration_version": version,
+                "calibration_age_s": age_s,
             }
         case SourceOpened(t_ns, source):
             return {"e": "opened", "t_ns": t_ns, "source": source}

@@ -159,6 +159,7 @@ class Core:
         self._session = session
         fuser = None if before is None else self._fuser
         self._use_calibration()
+        self._fuser.worn_since(event.t_ns - round(event.calibration_age_s * 1e9))
         if fuser is not None:
             self._fuser.take_over(fuser)
         if (doubt := headings(rig.sources)) is not None:

@@ -30,6 +30,8 @@ class Configured:
     calibration: Calibration | None
     """What the store held for this rig."""
     calibration_version: int | None = None
+    calibration_age_s: float = 0.0
+    """How long ago it was stored, s: its headings have wandered since."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,6 +50,16 @@ def stored(rig: Rig) -> Found:
     return Found(latest.calibration, latest.version, latest.notes)
 
 
+def age_of(calibration: Calibration, now: datetime.datetime | None = None) -> float:
+    """Return how long ago a calibration was stored, s; 0 where that is not known or not past."""
+    try:
+        then = datetime.datetime.fromisoformat(calibration.created_utc)
+        elapsed = (now or datetime.datetime.now(datetime.UTC)) - then
+    except (ValueError, TypeError):  # no date, or one without its zone
+        return 0.0
+    return max(0.0, elapsed.total_seconds())
+
+
 def save(rig: Rig, calibration: Calibration) -> int:
     """Write a new version, with the date, and return its number.
 

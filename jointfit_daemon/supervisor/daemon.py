@@ -282,7 +282,8 @@ class Daemon:
         for complaint in found.complaints:
             self._tell("calibration", complaint, "warning")
         now_ns = time.monotonic_ns()
-        self._heart.feed(Configured(now_ns, rig, found.calibration, found.version))
+        age_s = 0.0 if found.calibration is None else calibrations.age_of(found.calibration)
+        self._heart.feed(Configured(now_ns, rig, found.calibration, found.version, age_s))
 
     async def _reload_when_asked(self) -> None:
         while True:

@@ -78,7 +78,7 @@ def test_every_event_comes_back_equal(event: Event) -> None:
 
 
 def test_a_configuration_comes_back_with_its_rig(table: dict[str, Any]) -> None:
-    event = Configured(5, parse_rig(table), None, None)
+    event = Configured(5, parse_rig(table), None, None, 7.5)
     assert decode_event(orjson.loads(encode_event(event))) == event
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import datetime
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -130,3 +131,20 @@ async def test_a_reload_while_a_calibration_is_written_finds_it(
     configured = [event for event in core.events if isinstance(event, Configured)]
     assert configured[-1].calibration is not None
     assert configured[-1].calibration_version == 1
+
+
+@pytest.mark.parametrize(
+    ("created", "age_s"),
+    [
+        ("2026-03-01T10:00:00+00:00", 3600.0),
+        ("2026-03-01T12:00:00+01:00", 0.0),
+        ("2026-03-02T10:00:00+00:00", 0.0),
+        ("2026-03-01T10:00:00", 0.0),
+        ("", 0.0),
+    ],
+)
+def test_the_age_of_a_calibration_is_known_or_nothing(created: str, age_s: float) -> None:
+    """A host without a clock of its own may think it is yesterday."""
+    now = datetime.datetime(2026, 3, 1, 11, tzinfo=datetime.UTC)
+    calibration = Calibration("mean", (), (), (), {}, {}, {}, created_utc=created)
+    assert calibrations.age_of(calibration, now) == age_s

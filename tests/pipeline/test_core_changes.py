@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
@@ -164,6 +165,22 @@ def test_limbs_of_any_shape_are_calibrated_by_standing_still(worn: dict[str, str
     ]
     assert len(state.joints) == len(state.segments) + 1
     accounted(bench)
+
+
+def test_a_calibration_of_yesterday_is_claimed_with_a_heading_of_yesterday() -> None:
+    rig = shaped({"S1": "thigh", "S3": "shank"})
+    _, calibration = calibrated_by_standing(rig)
+    sds = []
+    for age_s in (0.0, 86_400.0):
+        bench = Bench()
+        started = Configured(BEGIN_NS, parse_rig(rig), calibration, 1, age_s)
+        bench.feed([started, *(SourceOpened(BEGIN_NS, name) for name in ("S1", "S3"))])
+        bench.feed(still(("S1", "S3"), 0, 60))
+        sds.append(bench.states[-1].segments[0].sd)
+    assert sds[0] is not None
+    assert sds[1] is not None
+    wandered = math.radians(0.3) * math.sqrt(1440.0 / 3.0)
+    assert sds[1] == pytest.approx(math.hypot(sds[0], wandered), rel=1e-3)
 
 
 def test_a_reload_goes_on_with_the_same_watch_of_a_limb_that_is_worn_alike() -> None:
