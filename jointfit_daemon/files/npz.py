@@ -17,7 +17,8 @@ segments' axes too, which are named like the world's.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -58,16 +59,30 @@ def quaternions_z_up(quaternions: ArrayLike) -> NDArray[np.float64]:
     return _unit(turned)
 
 
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return all arrays of an NPZ file.
+
+    Raises
+    ------
+    Malformed
+        It is none, is cut off, or holds what only Python could read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except (BadZipFile, EOFError, ValueError, AttributeError) as fault:
+        raise Malformed(f"{path}: not an NPZ file, or cut off: {fault}") from fault
+
+
 def read_orientations_npz(path: Path) -> OrientationTrial:
     """Return the trial of an NPZ file.
 
     Raises
     ------
     Malformed
-        No ``t``, or neither a sensor nor a bone.
+        As `read_arrays`; no ``t``, or neither a sensor nor a bone.
     """
-    with np.load(path, allow_pickle=False) as found:
-        arrays = {name: found[name] for name in found.files}
+    arrays = read_arrays(path)
     names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]
     bones = [n.removeprefix(_BONE) for n in arrays if n.startswith(_BONE)]
     if "t" not in arrays or not (names or bones):

@@ -221,6 +221,7 @@ def _inputs(
     if static is not None:
         mounts, still = fuse_trial.read_static(*_pair(static), limb)
     read = [fuse_trial.read_trial(*_pair(text), limb, still) for text in trials]
+    read = fuse_trial.told_apart(read, [_pair(text)[0] for text in trials])
     told = doubts(limb.chain, read, mounts)
     if mounts is None:
         told.append(

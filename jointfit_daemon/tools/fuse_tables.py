@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jointfit_daemon.files.npz import quaternions_z_up, read_orientations_npz
+from jointfit_daemon.files.npz import quaternions_z_up, read_arrays, read_orientations_npz
 from jointfit_daemon.files.sto import read_orientations_sto
 from jointfit_daemon.kinematics import rotation
 
@@ -75,18 +75,18 @@ def read_table(path: Path, up: Axis) -> Table:
 
 def refuse_odd_arrays(path: Path) -> None:
     """Refuse arrays of an NPZ file that are no unit quaternions, one a row of ``t``."""
-    with np.load(path, allow_pickle=False) as arrays:
-        count = len(arrays["t"]) if "t" in arrays.files else None
-        for name in arrays.files:
-            if not (name.endswith("_quat") or name.startswith("q_")):
-                continue
-            q = np.asarray(arrays[name], dtype=np.float64)
-            if count is not None and q.shape != (count, 4):
-                raise Unusable(
-                    f"{path}: {name} has shape {q.shape}, expected {(count, 4)}: a quaternion "
-                    f"w, x, y, z for each of the {count} instants of t; gaps are NaN"
-                )
-            refuse_other_units(path, name, q)
+    arrays = read_arrays(path)
+    count = len(arrays["t"]) if "t" in arrays else None
+    for name, array in arrays.items():
+        if not (name.endswith("_quat") or name.startswith("q_")):
+            continue
+        q = np.asarray(array, dtype=np.float64)
+        if count is not None and q.shape != (count, 4):
+            raise Unusable(
+                f"{path}: {name} has shape {q.shape}, expected {(count, 4)}: a quaternion "
+                f"w, x, y, z for each of the {count} instants of t; gaps are NaN"
+            )
+        refuse_other_units(path, name, q)
 
 
 def refuse_other_units(path: Path, name: str, q: Array) -> None:

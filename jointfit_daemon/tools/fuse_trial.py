@@ -5,7 +5,7 @@ Law: what leaves here has z up and one time axis, the sensors'.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -146,6 +146,23 @@ def read_sensors(path: Path, chain: Chain, up: Axis) -> Table:
     table = read_table(path, up)
     q = sensors_of(table, [s for group in chain.sensors for s in group], path)
     return Table(table.t_s, q, table.bones)
+
+
+def told_apart(trials: Sequence[OfflineTrial], paths: Sequence[Path]) -> list[OfflineTrial]:
+    """Return the trials, named by their whole paths where two files are called alike.
+
+    Raises
+    ------
+    Unusable
+        One file is named twice: what is left out would be fitted to.
+    """
+    if twice := sorted({str(path) for path in paths if paths.count(path) > 1}):
+        raise Unusable(f"{', '.join(twice)}: named more than once; each trial counts once")
+    names = [trial.name for trial in trials]
+    return [
+        replace(trial, name=str(path)) if names.count(trial.name) > 1 else trial
+        for trial, path in zip(trials, paths, strict=True)
+    ]
 
 
 def read_worn(path: Path, chain: Chain, up: Axis, without: Sequence[str]) -> Table:

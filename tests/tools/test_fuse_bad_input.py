@@ -149,6 +149,16 @@ def test_sensors_and_bones_of_one_name_are_kept_apart(files: Path) -> None:
     assert found["same", "mean"]["segments_rms"]["shank"] > np.deg2rad(1.0)
 
 
+def test_trials_of_one_name_are_told_apart_and_one_trial_twice_is_refused(files: Path) -> None:
+    (files / "other").mkdir()
+    other = files / "other" / "m0.npz"
+    write_orientations_npz(other, movement(1))
+    found = rows(run("evaluate", files / "m0.npz", other, *LIMB, "--json"))
+    assert {trial for trial, _ in found} == {str(files / "m0.npz"), str(other)}
+    text = said(run("evaluate", files / "m0.npz", files / "m0.npz", *LIMB))
+    assert "named more than once" in text
+
+
 def test_a_file_may_hold_the_reference_alone(files: Path) -> None:
     trial = movement()
     held = {f"q_{name}": q for name, q in trial.bones.items()}
@@ -164,6 +174,15 @@ def test_arrays_of_another_length_or_width_are_told_by_name(files: Path) -> None
         np.savez(files / "odd.npz", **{**held, "A_quat": odd})
         text = said(run("evaluate", files / "odd.npz", *LIMB))
         assert f"A_quat has shape {odd.shape}, expected (200, 4)" in text
+
+
+@pytest.mark.parametrize("length", [0, 100, 5000])
+def test_a_file_that_is_cut_off_is_told_by_name(files: Path, length: int) -> None:
+    whole = (files / "m0.npz").read_bytes()
+    assert len(whole) > length
+    (files / "cut.npz").write_bytes(whole[:length])
+    text = said(run("evaluate", files / "cut.npz", *LIMB))
+    assert "cut.npz: not an NPZ file, or cut off" in text
 
 
 def test_four_zeros_are_a_gap_and_no_complaint(files: Path) -> None:
