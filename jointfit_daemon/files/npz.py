@@ -68,7 +68,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         It is none, is cut off, or holds what only Python could read.
     """
     try:
-        with np.load(path, allow_pickle=False) as found:
+        # numpy leaves a file open that it opened itself and cannot read
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
             return {name: found[name] for name in found.files}
     except (BadZipFile, EOFError, ValueError, AttributeError) as fault:
         raise Malformed(f"{path}: not an NPZ file, or cut off: {fault}") from fault
