@@ -206,12 +206,12 @@ class XbusEvents:
 
     def _continued(self, ticks: int | None) -> list[Decoded]:
         """Return a gap or a restart, if there was one."""
-        step = self._continuity.orientation(ticks)
-        if step.restarted:
+        lost, restarted = self._continuity.orientation(ticks)
+        if restarted:
             self._forget_orientation()
             return [DeviceEvent("restart", f"its clock began anew at {ticks} ticks")]
-        if step.lost:
-            return [DeviceEvent("gap", f"{step.lost} messages lost", {"lost": step.lost})]
+        if lost:
+            return [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})]
         return []
 
     def _forget_orientation(self) -> None:

@@ -238,8 +238,9 @@ class Core:
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, "device", source, "streaming"))
-            if isinstance(item.measurement, ImuSample):
-                outputs += self._imu_sample(source, item.measurement, item.stamp)
+            measurement, stamp = item
+            if isinstance(measurement, ImuSample):
+                outputs += self._imu_sample(source, measurement, stamp)
             else:
                 self._mocap_frame(item)
         return outputs
@@ -254,20 +255,21 @@ class Core:
         return list(self._bulletin.add(self._now_ns, source, item))
 
     def _imu_sample(self, source: str, sample: ImuSample, stamp: Stamp) -> list[Output]:
-        t_ns = stamp.t_ns
+        t_ns, _, synced, epoch, _ = stamp
+        q = sample.q_world_sensor
         self._aligner.push(
             source,
             t_ns - self._lag_ns.get(source, 0),
             sample.arrival_ns,
-            sample.q_world_sensor,
-            synced=stamp.synced,
-            epoch=stamp.epoch,
+            q,
+            synced=synced,
+            epoch=epoch,
             rate=sample.rate,
         )
-        if self._lags is not None and stamp.synced:
-            self._lags.add_sample(source, t_ns, sample.q_world_sensor, stamp.epoch)
+        if self._lags is not None and synced:
+            self._lags.add_sample(source, t_ns, q, epoch)
         if self._session.collecting:
-            return self._session.add_sample(source, t_ns, sample.q_world_sensor)
+            return self._session.add_sample(source, t_ns, q)
         return []
 
     def _mocap_frame(self, item: Stamped) -> None:

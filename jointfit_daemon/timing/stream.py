@@ -139,7 +139,11 @@ class Stream:
         sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
             return self._insert(sample)
-        self._learn_delay(arrival_ns - t_ns)
+        delay_ns, usual_ns = arrival_ns - t_ns, self._delay_ns
+        if usual_ns is not None:
+            least, most = usual_ns - self._delay_step, usual_ns + _DELAY_UP * self._delay_step
+            delay_ns = least if delay_ns < least else min(delay_ns, most)
+        self._delay_ns = delay_ns
         samples.append(sample)
         self.newest_ns, self.waited_for = t_ns, True
         if arrival_ns > self.newest_arrival_ns:  # noqa: PLR1730 - max() costs more
@@ -161,13 +165,6 @@ class Stream:
         samples[at].turn = None
         samples.insert(at, sample)
         return None
-
-    def _learn_delay(self, delay_ns: int) -> None:
-        usual, step = self._delay_ns, self._delay_step
-        if usual is not None:
-            least, most = usual - step, usual + _DELAY_UP * step
-            delay_ns = least if delay_ns < least else min(delay_ns, most)
-        self._delay_ns = delay_ns
 
     # --- out ---------------------------------------------------------------------------------
 
