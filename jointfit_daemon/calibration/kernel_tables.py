@@ -76,10 +76,11 @@ class Tables:
         """Return correction, rad, and leverage ratio, of a and of b; then T_x and T_y, rad."""
         seen = [*u, *tilts]
         smooth = features.smooth_terms_one(seen)
-        terms = self.terms.dot(np.array([*smooth, *[v * v for v in seen], 1.0]))
+        row = [*smooth, *[v * v for v in seen], 1.0]
+        terms = self.terms.dot(np.array(row, np.float64))  # told the type, numpy need not look
         bumps, roots = terms[: self.bumps], terms[self.bumps : self.roots]
         np.exp(bumps, bumps)
-        np.multiply(roots, roots, roots)
+        np.square(roots, roots)
         *c, plain, tilted = self.sums.dot(terms).tolist()
         if max(c) > LARGEST or min(c) < -LARGEST:
             c = [min(max(each, -LARGEST), LARGEST) for each in c]
