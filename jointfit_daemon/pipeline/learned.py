@@ -85,7 +85,13 @@ class Learned:
             name: replace(item, models=old.segment[name].models)
             for name, item in calibration.segment.items()
         }
-        return replace(calibration, segment=segments, memory=old.memory, quality=quality)
+        return replace(
+            calibration,
+            segment=segments,
+            correlations=old.correlations,
+            memory=old.memory,
+            quality=quality,
+        )
 
 
 def _shown(figures: Mapping[str, Any]) -> dict[str, object]:
@@ -99,7 +105,9 @@ def _shown(figures: Mapping[str, Any]) -> dict[str, object]:
 
 def models_only(before: Calibration, after: Calibration) -> bool:
     """Tell whether two calibrations differ in models and figures alone."""
-    return (
-        replace(before, segment={}, quality={}, memory="", created_utc="", software="")
-        == replace(after, segment={}, quality={}, memory="", created_utc="", software="")
-    )  # fmt: skip
+    return _but_models(before) == _but_models(after)
+
+
+def _but_models(one: Calibration) -> Calibration:
+    bare = replace(one, segment={}, correlations={}, memory="")
+    return replace(bare, quality={}, created_utc="", software="")

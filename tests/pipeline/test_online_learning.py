@@ -167,7 +167,13 @@ def asked(one: CalibrationSession) -> FitJob:
 def better() -> dict[str, Any]:
     models = calibration().segment
     swapped = {name: replace(item, models={}) for name, item in models.items()}
-    found = replace(calibration(), segment=swapped, quality={"online": {"frames": 7}}, memory="x")
+    found = replace(
+        calibration(),
+        segment=swapped,
+        quality={"online": {"frames": 7}},
+        memory="x",
+        correlations={"knee": -0.25},
+    )
     return {"calibration": found.to_dict(), "quality": dict(found.quality)}
 
 
