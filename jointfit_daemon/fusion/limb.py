@@ -123,9 +123,9 @@ class LimbFuser:
         Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
         (a sample was extrapolated in time), ``origin_fixed`` (cameras run but do not see O1, so
         that it is at the configured origin), ``stuck:`` per sensor, ``slipped:`` per sensor or
-        ``pair_disagrees:`` per segment, ``heading_unseen``, per segment ``one_sensor:``,
-        ``untrained:`` (outside the movements of the calibration), ``held:``, ``lost:``; ``gimbal``
-        last.
+        ``pair_disagrees:`` per segment, ``heading_disagrees:`` per joint, ``heading_unseen``, per
+        segment ``one_sensor:``, ``untrained:`` (outside the movements of the calibration),
+        ``held:``, ``lost:``; ``gimbal`` last.
         """
         orientations, stuck = self.watch.look(t_ns, completed_ns, orientations)
         if self._calibration is None:
@@ -259,7 +259,4 @@ def _worn_alike(was: Calibration, now: Calibration) -> bool:
 
 def _widened(one: Fused, more: float) -> Fused:
     """Return a segment with a standard deviation added, per axis, rad."""
-    if one.sd is None:
-        return one
-    flexion = None if one.flexion_sd is None else hypot(one.flexion_sd, more)
-    return one._replace(sd=hypot(one.sd, more), flexion_sd=flexion)
+    return one if one.sd is None else one._replace(sd=hypot(one.sd, more), doubt=more)

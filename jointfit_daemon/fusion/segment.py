@@ -54,7 +54,9 @@ class Fused(NamedTuple):
     used: tuple[str, ...]
     flags: tuple[str, ...]
     flexion_sd: float | None = None
-    """Standard deviation about the segment's x, rad, where the axes are known apart."""
+    """Standard deviation about the segment's x, rad, where its model tells the axes apart."""
+    doubt: float = 0.0
+    """Standard deviation per axis, rad, that who watches the sensors adds: `sd` has it already."""
 
 
 class SegmentFuser:

@@ -6,7 +6,7 @@ position's covariance is its trace, which is all that a LimbState carries.
 
 from __future__ import annotations
 
-from math import cos, sqrt
+from math import cos, hypot, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.joint_angles import read_joint
@@ -73,14 +73,17 @@ def read_angles(
     first entry is :math:`1 / \cos^2\theta` times the sum: the deviation of flexion, to first order
     (E: rates of Grood and Suntay's angles to angular velocity). It is None where the axes lock.
     Where a segment's deviation about its x is known apart, that stands for its sigma: flexion
-    hardly feels the others. `alike` is the correlation of both errors about it; it takes
-    :math:`2 \rho \sigma_1 \sigma_2` from the sum.
+    hardly feels the others. Where it is of both, `alike`, the correlation of what both models err
+    about it, takes :math:`2 \rho \sigma_1 \sigma_2` from the sum. What is held, a plain mean
+    or doubted errs by itself.
     """
     if above.q is None or below.q is None or above.sd is None or below.sd is None:
         return None
     angles, inner, gimbal = read_joint(above.q, below.q, flexion_sign=sign, left=left)
-    first = above.sd if above.flexion_sd is None else above.flexion_sd
-    second = below.sd if below.flexion_sd is None else below.flexion_sd
-    total = first * first + second * second - 2.0 * alike * first * second
+    first, second = above.flexion_sd, below.flexion_sd
+    total = (above.sd if first is None else hypot(first, above.doubt)) ** 2
+    total += (below.sd if second is None else hypot(second, below.doubt)) ** 2
+    if first is not None and second is not None:
+        total -= 2.0 * alike * first * second
     sd = None if gimbal else sqrt(total) / cos(angles.adduction)
     return AngleState(angles, inner, sd, gimbal)

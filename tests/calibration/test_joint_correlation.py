@@ -85,3 +85,21 @@ def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
     assert sd(0.0) == pytest.approx(hypot(0.03, 0.04))
     assert sd(-0.5) == pytest.approx(sqrt(0.0025 + 0.0012))
     assert sd(0.5) == pytest.approx(sqrt(0.0025 - 0.0012))
+
+
+def test_what_no_model_says_is_independent_however_alike_the_models_err() -> None:
+    """Held orientations, plain means and doubts of a watch come from elsewhere than the models."""
+    above = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
+    below = Fused((1.0, 0.0, 0.0, 0.0), 0.4, (), ("held:shank",))
+
+    def sd(one: Fused, other: Fused) -> float:
+        state = read_angles(one, other, sign=-1.0, left=False, alike=0.9)
+        assert state is not None
+        assert state.flexion_sd is not None
+        return state.flexion_sd
+
+    assert sd(above, below) == pytest.approx(hypot(0.03, 0.4))
+    assert sd(below, below) == pytest.approx(hypot(0.4, 0.4))
+    doubted = above._replace(doubt=0.2)
+    models = 2.0 * 0.03**2 * (1.0 - 0.9)
+    assert sd(doubted, doubted) == pytest.approx(sqrt(models + 2.0 * 0.2**2))
