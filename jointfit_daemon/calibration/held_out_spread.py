@@ -33,6 +33,8 @@ LEAST = 0.15
 PASSES = 5
 SMALLEST_VARIANCE = 1e-8
 HULL_PENALTY = 1e-2
+SMALLEST_LEVERAGE = 1e-12
+"""Who only stood still and straight has none; whatever moves lies far outside of that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +107,7 @@ def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
     for held in groups:
         matrix = hull(smooth[~held])
         h = np.einsum("ij,jk,ik->i", smooth, matrix, smooth)
-        found[held] = h[held] / np.quantile(h[~held], 0.995)
+        found[held] = h[held] / max(float(np.quantile(h[~held], 0.995)), SMALLEST_LEVERAGE)
     return np.minimum(found, FARTHEST)
 
 

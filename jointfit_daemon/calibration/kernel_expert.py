@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jointfit_daemon.calibration import kernel_features as features
-from jointfit_daemon.calibration.held_out_spread import hull, ratios
+from jointfit_daemon.calibration.held_out_spread import SMALLEST_LEVERAGE, hull, ratios
 from jointfit_daemon.calibration.kernel_ridge import Basis, choose, fit
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         coefficients=_rows(C.T.tolist()),
         centers=_rows(centers.tolist()),
         leverage=_rows(leverage.tolist()),
-        hull_leverage=float(np.quantile(h, HULL_QUANTILE)),
+        hull_leverage=max(float(np.quantile(h, HULL_QUANTILE)), SMALLEST_LEVERAGE),
         carried=tuple(held[-1].shares.sum(axis=(1, 2)).tolist()),
     )
     unseen = tuple(rho - each.residuals for each in held)

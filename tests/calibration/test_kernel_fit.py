@@ -208,3 +208,31 @@ def test_a_model_of_an_earlier_version_has_no_trend_and_still_works() -> None:
     old = KernelModel.read(data)
     inside = old.predict(knee.sensors, knee.other)
     assert knee.error(inside) < 1.2 * knee.error(model.predict(knee.sensors, knee.other))
+
+
+def test_who_stands_still_and_straight_for_most_of_the_time_still_gets_a_fit() -> None:
+    """Left out are the only frames that move: of what is left no leverage is above zero."""
+    knee = Knee()
+    for q in (*knee.sensors, knee.other, knee.bone):
+        q[100:] = (1.0, 0.0, 0.0, 0.0)
+    model = fit_kernel(knee.training())
+    said = model.predict(knee.sensors, knee.other)
+    assert knee.error(said) < 0.9 * knee.error(knee.sensors[0])
+    assert np.isfinite((*model.spread.inside, *model.spread.outside)).all()
+
+
+def test_nothing_is_corrected_upright_and_straight_however_far_off_all_training_was() -> None:
+    """The trend knows a constant; its weight is zero there, for no feature shows anything."""
+    knee = Knee(bend=2.0)
+    off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
+    knee.sensors = [rot.multiply(q, off) for q in knee.sensors]
+    deep = np.abs(rot.log(rot.multiply(rot.conjugate(knee.bone), knee.other))[:, 0]) > 0.7
+    taught = SegmentTraining.of([q[deep] for q in knee.sensors], knee.other[deep], knee.bone[deep])
+    model = fit_kernel(taught)
+    assert np.max(np.abs(np.array(model.trend)[:, 0])) > 1.0 * DEG
+    straight = rot.IDENTITY[None, :]
+    said = model.predict([straight, straight], straight)
+    assert rot.angle_between(said, straight)[0] < 1e-9
+    one = model.predict_one([(1.0, 0.0, 0.0, 0.0)] * 2, (1.0, 0.0, 0.0, 0.0))
+    assert rot.angle_between(one.q, straight[0]) < 1e-9
+    assert not one.extrapolating
