@@ -118,12 +118,13 @@ class Core:
     def health(self, now_ns: int) -> dict[str, object]:
         """Return counters and clocks of every device: the part of ``bridge/health`` known here."""
         if self._grid is None:
-            return {"devices": {}, "frames": {}, "calibration": {}}
+            return {"devices": {}, "frames": {}, "calibration": {}, "learning": {}}
         verdicts = {"mocap": self._cameras.verdicts()} | self._grid.verdicts()
         lags = {} if self._lags is None else self._lags.health()
         return health_of(self._sources, verdicts, self._session, self._fuser, now_ns) | {
             "lags": lags,
             "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames},
+            "learning": self._session.learned.health(self._learner, now_ns),
         }
 
     # --- configuration -----------------------------------------------------------------------
@@ -289,6 +290,7 @@ class Core:
         elif outputs and self._session.may_learn:
             fresh = self._learner.due(now_ns)
             outputs += [] if fresh is None else self._session.learn(fresh)
+            outputs += self._learner.notices(now_ns)
         outputs += self._bulletin.due(now_ns)
         if news := self._fuser.news(now_ns):
             outputs += sensor_notices(now_ns, news)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.trial import CalibrationSettings
     from jointfit_daemon.model import Chain
     from jointfit_daemon.pipeline.events import JobFinished
+    from jointfit_daemon.pipeline.online_learning import OnlineLearner
 
 
 class Verdict(NamedTuple):
@@ -71,6 +72,14 @@ class Learned:
         found = replace(found, quality={**found.quality, "online": online})
         text = f"learned from {online['frames']} frames in view of the cameras"
         return Verdict(found, Notice(event.t_ns, "calibration", "online", text, "info", data))
+
+    def health(self, learner: OnlineLearner, now_ns: int) -> dict[str, object]:
+        """Return the state of learning, JSON-able: somebody may have stopped it altogether."""
+        found = learner.health(now_ns)
+        if self.paused and found["state"] != "off":
+            why = "taken back by `unlearn`, until the next functional phase"
+            return found | {"state": "off", "reason": why, "stopped_s": None}
+        return found
 
     def taken_back(self, calibration: Calibration) -> Calibration | None:
         """Return the calibration with the models it had before; None where nothing was learned."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.online_fit import Fresh
 from jointfit_daemon.kinematics.rotation_scalar import interpolate_one, multiply_one
+from jointfit_daemon.pipeline.learning_watch import LearningWatch, hidden
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Quaternion
+    from jointfit_daemon.pipeline.events import Notice
     from jointfit_daemon.timing.align import AlignedFrame
 
     Array = NDArray[np.float64]
@@ -37,7 +39,9 @@ MOST, ENOUGH = 3000, 600
 """Frames kept: the newest; and how many ask for a refit, a minute of movement."""
 REST_NS = 180_000_000_000
 """Between two refits, and before the first one once there are frames enough."""
-_DOUBTS = ("stuck:", "slipped:", "pair_disagrees:", "one_sensor:", "held:", "lost:")
+_DOUBTS = (
+    "stuck:", "slipped:", "pair_disagrees:", "heading_disagrees:", "one_sensor:", "held:", "lost:",
+)  # fmt: skip
 _RECENT, _WAITING = 64, 16
 
 
@@ -65,13 +69,8 @@ class OnlineLearner:
     """
 
     def __init__(self, chain: Chain, calibration: Calibration | None, *, wanted: bool) -> None:
-        self.active = (
-            wanted
-            and calibration is not None
-            and calibration.fits(chain)
-            and bool(calibration.memory)
-            and all(name in calibration.clusters for name in chain.segments)
-        )
+        off = _off(chain, calibration, wanted=wanted)
+        self.active, self._watch = off is None, LearningWatch(off)
         self._chain = chain
         self._sensors = [sensor for group in chain.sensors for sensor in group]
         self._firsts = [self._sensors.index(group[0]) for group in chain.sensors if group]
@@ -84,6 +83,7 @@ class OnlineLearner:
             self._clusters = [(cluster.markers, cluster.body) for cluster in clusters]
         self._layout: MocapLayout | None = None
         self._columns: list[list[int]] | None = None
+        self._unnamed: list[str] = []
         self._epoch: int | None = None
         self._rest_from_ns: int | None = None
         self._begin_again()
@@ -94,6 +94,14 @@ class OnlineLearner:
         self._kept: deque[_Kept] = deque(maxlen=MOST)
         self._kept_ns = self._next_ns = 0
         self._last_ns: int | None = None
+
+    def notices(self, now_ns: int) -> list[Notice]:
+        """Return what is worth telling of what keeps the limb from learning, each change once."""
+        return self._watch.notices(now_ns)
+
+    def health(self, now_ns: int) -> dict[str, object]:
+        """Return whether anything is learned, and what keeps it from that, JSON-able."""
+        return self._watch.health(now_ns, len(self._kept))
 
     @property
     def kept(self) -> int:
@@ -107,14 +115,23 @@ class OnlineLearner:
         if not self.active or t_ns < self._next_ns:
             return
         if frame.layout is not self._layout:
-            self._layout, self._columns = frame.layout, self._found(frame.layout)
+            self._layout = frame.layout
+            self._unnamed = self._missing(frame.layout)
+            self._columns = None if self._unnamed else self._found(frame.layout)
         if epoch != self._epoch:
             self._begin_again()
             self._epoch = epoch
         self._next_ns = t_ns + EVERY_NS
-        seen = self._seen(frame)
-        if seen is not None:
+        if self._columns is None:
+            self._watch.hindered(t_ns, f"not in the stream: {', '.join(self._unnamed)}")
+            return
+        seen = self._seen(frame, self._columns)
+        unseen = self._unseen(seen)
+        if not unseen:
             self._waiting.append((t_ns, seen))
+            return
+        in_view = any(np.isfinite(x).any() for x in seen)
+        self._watch.hindered(t_ns, hidden(unseen), in_view=in_view)
 
     def add_frame(self, frame: AlignedFrame, flags: Collection[str]) -> None:
         """Take one frame of the sensors, and what fusion said of it."""
@@ -127,8 +144,11 @@ class OnlineLearner:
         waiting = self._waiting
         while waiting and waiting[0][0] <= frame.t_ns:
             t_ns, seen = waiting.popleft()
-            if not any(flag.startswith(_DOUBTS) for flag in flags):
+            doubts = [flag for flag in flags if flag.startswith(_DOUBTS)]
+            if not doubts:
                 self._pair(t_ns, seen)
+            else:
+                self._watch.hindered(t_ns, f"the sensors are in doubt: {', '.join(doubts)}")
 
     def due(self, now_ns: int) -> Fresh | None:
         """Return what was kept, if it is enough and the last refit was long ago."""
@@ -154,25 +174,42 @@ class OnlineLearner:
 
     # --- work --------------------------------------------------------------------------------
 
-    def _found(self, layout: MocapLayout) -> list[list[int]] | None:
-        columns = []
-        for markers, body in self._clusters:
-            stream, names = (layout.markers, markers) if body is None else (layout.bodies, (body,))
-            if any(name not in stream for name in names):
-                return None
-            columns.append([stream.index(name) for name in names])
-        return columns
+    def _missing(self, layout: MocapLayout) -> list[str]:
+        """Return what the stream has no name for."""
+        missing = [
+            name
+            for markers, body in self._clusters
+            for name in (markers if body is None else (body,))
+            if name not in (layout.markers if body is None else layout.bodies)
+        ]
+        return list(dict.fromkeys(missing))
 
-    def _seen(self, frame: MocapFrame) -> list[Array] | None:
-        if self._columns is None:
-            return None
-        seen = []
-        for columns, (_, body) in zip(self._columns, self._clusters, strict=True):
-            x = frame.markers[columns] if body is None else frame.body_orientations[columns[0]]
-            if not np.isfinite(x).all():
-                return None
-            seen.append(x)
-        return seen
+    def _found(self, layout: MocapLayout) -> list[list[int]]:
+        return [
+            [layout.markers.index(name) for name in markers]
+            if body is None
+            else [layout.bodies.index(body)]
+            for markers, body in self._clusters
+        ]
+
+    def _seen(self, frame: MocapFrame, columns: list[list[int]]) -> list[Array]:
+        return [
+            frame.markers[rows] if body is None else frame.body_orientations[rows[0]]
+            for rows, (_, body) in zip(columns, self._clusters, strict=True)
+        ]
+
+    def _unseen(self, seen: list[Array]) -> list[str]:
+        """Return markers and bodies that the cameras do not see; mostly none."""
+        unseen = []
+        for x, (markers, body) in zip(seen, self._clusters, strict=True):
+            if np.isfinite(x).all():
+                continue
+            if body is not None:
+                unseen.append(body)
+            else:
+                whole = np.isfinite(x.sum(axis=1)).tolist()
+                unseen += [name for name, there in zip(markers, whole, strict=True) if not there]
+        return list(dict.fromkeys(unseen))  # a marker may be of two clusters
 
     def _pair(self, t_ns: int, seen: list[Array]) -> None:
         """Keep what the sensors said when the cameras saw this, if both are whole and moved."""
@@ -187,13 +224,23 @@ class OnlineLearner:
             after = before
         said = self._said(t_ns, before, after)
         if said is None:
+            self._watch.hindered(t_ns, self._silent(before, after))
             return
+        self._watch.well(t_ns)
         if self._kept and t_ns - self._kept_ns < STILL_NS:
             last = self._kept[-1].sensors
             if all(_dot(said[i], last[i]) > STILL_DOT for i in self._firsts):
                 return
         self._kept.append(_Kept(said, seen))
         self._kept_ns = t_ns
+
+    def _silent(self, before: AlignedFrame, after: AlignedFrame) -> str:
+        for sensor in self._sensors:
+            if sensor not in before.orientations or sensor not in after.orientations:
+                return f"{sensor} gives no data"
+        if before.synced and after.synced:
+            return "the sensors pause again and again"
+        return "the clocks behind the sensors have not settled"
 
     def _said(
         self, t_ns: int, before: AlignedFrame, after: AlignedFrame
@@ -214,3 +261,15 @@ class OnlineLearner:
 
 def _dot(p: Quaternion, q: Quaternion) -> float:
     return abs(p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3])
+
+
+def _off(chain: Chain, calibration: Calibration | None, *, wanted: bool) -> str | None:
+    """Return why nothing can be learned, whatever the cameras see."""
+    if not wanted:
+        return "learn_online is off"
+    if calibration is None or not calibration.fits(chain):
+        return "not calibrated"
+    if not calibration.memory:
+        return "the calibration has no memory of a movement: run the functional phase once"
+    bare = [name for name in chain.segments if name not in calibration.clusters]
+    return f"no markers are known of {', '.join(bare)}" if bare else None

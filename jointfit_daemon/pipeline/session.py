@@ -89,7 +89,7 @@ class CalibrationSession:
         self._jobs = 0
         self._fitting: _Fit | None = None
         self._force = False
-        self._learned = Learned()
+        self.learned = Learned()
 
     def take_over(self, before: CalibrationSession, *, same_rig: bool) -> None:
         """Go on from the session before a reload: its worlds and pose, if they are still true."""
@@ -97,7 +97,7 @@ class CalibrationSession:
         if same_rig:
             self._alignment, self._static = before._alignment, before._static
             self._pose_s = before._pose_s
-            self._learned.paused = before._learned.paused
+            self.learned.paused = before.learned.paused
 
     @property
     def collecting(self) -> bool:
@@ -108,8 +108,8 @@ class CalibrationSession:
     def may_learn(self) -> bool:
         """Whether nothing is calibrated or learned right now, and there is something to improve."""
         busy = self._phase is not None or self._fitting is not None
-        known = self.calibration is not None and not self._learned.paused
-        return known and not busy and self._learned.job is None
+        known = self.calibration is not None and not self.learned.paused
+        return known and not busy and self.learned.job is None
 
     @property
     def phase(self) -> str:
@@ -191,7 +191,7 @@ class CalibrationSession:
     def _unlearn(self, request: Request) -> list[Output]:
         """Go back to the models before online learning, and learn nothing until a new movement."""
         now = self.calibration
-        before = None if now is None else self._learned.taken_back(now)
+        before = None if now is None else self.learned.taken_back(now)
         if before is None or self._fitting is not None:
             error = {"key": "phase", "message": "nothing was learned since the daemon started"}
             return [Reply(request.command, request.transaction, "error", {}, error)]
@@ -209,10 +209,10 @@ class CalibrationSession:
             return []
         self._jobs += 1
         job = self._jobs, self.calibration, self._chain, self._settings, fresh
-        return [self._learned.ask(*job)]
+        return [self.learned.ask(*job)]
 
     def _learn(self, event: JobFinished, before: Calibration) -> list[Output]:
-        found, notice = self._learned.finished(event, before, self.version)
+        found, notice = self.learned.finished(event, before, self.version)
         if found is None:
             return [notice]
         self.calibration, self.version = found, None
@@ -292,7 +292,7 @@ class CalibrationSession:
         if self.lags is not None:
             payload |= {"lag_ns": self.lags.known_ns(), "tracked": self.lags.tracked()}
         self._jobs += 1
-        self._learned.job = None  # one worker: it leaves what it learns for this
+        self.learned.job = None  # one worker: it leaves what it learns for this
         self._fitting = _Fit(self._jobs, phase.name, trial if phase.name == "static" else None)
         outputs: list[Output] = []
         if phase.overflowed:
@@ -309,7 +309,7 @@ class CalibrationSession:
     def job_finished(self, event: JobFinished) -> list[Output]:
         """Take what the worker made of the last phase. Results of cancelled jobs are ignored."""
         fit = self._fitting
-        if event.job == self._learned.job and self.calibration is not None:
+        if event.job == self.learned.job and self.calibration is not None:
             return self._learn(event, self.calibration)
         if fit is None or event.job != fit.job:
             return []
@@ -344,7 +344,7 @@ class CalibrationSession:
             ]
         self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
         if kind == "functional":
-            self._learned = Learned()
+            self.learned = Learned()
         phase = "posed" if kind == "static" else "calibrated"
         text = "static pose taken: sensors re-seated" if kind == "static" else "calibrated"
         return [
