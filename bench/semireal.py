@@ -35,7 +35,7 @@ class KneeTrial:
     thigh: Array
     shank: Array
 
-    def part(self, frames: slice) -> KneeTrial:
+    def part(self, frames: slice | NDArray[np.bool_]) -> KneeTrial:
         a, b, c, d = (q[frames] for q in self.sensors)
         return KneeTrial((a, b, c, d), self.thigh[frames], self.shank[frames])
 

@@ -69,7 +69,7 @@ class _Leg(NamedTuple):
 
 @cache
 def skin_knee(data: Path, movement: str, side: str) -> KneeTrial:
-    """Return one movement of one leg, ``r`` or ``l``."""
+    """Return one movement, or the static trial without a filter's errors, of leg ``r`` or ``l``."""
     leg, static = (_legs(data, name)[side] for name in (movement, STATIC))
     mounts = [
         rotation.average(rotation.multiply(rotation.conjugate(q), bone))
@@ -116,7 +116,9 @@ def _legs(data: Path, name: str) -> dict[str, _Leg]:
 
 
 def _filter_errors(data: Path, movement: str, t_s: Array) -> list[Array]:
-    """Return the error of each sensor's filter, q_world_world, shape (n, 4)."""
+    """Return the error of each sensor's filter, q_world_world, shape (n, 4); none while static."""
+    if movement == STATIC:
+        return [np.tile(rotation.IDENTITY, (len(t_s), 1))] * len(SENSORS["r"])
     known = movement if movement != "STS1" else "squats1"
     with np.load(data / FOLDER / f"{known}.npz", allow_pickle=False) as arrays:
         at, pairs = (

@@ -2,7 +2,8 @@ r"""What the anchored model looks at: joint rotation, disagreement of sensors, t
 
 Law: relative rotations are blind to any constant turn of the world, tilts to any turn about the
 vertical, so both are to the heading of a person. Every feature vanishes where sensors agree, the
-joint is straight and the segment upright, as in the static pose: a correction needs no intercept.
+joint is straight and the segment upright, as people stand, more or less, in the static pose, where
+nothing is to be corrected: a correction needs no intercept.
 
 .. math:: a_z(x) = e^{-|x - z|^2 / 2} - e^{-|x|^2 / 2} - e^{-|z|^2 / 2} + 1
 
@@ -114,7 +115,7 @@ def widths_of(width: float, sensors: int, *, tilted: bool) -> Array:
 
 
 def spread_centers(x: Array) -> Array:
-    """Return frames that lie far from each other and from the static pose, shape (m, width).
+    """Return frames that lie far from each other and from zero, shape (m, width).
 
     Farthest-point choice, at most 24: each is the frame farthest from all before it.
 

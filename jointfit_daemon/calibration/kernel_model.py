@@ -10,9 +10,10 @@ movements better. Inside training they count alike. Outside, their corrections f
 trend T of `kernel_trend`, which carries over best, that of b at once, that of a farther off. About
 the long axis there is no trend: there b gives way to a, and a to the mean.
 
-Law: in the static pose, which lies inside, nothing is corrected; a heading changes nothing. What
-the model is worth is measured on frames that its fit has not seen, axis by axis, and grows with
-the distance from training that either expert sees.
+Law: upright and straight, where sensors agree, no leverage is left and nothing is corrected,
+wherever training was; a heading changes nothing. What the model is worth is measured on frames that
+its fit has not seen, axis by axis, and grows with the distance from training that either expert
+sees.
 """
 
 from __future__ import annotations

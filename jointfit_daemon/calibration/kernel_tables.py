@@ -1,6 +1,6 @@
 r"""Two experts and the trend as the frame loop wants them: one frame in two matrix products.
 
-All exponents of the bumps of both, of the static pose's own among them,
+All exponents of the bumps of both, of that about zero among them,
 
 .. math:: -\tfrac12 |x - z|^2 = [z / \ell, -\tfrac12 \ell^{-2}, -\tfrac12 |z|^2]
           \cdot [u, u^2, 1], \quad x = u / \ell
@@ -105,7 +105,7 @@ class _Part:
         scale[: len(lengths)] = 1.0 / lengths
         C = np.array(expert.coefficients)
         s = len(expert.leverage)
-        centers = np.zeros((len(expert.centers) + 1, width))  # the last one is the static pose
+        centers = np.zeros((len(expert.centers) + 1, width))  # the last one is zero
         if expert.centers:
             centers[:-1, : len(lengths)] = np.array(expert.centers)
         half = 0.5 * np.sum(centers**2, axis=1)

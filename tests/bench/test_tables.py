@@ -12,7 +12,7 @@ PROMISED = {
     "accuracy": {f"B-{k}" for k in range(1, 17)},
     "timing": {"T1", "T2", "T3", "T4", "T5", "T6", "T7", "T8", "T9", "T10-clock", "T10-lag"},
     "markers": {f"D-{k}" for k in range(1, 14)},
-    "fusion": {f"F-{k}" for k in range(1, 10)} | {"E-1", "S-2"},
+    "fusion": {f"F-{k}" for k in range(1, 11)} | {"E-1", "S-2"},
 }
 OPEN = {
     "F-2": {"walking1, anchored: flexion"},
