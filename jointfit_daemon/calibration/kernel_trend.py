@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.calibration.kernel_expert import LARGEST
 from jointfit_daemon.calibration.kernel_features import TILTS
 from jointfit_daemon.calibration.robust import huber_weights, robust_scale
 
@@ -32,8 +33,6 @@ PENALTY = 1e-2
 PASSES = 4
 SMALLEST_SCALE = 0.02
 """What hardly moved in training is not blown up, rad."""
-LARGEST = 0.4
-"""No component of a trend exceeds this, rad."""
 LEVEL_AXES = (0, 1)
 
 
@@ -52,7 +51,7 @@ def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
 
 
 def trend(rows: tuple[Row, Row], u: Array) -> Array:
-    """Return T of every frame, rad, shape (n, 3)."""
+    """Return T of every frame, rad, shape (n, 3); no component exceeds that of a correction."""
     found = np.zeros((len(u), 3))
     table = np.array(rows)
     found[:, LEVEL_AXES] = table[:, 0] + u @ table[:, 1:].T

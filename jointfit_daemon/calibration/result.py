@@ -230,9 +230,15 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         software=data["software"],
         created_utc=data["created_utc"],
         links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
-        correlations={name: float(rho) for name, rho in data.get("correlations", {}).items()},
+        correlations={name: _alike(rho) for name, rho in data.get("correlations", {}).items()},
         memory=str(data.get("memory", "")),
     )
+
+
+def _alike(value: Any) -> float:
+    if not -1.0 < (rho := float(value)) < 1.0:
+        raise ValueError(f"correlation {rho}")
+    return rho
 
 
 def _sensor(item: Mapping[str, Any]) -> SensorCalibration:

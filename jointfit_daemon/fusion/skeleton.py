@@ -1,7 +1,8 @@
 """Joint positions and angles of one frame, with their standard deviations. Law: floats only.
 
-Orientation errors are taken as isotropic and independent between segments; what is kept of a
-position's covariance is its trace, which is all that a LimbState carries.
+Orientation errors are taken as isotropic and independent between segments, but for flexion, see
+`read_angles`; what is kept of a position's covariance is its trace, which is all that a LimbState
+carries.
 """
 
 from __future__ import annotations

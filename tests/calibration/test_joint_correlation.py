@@ -10,11 +10,13 @@ import pytest
 
 from jointfit_daemon.calibration.joint_correlation import error_correlation, error_correlations
 from jointfit_daemon.calibration.model_fit import LimbTraining, all_alive
+from jointfit_daemon.calibration.result import Calibration, UnknownSchema
 from jointfit_daemon.calibration.segment_model import SegmentTraining
 from jointfit_daemon.fusion.segment import Fused
 from jointfit_daemon.fusion.skeleton import read_angles
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.model import Chain
+from tests.calibration.taught_limb import calibration
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -103,3 +105,14 @@ def test_what_no_model_says_is_independent_however_alike_the_models_err() -> Non
     doubted = above._replace(doubt=0.2)
     models = 2.0 * 0.03**2 * (1.0 - 0.9)
     assert sd(doubted, doubted) == pytest.approx(sqrt(models + 2.0 * 0.2**2))
+
+
+@pytest.mark.parametrize("rho", [1.0, -1.5, float("nan")])
+def test_a_stored_correlation_that_cannot_be_is_no_calibration(rho: float) -> None:
+    """It would make a variance of flexion negative, in the middle of a frame."""
+    data = calibration().to_dict()
+    assert Calibration.from_dict({**data, "correlations": {"knee": -0.3}}).correlations == {
+        "knee": -0.3
+    }
+    with pytest.raises(UnknownSchema, match="correlation"):
+        Calibration.from_dict({**data, "correlations": {"knee": rho}})

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.calibration.held_out_spread import measure_spread
+from jointfit_daemon.calibration.kernel_expert import LARGEST
 from jointfit_daemon.calibration.kernel_model import KernelModel, fit_kernel
 from jointfit_daemon.calibration.kernel_ridge import stacked
-from jointfit_daemon.calibration.kernel_trend import LARGEST, fit_trend, trend
+from jointfit_daemon.calibration.kernel_trend import fit_trend, trend
 from jointfit_daemon.calibration.segment_model import SegmentTraining
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
