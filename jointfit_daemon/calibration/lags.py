@@ -91,7 +91,8 @@ def segment_lags(
     Returns
     -------
     dict
-        Sensors of which neither says anything are absent.
+        Sensors of which neither says anything are absent; so are those whose movement alone says
+        less than its standard deviation: that is noise, and would set partners apart.
     """
     names = [name for name, lag in moving.items() if lag.refused is None]
     alone = {n: ChosenLag(lag, sd, "plate") for n, (lag, sd) in prior.items() if n not in names}
@@ -115,6 +116,7 @@ def segment_lags(
             round(lag), float(sd), "plate and movement" if name in trusted else "movement"
         )
         for name, lag, sd in zip(names, lags.tolist(), sds.tolist(), strict=True)
+        if name in trusted or abs(lag) > sd
     }
 
 

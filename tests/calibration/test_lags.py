@@ -46,6 +46,14 @@ def test_flesh_keeps_a_lag_on_skin_from_looking_sure() -> None:
     )
 
 
+def test_a_lag_smaller_than_its_deviation_is_noise_and_not_used() -> None:
+    """The recorded squats as bytes: 3.6 ± 4.7 ms for one of a pair, nothing for the other."""
+    assert segment_lags({"S1": said(3.6, 4.7)}, {}) == {}
+    assert set(segment_lags({"S1": said(3.6, 4.7), "S2": said(15.0, 1.0)}, {})) == {"S2"}
+    with_plate = segment_lags({"S1": said(0.5, 4.7)}, {"S1": (100_000, 0.2 * MS)})
+    assert with_plate["S1"].source == "plate and movement"
+
+
 def test_a_sensor_known_from_the_plate_tells_the_markers_flesh_to_its_neighbor() -> None:
     moving = {"S1": said(9.0, 0.5), "S2": said(14.0, 0.5)}
     alone = segment_lags(moving, {})["S2"]
