@@ -142,16 +142,16 @@ def _degrees(angle: float | None) -> float | None:
     A whole number over a power of ten is found in a third of the time that `round` takes for
     digits, and a pose has forty of them.
     """
-    if angle is None or not isfinite(angle):
+    if angle is None or not isfinite(whole := angle * _HUNDREDTHS):
         return None
-    return round(angle * _HUNDREDTHS) / 100.0
+    return round(whole) / 100.0
 
 
 def _rounded(values: Iterable[float] | None, digits: int) -> list[float | None] | None:
     if values is None:
         return None
     scale = 10.0**digits
-    return [round(value * scale) / scale if isfinite(value) else None for value in values]
+    return [round(whole) / scale if isfinite(whole := value * scale) else None for value in values]
 
 
 def _plain(value: object) -> object:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import orjson
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -145,6 +145,7 @@ def test_an_unknown_joint_is_null_not_zero() -> None:
     }  # fmt: skip
 
 
+@example(1.797693134862316e304)  # finite, and not in hundredths of a degree
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_no_number_json_does_not_know_gets_out(value: float) -> None:
     joint = JointState("knee", (value, value, value), value, JointAngles(value, value, value))
