@@ -1,24 +1,21 @@
 """All ways of fusing the sensors of a knee, side by side, under one name each.
 
-Law: every way is fitted to the same frames and sees the same sensors. ``markley`` learns nothing
-but a constant turn of the world and of each mount, and the sensors' weights; ``linear`` is the
-ridge of an earlier version of this program, the baseline of the default.
+Law: every way is fitted to the same frames and sees the same sensors. All are the program's own but
+``linear``, the ridge of an earlier version, which stays as a baseline of the default.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast, get_args
 
 import numpy as np
 
 from jointfit_daemon.calibration.anchored import fit_anchored
 from jointfit_daemon.calibration.joint_correlation import error_correlation
-from jointfit_daemon.calibration.kernel_model import fit_kernel
-from jointfit_daemon.calibration.mount import fit_alignment
 from jointfit_daemon.calibration.redundancy import fit_segment
 from jointfit_daemon.calibration.segment_model import SegmentTraining
-from jointfit_daemon.calibration.weighted_mean import fuse, fusion_weights
-from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.calibration.trial import Method
+from jointfit_daemon.calibration.weighted_mean import fuse
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 
 if TYPE_CHECKING:
@@ -53,17 +50,17 @@ def segments(trial: KneeTrial) -> tuple[Segment, Segment]:
 
 def fit(method: str, trials: Sequence[KneeTrial]) -> Predict:
     """Return the method, trained; what it returns gives both orientations, shape (n, 4) each."""
-    first, second = (_segment(method, training) for training in _training(trials))
+    first, second = models(trials, method)
 
     def predict(trial: KneeTrial) -> tuple[Array, Array]:
         thigh, shank = segments(trial)
-        return first(thigh), second(shank)
+        return first.predict(thigh.sensors, thigh.other), second.predict(shank.sensors, shank.other)
 
     return predict
 
 
 def models(trials: Sequence[KneeTrial], method: str = "anchored") -> tuple[SegmentModel, ...]:
-    """Return the segment models of a method that has some, thigh and shank."""
+    """Return the models of thigh and shank."""
     return tuple(_model(method, training) for training in _training(trials))
 
 
@@ -92,42 +89,15 @@ def axis_deviations(model: SegmentModel, segment: Segment) -> Array:
     return np.array(rows)
 
 
-def _segment(method: str, training: SegmentTraining) -> Callable[[Segment], Array]:
-    if method == "single":
-        errors = [rotation.angle_between(q, training.q_reference) for q in training.sensors]
-        best = int(np.argmin([np.mean(error**2) for error in errors]))
-        return lambda segment: segment.sensors[best]
-    if method == "markley":
-        return _markley(training)
-    model = _model(method, training)
-    return lambda segment: model.predict(segment.sensors, segment.other)
-
-
 def _model(method: str, training: SegmentTraining) -> SegmentModel:
     if method == "linear":
         return fit_anchored(training)
-    if method == "anchored":
-        return fit_kernel(training)
-    if method not in ("mean", "patent6", "patent12"):
-        raise ValueError(f"method {method!r}")
+    if method not in get_args(Method):
+        raise ValueError(f"method {method!r}; known: {', '.join(METHODS)}")
     return fit_segment(
-        "mean" if method == "mean" else "patent6" if method == "patent6" else "patent12",
+        cast("Method", method),
         training.sensors,
         training.q_other,
         training.q_reference,
         training.trials,
     )
-
-
-def _markley(training: SegmentTraining) -> Callable[[Segment], Array]:
-    """World turned about the vertical and mount, fitted to each sensor; then the weighted mean."""
-    found = [fit_alignment("heading", q, training.q_reference) for q in training.sensors]
-
-    def aligned(sensors: Sequence[Array]) -> list[Array]:
-        return [
-            rotation.multiply(rotation.multiply(one.q_world, q), one.q_mount)
-            for one, q in zip(found, sensors, strict=True)
-        ]
-
-    weights = tuple(fusion_weights(aligned(training.sensors), training.q_reference).tolist())
-    return lambda segment: fuse(aligned(segment.sensors), weights)

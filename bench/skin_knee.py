@@ -57,6 +57,10 @@ MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
 """Worn while standing alone; a model whose poses change with them would have other bones then."""
 
 
+AS_RECORDED = (0, 1, 2, 3)
+"""Each sensor has the errors that the semi-real recordings give it."""
+
+
 class _Leg(NamedTuple):
     """What a trial says of one leg before mounts and filters, shape (n, 4) each."""
 
@@ -68,18 +72,22 @@ class _Leg(NamedTuple):
 
 
 @cache
-def skin_knee(data: Path, movement: str, side: str) -> KneeTrial:
-    """Return one movement, or the static trial without a filter's errors, of leg ``r`` or ``l``."""
+def skin_knee(
+    data: Path, movement: str, side: str, errors_of: tuple[int, ...] = AS_RECORDED
+) -> KneeTrial:
+    """Return one movement, or the static trial without a filter's errors, of leg ``r`` or ``l``.
+
+    `errors_of` says whose filter's errors each sensor has.
+    """
     leg, static = (_legs(data, name)[side] for name in (movement, STATIC))
     mounts = [
         rotation.average(rotation.multiply(rotation.conjugate(q), bone))
         for q, bone in zip(static.skin, (static.thigh,) * 2 + (static.shank,) * 2, strict=True)
     ]
+    errors = _filter_errors(data, movement, leg.t_s)
     columns = [
-        rotation.multiply(rotation.multiply(error, q), mount)
-        for error, q, mount in zip(
-            _filter_errors(data, movement, leg.t_s), leg.skin, mounts, strict=True
-        )
+        rotation.multiply(rotation.multiply(errors[k], q), mount)
+        for k, q, mount in zip(errors_of, leg.skin, mounts, strict=True)
     ]
     seen = np.all([np.isfinite(q).all(axis=1) for q in columns], axis=0)
     a, b, c, d = (q[seen] for q in columns)

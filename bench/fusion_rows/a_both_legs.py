@@ -1,4 +1,4 @@
-"""Rows F-7 to F-10: sit-to-stand, movements left out, claims, and standing still, on both legs.
+"""Rows F-7 to F-11: sit-to-stand, movements left out, claims, and standing still, on both legs.
 
 Trials of `skin_knee`: the same subject as rows F-1 to F-5, made anew with poses of our own inverse
 kinematics, the left leg and sit-to-stand besides.
@@ -14,7 +14,7 @@ from bench import methods
 from bench.experiment import Experiment, Figure
 from bench.fusion_rows.a_recorded import DEFAULT, NAMES, NOTHING, TOLERANCE, flexion_scores
 from bench.semireal import FOLDER, Judge, training_frames
-from bench.skin_knee import MOVEMENTS, STATIC, SUBJECT, skin_knee
+from bench.skin_knee import AS_RECORDED, MOVEMENTS, STATIC, SUBJECT, skin_knee
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     Errors = tuple[float, float, float]
 
 SIDES = {"right": "r", "left": "l"}
+EXCHANGED = (AS_RECORDED, (1, 2, 3, 0), (3, 0, 1, 2), (2, 3, 0, 1), (1, 0, 3, 2))
+"""Whose filter's errors each sensor has."""
 RIVALS = ("mean", "patent12", "linear", DEFAULT)
 DEEP_DEG = 40.0
 
@@ -36,16 +38,36 @@ def sit_to_stand(data: Path) -> list[Figure]:
     """
     figures = []
     for side, trials in _both(data).items():
-        squats = trials["squats1"]
-        begin = squats.part(slice(0, training_frames(squats)))
-        taught = [begin, trials["walking1"], trials["DJ1"]]
-        found = _errors(Judge.of(begin), taught, trials["STS1"])
+        found = _risen(trials)
         for method, errors in found.items():
             goals = _best(found) if method == DEFAULT else (NOTHING,) * 3
             figures += [
                 Figure(f"{side}, {method}: {name}", error, goal)
                 for name, error, goal in zip(NAMES, errors, goals, strict=True)
             ]
+    return figures
+
+
+def exchanged(data: Path) -> list[Figure]:
+    """F-11: the same with the filters' errors exchanged between the sensors, RMS of five ways.
+
+    The recordings give every sensor one filter's error; which has which is chance.
+    """
+    figures = []
+    for side in SIDES:
+        ways = [_risen(_both(data, errors_of)[side]) for errors_of in EXCHANGED]
+        found: dict[str, Errors] = {}
+        for method in RIVALS:
+            a, b, c = np.sqrt(np.mean(np.square([way[method] for way in ways]), axis=0)).tolist()
+            found[method] = (a, b, c)
+        figures += [
+            Figure(f"{side}: {name}", error, goal)
+            for name, error, goal in zip(NAMES, found[DEFAULT], _best(found), strict=True)
+        ]
+        kept = [np.less_equal(way[DEFAULT], _best(way)) for way in ways]
+        for i, name in enumerate(NAMES):
+            count = float(sum(each[i] for each in kept))
+            figures.append(Figure(f"{side}: {name} kept, ways of 5", count, NOTHING, unit=""))
     return figures
 
 
@@ -114,11 +136,19 @@ def standing(data: Path) -> list[Figure]:
     return figures
 
 
-def _both(data: Path) -> dict[str, dict[str, KneeTrial]]:
+def _both(data: Path, errors_of: tuple[int, ...] = AS_RECORDED) -> dict[str, dict[str, KneeTrial]]:
     return {
-        side: {movement: skin_knee(data, movement, letter) for movement in MOVEMENTS}
+        side: {movement: skin_knee(data, movement, letter, errors_of) for movement in MOVEMENTS}
         for side, letter in SIDES.items()
     }
+
+
+def _risen(trials: dict[str, KneeTrial]) -> dict[str, Errors]:
+    """Return errors in sit-to-stand, trained on 60 % of the squats, walking and the jump."""
+    squats = trials["squats1"]
+    begin = squats.part(slice(0, training_frames(squats)))
+    taught = [begin, trials["walking1"], trials["DJ1"]]
+    return _errors(Judge.of(begin), taught, trials["STS1"])
 
 
 def _errors(judge: Judge, taught: list[KneeTrial], trial: KneeTrial) -> dict[str, Errors]:
@@ -135,4 +165,5 @@ EXPERIMENTS = (
     Experiment("F-8", "each of four movements left out, default", left_out, _DATA),
     Experiment("F-9", "flexion within its claimed deviation, both legs", coverage, _DATA),
     Experiment("F-10", "corrected in the static pose", standing, _DATA),
+    Experiment("F-11", "sit-to-stand, filters' errors exchanged", exchanged, _DATA),
 )

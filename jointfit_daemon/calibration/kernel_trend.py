@@ -19,7 +19,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.kernel_expert import LARGEST
 from jointfit_daemon.calibration.kernel_features import TILTS
-from jointfit_daemon.calibration.robust import huber_weights, robust_scale
+from jointfit_daemon.calibration.robust_ridge import fit_ridge
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     Row = tuple[float, ...]
 
 PENALTY = 1e-2
-PASSES = 4
 SMALLEST_SCALE = 0.02
 """What hardly moved in training is not blown up, rad."""
 LEVEL_AXES = (0, 1)
@@ -75,21 +74,7 @@ def _axis(u: Array, y: Array, axis: int) -> Row:
     tilt = width - TILTS + (1 - axis)
     row = np.zeros(1 + width)
     for columns in (pairs, [*pairs, tilt]):
-        found = _ridge(np.concatenate([np.ones((len(u), 1)), u[:, columns]], axis=1), y)
+        phi = np.concatenate([np.ones((len(u), 1)), u[:, columns]], axis=1)
+        found = fit_ridge(phi, y[:, None], PENALTY, SMALLEST_SCALE).coefficients[:, 0]
         row[[0, *(1 + column for column in columns)]] += 0.5 * found
     return tuple(row.tolist())
-
-
-def _ridge(phi: Array, y: Array) -> Array:
-    """Return coefficients of ridge regression with Huber weights, shape (p,)."""
-    scales = np.sqrt(np.mean(phi**2, axis=0)) + SMALLEST_SCALE
-    g = phi / scales
-    weights, found = np.ones(len(y)), np.zeros(g.shape[1])
-    for _ in range(PASSES):
-        weighted = g * weights[:, None]
-        H = weighted.T @ g + PENALTY * len(y) * np.eye(g.shape[1])
-        found = np.linalg.solve(H, weighted.T @ y)
-        sizes = np.abs(y - g @ found)
-        weights = huber_weights(sizes, robust_scale(sizes))
-    back: Array = found / scales
-    return back

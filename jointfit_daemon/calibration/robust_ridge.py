@@ -31,7 +31,7 @@ class Ridge:
     """A fit, in units of the regressors as given."""
 
     coefficients: Array
-    """Shape (p, 3): target per unit of regressor."""
+    """Shape (p, k): k targets per unit of regressor."""
     leverage: Array
     """Shape (p, p): ``phi @ leverage @ phi`` is n g^T H^-1 g, how far phi lies outside the hull."""
     scales: Array
@@ -58,13 +58,18 @@ class CrossValidated:
         return float(np.sum(self.residuals**2))
 
 
-def fit_ridge(phi: Array, rho: Array, penalty: float) -> Ridge:
-    """Fit rho (n, 3) on phi (n, p); five passes of Huber weights on the residual length."""
+def fit_ridge(
+    phi: Array, rho: Array, penalty: float, smallest_scale: float = _SMALLEST_SCALE
+) -> Ridge:
+    """Fit rho (n, k) on phi (n, p); five passes of Huber weights on the residual length.
+
+    `smallest_scale` is added to the RMS of each regressor: what hardly moved is not blown up.
+    """
     n, p = phi.shape
-    scales = np.sqrt(np.mean(phi**2, axis=0)) + _SMALLEST_SCALE
+    scales = np.sqrt(np.mean(phi**2, axis=0)) + smallest_scale
     g = phi / scales
     weights = np.ones(n)
-    H, C = np.eye(p), np.zeros((p, 3))
+    H, C = np.eye(p), np.zeros((p, rho.shape[1]))
     for _ in range(PASSES):
         weighted = g * weights[:, None]
         H = weighted.T @ g + penalty * n * np.eye(p)
