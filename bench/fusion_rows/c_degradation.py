@@ -50,14 +50,14 @@ JUMP_GOAL = 1.61
 """In units of the RMS error that is claimed: the sphere that holds 95 % of normal errors."""
 
 
-def _people(seeds: tuple[int, ...]) -> Iterator[tuple[int, Calibration]]:
+def calibrated_people(seeds: tuple[int, ...]) -> Iterator[tuple[int, Calibration]]:
     for seed in seeds:
         calibration = faults.calibrated(seed)
         if calibration is not None:
             yield seed, calibration
 
 
-def _fuser(calibration: Calibration) -> LimbFuser:
+def fuser_of(calibration: Calibration) -> LimbFuser:
     return LimbFuser(bench_rig().chain, calibration)
 
 
@@ -65,12 +65,14 @@ def _cases(
     seeds: tuple[int, ...], spoil: Callable[[faults.Worn, str, float, int], faults.Worn]
 ) -> Iterator[tuple[float, str, list[tuple[float, SensorNews]], Array]]:
     """Yield, for every person and sensor: when the fault began, who, what was told, jumps."""
-    for seed, calibration in _people(seeds):
+    for seed, calibration in calibrated_people(seeds):
         person = faults.live(seed, FAULT_S, RATE_HZ)
-        before, _ = faults.play(_fuser(calibration), person)
+        before, _ = faults.play(fuser_of(calibration), person)
         for k, name in enumerate(person.said):
             at_s = FIRST_S + APART_S * k + 0.37 * seed
-            after, told = faults.play(_fuser(calibration), spoil(person, name, at_s, 10 * seed + k))
+            after, told = faults.play(
+                fuser_of(calibration), spoil(person, name, at_s, 10 * seed + k)
+            )
             segment = 0 if name in ("S1", "S2") else 1
             soon = (person.t_s >= at_s) & (person.t_s < at_s + SOON_S)
             yield at_s, name, told, faults.jumps(before, after, segment)[soon]
@@ -130,8 +132,8 @@ def false_alarms(
     """Return how often healthy people are told anything, per hour."""
     told, played = 0, 0.0
     part_s = 300.0
-    for seed, calibration in _people(seeds):
-        fuser = _fuser(calibration)
+    for seed, calibration in calibrated_people(seeds):
+        fuser = fuser_of(calibration)
         for part in range(round(hours * 3600 / part_s)):
             begin_s = faults.BEGIN_S + part_s * part
             person = faults.live(seed, part_s, DRIFT_HZ, begin_s)
@@ -188,12 +190,12 @@ def drift(_: Path, seeds: tuple[int, ...] = SEEDS[:3]) -> list[Figure]:
 
 def _drifted(seeds: tuple[int, ...], names: tuple[str, ...], rate: float) -> tuple[float, float]:
     squares: dict[bool, list[float]] = {True: [], False: []}
-    for seed, calibration in _people(seeds):
+    for seed, calibration in calibrated_people(seeds):
         person = faults.live(seed, DRIFT_S, DRIFT_HZ)
         person = faults.drifting(person, names, float(np.deg2rad(rate)) / 60)
         late = person.t_s > DRIFT_S - 60
         for watched, found in squares.items():
-            fuser = _fuser(calibration)
+            fuser = fuser_of(calibration)
             if not watched:
                 fuser.links = None
             states, _ = faults.play(fuser, person)

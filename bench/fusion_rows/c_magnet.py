@@ -15,7 +15,7 @@ import numpy as np
 from bench import faults
 from bench.experiment import Experiment, Figure
 from bench.faults import PULL_S, SEGMENTS, STAY_S
-from bench.fusion_rows.c_degradation import JUMP_GOAL, RATE_HZ, SEEDS, _fuser, _people
+from bench.fusion_rows.c_degradation import JUMP_GOAL, RATE_HZ, SEEDS, calibrated_people, fuser_of
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+PEOPLE = (*SEEDS, 11, 12, 13, 14)
+"""Four more than those the limits were found with."""
 MAGNET_S, FIRST_S, APART_S = 80.0, 12.3, 2.9
 LEAST_DEG, MOST_DEG = 20.0, 40.0
 PASSED_DEG = 10.0
@@ -64,7 +66,7 @@ class Pulled(NamedTuple):
 def _cases(
     seeds: tuple[int, ...], groups: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[Calibration, Worn, tuple[str, ...], float, float]]:
-    for seed, calibration in _people(seeds):
+    for seed, calibration in calibrated_people(seeds):
         person = faults.live(seed, MAGNET_S, RATE_HZ)
         for k, names in enumerate(groups):
             dice = np.random.default_rng(10 * seed + k)
@@ -75,8 +77,8 @@ def _cases(
 def _pulled(
     calibration: Calibration, person: Worn, names: tuple[str, ...], at_s: float, angle: float
 ) -> Pulled:
-    healthy, _ = faults.play(_fuser(calibration), person)
-    states, told = faults.play(_fuser(calibration), faults.pulled(person, names, at_s, angle))
+    healthy, _ = faults.play(fuser_of(calibration), person)
+    states, told = faults.play(fuser_of(calibration), faults.pulled(person, names, at_s, angle))
     end_s = at_s + 2 * PULL_S + STAY_S
     lasts = (person.t_s >= at_s) & (person.t_s < end_s)
     after = person.t_s >= end_s + OVER_S
@@ -123,7 +125,7 @@ def _rms(x: Array) -> float:
 
 
 def magnet(
-    _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = SEEDS
+    _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = PEOPLE
 ) -> list[Figure]:
     """Return what is told of a disturbance, and how far the output is from the bones."""
     found = [_pulled(*case) for case in _cases(seeds, groups)]

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
+    from jointfit_simulators.scene import Scene
+
 BASE = "jointfit/station"
 SENSORS = ("S1", "S2", "S3", "S4")
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
@@ -199,6 +201,20 @@ class Station:
         """Yield the daemon's process."""
         async with daemon_child(self.folder, self.rig) as child:
             yield child
+
+
+@contextlib.asynccontextmanager
+async def in_this_process(scene: Scene) -> AsyncIterator[None]:
+    """Run virtual hardware here, where a test can reach into it; raise what it raised."""
+    ready = asyncio.Event()
+    task = asyncio.create_task(scene.run(lambda _: ready.set()), name="scene")
+    try:
+        await ready.wait()
+        yield
+    finally:
+        scene.stop()
+        await asyncio.wait([task])
+        task.result()
 
 
 @contextlib.asynccontextmanager

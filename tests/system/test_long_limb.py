@@ -18,7 +18,7 @@ from jointfit_simulators.rig_file import RigOptions
 from jointfit_simulators.scene import Scene, SceneOptions
 from jointfit_simulators.settings import Knobs, perfect, turn
 from jointfit_simulators.wearer import Wearer
-from tests.system.station import BASE, Station, listening, sensors_in
+from tests.system.station import BASE, Station, in_this_process, listening, sensors_in
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -52,15 +52,8 @@ async def played(folder: Path, port: int) -> AsyncIterator[Scene]:
     options = SceneOptions(folder, wires=WIRES, rig=rig)
     subject = Wearer(knobs, parse_programme("stand"), sensors=SENSORS)
     scene = Scene(knobs, subject, options, now_ns=time.monotonic_ns())
-    ready = asyncio.Event()
-    task = asyncio.create_task(scene.run(lambda _: ready.set()), name="scene")
-    try:
-        await ready.wait()
+    async with in_this_process(scene):
         yield scene
-    finally:
-        scene.stop()
-        await asyncio.wait([task])
-        task.result()
 
 
 async def taken(scene: Scene, listener: Listener, motion: str, *phase: Any) -> Any:

@@ -19,7 +19,7 @@ from jointfit_simulators.rig_file import RigOptions
 from jointfit_simulators.scene import Scene, SceneOptions
 from jointfit_simulators.settings import Knobs, perfect, turn
 from jointfit_simulators.wearer import Wearer
-from tests.system.station import BASE, SENSORS, Station, listening
+from tests.system.station import BASE, SENSORS, Station, in_this_process, listening
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -64,15 +64,8 @@ async def played(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
     subject = Wearer(knobs, parse_programme("stand"))
     scene = SpoiledScene(knobs, subject, options, now_ns=time.monotonic_ns())
     scene.spoil()
-    ready = asyncio.Event()
-    task = asyncio.create_task(scene.run(lambda _: ready.set()), name="scene")
-    try:
-        await ready.wait()
+    async with in_this_process(scene):
         yield scene
-    finally:
-        scene.stop()
-        await asyncio.wait([task])
-        task.result()
 
 
 async def taken(simulator: SpoiledScene, listener: Listener, motion: str, *phase: Any) -> Any:
