@@ -67,7 +67,7 @@ def encode_event(event: Event) -> bytes:
     return orjson.dumps(_described(event), _exact, orjson.OPT_SERIALIZE_NUMPY)
 
 
-def _described(event: Event) -> dict[str, Any]:  # noqa: C901, PLR0911 - one return a kind
+def _described(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return a kind
     match event:
         case Tick(t_ns):
             return {"e": "tick", "t_ns": t_ns}

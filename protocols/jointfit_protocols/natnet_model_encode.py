@@ -52,7 +52,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
     return b"".join(parts)
 
 
-def _put(description: Description, version: Version) -> tuple[int, bytes]:  # noqa: C901, PLR0911 - one case a type
+def _put(description: Description, version: Version) -> tuple[int, bytes]:  # noqa: PLR0911 - one case a type
     match description:
         case MarkerSetDescription():
             return MARKER_SET, put_text(description.name) + put_texts(description.markers)
