@@ -47,6 +47,9 @@ _LEAST_OVERLAP = 0.5
 _CANDIDATE = 0.5
 """Share of the best correlation from which on a maximum deserves a fit of its own."""
 _CANDIDATES = 4
+_TIE = 1e-3
+"""Correlations of magnitudes that differ by less do not rank lags: periodic motion gives equal
+maxima, whose order is rounding. The fits on three axes decide between them."""
 _SAME_S = 0.01
 """Fits that end this near to each other are one."""
 _RIVAL = 1.5
@@ -203,7 +206,7 @@ def estimate_in_steps(
 
 def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
     """Return the best of the fits, and why not to use it."""
-    fit = min(fits, key=lambda one: one.residual_rms)
+    fit, rival = _best_and_rival(fits, seen)
     estimate = replace(
         seen,
         lag_ns=1e9 * fit.tau_s,
@@ -215,17 +218,32 @@ def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> Lag
         mean_weight=fit.mean_weight,
         pairs=fit.pairs,
     )
-    return replace(estimate, refused=_gate(estimate, fit, settings) or _rival(fit, fits, seen))
+
+    refused = _gate(estimate, fit, settings)
+    if refused is None and rival is not None:
+        other = 1e3 * rival.tau_s
+        refused = f"the motion is periodic: a lag of {other:.0f} ms fits as well; {IRREGULAR}"
+    return replace(estimate, refused=refused)
 
 
-def _rival(best: LagFit, fits: list[LagFit], seen: LagEstimate) -> str | None:
-    """Say so where another lag fits nearly as well."""
-    alike = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2
-    for fit in fits:
-        if abs(fit.tau_s - best.tau_s) > _SAME_S and fit.residual_rms**2 < alike:
-            other = 1e3 * fit.tau_s
-            return f"the motion is periodic: a lag of {other:.0f} ms fits as well; {IRREGULAR}"
-    return None
+def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagFit | None]:
+    """Return the best fit, and another lag that fits nearly as well, or None.
+
+    Without a rival the least residual is best. With rivals the residuals do not decide: the
+    smallest lag is returned, and the rival nearest to it.
+    """
+    best = min(fits, key=lambda fit: fit.residual_rms)
+    limit = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2
+    alike = [best, *(fit for fit in fits if fit is not best and fit.residual_rms**2 < limit)]
+    if all(abs(fit.tau_s - best.tau_s) <= _SAME_S for fit in alike):
+        return best, None
+
+    # Whole milliseconds, because lags of equal size and opposite sign differ in their last bits.
+    nearest = min(alike, key=lambda fit: (round(1e3 * abs(fit.tau_s)), fit.tau_s < 0.0))
+    others = [fit for fit in alike if abs(fit.tau_s - nearest.tau_s) > _SAME_S / 2]
+    return nearest, min(
+        others, key=lambda fit: (round(1e3 * abs(fit.tau_s - nearest.tau_s)), fit.tau_s < 0.0)
+    )
 
 
 def _too_little(rate: float, acceleration: float, settings: LagSettings) -> str:
@@ -281,21 +299,30 @@ def coarse_lags(
 ) -> tuple[tuple[float, ...], str | None]:
     """Return lags, s, that correlate the magnitudes of both rates, best first, or why not.
 
-    The magnitude needs no rotation. A maximum at the border of the search is none.
+    The magnitude needs no rotation. The best correlation must be a maximum inside the search: one
+    at its border means that the lag lies outside. Maxima that differ by less than `_TIE` have no
+    order, so they are ranked by the size of the lag, and those at the border are fitted, too.
     """
     step, reach = settings.step_s, round(settings.span_s / settings.step_s)
     scores = _correlations(imu, ref, step, reach)
-    best = int(np.argmax(scores))
-    if not np.isfinite(scores[best]):
+    best = float(scores.max())
+    if not np.isfinite(best):
         return (), NO_OVERLAP
-    if best in {0, scores.size - 1}:
+
+    padded = np.concatenate(([-inf], scores, [-inf]))
+    peaks = np.flatnonzero((scores > padded[:-2]) & (scores >= padded[2:]))
+    inside = peaks[(peaks > 0) & (peaks < scores.size - 1)]
+    tied = peaks[scores[peaks] >= best - _TIE]
+    if not np.isin(tied, inside).any():
         return (), (
             f"no common motion within {settings.span_s:g} s: check that the sensor sits on this "
             "body and that both clocks are mapped"
         )
-    peaks = np.flatnonzero((scores[1:-1] > scores[:-2]) & (scores[1:-1] >= scores[2:])) + 1
-    peaks = peaks[scores[peaks] >= _CANDIDATE * scores[best]]
-    ranked = peaks[np.argsort(-scores[peaks], kind="stable")][:_CANDIDATES]
+
+    tied = tied[np.argsort(np.abs(tied - reach), kind="stable")]
+    lesser = np.setdiff1d(inside[scores[inside] >= _CANDIDATE * best], tied)
+    lesser = lesser[np.argsort(-scores[lesser], kind="stable")]
+    ranked = np.concatenate((tied, lesser))[:_CANDIDATES]
     return tuple(((ranked - reach) * step).tolist()), None
 
 

@@ -280,6 +280,25 @@ def test_periodic_motion_is_ambiguous_in_a_wide_search() -> None:
     assert estimate_lag(t_ns, q, t_ns, q).refused is None  # mapped clocks: the near one is right
 
 
+@pytest.mark.parametrize("span_s", [0.5, 1.0, 3.0])
+def test_rounding_does_not_decide_what_periodic_motion_is_refused_for(span_s: float) -> None:
+    # The magnitude repeats every 0.5 s, so the border of each search correlates as well as zero.
+    t = np.arange(0, 12, 0.01)
+    t_ns = (t * 1e9).astype(np.int64)
+    angle = 2.0 * np.sin(2 * np.pi * t)[:, None] * [1, 0, 0]
+    refusals = set()
+    for seed in range(8):
+        rounding = np.random.default_rng(seed).normal(scale=1e-12, size=angle.shape)
+        q = Rotation.from_rotvec(angle + rounding).as_quat(scalar_first=True)
+        estimate = estimate_lag(t_ns, q, t_ns, q, LagSettings(span_s=span_s))
+        refusals.add((estimate.refused, round(estimate.lag_ns / MS)))
+    assert len(refusals) == 1
+    refused, lag_ms = refusals.pop()
+    assert lag_ms == 0
+    assert refused is not None
+    assert "periodic: a lag of 500 ms fits as well" in refused
+
+
 def test_the_interpolant_follows_what_the_low_pass_lets_through() -> None:
     t = np.arange(0, 2, 0.01)
     waves = np.stack([np.sin(2 * np.pi * f * t) for f in (1, 4, 10)], axis=1)
