@@ -167,29 +167,31 @@ class Scene:
         say
             Told where everything is when all is ready, and what was sent when nothing more is.
         """
-        async with asyncio.TaskGroup() as tasks:
-            serving = [
-                tasks.create_task(stream.device.run(), name=f"device {name}")
-                for name, stream in self._hardware.streams.items()
-            ]
-            if self._server is not None:
-                serving.append(tasks.create_task(self._server.run(), name="natnet"))
-                await self._server.ready.wait()
-            rig = self._write_rig()
-            playing = tasks.create_task(self._player.run(), name="player")
-            following = tasks.create_task(self._follow_script(say), name="script")
-            truth = self._options.directory / TRUTH_FILE
-            ports = self._hardware.ports
-            say({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
-            await self._quit.wait()
-            playing.cancel()
-            following.cancel()
-            self._player.finish()
-            say(self.account())
-            await asyncio.sleep(LINGER_S)
-            for task in serving:
-                task.cancel()
-        self.close()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                serving = [
+                    tasks.create_task(stream.device.run(), name=f"device {name}")
+                    for name, stream in self._hardware.streams.items()
+                ]
+                if self._server is not None:
+                    serving.append(tasks.create_task(self._server.run(), name="natnet"))
+                    await self._server.ready.wait()
+                rig = self._write_rig()
+                playing = tasks.create_task(self._player.run(), name="player")
+                following = tasks.create_task(self._follow_script(say), name="script")
+                truth = self._options.directory / TRUTH_FILE
+                ports = self._hardware.ports
+                say({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
+                await self._quit.wait()
+                playing.cancel()
+                following.cancel()
+                self._player.finish()
+                say(self.account())
+                await asyncio.sleep(LINGER_S)
+                for task in serving:
+                    task.cancel()
+        finally:  # cancelled or failed, too: ports and files stay open otherwise
+            self.close()
 
     async def _follow_script(self, say: Callable[[dict[str, object]], None]) -> None:
         """Obey every command of the script in its time."""

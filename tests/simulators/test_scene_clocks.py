@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+import time
+from pathlib import Path
+from typing import Any
 
 import orjson
 import pytest
@@ -15,10 +17,8 @@ from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
 from jointfit_simulators.settings import Knobs
 from jointfit_simulators.wearer import Wearer
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 NOW = 10**13
+"""Host time for parts that look at no clock of their own."""
 
 
 def test_a_clock_runs_as_it_is_asked_to() -> None:
@@ -50,7 +50,8 @@ def test_the_log_tells_device_number_and_instant(tmp_path: Path) -> None:
 def scene(folder: Path, **options: Any) -> Scene:
     knobs = Knobs()
     wearer = Wearer(knobs, parse_programme("stand"), motion_files={})
-    return Scene(knobs, wearer, SceneOptions(folder, **options), now_ns=NOW)
+    now_ns = time.monotonic_ns()  # the script waits for instants after it
+    return Scene(knobs, wearer, SceneOptions(folder, **options), now_ns=now_ns)
 
 
 def test_clocks_that_are_not_there_cannot_be_asked(tmp_path: Path) -> None:
@@ -69,3 +70,17 @@ async def test_a_script_is_obeyed_in_time_and_its_faults_are_told(tmp_path: Path
     text = (tmp_path / "rig.toml").read_text(encoding="utf-8")
     assert text.count("trigger_indication") == 2
     assert text.count("sync_line = 0") == 1
+
+
+def descriptors() -> set[str]:
+    return {path.name for path in Path("/proc/self/fd").iterdir()}
+
+
+async def test_a_cancelled_scene_closes_its_ports_and_files(tmp_path: Path) -> None:
+    before = descriptors()
+    ready = asyncio.Event()
+    playing = asyncio.create_task(scene(tmp_path, sample_log=True).run(lambda _: ready.set()))
+    await ready.wait()
+    playing.cancel()
+    await asyncio.wait([playing])
+    assert descriptors() <= before
