@@ -126,7 +126,7 @@ class TlsSettings(Settings):
 class MqttSettings(Settings):
     """``[mqtt]``."""
 
-    host: str = Field("localhost", min_length=1, description="name or address of the broker")
+    host: str = Field("127.0.0.1", min_length=1, description="name or address of the broker")
     port: int = Field(0, ge=0, le=65535, description="TCP port; 0: 1883, or 8883 with tls")
     base: str = Field("", description="first levels of every topic; default jointfit/<rig name>")
     username: str | None = Field(None, description="user name for the broker")

@@ -17,7 +17,7 @@ class RigOptions:
 
     name: str = "demo"
     output_rate_hz: float = 100.0
-    mqtt_host: str = "localhost"
+    mqtt_host: str = "127.0.0.1"  # not every machine can resolve "localhost"
     mqtt_port: int = 1883
     mqtt_base: str = "jointfit/demo"
     mqtt_version: str = "5"

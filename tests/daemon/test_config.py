@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import tomllib
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jointfit_daemon.config import ConfigError, load_rig, parse_rig, rig_schema
+from jointfit_daemon.config import ConfigError, MqttSettings, load_rig, parse_rig, rig_schema
 from jointfit_daemon.driver import CanBusSettings
+from jointfit_simulators.rig_file import RigOptions
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
+PROJECT = Path(__file__).resolve().parents[2]
 Table = dict[str, Any]
 
 
@@ -221,6 +223,12 @@ def test_names_of_files_start_at_the_folder_of_the_rig(
     assert mqtt.tls is not None
     assert mqtt.tls.ca == "/etc/ca.pem"
     assert mqtt.tcp_port == 8883
+
+
+def test_the_broker_is_reached_without_resolving_a_name() -> None:
+    example = tomllib.loads((PROJECT / "examples" / "knee.toml").read_text(encoding="utf-8"))
+    for host in (MqttSettings().host, RigOptions().mqtt_host, example["mqtt"]["host"]):
+        assert ip_address(host).is_loopback  # the name may lack in /etc/hosts
 
 
 anything = st.recursive(

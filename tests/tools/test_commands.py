@@ -59,7 +59,7 @@ def test_the_schema_names_the_keys_of_rig_and_drivers() -> None:
 
 def test_calibrating_without_a_broker_says_where_it_looked(tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
-    text = EXAMPLE.read_text("utf-8").replace('host = "localhost"', 'host = "127.0.0.1"\nport = 9')
+    text = EXAMPLE.read_text("utf-8").replace('host = "127.0.0.1"', 'host = "127.0.0.1"\nport = 9')
     rig.write_text(text)
     result = run(app, ["calibrate", str(rig), "--yes", "--phase", "static"])
     assert result.exit_code == 1
