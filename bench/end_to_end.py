@@ -25,7 +25,7 @@ from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.outputs.mqtt_client import MqttClient
 from jointfit_daemon.tools.demo_processes import daemon, simulator
-from tests.broker_fixture import MosquittoBroker
+from tests.broker_fixture import chosen_broker
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -261,7 +261,7 @@ def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
 async def _everything(
     data: Path, folder: Path, methods: Sequence[Method], walkers: Sequence[Method]
 ) -> dict[tuple[str, Method], Played]:
-    broker = MosquittoBroker(folder)
+    broker = chosen_broker()(folder)
     broker.start()
     found: dict[tuple[str, Method], Played] = {}
 

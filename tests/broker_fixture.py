@@ -1,4 +1,8 @@
-"""Real brokers on free loopback ports, started and stopped by tests."""
+"""Real brokers on free loopback ports, started and stopped by tests: mosquitto and iotcore.
+
+Invariant: both are a process of this user, with MQTT 5 at ``port`` and MQTT 3.1.1 at
+``port_of("3.1.1")``. Each can be stopped, frozen and started again on the same ports.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +11,21 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
+from abc import ABC, abstractmethod
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar
+
+from typing_extensions import override  # typing has it from Python 3.12
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from iotcore import Broker
-
 HOST = "127.0.0.1"
+MOSQUITTO_MISSING = "mosquitto is not installed (Debian: apt install mosquitto)"
+CHOICE = "JOINTFIT_TEST_BROKER"
+"""Environment variable with the broker for tests that need no particular one."""
 
 
 def free_port() -> int:
@@ -40,34 +50,40 @@ def wait_for_listener(port: int, within_s: float = 5.0) -> None:
             return
 
 
-class MosquittoBroker:
-    """One mosquitto process; it can be stopped, frozen and started again on the same port."""
+class Broker(ABC):
+    """One broker process."""
 
     PATH: ClassVar[str] = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
     host: ClassVar[str] = HOST
 
-    def __init__(self, folder: Path, *, more: str = "") -> None:
+    def __init__(self) -> None:
         self.port = free_port()
-        self._config = folder / f"mosquitto-{self.port}.conf"
-        self._config.write_text(
-            f"listener {self.port} {HOST}\nallow_anonymous true\npersistence false\n"
-            f"set_tcp_nodelay true\nuser {os.environ.get('USER') or 'root'}\n{more}",
-            encoding="utf-8",
-        )
         self._process: subprocess.Popen[bytes] | None = None
+
+    @classmethod
+    @abstractmethod
+    def missing(cls) -> str | None:
+        """Return why this broker cannot run here, and how to install it; None if it can."""
+
+    @abstractmethod
+    def _command(self) -> list[str]:
+        """Return the program and its arguments."""
+
+    def port_of(self, version: str) -> int:
+        """Return the port for clients of an MQTT version, "5" or "3.1.1"."""
+        del version  # most brokers serve every version on one port
+        return self.port
 
     def start(self) -> None:
         """Start the process and wait until it listens."""
-        program = shutil.which("mosquitto", path=self.PATH)
-        if program is None:
-            raise FileNotFoundError("mosquitto")
         self._process = subprocess.Popen(
-            [program, "-c", str(self._config)],
+            self._command(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        wait_for_listener(self.port)
+        for version in ("5", "3.1.1"):
+            wait_for_listener(self.port_of(version))
 
     def stop(self) -> None:
         """Kill the process: connections break and retained messages are forgotten."""
@@ -88,32 +104,65 @@ class MosquittoBroker:
             self._process.send_signal(signal.SIGCONT)
 
 
-class IotcoreBroker:
-    """The embedded broker of the demo, bound to the loopback."""
+class MosquittoBroker(Broker):
+    """Mosquitto with one listener; `more` are further lines of its configuration."""
 
-    host: ClassVar[str] = HOST
+    def __init__(self, folder: Path, *, more: str = "") -> None:
+        super().__init__()
+        self._config = folder / f"mosquitto-{self.port}.conf"
+        self._config.write_text(
+            f"listener {self.port} {HOST}\nallow_anonymous true\npersistence false\n"
+            f"set_tcp_nodelay true\nuser {os.environ.get('USER') or 'root'}\n{more}",
+            encoding="utf-8",
+        )
+
+    @classmethod
+    @override
+    def missing(cls) -> str | None:
+        if shutil.which("mosquitto", path=cls.PATH) is not None:
+            return None
+        return MOSQUITTO_MISSING
+
+    @override
+    def _command(self) -> list[str]:
+        program = shutil.which("mosquitto", path=self.PATH)
+        assert program is not None, self.missing()
+        return [program, "-c", str(self._config)]
+
+
+class EmbeddedBroker(Broker):
+    """iotcore, the broker of the demo, with a listener for each MQTT version."""
 
     def __init__(self, folder: Path) -> None:
-        self.port, self.port5 = free_port(), free_port()
-        self._folder = folder
-        self._broker: Broker | None = None
+        super().__init__()
+        self._port_of_3_1_1 = free_port()
+        self._config = folder / f"iotcore-{self.port}.toml"
+        self._config.write_text(self._config_text(), encoding="utf-8")
 
-    def start(self) -> None:
-        """Start the child process and wait until both listeners answer."""
-        from iotcore import Broker  # noqa: PLC0415 - an extra
+    @classmethod
+    @override
+    def missing(cls) -> str | None:
+        if find_spec("iotcore") is not None:
+            return None
+        return "iotcore is not installed (pip install jointfitd[demo])"
 
-        self._broker = Broker(config_path=str(self._write_config()))
-        self._broker.start()
-        wait_for_listener(self.port)
-        wait_for_listener(self.port5)
+    @override
+    def port_of(self, version: str) -> int:
+        return self.port if version == "5" else self._port_of_3_1_1
 
-    def stop(self) -> None:
-        """Stop the child process."""
-        if self._broker is not None:
-            self._broker.stop()
-            self._broker = None
+    @override
+    def _command(self) -> list[str]:
+        return [sys.executable, "-P", "-c", _SERVE, str(self._config)]
 
-    def _write_config(self) -> Path:
+    def _config_text(self) -> str:
+        router = """id = 0
+[router]
+id = 0
+max_connections = 1000
+max_outgoing_packet_count = 200
+max_segment_size = 104857600
+max_segment_count = 10
+"""
         listener = """
 [{section}.1]
 name = "{section}"
@@ -125,16 +174,41 @@ max_payload_size = 1048576
 max_inflight_count = 100
 dynamic_filters = true
 """
-        text = """id = 0
-[router]
-id = 0
-max_connections = 1000
-max_outgoing_packet_count = 200
-max_segment_size = 104857600
-max_segment_count = 10
+        return (
+            router
+            + listener.format(section="v4", port=self._port_of_3_1_1)
+            + listener.format(section="v5", port=self.port)
+        )
+
+
+_SERVE = """
+import sys
+from iotcore.iotcore import IotCoreBroker
+IotCoreBroker(config_path=sys.argv[1]).run_forever()
 """
-        text += listener.format(section="v4", port=self.port)
-        text += listener.format(section="v5", port=self.port5)
-        path = self._folder / "iotcore.toml"
-        path.write_text(text, encoding="utf-8")
-        return path
+# Not iotcore's own Broker: it keeps its process private, and tests must be able to freeze it.
+
+_CLASSES: dict[str, type[MosquittoBroker | EmbeddedBroker]] = {
+    "mosquitto": MosquittoBroker,
+    "embedded": EmbeddedBroker,
+}
+
+
+def chosen_broker() -> type[MosquittoBroker | EmbeddedBroker]:
+    """Return the broker for tests that need no particular one.
+
+    It is the one that the environment variable `CHOICE` names. Without it, mosquitto is taken
+    where it is installed, because users run that; the embedded one otherwise.
+
+    Raises
+    ------
+    ValueError
+        The variable names no broker.
+    """
+    name = os.environ.get(CHOICE)
+    if not name:
+        return MosquittoBroker if MosquittoBroker.missing() is None else EmbeddedBroker
+    if name not in _CLASSES:
+        message = f"{CHOICE}={name}: expected {' or '.join(_CLASSES)}"
+        raise ValueError(message)
+    return _CLASSES[name]

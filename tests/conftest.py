@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import inspect
 import os
-import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
-from tests.broker_fixture import IotcoreBroker, MosquittoBroker
+from tests.broker_fixture import EmbeddedBroker, MosquittoBroker, chosen_broker
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Callable, Iterator
+
+    from tests.broker_fixture import Broker
 
 settings.register_profile("home", deadline=None)  # a loaded machine is no fault of the code
 settings.register_profile("ci", deadline=None, derandomize=True)
@@ -38,25 +40,52 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture
-def mosquitto(tmp_path: Path) -> Iterator[MosquittoBroker]:
-    """Yield a running mosquitto on a free loopback port, without persistence."""
-    if shutil.which("mosquitto", path=MosquittoBroker.PATH) is None:
-        pytest.skip("mosquitto is not installed (Debian: apt install mosquitto)")
-    broker = MosquittoBroker(tmp_path)
+@contextlib.contextmanager
+def _running(make: Callable[[], Broker], missing: str | None) -> Iterator[Broker]:
+    if missing is not None:
+        pytest.skip(missing)
+    broker = make()
     broker.start()
-    yield broker
-    broker.stop()
+    try:
+        yield broker
+    finally:
+        broker.stop()
 
 
 @pytest.fixture
-def iotcore_broker(tmp_path: Path) -> Iterator[IotcoreBroker]:
-    """Yield a running iotcore broker: MQTT 3.1.1 at ``port``, MQTT 5 at ``port5``."""
-    pytest.importorskip("iotcore", reason="iotcore is not installed (pip install jointfitd[demo])")
-    broker = IotcoreBroker(tmp_path)
-    broker.start()
-    yield broker
-    broker.stop()
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    """Yield a running broker on free loopback ports: the one that `chosen_broker` returns."""
+    chosen = chosen_broker()
+    with _running(lambda: chosen(tmp_path), chosen.missing()) as running:
+        yield running
+
+
+@pytest.fixture
+def embedded_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Yield a running iotcore, for tests of the broker that comes with pip."""
+    with _running(lambda: EmbeddedBroker(tmp_path), EmbeddedBroker.missing()) as running:
+        yield running
+
+
+@pytest.fixture
+def start_mosquitto(tmp_path: Path) -> Iterator[Callable[[str], Broker]]:
+    """Yield a function that starts a mosquitto with further lines of configuration.
+
+    For tests of what the embedded broker lacks: TLS, passwords, access lists.
+    """
+    with contextlib.ExitStack() as brokers:
+
+        def start(more: str) -> Broker:
+            made = _running(lambda: MosquittoBroker(tmp_path, more=more), MosquittoBroker.missing())
+            return brokers.enter_context(made)
+
+        yield start
+
+
+@pytest.fixture
+def mosquitto(start_mosquitto: Callable[[str], Broker]) -> Broker:
+    """Return a running mosquitto without anything special."""
+    return start_mosquitto("")
 
 
 def _open_descriptors() -> set[tuple[str, str]]:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 import sys
 import tempfile
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.gateway import Figures, Load, run
 from bench.harness import Bench, Row, percentile
 from jointfit_daemon.tools.embedded_broker import embedded_broker
-from tests.broker_fixture import MosquittoBroker
+from tests.broker_fixture import EmbeddedBroker, MosquittoBroker
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -32,16 +30,9 @@ def _mosquitto(folder: Path) -> Iterator[int]:
         broker.stop()
 
 
-def _missing(broker: str) -> str | None:
-    if broker == "mosquitto" and shutil.which(broker, path=MosquittoBroker.PATH) is None:
-        return "mosquitto is not installed: sudo apt install mosquitto"
-    if broker == "iotcore" and find_spec("iotcore") is None:
-        return "iotcore is not installed: it comes with the extra `demo`"
-    return None
-
-
 def _played(broker: str, load: Load, quick: bool) -> Figures | None:
-    if (reason := _missing(broker)) is not None:
+    needed = MosquittoBroker if broker == "mosquitto" else EmbeddedBroker
+    if (reason := needed.missing()) is not None:
         print(f"not run: {reason}", file=sys.stderr)
         return None
     with tempfile.TemporaryDirectory(prefix="jointfit-bench-") as temporary:

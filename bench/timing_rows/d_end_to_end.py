@@ -31,10 +31,10 @@ def _arrivals(_: Path) -> list[Figure]:
 
 async def _live() -> Outcome:
     from bench.restarts import live  # noqa: PLC0415 - a rig needs packages other rows do without
-    from tests.broker_fixture import MosquittoBroker  # noqa: PLC0415 - so do brokers
+    from tests.broker_fixture import chosen_broker  # noqa: PLC0415 - so do brokers
 
     with tempfile.TemporaryDirectory() as folder:
-        broker = MosquittoBroker(Path(folder))
+        broker = chosen_broker()(Path(folder))
         broker.start()
         try:
             return await live(Path(folder), broker.port, _REBOOTS, rest_s=4.0)

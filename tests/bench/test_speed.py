@@ -12,6 +12,7 @@ import pytest
 
 from bench.harness import Bench, Row, as_json, as_text, fixed_loop, percentile
 from bench.speed import main
+from tests.broker_fixture import MOSQUITTO_MISSING
 
 if TYPE_CHECKING:
     from typing import Any
@@ -56,7 +57,7 @@ def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
 def test_the_daemon_is_measured_between_hardware_and_broker(tmp_path: Path) -> None:
     rows = measured(tmp_path, "gateway100", 85.0)
     if "4 × 100 Hz: latency, p99" not in rows:
-        pytest.skip("mosquitto is not installed")
+        pytest.skip(MOSQUITTO_MISSING)
     assert rows["4 × 100 Hz: samples unaccounted for"]["figure"] == 0
     assert 0 < rows["4 × 100 Hz: latency, median"]["figure"] < 200
 

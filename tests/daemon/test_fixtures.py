@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.broker_fixture import CHOICE, EmbeddedBroker, MosquittoBroker, chosen_broker
+
 if TYPE_CHECKING:
-    from tests.broker_fixture import IotcoreBroker, MosquittoBroker
+    from tests.broker_fixture import Broker
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -25,13 +27,29 @@ LEAKS = {
 }
 
 
-def test_mosquitto_accepts_connections(mosquitto: MosquittoBroker) -> None:
-    socket.create_connection((mosquitto.host, mosquitto.port), timeout=1).close()
+@pytest.mark.parametrize("name", ["mosquitto", "embedded_broker"])
+def test_a_broker_listens_for_both_protocol_versions(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    broker: Broker = request.getfixturevalue(name)
+    for version in ("5", "3.1.1"):
+        socket.create_connection((broker.host, broker.port_of(version)), timeout=1).close()
 
 
-def test_iotcore_listens_for_both_protocol_versions(iotcore_broker: IotcoreBroker) -> None:
-    for port in (iotcore_broker.port, iotcore_broker.port5):
-        socket.create_connection((iotcore_broker.host, port), timeout=1).close()
+def test_without_mosquitto_the_embedded_broker_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(CHOICE, raising=False)
+    monkeypatch.setattr(MosquittoBroker, "PATH", "/nowhere")
+    assert chosen_broker() is EmbeddedBroker
+
+
+def test_a_broker_can_be_chosen_by_name_and_a_wrong_name_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(CHOICE, "embedded")
+    assert chosen_broker() is EmbeddedBroker
+    monkeypatch.setenv(CHOICE, "mosquito")
+    with pytest.raises(ValueError, match="mosquitto or embedded"):
+        chosen_broker()
 
 
 @pytest.mark.parametrize("complaint", LEAKS)

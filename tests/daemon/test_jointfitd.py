@@ -25,7 +25,7 @@ from tests.daemon import fake_drivers
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -110,13 +110,13 @@ async def states(port: int, count: int) -> list[dict[str, Any]]:
 
 
 async def test_it_runs_stops_and_its_log_replays_byte_for_byte(
-    process: Process, mosquitto: MosquittoBroker, monkeypatch: pytest.MonkeyPatch
+    process: Process, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    process.write(mosquitto.port)
+    process.write(broker.port)
     with running(process) as daemon:
-        assert len(await states(mosquitto.port, 30)) == 30
+        assert len(await states(broker.port, 30)) == 30
         daemon.send_signal(signal.SIGHUP)
-        assert len(await states(mosquitto.port, 30)) == 30
+        assert len(await states(broker.port, 30)) == 30
         began = time.monotonic()
         daemon.send_signal(signal.SIGTERM)
         _, said = await asyncio.to_thread(daemon.communicate)

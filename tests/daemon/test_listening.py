@@ -15,7 +15,7 @@ from jointfit_daemon.tools.embedded_broker import embedded_broker
 from tests.daemon import fake_drivers
 
 if TYPE_CHECKING:
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 PROJECT = Path(__file__).resolve().parents[2]
 LISTENS = "0A"
@@ -55,9 +55,9 @@ def test_a_listening_socket_is_found() -> None:
         assert listening(os.getpid()) == ["0100007F"]
 
 
-def test_the_daemon_listens_on_no_tcp_port(tmp_path: Path, mosquitto: MosquittoBroker) -> None:
+def test_the_daemon_listens_on_no_tcp_port(tmp_path: Path, broker: Broker) -> None:
     rig = tmp_path / "rig.toml"
-    rig.write_text(fake_drivers.SMALLEST_RIG.format(port=mosquitto.port))
+    rig.write_text(fake_drivers.SMALLEST_RIG.format(port=broker.port))
     fake_drivers.install(tmp_path / "site")
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), str(PROJECT)]),

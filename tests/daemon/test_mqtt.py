@@ -1,4 +1,4 @@
-"""The link to a real mosquitto: what users of such daemons complain about, tried."""
+"""The link to a real broker: what users of such daemons complain about, tried."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from jointfit_daemon.outputs.mqtt import (
 from jointfit_daemon.outputs.mqtt_client import MqttClient, NoAnswer
 from jointfit_daemon.outputs.outbox import Outbox
 from jointfit_daemon.outputs.publisher import OFFLINE, ONLINE, MqttPublisher
-from tests.broker_fixture import MosquittoBroker, free_port
+from tests.broker_fixture import free_port
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-    from tests.broker_fixture import IotcoreBroker
+    from tests.broker_fixture import Broker
 
 BASE = "jointfit/test"
 LIFE = f"{BASE}/bridge/state"
@@ -61,7 +61,7 @@ async def running(link: Link) -> AsyncIterator[Link]:
 
 
 async def test_a_stop_that_comes_with_the_brokers_first_word_is_not_lost(
-    mosquitto: MosquittoBroker, monkeypatch: pytest.MonkeyPatch
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     connect = aiomqtt.Client.__aenter__
 
@@ -73,7 +73,7 @@ async def test_a_stop_that_comes_with_the_brokers_first_word_is_not_lost(
         return made
 
     monkeypatch.setattr(aiomqtt.Client, "__aenter__", connected_after_all)
-    link = asyncio.create_task(Link(mosquitto.port).publisher.run())
+    link = asyncio.create_task(Link(broker.port).publisher.run())
     await asyncio.wait([link], timeout=5)
     assert link.cancelled()
 
@@ -97,36 +97,33 @@ async def retained(port: int, wanted: int) -> dict[str, bytes]:
 
 
 async def test_retained_state_comes_back_after_a_broker_forgot_it(
-    mosquitto: MosquittoBroker,
+    broker: Broker,
 ) -> None:
-    link = Link(mosquitto.port)
+    link = Link(broker.port)
     state = {f"{BASE}/device/S{n}/availability": ONLINE for n in range(20)}
     for topic, payload in state.items():
         link.outbox.retain(topic, payload)
     async with running(link):
-        assert await retained(mosquitto.port, 21) == state | {LIFE: ONLINE}
-        mosquitto.stop()
+        assert await retained(broker.port, 21) == state | {LIFE: ONLINE}
+        broker.stop()
         await until(lambda: not link.publisher.connected)
-        mosquitto.start()
+        broker.start()
         began = time.monotonic()
         await until(lambda: link.publisher.connected)
         back_s = time.monotonic() - began
-        assert await retained(mosquitto.port, 21) == state | {LIFE: ONLINE}
+        assert await retained(broker.port, 21) == state | {LIFE: ONLINE}
     assert back_s < 3  # the promise is 1 s; the machine may be busy
 
 
-async def test_no_broker_at_boot_is_waited_for(tmp_path: Path) -> None:
-    broker = MosquittoBroker(tmp_path)
+async def test_no_broker_at_boot_is_waited_for(broker: Broker) -> None:
+    broker.stop()
     link = Link(broker.port)
     async with running(link):
         await asyncio.sleep(0.3)
         assert not link.publisher.connected
         broker.start()
-        try:
-            await until(lambda: link.publisher.connected)
-            assert await retained(broker.port, 1) == {LIFE: ONLINE}
-        finally:
-            broker.stop()
+        await until(lambda: link.publisher.connected)
+        assert await retained(broker.port, 1) == {LIFE: ONLINE}
 
 
 async def test_an_absent_broker_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -144,12 +141,12 @@ async def test_a_stop_in_the_instant_of_a_loss_is_a_stop() -> None:
             await asyncio.sleep(0.0002 * n)
 
 
-async def test_online_is_the_last_to_be_said(mosquitto: MosquittoBroker) -> None:
-    link = Link(mosquitto.port)
+async def test_online_is_the_last_to_be_said(broker: Broker) -> None:
+    link = Link(broker.port)
     order: list[str] = []
     for n in range(5):
         link.outbox.retain(f"{BASE}/z{n}", b"1")
-    async with MqttConnection(settings(mosquitto.port)) as watcher:
+    async with MqttConnection(settings(broker.port)) as watcher:
         await watcher.subscribe([f"{BASE}/#"])
         async with running(link), asyncio.timeout(5):
             async for message in watcher.messages():
@@ -159,44 +156,45 @@ async def test_online_is_the_last_to_be_said(mosquitto: MosquittoBroker) -> None
     assert order[-1] == LIFE
 
 
-async def test_a_vanished_daemon_is_offline_by_its_will(mosquitto: MosquittoBroker) -> None:
+async def test_a_vanished_daemon_is_offline_by_its_will(broker: Broker) -> None:
     will = Outgoing(LIFE, OFFLINE, 1, retain=True)
 
     async def vanish() -> None:
-        async with MqttConnection(settings(mosquitto.port), will=will) as connection:
+        async with MqttConnection(settings(broker.port), will=will) as connection:
             await connection.publish(Outgoing(LIFE, ONLINE, 1, retain=True))
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         await vanish()
     await asyncio.sleep(0.2)
-    assert await retained(mosquitto.port, 1) == {LIFE: OFFLINE}
+    assert await retained(broker.port, 1) == {LIFE: OFFLINE}
 
 
-async def test_a_daemon_that_leaves_says_offline(mosquitto: MosquittoBroker) -> None:
-    async with running(Link(mosquitto.port)) as link:
+async def test_a_daemon_that_leaves_says_offline(broker: Broker) -> None:
+    async with running(Link(broker.port)) as link:
         await until(lambda: link.publisher.sent > 0)
-    assert await retained(mosquitto.port, 1) == {LIFE: OFFLINE}
+    assert await retained(broker.port, 1) == {LIFE: OFFLINE}
 
 
-async def test_a_predecessors_late_will_does_not_stay(mosquitto: MosquittoBroker) -> None:
-    async with running(Link(mosquitto.port)) as link:
+async def test_a_predecessors_late_will_does_not_stay(broker: Broker) -> None:
+    async with running(Link(broker.port)) as link:
         await until(lambda: bool(link.publisher.figures()["confirmed"]))
-        async with MqttConnection(settings(mosquitto.port)) as other:
+        async with MqttConnection(settings(broker.port)) as other:
             await other.publish(Outgoing(LIFE, OFFLINE, 1, retain=True))
         async with asyncio.timeout(5):
-            while await retained(mosquitto.port, 1) != {LIFE: ONLINE}:
+            while await retained(broker.port, 1) != {LIFE: ONLINE}:
                 await asyncio.sleep(0.05)
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
 async def test_a_retained_command_is_never_run(
-    mosquitto: MosquittoBroker, version: str, caplog: pytest.LogCaptureFixture
+    broker: Broker, version: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     topic = f"{BASE}/bridge/request/calibrate"
-    async with MqttConnection(settings(mosquitto.port)) as operator:
+    port = broker.port_of(version)
+    async with MqttConnection(settings(port, version=version)) as operator:
         await operator.publish(Outgoing(topic, b'{"phase":"abort"}', 1, retain=True))
-        async with running(Link(mosquitto.port, version=version)) as link:
+        async with running(Link(port, version=version)) as link:
             await until(lambda: link.publisher.retained_requests == 1)
             await operator.publish(Outgoing(topic, b'{"phase":"static"}', 1))
             await until(lambda: len(link.requests) == 1)
@@ -205,8 +203,8 @@ async def test_a_retained_command_is_never_run(
 
 
 async def test_with_mqtt_5_even_a_fresh_command_marked_retained_is_not_run(
-    mosquitto: MosquittoBroker,
-) -> None:
+    mosquitto: Broker,
+) -> None:  # "retain as published", which the embedded broker lacks
     async with running(Link(mosquitto.port)) as link:
         await until(lambda: bool(link.publisher.figures()["confirmed"]))
         async with MqttConnection(settings(mosquitto.port)) as operator:
@@ -217,24 +215,24 @@ async def test_with_mqtt_5_even_a_fresh_command_marked_retained_is_not_run(
 
 
 async def test_a_frozen_broker_is_noticed_and_the_queue_stays_bounded(
-    mosquitto: MosquittoBroker,
+    broker: Broker,
 ) -> None:
-    async with running(Link(mosquitto.port)) as link:
+    async with running(Link(broker.port)) as link:
         await until(lambda: link.publisher.connected)
-        mosquitto.freeze()
+        broker.freeze()
         began = time.monotonic()
         while link.publisher.connected:
             link.outbox.stream(f"{BASE}/pose", bytes(600))
             await asyncio.sleep(0.005)
             assert time.monotonic() - began < 12
         assert link.outbox.queued < 600
-        mosquitto.thaw()
+        broker.thaw()
         await until(lambda: link.publisher.connected, 8)
 
 
-async def test_it_stops_under_load_thirty_times_of_thirty(mosquitto: MosquittoBroker) -> None:
+async def test_it_stops_under_load_thirty_times_of_thirty(broker: Broker) -> None:
     for number in range(30):
-        link = Link(mosquitto.port)
+        link = Link(broker.port)
         task = asyncio.create_task(link.publisher.run(), name="publisher")
         await until(lambda link=link: link.publisher.connected)  # type: ignore[misc]
 
@@ -254,20 +252,20 @@ async def test_it_stops_under_load_thirty_times_of_thirty(mosquitto: MosquittoBr
 
 
 async def test_a_broker_without_mqtt_5_gets_a_hint_and_no_silent_fallback(
-    iotcore_broker: IotcoreBroker,
+    embedded_broker: Broker,
 ) -> None:
     with pytest.raises(BrokerLost, match=r'version = "3\.1\.1"'):
-        async with MqttConnection(settings(iotcore_broker.port)):
+        async with MqttConnection(settings(embedded_broker.port_of("3.1.1"))):
             pass
-    async with MqttConnection(settings(iotcore_broker.port, version="3.1.1")):
+    async with MqttConnection(settings(embedded_broker.port_of("3.1.1"), version="3.1.1")):
         pass
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
 async def test_the_embedded_broker_serves_both_versions(
-    iotcore_broker: IotcoreBroker, version: str
+    embedded_broker: Broker, version: str
 ) -> None:
-    port = iotcore_broker.port5 if version == "5" else iotcore_broker.port
+    port = embedded_broker.port_of(version)
     async with running(Link(port, version=version)) as link:
         await until(lambda: bool(link.publisher.figures()["confirmed"]))
         async with MqttConnection(settings(port, version=version)) as watcher:
@@ -279,47 +277,43 @@ async def test_the_embedded_broker_serves_both_versions(
 
 
 async def test_a_forbidden_topic_is_noticed_by_the_self_test(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    start_mosquitto: Callable[[str], Broker],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr("jointfit_daemon.outputs.publisher.ECHO_S", 0.5)
     (tmp_path / "acl").write_text("topic read #\n")
     (tmp_path / "acl").chmod(0o600)
-    broker = MosquittoBroker(tmp_path, more=f"acl_file {tmp_path / 'acl'}\n")
-    broker.start()
-    try:
-        async with running(Link(broker.port)) as link:
-            await until(lambda: link.publisher.connected)
-            await asyncio.sleep(1)
-            assert link.publisher.figures()["confirmed"] is False
-    finally:
-        broker.stop()
+    broker = start_mosquitto(f"acl_file {tmp_path / 'acl'}\n")
+    async with running(Link(broker.port)) as link:
+        await until(lambda: link.publisher.connected)
+        await asyncio.sleep(1)
+        assert link.publisher.figures()["confirmed"] is False
     assert "check its ACL" in caplog.text
 
 
-async def test_a_wrong_password_says_so(tmp_path: Path) -> None:
+async def test_a_wrong_password_says_so(
+    tmp_path: Path, start_mosquitto: Callable[[str], Broker]
+) -> None:
     passwords = tmp_path / "passwords"
     passwords.write_text("")
     passwords.chmod(0o600)
-    broker = MosquittoBroker(tmp_path, more=f"password_file {passwords}\n")
-    broker.start()
+    broker = start_mosquitto(f"password_file {passwords}\n")
     secret = tmp_path / "secret"
     secret.write_text("wrong\n")
-    try:
-        with pytest.raises(BrokerLost, match=r"(?i)not auth|bad user"):
-            async with MqttConnection(
-                settings(broker.port, username="daemon", password_file=str(secret))
-            ):
-                pass
-    finally:
-        broker.stop()
+    login = settings(broker.port, username="daemon", password_file=str(secret))
+    with pytest.raises(BrokerLost, match=r"(?i)not auth|bad user"):
+        async with MqttConnection(login):
+            pass
 
 
 async def test_messages_of_ours_carry_expiry_content_type_and_version(
-    mosquitto: MosquittoBroker,
+    broker: Broker,
 ) -> None:
     async with (
-        aiomqtt.Client("127.0.0.1", mosquitto.port, protocol=aiomqtt.ProtocolVersion.V5) as reader,
-        MqttConnection(settings(mosquitto.port)) as connection,
+        aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as reader,
+        MqttConnection(settings(broker.port)) as connection,
     ):
         await reader.subscribe("#")
         await connection.publish(Outgoing("a", b"{}", expiry_s=2, correlation=b"7"))
@@ -331,8 +325,8 @@ async def test_messages_of_ours_carry_expiry_content_type_and_version(
     assert found["MessageExpiryInterval"] <= 2
 
 
-async def test_a_client_gets_the_answer_to_its_own_request(mosquitto: MosquittoBroker) -> None:
-    link = Link(mosquitto.port)
+async def test_a_client_gets_the_answer_to_its_own_request(broker: Broker) -> None:
+    link = Link(broker.port)
 
     def answer(message: Incoming) -> None:
         asked = orjson.loads(message.payload)
@@ -340,8 +334,8 @@ async def test_a_client_gets_the_answer_to_its_own_request(mosquitto: MosquittoB
             payload = orjson.dumps({"transaction": transaction, "status": "ok", "data": asked})
             link.outbox.event(f"{BASE}/bridge/response/calibrate", payload)
 
-    link.publisher = MqttPublisher(settings(mosquitto.port), link.outbox, answer)
-    async with running(link), MqttClient(settings(mosquitto.port)) as client:
+    link.publisher = MqttPublisher(settings(broker.port), link.outbox, answer)
+    async with running(link), MqttClient(settings(broker.port)) as client:
         await until(lambda: bool(link.publisher.figures()["confirmed"]))
         reply = await client.request("calibrate", {"phase": "static"})
         assert reply["status"] == "ok"
@@ -351,22 +345,22 @@ async def test_a_client_gets_the_answer_to_its_own_request(mosquitto: MosquittoB
             assert await anext(client.messages()) == ("bridge/state", {"state": "online"})
 
 
-async def test_a_client_that_nobody_answers_says_so(mosquitto: MosquittoBroker) -> None:
-    async with MqttClient(settings(mosquitto.port)) as client:
+async def test_a_client_that_nobody_answers_says_so(broker: Broker) -> None:
+    async with MqttClient(settings(broker.port)) as client:
         with pytest.raises(NoAnswer, match="is jointfitd running"):
             await client.request("calibrate", {}, timeout_s=0.2)
 
 
-async def test_a_client_whose_broker_goes_says_so(mosquitto: MosquittoBroker) -> None:
-    async with MqttClient(settings(mosquitto.port)) as client:
-        mosquitto.stop()
+async def test_a_client_whose_broker_goes_says_so(broker: Broker) -> None:
+    async with MqttClient(settings(broker.port)) as client:
+        broker.stop()
         with pytest.raises(BrokerLost):
             await anext(client.messages())
 
 
-async def test_connecting_can_be_given_up_at_any_moment(mosquitto: MosquittoBroker) -> None:
-    mosquitto.freeze()  # connects, never answers
-    connecting = asyncio.create_task(MqttConnection(settings(mosquitto.port)).__aenter__())
+async def test_connecting_can_be_given_up_at_any_moment(broker: Broker) -> None:
+    broker.freeze()  # connects, never answers
+    connecting = asyncio.create_task(MqttConnection(settings(broker.port)).__aenter__())
     await asyncio.sleep(0.2)
     connecting.cancel()
     await asyncio.wait([connecting], timeout=2)

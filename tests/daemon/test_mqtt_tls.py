@@ -14,11 +14,12 @@ from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.config.tables import TlsSettings
 from jointfit_daemon.outputs.mqtt import BrokerLost, MqttConnection
 from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context
-from tests.broker_fixture import MosquittoBroker
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable
     from pathlib import Path
+
+    from tests.broker_fixture import Broker
 
 KEY = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
 HERE = "DNS:localhost,IP:127.0.0.1"
@@ -66,19 +67,16 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def broker(request: pytest.FixtureRequest, pki: Path, tmp_path: Path) -> Iterator[MosquittoBroker]:
-    """Yield a broker with the certificate that the test names, by default a good one."""
-    if shutil.which("mosquitto", path=MosquittoBroker.PATH) is None:
-        pytest.skip("mosquitto is not installed (Debian: apt install mosquitto)")
+def broker(
+    request: pytest.FixtureRequest, pki: Path, start_mosquitto: Callable[[str], Broker]
+) -> Broker:
+    """Return a broker with the certificate that the test names, by default a good one."""
     name, *more = getattr(request, "param", ("broker",))
     listener = f"cafile {pki}/ours.crt\ncertfile {pki}/{name}.crt\nkeyfile {pki}/{name}.key\n"
-    made = MosquittoBroker(tmp_path, more=listener + "".join(f"{line}\n" for line in more))
-    made.start()
-    yield made
-    made.stop()
+    return start_mosquitto(listener + "".join(f"{line}\n" for line in more))
 
 
-def settings(broker: MosquittoBroker, host: str = "127.0.0.1", **tls: Any) -> MqttSettings:
+def settings(broker: Broker, host: str = "127.0.0.1", **tls: Any) -> MqttSettings:
     return MqttSettings(host=host, port=broker.port, base="jointfit/t", tls=TlsSettings(**tls))
 
 
@@ -90,13 +88,13 @@ async def said(settings: MqttSettings) -> str:
     return str(lost.value)
 
 
-async def test_a_broker_of_our_own_authority_is_trusted(broker: MosquittoBroker, pki: Path) -> None:
+async def test_a_broker_of_our_own_authority_is_trusted(broker: Broker, pki: Path) -> None:
     for host in ("127.0.0.1", "localhost"):
         async with MqttConnection(settings(broker, host, ca=str(pki / "ours.crt"))) as connection:
             assert await connection.subscribe(["jointfit/t/bridge/state"]) == []
 
 
-async def test_an_unknown_authority_is_refused(broker: MosquittoBroker, pki: Path) -> None:
+async def test_an_unknown_authority_is_refused(broker: Broker, pki: Path) -> None:
     for ca in (str(pki / "theirs.crt"), None):
         told = await said(settings(broker, ca=ca))
         assert "not signed by what" in told
@@ -104,27 +102,27 @@ async def test_an_unknown_authority_is_refused(broker: MosquittoBroker, pki: Pat
 
 
 @pytest.mark.parametrize("broker", [("expired",)], indirect=True)
-async def test_an_expired_certificate_is_refused(broker: MosquittoBroker, pki: Path) -> None:
+async def test_an_expired_certificate_is_refused(broker: Broker, pki: Path) -> None:
     assert "has expired: renew it" in await said(settings(broker, ca=str(pki / "ours.crt")))
 
 
 @pytest.mark.parametrize("broker", [("elsewhere",)], indirect=True)
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
 async def test_a_certificate_of_another_host_is_refused(
-    broker: MosquittoBroker, pki: Path, host: str
+    broker: Broker, pki: Path, host: str
 ) -> None:
     told = await said(settings(broker, host, ca=str(pki / "ours.crt")))
     assert f"for another name than {host}" in told
 
 
-async def test_a_listener_without_tls_is_told(mosquitto: MosquittoBroker, pki: Path) -> None:
+async def test_a_listener_without_tls_is_told(mosquitto: Broker, pki: Path) -> None:
     told = await said(settings(mosquitto, ca=str(pki / "ours.crt")))
     assert "does not answer to TLS" in told
 
 
 @pytest.mark.parametrize("broker", [("broker", "require_certificate true")], indirect=True)
 async def test_a_broker_that_asks_for_a_certificate_takes_ours_and_no_strangers(
-    broker: MosquittoBroker, pki: Path
+    broker: Broker, pki: Path
 ) -> None:
     ca = str(pki / "ours.crt")
 

@@ -21,11 +21,13 @@ from jointfit_daemon.outputs.mqtt_client import MqttClient
 from jointfit_daemon.outputs.mqtt_secrets import exposures, password_of
 from jointfit_daemon.outputs.outbox import Outbox
 from jointfit_daemon.outputs.publisher import MqttPublisher
-from tests.broker_fixture import MosquittoBroker
+from tests.broker_fixture import MOSQUITTO_MISSING, MosquittoBroker
 from tests.daemon import fake_drivers
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+
+    from tests.broker_fixture import Broker
 
 PROJECT = Path(__file__).resolve().parents[2]
 PASSWORD, KEY = "correct-horse-battery", "b7f3c1d92e85a640b7f3c1d92e85a640"
@@ -41,23 +43,19 @@ request_key_file = "key"
 
 
 @pytest.fixture
-def broker(tmp_path: Path) -> Iterator[MosquittoBroker]:
-    """Yield a broker that lets nobody in without the password."""
+def broker(tmp_path: Path, start_mosquitto: Callable[[str], Broker]) -> Broker:
+    """Return a broker that lets nobody in without the password."""
     program = shutil.which("mosquitto_passwd", path=MosquittoBroker.PATH)
     if program is None:
-        pytest.skip("mosquitto is not installed (Debian: apt install mosquitto)")
+        pytest.skip(MOSQUITTO_MISSING)
     passwords = tmp_path / "passwords"
     subprocess.run([program, "-b", "-c", str(passwords), "jointfitd", PASSWORD], check=True)
     passwords.chmod(0o600)
-    more = f"allow_anonymous false\npassword_file {passwords}\n"
-    made = MosquittoBroker(tmp_path, more=more)
-    made.start()
-    yield made
-    made.stop()
+    return start_mosquitto(f"allow_anonymous false\npassword_file {passwords}\n")
 
 
 @pytest.fixture
-def folder(tmp_path: Path, broker: MosquittoBroker) -> Path:
+def folder(tmp_path: Path, broker: Broker) -> Path:
     """Return the folder of a rig with its secrets."""
     for name, secret in (("password", PASSWORD), ("key", KEY)):
         (tmp_path / name).write_text(secret + "\n")
@@ -67,7 +65,7 @@ def folder(tmp_path: Path, broker: MosquittoBroker) -> Path:
     return tmp_path
 
 
-async def everything_published(broker: MosquittoBroker, folder: Path) -> bytes:
+async def everything_published(broker: Broker, folder: Path) -> bytes:
     """Return all topics and payloads of the first second, having asked for something, too."""
     settings = MqttSettings(
         host="127.0.0.1", port=broker.port, base="jointfit/bench", username="jointfitd",
@@ -129,7 +127,7 @@ def kept(folder: Path) -> bytes:
 
 @pytest.mark.system
 async def test_no_secret_is_in_arguments_environment_log_topics_or_recording(
-    broker: MosquittoBroker, folder: Path, daemon: subprocess.Popen[bytes]
+    broker: Broker, folder: Path, daemon: subprocess.Popen[bytes]
 ) -> None:
     published = await everything_published(broker, folder)
     seen = seen_from_outside(daemon)

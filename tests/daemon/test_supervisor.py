@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.pipeline.events import Event, Output
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
     from tests.daemon.fake_drivers import FakeImu
 
 
@@ -227,9 +227,9 @@ async def test_configuration_comes_first_and_time_never_stops(
 
 
 async def test_it_stops_under_load_thirty_times_of_thirty(
-    table: dict[str, Any], tmp_path: Path, mosquitto: MosquittoBroker, fakes: type[FakeImu]
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
-    fast = small(table, mosquitto.port)
+    fast = small(table, broker.port)
     for imu in fast["imu"]:
         imu["rate_hz"] = 400
     for number in range(30):
@@ -248,9 +248,9 @@ async def test_without_a_broker_it_runs_and_stops(
 
 
 async def test_a_reload_restarts_only_what_changed(
-    table: dict[str, Any], tmp_path: Path, mosquitto: MosquittoBroker, fakes: type[FakeImu]
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
-    rig = small(table, mosquitto.port)
+    rig = small(table, broker.port)
     core = RecordingCore()
     async with daemon(rig, tmp_path, core):
         await until(lambda: len(fakes.running) == 2)
@@ -271,12 +271,12 @@ async def test_a_reload_restarts_only_what_changed(
 
 
 async def test_a_bad_file_changes_nothing_and_says_why(
-    table: dict[str, Any], tmp_path: Path, mosquitto: MosquittoBroker, fakes: type[FakeImu]
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
-    rig = parse_rig(small(table, mosquitto.port))
+    rig = parse_rig(small(table, broker.port))
     core = RecordingCore()
     async with (
-        daemon(small(table, mosquitto.port), tmp_path, core),
+        daemon(small(table, broker.port), tmp_path, core),
         MqttClient(rig.mqtt) as client,
     ):
         await client.subscribe("bridge/event")
@@ -294,9 +294,9 @@ async def test_a_bad_file_changes_nothing_and_says_why(
 
 
 async def test_a_reload_to_another_base_takes_the_retained_state_along(
-    table: dict[str, Any], tmp_path: Path, mosquitto: MosquittoBroker, fakes: type[FakeImu]
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
-    rig = small(table, mosquitto.port)
+    rig = small(table, broker.port)
     async with daemon(rig, tmp_path):
         await until(lambda: len(fakes.running) == 2)
         rig["mqtt"]["base"] = "moved/rig"
@@ -313,12 +313,12 @@ async def test_a_reload_to_another_base_takes_the_retained_state_along(
 
 
 async def test_requests_are_answered_once_and_all_their_faults_told(
-    table: dict[str, Any], tmp_path: Path, mosquitto: MosquittoBroker
+    table: dict[str, Any], tmp_path: Path, broker: Broker
 ) -> None:
-    rig = parse_rig(small(table, mosquitto.port))
+    rig = parse_rig(small(table, broker.port))
     core = RecordingCore()
     async with (
-        daemon(small(table, mosquitto.port), tmp_path, core),
+        daemon(small(table, broker.port), tmp_path, core),
         MqttClient(rig.mqtt) as client,
     ):
         await client.subscribe("bridge/state")
@@ -343,9 +343,9 @@ async def test_requests_are_answered_once_and_all_their_faults_told(
 
 
 async def test_a_run_of_the_real_core_gives_poses_and_health(
-    table: dict[str, Any], tmp_path: Path, mosquitto: MosquittoBroker
+    table: dict[str, Any], tmp_path: Path, broker: Broker
 ) -> None:
-    rig = small(table, mosquitto.port)
+    rig = small(table, broker.port)
     seqs: list[int] = []
     async with daemon(rig, tmp_path), MqttClient(parse_rig(rig).mqtt) as client:
         await client.subscribe("pose", "bridge/health", "device/+/availability")
@@ -522,8 +522,8 @@ async def test_a_cancelled_fit_is_killed_and_not_heard_of() -> None:
     assert await fit("static", cancel_after_s=0.05) == []
 
 
-async def test_a_request_to_nobody_is_harmless(mosquitto: MosquittoBroker) -> None:
+async def test_a_request_to_nobody_is_harmless(broker: Broker) -> None:
     from jointfit_daemon.config import MqttSettings  # noqa: PLC0415 - here only
 
-    async with MqttConnection(MqttSettings(host="127.0.0.1", port=mosquitto.port)) as connection:
+    async with MqttConnection(MqttSettings(host="127.0.0.1", port=broker.port)) as connection:
         await connection.publish(Outgoing("x/bridge/request/calibrate", b"{}", 1))

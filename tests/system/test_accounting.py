@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.tools.demo_processes import Simulator
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
     from tests.system.station import Listener
 
 pytestmark = pytest.mark.system
@@ -41,10 +41,8 @@ async def replugged(simulator: Simulator, listener: Listener, name: str, *worn: 
 
 
 @pytest.mark.timeout(60)
-async def test_every_sample_of_a_noisy_run_has_one_verdict(
-    tmp_path: Path, mosquitto: MosquittoBroker
-) -> None:
-    station = Station(tmp_path, mosquitto.port, options=NOISY)
+async def test_every_sample_of_a_noisy_run_has_one_verdict(tmp_path: Path, broker: Broker) -> None:
+    station = Station(tmp_path, broker.port, options=NOISY)
     async with running(station) as (simulator, _, listener):
         await asyncio.sleep(3)
         await replugged(simulator, listener, "S1", "S1")
@@ -65,10 +63,10 @@ async def test_every_sample_of_a_noisy_run_has_one_verdict(
 
 @pytest.mark.timeout(60)
 async def test_without_line_noise_all_that_was_sent_is_received_and_the_rest_known_lost(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    station = Station(tmp_path, mosquitto.port, options=QUIET)
-    async with station.simulator() as simulator, station.daemon(), listening(mosquitto.port) as ear:
+    station = Station(tmp_path, broker.port, options=QUIET)
+    async with station.simulator() as simulator, station.daemon(), listening(broker.port) as ear:
         await ear.connected({*SENSORS, "mocap"})
         await asyncio.sleep(6)
         said = await simulator.quit()

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system
 
@@ -215,10 +215,10 @@ EXPECTED = {
 
 @pytest.mark.timeout(60)
 async def test_each_fault_is_named_with_its_remedy_and_the_rest_runs(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    async with plugged_in(tmp_path) as hardware, listening(mosquitto.port) as listener:
-        rig = write_rig(tmp_path, mosquitto.port, hardware.server.command_port)
+    async with plugged_in(tmp_path) as hardware, listening(broker.port) as listener:
+        rig = write_rig(tmp_path, broker.port, hardware.server.command_port)
         calibrate(rig, tmp_path / "state")
         async with daemon(tmp_path, rig) as child:
             await listener.until(

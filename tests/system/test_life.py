@@ -21,7 +21,7 @@ from tests.system.station import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system
 
@@ -45,44 +45,42 @@ async def retained(port: int, count: int) -> dict[str, Any]:
 
 @pytest.mark.timeout(60)
 async def test_sigterm_under_load_stops_in_time_and_leaves_everything_offline(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    station = Station(tmp_path, mosquitto.port, options=("--rate", "400"))
+    station = Station(tmp_path, broker.port, options=("--rate", "400"))
     async with running(station) as (_, daemon, listener):
         await listener.more_poses(100)
         code, took_s = await stopped(daemon)
         assert code == 0, station.log
         assert took_s < 5
-    left = await retained(mosquitto.port, 3 + len(EVERYONE))
+    left = await retained(broker.port, 3 + len(EVERYONE))
     assert left["bridge/state"] == OFFLINE
     assert {name for name in EVERYONE if left[f"device/{name}/availability"] == OFFLINE} == EVERYONE
     assert "Traceback" not in station.log
 
 
 @pytest.mark.timeout(60)
-async def test_the_broker_may_come_late_and_restart(
-    tmp_path: Path, mosquitto: MosquittoBroker
-) -> None:
-    mosquitto.stop()
-    station = Station(tmp_path, mosquitto.port)
+async def test_the_broker_may_come_late_and_restart(tmp_path: Path, broker: Broker) -> None:
+    broker.stop()
+    station = Station(tmp_path, broker.port)
     async with (
         station.simulator(),
         station.daemon() as daemon,
-        listening(mosquitto.port) as listener,
+        listening(broker.port) as listener,
     ):
         await asyncio.sleep(2.5)
         daemon.check()
         for _ in range(2):
             listener.latest.clear()
-            mosquitto.start()  # without anything retained: mosquitto forgets when it is killed
+            broker.start()  # nothing is retained: it was killed
             await listener.connected(EVERYONE, 8)
             await listener.more_poses(50)
-            found = await retained(mosquitto.port, 3 + len(EVERYONE))
+            found = await retained(broker.port, 3 + len(EVERYONE))
             assert found["bridge/state"] == ONLINE
             assert found["bridge/info"]["rig"] == "demo"
             assert found["calibration"]["phase"] == "uncalibrated"
             assert all(found[f"device/{name}/availability"] == ONLINE for name in EVERYONE)
-            mosquitto.stop()
+            broker.stop()
             await asyncio.sleep(0.5)
         code, _ = await stopped(daemon)
         assert code == 0, station.log
@@ -91,16 +89,16 @@ async def test_the_broker_may_come_late_and_restart(
 
 @pytest.mark.timeout(60)
 async def test_a_killed_simulator_and_a_broken_reload_cost_only_what_was_lost(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    station = Station(tmp_path, mosquitto.port)
+    station = Station(tmp_path, broker.port)
     async with station.simulator() as first, station.daemon() as daemon:
-        async with listening(mosquitto.port) as listener:
+        async with listening(broker.port) as listener:
             await listener.connected(EVERYONE)
             assert first.process is not None
             first.process.kill()
             await listener.until(lambda: not listener.online)
-            async with Station(tmp_path, mosquitto.port).simulator():
+            async with Station(tmp_path, broker.port).simulator():
                 await listener.connected(set(SENSORS), 2.5)
                 await broken_reload(station, listener, daemon)
                 station.write_rig()  # cameras came back on another port

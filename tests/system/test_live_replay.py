@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.tools.demo_processes import Child, Simulator
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system
 
@@ -55,9 +55,9 @@ async def reloaded(station: Station, daemon: Child, listener: Listener) -> None:
 
 @pytest.mark.timeout(120)
 async def test_a_run_with_calibration_reconnect_and_reload_replays_byte_for_byte(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    station = Station(tmp_path, mosquitto.port, more_toml="[recording]\n")
+    station = Station(tmp_path, broker.port, more_toml="[recording]\n")
     async with running(station) as (simulator, daemon, listener):
         await calibrated(simulator, listener)
         assert listener.latest["calibration"]["phase"] == "calibrated"

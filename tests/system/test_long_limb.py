@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
     from tests.system.station import Listener
 
 pytestmark = pytest.mark.system
@@ -85,10 +85,10 @@ async def errors_deg(scene: Scene, listener: Listener, folder: Path) -> dict[str
 
 @pytest.mark.timeout(120)
 async def test_a_chain_of_three_with_six_sensors_is_calibrated_followed_and_put_on_anew(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    station = Station(tmp_path, mosquitto.port)
-    async with played(tmp_path, mosquitto.port) as scene:
+    station = Station(tmp_path, broker.port)
+    async with played(tmp_path, broker.port) as scene:
         station.write_rig(*CHAIN)
         async with station.daemon(), listening(station.port) as listener:
             await listener.connected({*SENSORS, "mocap"})

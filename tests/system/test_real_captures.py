@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
 
@@ -92,7 +92,7 @@ class Heard:
 
 @asynccontextmanager
 async def gateway(
-    folder: Path, broker: MosquittoBroker, device: XbusReplay, server: NatNetReplay | None = None
+    folder: Path, broker: Broker, device: XbusReplay, server: NatNetReplay | None = None
 ) -> AsyncIterator[Heard]:
     """Run the daemon on a device and perhaps a server of recordings; yield what is heard of it."""
     rig = folder / "rig.toml"
@@ -120,12 +120,12 @@ def xsens(shared_data: Path, number: int) -> bytes:
 
 
 async def test_real_quaternions_and_real_camera_frames_are_counted_to_the_last_one(
-    tmp_path: Path, shared_data: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, shared_data: Path, broker: Broker
 ) -> None:
     device = XbusReplay(tmp_path / "imu", xsens(shared_data, 5))
     traffic = shared_data / "mocap/natnet_v3_mje-nz/test_data/raw/traffic.pcapng"
     server = NatNetReplay((p.t_ns, p.payload) for p in read_udp(traffic.read_bytes()))
-    async with gateway(tmp_path, mosquitto, device, server) as heard:
+    async with gateway(tmp_path, broker, device, server) as heard:
         began = time.monotonic()
         await device.play()
         took_s = time.monotonic() - began
@@ -154,10 +154,10 @@ async def test_real_quaternions_and_real_camera_frames_are_counted_to_the_last_o
 
 @pytest.mark.parametrize("number", [1, 3])
 async def test_a_real_stream_without_quaternions_gives_no_sample_and_no_corruption(
-    tmp_path: Path, shared_data: Path, mosquitto: MosquittoBroker, number: int
+    tmp_path: Path, shared_data: Path, broker: Broker, number: int
 ) -> None:
     device = XbusReplay(tmp_path / "imu", xsens(shared_data, number))
-    async with gateway(tmp_path, mosquitto, device) as heard:
+    async with gateway(tmp_path, broker, device) as heard:
         await device.play()
         assert device.sent == 100
         await heard.until(lambda: any("silent for 1 s" in text for text in heard.texts))

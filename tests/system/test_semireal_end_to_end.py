@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from bench.end_to_end import Played
     from jointfit_daemon.calibration.trial import Method
-    from tests.broker_fixture import MosquittoBroker
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
@@ -33,8 +32,7 @@ def knee(shared_data: Path) -> Squats:
 
 
 @pytest.fixture
-def played(shared_data: Path, mosquitto: MosquittoBroker) -> dict[tuple[str, Method], Played]:
-    mosquitto.stop()  # the run starts its own; without mosquitto this test is skipped
+def played(shared_data: Path) -> dict[tuple[str, Method], Played]:
     return end_to_end.run(shared_data, METHODS)
 
 

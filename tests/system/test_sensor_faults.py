@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.tools.demo_processes import Simulator
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system
 
@@ -70,15 +70,15 @@ def longest_pause_s(poses: list[dict[str, Any]]) -> float:
 
 @pytest.mark.timeout(90)
 async def test_sensors_that_fail_are_told_lived_through_and_told_to_be_back(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
     calibration = fitted(bench_rig())  # of the very wearer whom the simulator plays
     programme = ("--seed", "1", "--no-mocap", "--programme", "walk:600")
-    station = Station(tmp_path, mosquitto.port, options=programme)
+    station = Station(tmp_path, broker.port, options=programme)
     async with station.simulator() as simulator:
         store = load_rig(station.rig).calibration_store
         CalibrationStore(tmp_path / "state" / "calibrations", store).save(calibration)
-        async with station.daemon(), listening(mosquitto.port) as listener:
+        async with station.daemon(), listening(broker.port) as listener:
             await listener.connected({"S1", "S2", "S3", "S4"})
             await listener.until(lambda: listener.poses and listener.poses[-1]["sync"] == "locked")
             healthy = await listener.more_poses(150)

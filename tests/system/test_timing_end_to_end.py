@@ -12,7 +12,7 @@ from bench.stamp_truth import OPTICAL
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system
 
@@ -25,10 +25,8 @@ MOST_PTP_ERROR_NS = 50_000
 
 
 @pytest.mark.timeout(180)
-async def test_time_is_right_in_every_frame_that_says_so(
-    tmp_path: Path, mosquitto: MosquittoBroker
-) -> None:
-    found = await live(tmp_path, mosquitto.port, ("S1", OPTICAL), rest_s=1.0)
+async def test_time_is_right_in_every_frame_that_says_so(tmp_path: Path, broker: Broker) -> None:
+    found = await live(tmp_path, broker.port, ("S1", OPTICAL), rest_s=1.0)
     assert found.replayed
     assert found.unknown < 0.01
     for source in EVERY:
@@ -44,11 +42,9 @@ async def test_time_is_right_in_every_frame_that_says_so(
 
 
 @pytest.mark.timeout(180)
-async def test_a_wired_sync_line_takes_even_the_delay_out(
-    tmp_path: Path, mosquitto: MosquittoBroker
-) -> None:
+async def test_a_wired_sync_line_takes_even_the_delay_out(tmp_path: Path, broker: Broker) -> None:
     """Stamps of a tied clock are right without anybody knowing what the transport takes."""
-    found = await live(tmp_path, mosquitto.port, (), rest_s=9.0, more=("--sync-line",))
+    found = await live(tmp_path, broker.port, (), rest_s=9.0, more=("--sync-line",))
     assert found.replayed
     for source in ("S1", "S3"):
         errors = found.errors_ns(source, "direct")
@@ -58,11 +54,9 @@ async def test_a_wired_sync_line_takes_even_the_delay_out(
 
 
 @pytest.mark.timeout(180)
-async def test_cameras_on_ptp_need_no_echo_and_no_settling(
-    tmp_path: Path, mosquitto: MosquittoBroker
-) -> None:
+async def test_cameras_on_ptp_need_no_echo_and_no_settling(tmp_path: Path, broker: Broker) -> None:
     """The daemon knows its own UNIX time, and that is what cameras on PTP stamp frames with."""
-    found = await live(tmp_path, mosquitto.port, (), rest_s=3.0, more=("--ptp",))
+    found = await live(tmp_path, broker.port, (), rest_s=3.0, more=("--ptp",))
     assert found.replayed
     errors = found.errors_ns(OPTICAL, "direct")
     assert len(errors) > 500

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from tests.broker_fixture import MosquittoBroker
+    from tests.broker_fixture import Broker
     from tests.system.station import Listener
 
 pytestmark = pytest.mark.system
@@ -116,10 +116,10 @@ async def knee_error_deg(listener: Listener, folder: Path) -> float:
 
 @pytest.mark.timeout(120)
 async def test_worlds_a_right_angle_apart_are_aligned_or_the_assumption_is_said(
-    tmp_path: Path, mosquitto: MosquittoBroker
+    tmp_path: Path, broker: Broker
 ) -> None:
-    station = Station(tmp_path, mosquitto.port)
-    async with played(tmp_path, mosquitto.port) as simulator:
+    station = Station(tmp_path, broker.port)
+    async with played(tmp_path, broker.port) as simulator:
         station.write_rig()
         await calibrated_twice(station, simulator)
     assert "the worker said" not in station.log  # fits print nothing
