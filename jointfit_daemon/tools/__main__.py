@@ -14,6 +14,7 @@ from jointfit_daemon.tools import (
     fuse,
     markers,
     report,
+    sample,
     schema,
 )
 
@@ -32,6 +33,7 @@ app.command(name="decode")(decode.decode)
 app.add_typer(fuse.app)
 app.command(name="markers")(markers.markers)
 app.command(name="report")(report.report)
+app.command(name="sample")(sample.sample)
 app.command(name="schema")(schema.schema)
 
 

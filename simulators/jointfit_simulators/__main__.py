@@ -29,6 +29,7 @@ from jointfit_simulators.motion import MOTIONS
 from jointfit_simulators.programme import UnknownMotion, parse_programme
 from jointfit_simulators.replayed import Replayed
 from jointfit_simulators.rig_file import RigOptions
+from jointfit_simulators.sample_data import write_sample
 from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
 from jointfit_simulators.settings import Knobs, knobs_from_toml, perfect, turn
 from jointfit_simulators.trial import read_recording
@@ -64,6 +65,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("knobs", help="list every knob with its default")
     commands.add_parser("motions", help="list every motion")
+    sample = commands.add_parser("sample", help="write short trials, a model, captures and a rig")
+    sample.add_argument("folder", type=Path, help="made when absent; must be empty")
+    sample.add_argument("--seed", type=int, default=1, help="another seed is another wearer")
+    sample.add_argument(
+        "--force", action="store_true", help="write into a folder that is not empty"
+    )
     play = commands.add_parser(
         "play", help="play a scene until told to quit", epilog=COMMANDS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -198,6 +205,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say({"motions": list(MOTIONS)})
     else:
         try:
+            if options.command == "sample":
+                _say(
+                    {"files": write_sample(options.folder, seed=options.seed, force=options.force)}
+                )
+                return 0
             with asyncio.Runner(loop_factory=_punctual_loop) as runner:
                 runner.run(_play(options))
         except (ValueError, UnknownMotion, OSError) as error:
