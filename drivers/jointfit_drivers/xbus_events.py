@@ -7,10 +7,10 @@ where bytes take no time, that of the chunk.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
-from jointfit_drivers.xbus_continuity import Continuity
+from jointfit_drivers.xbus_continuity import Continuity, Step
 from jointfit_drivers.xbus_raw import RAW, Message
 from jointfit_drivers.xbus_sync import describe
 from jointfit_protocols import xbus_messages as setup
@@ -35,6 +35,16 @@ _QUATERNION = int(Item.QUATERNION)
 _STATUS_BYTE, _STATUS_WORD = int(Item.STATUS_BYTE), int(Item.STATUS_WORD)
 _WANTED = {_COUNTER, _TIME, _QUATERNION, _STATUS_BYTE, _STATUS_WORD}
 _ALIGNED = ("sensor", "local")
+
+
+class _Orientation(NamedTuple):
+    """A message with an orientation, not judged yet."""
+
+    message: XbusMessage
+    arrived_ns: int
+    values: Mapping[int, Any]
+    world_id: int
+    pulses: list[Decoded]
 
 
 class XbusEvents:
@@ -68,6 +78,7 @@ class XbusEvents:
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
         self._continuity = Continuity(rate_hz)
+        self._held: _Orientation | None = None
         self._tick_clock = TickClock(setup.TICK_NS, setup.WRAP_32_BIT)
         self._gate = OrientationGate()
         self._last_ns = self._arrival_ns = 0
@@ -98,14 +109,14 @@ class XbusEvents:
         if self._xbus.pending:
             quiet_ns = chunk.t_ns - self._last_ns - len(chunk.data) * self._byte_ns
             if quiet_ns > self._silence_ns:  # the rest of what waits will never come
-                out = self.flush()
+                out = self._take(self._xbus.flush())
         self._last_ns = chunk.t_ns
         found = self._xbus.feed(chunk.data)
         return out + self._take(found) if found else out
 
     def flush(self) -> list[Decoded]:
-        """Give up waiting for the rest of a pending message."""
-        return self._take(self._xbus.flush())
+        """Give up waiting: for the rest of a pending message, and for what would confirm one."""
+        return self._take(self._xbus.flush()) + self._drop_held()
 
     def _take(self, found: list[XbusMessage | WireCorrupt]) -> list[Decoded]:
         out: list[Decoded] = []
@@ -155,45 +166,71 @@ class XbusEvents:
     def _said(
         self, message: XbusMessage, values: Mapping[int, Any], world_id: int
     ) -> list[Decoded]:
-        """Return the sample of the items of an MTData2, after what its counter and time say."""
-        counter: int | None = values.get(_COUNTER)
-        if counter is not None:
-            self._continuity.message(counter)
+        """Return what the items of an MTData2 give, after what its counter and time show."""
+        raw = self._raw
         pulses = self._pulses(message, values) if self._wires else []
-        if self._raw is not None:
-            return pulses + self._felt(message, values, self._raw)
-        native: Quaternion | None = values.get(_QUATERNION)
-        if native is None:
+        ticks: int | None = values.get(_TIME)
+        if raw is None:
+            is_orientation = _QUATERNION in values
+        else:  # a message without either, as of a receiver, gives no orientation
+            is_orientation = ticks is not None and raw.is_complete(values)
+        if not is_orientation:
+            self._continuity.other()
             return pulses
         self._measuring = True
+        arrived_ns = self._arrived(message)
+        step = self._continuity.orientation(values.get(_COUNTER), ticks, arrived_ns)
+        orientation = _Orientation(message, arrived_ns, values, world_id, pulses)
+        return self._continue(step, orientation)
+
+    def _continue(self, step: Step, orientation: _Orientation) -> list[Decoded]:
+        """Return `orientation`, and what becomes of the one that was held for it."""
+        held, self._held = self._held, orientation if step.held else None
+        out: list[Decoded] = []
+        if held is not None and not step.confirmed:
+            out.append(self._refuse(held.message, "counter and time contradict the others"))
+        if step.held:
+            return out
+        if step.restarted and held is not None:
+            self._forget_orientation()
+            text = f"its clock began anew at {held.values.get(_TIME)} ticks"
+            out.append(DeviceEvent("restart", text))
+        out += _gap(step.lost)
+        if held is not None and step.confirmed:
+            out += self._measured(held)
+            out += _gap(step.lost_since)
+        return out + self._measured(orientation)
+
+    def _measured(self, orientation: _Orientation) -> list[Decoded]:
+        """Return the sample of an orientation that belongs to the stream."""
+        message, arrived_ns, values, world_id, pulses = orientation
         ticks: int | None = values.get(_TIME)
+        counter: int | None = values.get(_COUNTER)
+        if self._raw is not None and ticks is not None:
+            return pulses + self._felt(orientation, ticks, self._raw)
+        native: Quaternion = values[_QUATERNION]
         status: int | None = values.get(_STATUS_WORD, values.get(_STATUS_BYTE))
-        out = self._continued(ticks)
-        out += pulses
+        out = pulses
         world = world_of(world_id) or "ENU"
         q = self._gate.admit(native if world == "ENU" else canonical(native, world))
         if q is None:
             out.append(self._refuse(message, "quaternion norm is not 1"))
         else:
-            out.append(ImuSample(self._arrived(message), q, native, ticks, counter, status))
+            out.append(ImuSample(arrived_ns, q, native, ticks, counter, status))
         if not self._judged:
             out += self._judge()
         return out
 
-    def _felt(self, message: XbusMessage, values: Mapping[int, Any], raw: XbusRaw) -> list[Decoded]:
-        """Return what raw readings give; nothing for a message without, as of a receiver."""
-        ticks: int | None = values.get(_TIME)
-        if ticks is None or not raw.is_complete(values):
-            return []
-        self._measuring = True
-        out = self._continued(ticks)
-        counter: int | None = values.get(_COUNTER)
-        status: int | None = values.get(_STATUS_WORD)
-        said = Message(self._arrived(message), ticks, counter, status)
+    def _felt(self, orientation: _Orientation, ticks: int, raw: XbusRaw) -> list[Decoded]:
+        """Return what raw readings give."""
+        values = orientation.values
+        said = Message(
+            orientation.arrived_ns, ticks, values.get(_COUNTER), values.get(_STATUS_WORD)
+        )
         found = raw.samples(said, values, self.tick_clock.modulus or setup.WRAP_32_BIT)
         if found is None:
-            return [*out, self._refuse(message, "raw readings that no sensor gives")]
-        return out + found
+            return [self._refuse(orientation.message, "raw readings that no sensor gives")]
+        return found
 
     def _pulses(self, message: XbusMessage, values: Mapping[int, object]) -> list[Decoded]:
         """Return the edges that a message tells of."""
@@ -203,16 +240,6 @@ class XbusEvents:
             for wire, edge in found
             if isinstance(edge, Trigger)
         ]
-
-    def _continued(self, ticks: int | None) -> list[Decoded]:
-        """Return a gap or a restart, if there was one."""
-        lost, restarted = self._continuity.orientation(ticks)
-        if restarted:
-            self._forget_orientation()
-            return [DeviceEvent("restart", f"its clock began anew at {ticks} ticks")]
-        if lost:
-            return [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})]
-        return []
 
     def _forget_orientation(self) -> None:
         self._gate.forget()
@@ -236,7 +263,7 @@ class XbusEvents:
         """Return what a message other than a measurement says."""
         mid, data = message.mid, message.data
         if mid == MessageId.WAKE_UP:
-            return self._woke()
+            return [] if data else self._woke()  # a damaged measurement has data
         if mid in {MessageId.ERROR, MessageId.WARNING}:
             code = data[0] if data else 0
             kind = "error" if mid == MessageId.ERROR else "warning"
@@ -249,12 +276,24 @@ class XbusEvents:
 
     def _woke(self) -> list[Decoded]:
         """Return a restart if the device had been measuring: it lost power, or was reset."""
+        out = self._drop_held()
         self._continuity.forget()
         self._forget_orientation()
-        if not self._measuring:
+        if self._measuring:
+            self._measuring = False
+            out.append(DeviceEvent("restart", "it woke up anew"))
+        return out
+
+    def _drop_held(self) -> list[Decoded]:
+        """Return the loss of an orientation that nothing confirmed."""
+        held, self._held = self._held, None
+        if held is None:
             return []
-        self._measuring = False
-        return [DeviceEvent("restart", "it woke up anew")]
+        return [self._refuse(held.message, "counter and time contradict the others")]
+
+
+def _gap(lost: int) -> list[Decoded]:
+    return [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})] if lost else []
 
 
 def _info(mid: int, data: bytes) -> dict[str, object]:

@@ -162,8 +162,11 @@ def test_the_clock_wraps_where_the_model_says_or_where_it_is_seen(
 
 
 def test_time_that_falls_is_a_restart_and_no_gap() -> None:
-    events = fed(decoder(), message(500, 70_000), message(501, 70_100), message(0, 100))
+    events = fed(
+        decoder(), message(500, 70_000), message(501, 70_100), message(0, 100), message(1, 200)
+    )
     assert [kind for kind, _ in told(events)] == ["restart"]
+    assert [one.counter for one in samples(events)] == [500, 501, 0, 1]
 
 
 def test_stale_messages_before_fresh_ones_are_a_gap_in_the_same_clock() -> None:
@@ -172,7 +175,13 @@ def test_stale_messages_before_fresh_ones_are_a_gap_in_the_same_clock() -> None:
 
 
 def test_time_that_leaps_without_the_counter_is_a_restart() -> None:
-    events = fed(decoder(), message(10, 1_000), message(11, 1_100), message(12, 601_100))
+    events = fed(
+        decoder(),
+        message(10, 1_000),
+        message(11, 1_100),
+        message(12, 601_100),
+        message(13, 601_200),
+    )
     assert [kind for kind, _ in told(events)] == ["restart"]
 
 
@@ -186,30 +195,89 @@ def test_waking_up_is_a_restart_once_it_has_measured() -> None:
 @given(st.integers(0, 65535), st.integers(0, 2**31), st.lists(st.integers(0, 400), max_size=60))
 def test_whatever_is_lost_is_counted_exactly(counter: int, ticks: int, losses: list[int]) -> None:
     follow = Continuity(100.0)
-    follow.message(counter)
-    assert follow.orientation(ticks) == Step(0, restarted=False)
+    assert follow.orientation(counter, ticks, 0) == Step()
     for lost in losses:
         counter, ticks = (counter + lost + 1) % 65536, ticks + 100 * (lost + 1)
-        follow.message(counter)
-        assert follow.orientation(ticks) == Step(lost, restarted=False)
+        assert follow.orientation(counter, ticks, 0) == Step(lost)
 
 
-@given(st.integers(0, 10_000), st.integers(10_001, 2**31))
-def test_a_reset_clock_is_always_a_restart(after: int, before: int) -> None:
-    follow, steps = Continuity(100.0), []
-    for counter, ticks in enumerate((before - 100, before, after)):
-        follow.message(counter)
-        steps.append(follow.orientation(ticks).restarted)
-    assert steps == [False, False, True]
+@given(st.integers(0, 10_000), st.integers(13_000, 2**31))
+def test_a_reset_clock_is_a_restart_as_soon_as_a_second_message_says_so(
+    after: int, before: int
+) -> None:
+    follow = Continuity(100.0)
+    ticks = (before - 100, before, after, after + 100)
+    steps = [follow.orientation(counter, at, 0) for counter, at in enumerate(ticks)]
+    assert [step.restarted for step in steps] == [False, False, False, True]
+    assert steps[2].held
+    assert steps[3].confirmed
 
 
 def test_a_device_at_another_rate_than_asked_does_not_restart() -> None:
     follow = Continuity(100.0)
     for number in range(100):
-        follow.message(number)
-        assert not follow.orientation(200 * number).restarted
-    follow.message(1099)
-    assert follow.orientation(200 * 1099) == Step(999, restarted=False)
+        assert not follow.orientation(number, 200 * number, 0).restarted
+    assert follow.orientation(1099, 200 * 1099, 0) == Step(999)
+
+
+def test_time_that_stands_still_and_goes_on_is_no_bug() -> None:
+    wires = [message(number, 1_000) for number in range(30)]
+    wires += [message(30 + number, 1_000 + 100 * number) for number in range(30)]
+    events = fed(decoder(), *wires)
+    assert told(events) == []
+    assert len(samples(events)) == 60
+
+
+@pytest.mark.parametrize(
+    ("counter", "ticks"), [(7 | 1 << 15, 700), (7, 700 | 1 << 20), (12, 700), (9_000, 2**31)]
+)
+def test_one_damaged_message_is_no_gap_and_no_restart(counter: int, ticks: int) -> None:
+    wires = [message(number, 100 * number) for number in range(1, 20)]
+    wires[6] = message(counter, ticks)
+    events = fed(decoder(), *wires)
+    assert told(events) in ([], [("gap", {"lost": 1})], [("gap", {"lost": 5})])
+    assert len(samples(events)) >= 18
+    assert [event.discarded for event in events if isinstance(event, Corrupt)] in (
+        [], [len(wires[6])],
+    )  # fmt: skip
+
+
+def test_a_damaged_first_message_is_no_restart() -> None:
+    wires = [message(number, 100 * number) for number in range(1, 20)]
+    wires[0] = message(40_000, 3_000_000_000)
+    events = fed(decoder(), *wires)
+    assert told(events) == []
+    assert len(samples(events)) == 19
+
+
+def test_a_counter_that_begins_again_alone_is_neither_a_loss_nor_a_restart() -> None:
+    wires = [message(number, 100 * number) for number in range(1, 20)]
+    wires += [message(number - 19, 100 * number) for number in range(20, 40)]
+    events = fed(decoder(), *wires)
+    assert told(events) == []
+    assert len(samples(events)) == 39
+
+
+def test_a_gap_of_hours_is_counted_whole() -> None:
+    wires = [message(number, 100 * number) for number in range(20)]
+    wires += [message((100_000 + number) % 65536, 100 * (100_000 + number)) for number in range(2)]
+    assert told(fed(decoder(), *wires)) == [("gap", {"lost": 99_980})]
+
+
+def test_a_wake_up_with_data_is_a_damaged_measurement() -> None:
+    events = fed(decoder(), message(1, 100), encode(MessageId.WAKE_UP, bytes(20)), message(2, 200))
+    assert told(events) == []
+
+
+@given(st.lists(st.tuples(st.none() | st.integers(0, 65535), st.none() | st.integers(0, 2**32))))
+def test_any_counters_and_times_are_accepted(steps: list[tuple[int | None, int | None]]) -> None:
+    follow = Continuity(100.0)
+    held = False
+    for counter, ticks in steps:
+        step = follow.orientation(counter, ticks, 0)
+        assert 0 <= step.lost <= 2**32 // 50
+        assert not step.confirmed or held
+        held = step.held
 
 
 def test_a_quaternion_of_another_norm_is_refused() -> None:

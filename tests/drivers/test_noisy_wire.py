@@ -1,0 +1,101 @@
+"""Damage on the wire is counted as damage: it makes no losses and no restarts of its own."""
+
+from __future__ import annotations
+
+import random
+from typing import TYPE_CHECKING, NamedTuple
+
+import pytest
+
+from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
+from jointfit_daemon.timing.clock import DeviceClock
+from jointfit_drivers.xbus_events import XbusEvents
+from jointfit_protocols.mtdata2 import Item, encode_items
+from jointfit_protocols.xbus import MessageId, encode
+from jointfit_simulators.contract_scene import orientation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.driver import Decoder
+
+SECONDS = 12
+RATE_HZ = 100
+PERIOD_NS = 1_000_000_000 // RATE_HZ
+MESSAGES = SECONDS * RATE_HZ
+SEEDS = range(5)
+
+
+class Outcome(NamedTuple):
+    """What a decoder and the clock behind it reported of one run."""
+
+    received: int
+    lost: int
+    restarts: int
+
+
+def measurement(number: int) -> bytes:
+    items = (
+        (Item.PACKET_COUNTER, number % 65536),
+        (Item.SAMPLE_TIME_FINE, 5_000_000 + 100 * number),
+        (Item.STATUS_WORD, 3),
+        (Item.QUATERNION, orientation(number)),
+    )
+    return encode(MessageId.MT_DATA2, encode_items(items))
+
+
+def outcome(decoder: Decoder, chunks: list[bytes]) -> Outcome:
+    clock = DeviceClock(PERIOD_NS)
+    received = lost = restarts = 0
+    for number, data in enumerate(chunks):
+        for event in decoder.feed(Chunk((number + 1) * PERIOD_NS, data)):
+            if isinstance(event, ImuSample):
+                received += 1
+                clock.feed_sample(event.ticks, event.counter, event.arrival_ns, decoder.tick_clock)
+                restarts += sum(news.kind == "restart" for news in clock.news)
+                clock.news.clear()
+            elif isinstance(event, DeviceEvent):
+                restarts += event.kind == "restart"
+                count = event.data.get("lost", 0)
+                lost += count if isinstance(count, int) else 0
+    return Outcome(received, lost, restarts)
+
+
+def with_flipped_bits(chance: random.Random, data: bytes) -> bytes:
+    """Return `data` with one bit flipped in a tenth of its bytes."""
+    return bytes(
+        byte ^ (1 << chance.randrange(8)) if chance.random() < 0.1 else byte for byte in data
+    )
+
+
+def with_damage_that_passes(chance: random.Random, number: int) -> bytes:
+    """Return a message of which every tenth is damaged, its checksum right one time in ten."""
+    data = bytearray(measurement(number))
+    if chance.random() < 0.1:
+        data[chance.randrange(4, len(data) - 1)] ^= 1 << chance.randrange(8)
+        if chance.random() < 0.1:
+            data[-1] = -sum(data[1:-1]) % 256
+    return bytes(data)
+
+
+def wires(damage: Callable[[random.Random, int], bytes], seed: int) -> list[bytes]:
+    chance = random.Random(seed)
+    return [damage(chance, number) for number in range(MESSAGES)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda chance, number: with_flipped_bits(chance, measurement(number)),
+        with_damage_that_passes,
+    ],
+    ids=["a tenth of all bytes", "a tenth of all messages"],
+)
+def test_xbus_reports_no_more_lost_than_were_sent_and_no_restart(
+    damage: Callable[[random.Random, int], bytes], seed: int
+) -> None:
+    found = outcome(XbusEvents(None, RATE_HZ), wires(damage, seed))
+    assert found.restarts == 0, found
+    assert found.received + found.lost <= MESSAGES, found
+    assert found.lost <= MESSAGES - found.received, found
