@@ -224,7 +224,9 @@ class Core:
         if state is None:
             return []
         outputs = self._take(event.source, state, state.feed(event.chunk))
-        outputs += self._advance()
+        # After a stall of the process the other sources' samples are still in the kernel: a
+        # deadline ends the waiting at a Tick, which comes after everything readable was read.
+        outputs += self._advance(complete_only=True)
         return outputs
 
     def _take(
@@ -278,11 +280,12 @@ class Core:
 
     # --- time --------------------------------------------------------------------------------
 
-    def _advance(self) -> list[Output]:
+    def _advance(self, *, complete_only: bool = False) -> list[Output]:
         if self._rig is None:
             return []
         now_ns = self._now_ns
-        outputs: list[Output] = [self._fuse(frame) for frame in self._aligner.advance(now_ns)]
+        frames = self._aligner.advance(now_ns, complete_only=complete_only)
+        outputs: list[Output] = [self._fuse(frame) for frame in frames]
         if outputs and self._lags is not None:
             outputs += self._lags.step(now_ns)
         if self._session.collecting:

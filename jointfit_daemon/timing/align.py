@@ -153,15 +153,35 @@ class FrameAligner:
             self._changed = False
         return self._deadline_ns
 
-    def advance(self, now_ns: int) -> list[AlignedFrame]:
-        """Return the frames due at `now_ns`, in order."""
+    def advance(self, now_ns: int, *, complete_only: bool = False) -> list[AlignedFrame]:
+        """Return the frames due at `now_ns`, in order.
+
+        Parameters
+        ----------
+        now_ns : int
+            Host instant, ns.
+        complete_only : bool
+            Return no frame that still lacks a sample, even if its deadline has passed. For calls
+            between two reads: after a stall of the process the missing sample has usually
+            arrived and waits in the kernel, to be read next.
+        """
         frames: list[AlignedFrame] = []
         while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
+            if complete_only and self._lacks_sample():
+                break
             frame = self._emit(due_ns)
             self._changed = True
             if frame is not None:
                 frames.append(frame)
         return frames
+
+    def _lacks_sample(self) -> bool:
+        """Return whether a stream that is waited for has no sample at or after the next frame."""
+        t_k = (self._next or 0) * self._period_ns
+        return any(
+            stream.waited_for and stream.newest_ns < (t_k - stream.period_ns if self._fast else t_k)
+            for _, stream in self._items
+        )
 
     def _begin(self) -> bool:
         """Choose the next frame; skip those no stream can serve. False if there is none yet."""

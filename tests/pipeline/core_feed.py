@@ -147,14 +147,15 @@ class Bench:
         """Feed events in order, and Ticks between them as the core asks for."""
         for event in events:
             self.wait_until(arrival_ns(event))
-            self._give(event, arrival_ns(event))
+            self.give(event, arrival_ns(event))
 
     def wait_until(self, t_ns: int) -> None:
         """Let time go on to `t_ns`."""
         while (due_ns := self.core.next_deadline_ns) is not None and due_ns < t_ns:
-            self._give(Tick(due_ns), due_ns)
+            self.give(Tick(due_ns), due_ns)
 
-    def _give(self, event: Event, now_ns: int) -> None:
+    def give(self, event: Event, now_ns: int) -> None:
+        """Feed one event at `now_ns`, without the Ticks that were due before it."""
         self.fed.append(event)
         for output in self.core.feed(event):
             self.out.append(output)

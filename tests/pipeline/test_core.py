@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.event_log import decode_event, encode_event, encode_state
-from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened
+from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened, Tick
 from jointfit_daemon.pipeline.replay import replay_states
 from jointfit_protocols.can_frame import RECORD_BYTES
 from tests.pipeline.core_feed import (
@@ -144,3 +144,25 @@ def test_one_missing_sample_does_delay_its_frame() -> None:
     whole, holed = waited(frozenset()), waited(frozenset({("S4", SETTLED + 5)}))
     delays = [holed[t_ns] - whole[t_ns] for t_ns in whole if t_ns in holed]
     assert max(delays) > 0.5 * PERIOD_NS
+
+
+def test_samples_that_waited_in_the_kernel_during_a_stall_are_not_late() -> None:
+    bench = Bench()
+    bench.feed(opening())
+    bench.feed(sorted((chunk(n, i) for n in SOURCES for i in range(2 * SETTLED)), key=arrival_ns))
+    late = {name: counts["late"] for name, counts in bench.devices().items()}
+    frames = len(bench.states)
+
+    # A process that was stalled for 60 ms reads its sources one after the other, then the timer.
+    stalled = range(2 * SETTLED, 2 * SETTLED + 6)
+    now_ns = arrival_ns(chunk("mocap", stalled[-1])) + 10 * MS
+    for name in SOURCES:
+        for number in stalled:
+            event = chunk(name, number)
+            bench.give(ChunkArrived(name, Chunk(now_ns, event.chunk.data)), now_ns)
+    bench.give(Tick(now_ns), now_ns)
+    after = range(stalled[-1] + 2, stalled[-1] + 20)
+    bench.feed(sorted((chunk(n, i) for n in SOURCES for i in after), key=arrival_ns))
+
+    assert {name: counts["late"] for name, counts in bench.devices().items()} == late
+    assert len(bench.states) - frames >= len(stalled) - 1
