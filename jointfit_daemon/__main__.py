@@ -1,4 +1,6 @@
-"""The daemon's command line. Law: exit 0 stopped as asked, 1 a bug, 2 usage or configuration.
+"""The daemon's command line.
+
+Invariant: exit 0 stopped as asked, 1 a bug, 2 usage or configuration, 3 state directory in use.
 
 Starts light: what only a running daemon needs is imported once the configuration is known good.
 """
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("jointfit_daemon")
 
-EXIT_BUG, EXIT_USAGE = 1, 2
+EXIT_BUG, EXIT_USAGE, EXIT_IN_USE = 1, 2, 3
 LAST_WAIT_S = 2.0
 """How long leaving may wait for a thread: a name lookup cannot be interrupted."""
 
@@ -43,7 +45,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(describe(rig))
         return 0
     _start_logging(options.log_level, rig.name)
+    if not _own_state():
+        return EXIT_IN_USE
     return _run(options.config, rig)
+
+
+def _own_state() -> bool:
+    """Lock the state directory until the process ends; return whether no other daemon has it."""
+    from jointfit_daemon.supervisor.state_directory import (
+        PRIVATE_UMASK,
+        StateDirectoryInUseError,
+        lock_state,
+        make_private,
+        state_directory,
+    )
+
+    os.umask(PRIVATE_UMASK)  # calibrations and recordings are personal data
+    try:
+        lock_state(state_directory())
+    except StateDirectoryInUseError as error:
+        log.error("%s", error)  # noqa: TRY400 - the traceback would add nothing
+        return False
+    make_private(state_directory())
+    return True
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.calibration.store import CalibrationStore, CalibrationUnreadable
+from jointfit_daemon.supervisor.state_directory import state_directory
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.result import Calibration
@@ -21,11 +20,6 @@ class Found(NamedTuple):
     calibration: Calibration | None
     version: int | None
     complaints: tuple[str, ...]
-
-
-def state_directory() -> Path:
-    """Return where the daemon keeps what outlives it: systemd's choice, else ./state."""
-    return Path(os.environ.get("STATE_DIRECTORY", "state").split(":")[0])
 
 
 def store_of(rig: Rig) -> CalibrationStore:

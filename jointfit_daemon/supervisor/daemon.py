@@ -51,6 +51,7 @@ from jointfit_daemon.supervisor.process import ProcessWatch
 from jointfit_daemon.supervisor.request_guard import RequestGuard
 from jointfit_daemon.supervisor.requests import reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
+from jointfit_daemon.supervisor.state_directory import state_directory
 from jointfit_daemon.supervisor.status import Pace, Seen, phase_of, status_line
 from jointfit_daemon.supervisor.storing import StoreRunner
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
@@ -180,7 +181,7 @@ class Daemon:
         recording = self._rig.recording
         if recording is None:
             return
-        folder = calibrations.state_directory() / recording.directory
+        folder = state_directory() / recording.directory
         try:
             self._heart.log = EventLog(folder, self._rig.name)
         except OSError as fault:

@@ -151,6 +151,50 @@ def test_a_bad_rig_ends_it_with_all_faults_and_exit_code_2(process: Process) -> 
     assert "Traceback" not in said
 
 
+def wait_for(path: Path) -> None:
+    until = time.monotonic() + 15
+    while not path.exists():
+        assert time.monotonic() < until, f"{path} does not appear"
+        time.sleep(0.02)
+
+
+def test_a_second_daemon_in_one_state_directory_ends_with_exit_code_3(process: Process) -> None:
+    process.write(1)
+    with running(process) as first:
+        wait_for(process.state / "recordings")
+        with running(process) as second:
+            _, said = second.communicate(timeout=15)
+        assert second.returncode == 3
+        assert f"used by another jointfitd (process {first.pid})" in said
+        assert "Traceback" not in said
+        assert first.poll() is None
+        first.kill()
+        first.wait()
+    with running(process) as third:  # no stale lock
+        time.sleep(1)
+        assert third.poll() is None
+
+
+def test_all_it_writes_is_private_whatever_the_umask(process: Process) -> None:
+    process.write(1)
+    old = process.state / "calibrations" / "default" / "0001.json"
+    old.parent.mkdir(parents=True)
+    old.write_text("{}")
+    old.chmod(0o644)
+    before = os.umask(0)
+    try:
+        with running(process):
+            wait_for(process.state / "recordings")
+            time.sleep(0.5)
+    finally:
+        os.umask(before)
+    modes = {path: path.stat().st_mode & 0o777 for path in process.state.rglob("*")}
+    assert len(modes) >= 5
+    assert {mode for path, mode in modes.items() if path.is_file()} == {0o600}
+    assert {mode for path, mode in modes.items() if path.is_dir()} == {0o700}
+    assert process.state.stat().st_mode & 0o777 == 0o700
+
+
 def test_under_systemd_lines_carry_levels_and_no_time(process: Process) -> None:
     process.write(1)
     with running(process, JOURNAL_STREAM="1:2") as daemon:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from jointfit_daemon.__main__ import EXIT_USAGE
+from jointfit_daemon.__main__ import EXIT_IN_USE, EXIT_USAGE
 from jointfit_daemon.outputs.mqtt_secrets import CREDENTIAL
 from jointfit_daemon.supervisor.daemon import STOP_S
 
@@ -45,7 +45,7 @@ def test_both_units_differ_only_where_the_instance_is_named() -> None:
 
 def test_a_wrong_rig_is_not_tried_again_and_all_else_is() -> None:
     assert setting("Restart") == "always"
-    assert setting("RestartPreventExitStatus") == str(EXIT_USAGE)
+    assert setting("RestartPreventExitStatus") == f"{EXIT_USAGE} {EXIT_IN_USE}"
     assert setting("StartLimitIntervalSec") == "0"
     assert "ExecStartPre" not in dict(directives(ONE))  # its exit status would restart for ever
 
@@ -53,7 +53,7 @@ def test_a_wrong_rig_is_not_tried_again_and_all_else_is() -> None:
 def test_the_shipped_times_are_the_documented_ones() -> None:
     assert setting("Type") == "notify"
     assert setting("RestartSec") == "2"
-    assert "| restart | 2 s after any end but exit code 2, for ever |" in GUIDE
+    assert "| restart | 2 s after any end but exit codes 2 and 3, for ever |" in GUIDE
     assert setting("WatchdogSec") == "10"
     assert "| watchdog | 10 s (`WatchdogSec=`)" in GUIDE
     assert setting("TimeoutStopSec") == "15"
