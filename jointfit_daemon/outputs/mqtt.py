@@ -39,6 +39,7 @@ _Properties: Any = (
 
 _INCOMING = 64  # requests are rare; a flood of them must not grow
 _REFUSED = 0x80  # MQTT reason codes from here on are refusals
+_TAKEN_OVER = 0x8E  # reason code "session taken over"
 
 _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # else stalls of 40 ms
@@ -137,6 +138,11 @@ class MqttConnection:
             self._client.abandon()
             raise
         return self
+
+    @property
+    def taken_over(self) -> bool:
+        """Whether the broker ended it because another client connected with the same id."""
+        return self._client.taken_over
 
     async def __aexit__(
         self,
@@ -293,6 +299,14 @@ class _Client(aiomqtt.Client):
     """aiomqtt's client, which can also be dropped in the middle of connecting."""
 
     _abandoned = False
+    taken_over = False
+
+    def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
+    ) -> None:
+        """Remember the reason: of several tasks that fail, the first may know none."""
+        self.taken_over |= getattr(reason_code, "value", None) == _TAKEN_OVER
+        super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def abandon(self) -> None:
         """Close whatever is open, without a word; else a failed connect keeps it for seconds."""

@@ -18,6 +18,12 @@ from jointfit_daemon.outputs.mqtt import (
     Outgoing,
     stop_if_cancelled,
 )
+from jointfit_daemon.outputs.mqtt_rival import (
+    GLANCE_S,
+    RivalDetector,
+    await_departure,
+    is_publishing,
+)
 from jointfit_daemon.outputs.mqtt_secrets import exposures, password_of
 
 if TYPE_CHECKING:
@@ -54,6 +60,8 @@ class MqttPublisher:
         self._requests = f"{settings.base}/bridge/request/"
         self._said = ""
         self._echo = asyncio.Event()
+        self._rivals = RivalDetector()
+        self._lasted_s, self._taken_over = 0.0, False
         self.connected = False
         self.connects = self.sent = self.retained_requests = 0
         outbox.retain(outbox.life, ONLINE)
@@ -79,11 +87,17 @@ class MqttPublisher:
             )
         while True:
             attempt = asyncio.create_task(self._serve(), name="mqtt connection")  # see _serve
+            reason = ""
             try:
                 await attempt  # no TaskGroup: it forgets a cancellation that meets a loss
             except* BrokerLost as lost:
-                self._tell(_first(lost))
+                reason = _first(lost)
             stop_if_cancelled()
+            try:
+                if not await self._gave_way():
+                    self._tell(self._contested if self._taken_over else reason)
+            except BrokerLost as lost:
+                self._tell(str(lost))
             await asyncio.sleep(random.uniform(*_RETRY_S))  # noqa: S311 - no secret
 
     async def emptied(self, within_s: float) -> None:
@@ -92,6 +106,26 @@ class MqttPublisher:
         until = loop.time() + within_s
         while self.connected and self._outbox.unsaid and loop.time() < until:  # noqa: ASYNC110 - 3 facts
             await asyncio.sleep(_LOOK_S)
+
+    @property
+    def _contested(self) -> str:
+        return (
+            f"broker {self._settings.host}:{self._settings.tcp_port}: another client connected "
+            f"with our client id {client_id(self._settings.base)!r}: a second jointfitd with "
+            f"base {self._settings.base}? Stop one, or give each rig its own name"
+        )
+
+    async def _gave_way(self) -> bool:
+        """Leave the client id to a daemon that had it before us, until that one is gone."""
+        lasted_s, self._lasted_s = self._lasted_s, 0.0
+        if not self._rivals.suspects(lasted_s, taken_over=self._taken_over):
+            return False
+        if not (self._taken_over or await is_publishing(self._settings, GLANCE_S)):
+            return False
+        log.error("mqtt: %s. That one was first: publishing waits until it ends", self._contested)
+        await await_departure(self._settings, OFFLINE)
+        log.warning("mqtt: the other client with our client id is gone: connecting")
+        return True
 
     def _tell(self, reason: str) -> None:
         if reason != self._said:  # a line when something changes, not one per attempt
@@ -112,6 +146,7 @@ class MqttPublisher:
             log.info("mqtt: connected to %s:%d", self._settings.host, self._settings.tcp_port)
             self._echo.clear()
             self._outbox.reconnected()
+            began_s, self._taken_over = asyncio.get_running_loop().time(), False
             try:
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(self._listen(connection), name="mqtt requests")
@@ -119,6 +154,8 @@ class MqttPublisher:
                     tasks.create_task(self._await_echo(), name="mqtt self-test")
             finally:
                 self.connected = False
+                self._lasted_s = asyncio.get_running_loop().time() - began_s
+                self._taken_over = connection.taken_over
 
     async def _write(self, connection: MqttConnection) -> None:
         while True:
