@@ -44,7 +44,7 @@ def delays_ns(count: int, blocked_s: float = 0.004) -> tuple[list[int], list[int
 
 
 async def _measure(count: int, blocked_s: float) -> tuple[list[int], list[int]]:
-    opened = StampedSocket("127.0.0.1", 0)
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
     arrivals: list[Arrival] = []
     read_ns: list[int] = []
 

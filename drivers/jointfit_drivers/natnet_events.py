@@ -1,9 +1,9 @@
 """The pure half of the NatNet driver: datagrams in, optical frames and clock echoes out.
 
-Law: a function of the chunks fed; no clock, no socket. Datagrams of both directions may come, for
-a capture holds both; what a client says has no effect, except that the arrival of an echo request
-is the sending time of its answer. Frames wait for nothing: one that comes before its model is
-counted in `unpublished` and dropped.
+Invariant: a function of the chunks fed; no clock, no socket. A capture holds datagrams of both
+directions. Those of a client have no effect, except that the arrival of an echo request is the
+sending time of its answer. A frame that arrives before its model is counted in `unpublished` and
+dropped. No number is used before its range was checked.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_drivers.natnet_bitstream import Bitstream
 from jointfit_drivers.natnet_continuity import Continuity
 from jointfit_drivers.natnet_names import bind
 from jointfit_drivers.natnet_poses import Poses
-from jointfit_drivers.natnet_terms import bitstream_response, same_instance
+from jointfit_drivers.natnet_terms import bitstream_response, same_instance, usable_hz
 from jointfit_drivers.natnet_time import FrameTime
 from jointfit_protocols.corrupt import Corrupt as WireCorrupt
 from jointfit_protocols.natnet_frame import (
@@ -31,7 +32,6 @@ from jointfit_protocols.natnet_messages import (
     MessageId,
     Response,
     ServerInfo,
-    decode,
     is_versioned,
 )
 from jointfit_protocols.natnet_model import ModelDefinition
@@ -49,7 +49,10 @@ _ECHO_LIMIT_NS = 10**9
 _PENDING_ECHOES = 8
 _NAMED_UNKNOWN = 16
 """So many unknown ids are named in warnings; the rest is only counted."""
-_UNTOLD = (0, 0)
+_MOST_SECONDS = 2**63 // 10**9
+"""Stamps beyond this, s, are no uptime: their nanoseconds exceed 64 bits."""
+_MOST_LISTED = 200
+"""Names of markers or bodies that an event lists; the count beside them is exact."""
 _FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
 _ANNOUNCED = {
     FRAME_MODEL_CHANGED: "the model list changed",
@@ -67,7 +70,7 @@ class NatNetEvents:
     """
 
     def __init__(self, settings: NatNetSettings) -> None:
-        self._wanted_version = settings.wanted_version
+        self._bitstream = Bitstream(settings.wanted_version)
         self._latency_ms = settings.latency_ms
         self._time = FrameTime(settings)
         self._wanted_markers = {
@@ -78,7 +81,7 @@ class NatNetEvents:
         self._poses = Poses(settings.up_axis)
         self._continuity = Continuity()
         self._info: ServerInfo | None = None
-        self._version = _UNTOLD
+        self._hz: int | None = None
         self._binding: Binding | None = None
         self._asked: dict[int, int] = {}
         self._announced = 0
@@ -90,7 +93,7 @@ class NatNetEvents:
         self.unknown_ids = 0
         """Markers and bodies dropped because the model does not have their id."""
         self.suspicious = 0
-        """Poses refused because their numbers are no pose."""
+        """Poses, stamps and echoes refused because their numbers cannot be true."""
         self._handlers: dict[type, Callable[[Chunk, Message], list[Decoded]]] = {
             ServerInfo: self._server,
             ModelDefinition: self._model,
@@ -101,14 +104,13 @@ class NatNetEvents:
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """The server's high-resolution counter, once the server has said its frequency.
+        """The server's high-resolution counter, once its frequency is known and plausible.
 
         UNIX time where cameras on PTP stamp the frames.
         """
         if self._time.precise:
             return self._time.tick_clock
-        hz = self._info.clock_hz if self._info is not None else None
-        return TickClock(0, None, hz) if hz else None
+        return TickClock(0, None, self._hz) if self._hz else None
 
     @property
     def messages(self) -> int:
@@ -131,34 +133,29 @@ class NatNetEvents:
         return self._continuity.late
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return what one datagram says; never raises."""
-        message = decode(chunk.data, self._version)
-        if type(message) is FrameOfData:
-            self._messages += 1
-            return self._frame(chunk, message)
+        """Return the content of one datagram; never raises."""
+        before = self._bitstream.version
+        message = self._bitstream.decode(chunk.data)
         if isinstance(message, WireCorrupt):
             return self._unreadable(chunk, message)
+
         self._messages += 1
+        adopted = [] if self._bitstream.version == before else self._adopted()
+        if type(message) is FrameOfData:
+            return adopted + self._frame(chunk, message)
         handler = self._handlers.get(type(message))
-        return handler(chunk, message) if handler is not None else []
+        return adopted if handler is None else adopted + handler(chunk, message)
 
     def flush(self) -> list[Decoded]:
         """Return nothing: datagrams are whole."""
         return []
 
     def _unreadable(self, chunk: Chunk, corrupt: WireCorrupt) -> list[Decoded]:
-        """Count a datagram as lost, unless another bitstream than the one known explains it."""
-        if self._version == _UNTOLD and is_versioned(chunk.data):
+        """Count a datagram as corrupt, unless the server has not named its bitstream yet."""
+        if not self._bitstream.known and is_versioned(chunk.data):
             self._messages += 1
             self.unpublished += chunk.data.startswith(_FRAME)
             return []
-        if is_versioned(chunk.data):
-            wanted = self._wanted_version
-            if wanted is not None and wanted != self._version:
-                frame = decode(chunk.data, wanted)
-                if isinstance(frame, FrameOfData):
-                    self._messages += 1
-                    return [*self._adopt(wanted), *self._frame(chunk, frame)]
         self._discarded += corrupt.discarded
         return [Corrupt(corrupt.discarded, corrupt.reason)]
 
@@ -168,29 +165,34 @@ class NatNetEvents:
         info, before = cast("ServerInfo", message), self._info
         if info == before:
             return []
-        self._info = info
-        out: list[Decoded] = [_introduced(info)]
-        if before is not None and not same_instance(info, before):
+
+        # A frequency that no counter has would make every stamp of the frames wrong.
+        self._info, self._hz = info, usable_hz(info)
+        out: list[Decoded] = [_introduced(info, self._hz)]
+        if before is None or same_instance(info, before):
+            self._bitstream.announce(info.bitstream)
+        else:
+            self._bitstream.restart(info.bitstream)
             self._binding = None
             self._continuity.forget()
             out.append(DeviceEvent("restart", f"another server answers: {info.application}"))
-        return out + self._adopt(info.bitstream)
 
-    def _adopt(self, version: tuple[int, int]) -> list[Decoded]:
-        """Read frames and models as `version` from here on."""
-        before, self._version = self._version, version
-        name = f"{version[0]}.{version[1]}"
-        if not supported(version):
+        if not supported(info.bitstream):
+            name = "{}.{}".format(*info.bitstream)
             text = f"the server speaks NatNet {name}, 3.0 or newer is needed"
-            return [DeviceEvent("error", text, {"bitstream": name})]
-        if before in (_UNTOLD, version):
-            return []
+            out.append(DeviceEvent("error", text, {"bitstream": name}))
+        return out
+
+    def _adopted(self) -> list[Decoded]:
+        name = "{}.{}".format(*self._bitstream.version)
         return [DeviceEvent("setting", f"bitstream is {name} now", {"bitstream": name})]
 
     def _response(self, _: Chunk, message: Message) -> list[Decoded]:
         """Take the answer to ``Bitstream,x.y``; nothing else that is answered concerns us."""
         version = bitstream_response(cast("Response", message).text)
-        return [] if version is None else self._adopt(version)
+        if version is not None:
+            self._bitstream.confirm(version)
+        return []
 
     def _model(self, _: Chunk, message: Message) -> list[Decoded]:
         model = cast("ModelDefinition", message)
@@ -207,7 +209,10 @@ class NatNetEvents:
             out.append(_described(binding, self.unpublished))
         if not model.complete:
             out.append(DeviceEvent("warning", "a description of unknown type ends the model list"))
-        unknown = {"unknown": list(binding.unknown), "known": list(binding.layout.markers)}
+        unknown = {
+            "unknown": list(binding.unknown),
+            "known": list(binding.layout.markers[:_MOST_LISTED]),
+        }
         self._named_unknown.clear()
         return out + [DeviceEvent("warning", text, unknown) for text in complaints]
 
@@ -225,12 +230,15 @@ class NatNetEvents:
         sent_ns = self._asked.pop(stamp, stamp)
         if self._time.precise or not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
             return []
+        if self._hz is not None and ticks > _MOST_SECONDS * self._hz:
+            self.suspicious += 1
+            return []
         return [ClockEcho(sent_ns, chunk.t_ns, ticks)]
 
     # --- frames -------------------------------------------------------------------------------
 
     def _frame(self, chunk: Chunk, frame: FrameOfData) -> list[Decoded]:
-        step = self._continuity.frame(frame.number, frame.transmit)
+        step = self._continuity.frame(frame.number, frame.transmit, chunk.t_ns)
         if not step.use:
             return []
         out: list[Decoded] = []
@@ -266,18 +274,21 @@ class NatNetEvents:
         """Return when the frame was exposed, in ticks of the clock that counts."""
         if self._time.precise:
             return self._time.unix_ns(frame, out)
+        if self._hz is not None and max(frame.exposure, frame.transmit) > _MOST_SECONDS * self._hz:
+            self.suspicious += 1
+            return None
         return frame.exposure or self._exposure(frame, out)
 
     def _exposure(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
         """Return the exposure as configured, where the cameras do not stamp it."""
-        hz = self._info.clock_hz if self._info is not None else None
-        if not hz or not frame.transmit:
+        hz = self._hz
+        if hz is None or not frame.transmit:
             return None
         if self._stamped:
             self._stamped = False
             text = f"no exposure stamps (USB cameras?): {self._latency_ms:g} ms before transmission"
             out.append(DeviceEvent("warning", text, {"latency_ms": self._latency_ms}))
-        return frame.transmit - round(self._latency_ms * hz / 1000)
+        return max(0, frame.transmit - round(self._latency_ms * hz / 1000))
 
     def _announce(self, params: int) -> list[Decoded]:
         """Say what the frame's flags newly announce."""
@@ -309,7 +320,7 @@ def _sharing(binding: Binding, before: Binding) -> Binding:
     return replace(binding, layout=before.layout)
 
 
-def _introduced(info: ServerInfo) -> DeviceEvent:
+def _introduced(info: ServerInfo, hz: int | None) -> DeviceEvent:
     firmware = ".".join(map(str, info.application_version))
     natnet = ".".join(map(str, info.natnet_version))
     transport = "multicast" if info.multicast else "unicast"
@@ -319,7 +330,7 @@ def _introduced(info: ServerInfo) -> DeviceEvent:
         "firmware": firmware,
         "natnet": natnet,
         "transport": transport,
-        "clock_hz": info.clock_hz,
+        "clock_hz": hz,
         "data_port": info.data_port,
         "group": info.group,
     }
@@ -330,8 +341,8 @@ def _described(binding: Binding, unpublished: int) -> DeviceEvent:
     layout = binding.layout
     text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
     data = {
-        "markers": list(layout.markers),
-        "bodies": list(layout.bodies),
+        "markers": list(layout.markers[:_MOST_LISTED]),
+        "bodies": list(layout.bodies[:_MOST_LISTED]),
         "unpublished": unpublished,
     }
     return DeviceEvent("info", text, data)

@@ -1,29 +1,38 @@
-"""Sockets to one server inside the event loop. Law: what fails in a callback is raised in `pause`.
+"""Sockets to one NatNet server inside the event loop.
 
-A reader callback has no caller to raise to, so its failure is kept and thrown where the driver's
-coroutine waits: `DeviceLost` for the network's failures, the exception itself for a bug.
+Invariant: what fails in a callback is raised in `pause`. A reader callback has no caller to raise
+to, so its failure is stored and raised where the driver's coroutine waits: `DeviceLost` for
+failures of the network, the exception itself for a bug.
+
+Frames are accepted from any port of the server, because multicast frames leave its data port.
+Control messages are accepted on the command socket only, and only from the server's command port.
 """
 
 from __future__ import annotations
 
 import asyncio
 import errno
+import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLost
 from jointfit_daemon.model import Chunk
 from jointfit_drivers.natnet_socket import StampedSocket
-from jointfit_protocols.natnet_messages import encode
+from jointfit_protocols.natnet_messages import MessageId, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
     from typing import Self
 
+    from jointfit_drivers.natnet_socket import Arrival
     from jointfit_protocols.natnet_messages import Message
 
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
 """Errors that concern one datagram and not the connection."""
+_FORGED_NS = 100_000_000
+"""An ICMP refusal this soon after a datagram of the server is forged or stale, ns."""
+_FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
 class Link:
@@ -47,11 +56,12 @@ class Link:
         self._sockets: list[StampedSocket] = []
         self._news = asyncio.Event()
         self._failure: Exception | None = None
+        self._heard_ns = 0
         self.foreign = 0
-        """Datagrams from other hosts, not taken."""
+        """Datagrams dropped because of where they came from; the kernel drops most others."""
 
     def __enter__(self) -> Self:
-        self._command = self._open(StampedSocket(self._local, 0))
+        self._command = self._open(StampedSocket(self._local, 0, sender=self._server[0]))
         return self
 
     def __exit__(
@@ -66,7 +76,7 @@ class Link:
 
     def join(self, group: str, port: int) -> None:
         """Open the data socket of a multicast server; OSError as the system says."""
-        self._open(StampedSocket.in_group(group, port, self._local))
+        self._open(StampedSocket.in_group(group, port, self._local, sender=self._server[0]))
 
     def send(self, message: Message) -> None:
         """Send one message to the server's command port.
@@ -79,7 +89,7 @@ class Link:
         try:
             self._command.send(encode(message), self._server)
         except OSError as error:
-            if error.errno not in _FLEETING:
+            if error.errno not in _FLEETING and not self._forged(error):
                 raise self._lost(error) from error
 
     def wake(self) -> None:
@@ -115,12 +125,25 @@ class Link:
         try:
             arrivals = source.receive()
         except OSError as error:
+            if self._forged(error):
+                return
             raise self._lost(error) from error
         for arrival in arrivals:
-            if arrival.host == self._server[0]:
-                self._take(Chunk(arrival.t_ns, arrival.data))
-            else:
+            frame = arrival.data.startswith(_FRAME)
+            if arrival.host != self._server[0] or not (frame or self._commands(source, arrival)):
                 self.foreign += 1
+                continue
+            self._heard_ns = arrival.t_ns
+            self._take(Chunk(arrival.t_ns, arrival.data))
+
+    def _commands(self, source: StampedSocket, arrival: Arrival) -> bool:
+        """Return whether a datagram may carry a control message."""
+        return source is self._command and arrival.port == self._server[1]
+
+    def _forged(self, error: OSError) -> bool:
+        """Return whether an ICMP refusal contradicts datagrams that have just arrived."""
+        recent = time.monotonic_ns() - self._heard_ns < _FORGED_NS
+        return recent and isinstance(error, ConnectionRefusedError)
 
     def _lost(self, error: OSError) -> DeviceLost:
         host, port = self._server

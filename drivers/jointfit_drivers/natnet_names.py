@@ -1,4 +1,7 @@
-"""Which id in the frames is which name in rig.toml. Law: pure; names rule, ids and orders do not.
+"""Which id in the frames is which name in rig.toml.
+
+Invariant: pure; names count, ids and orders do not. The time grows linearly with the model, and
+the number of columns is bounded, because a model of one datagram can name 65 000 markers.
 
 A labeled marker has id ``model << 16 | member``. The model is a rigid body, a skeleton or an asset;
 the name of its member is, in this order: the marker name in the description (bitstream 4.0 on), the
@@ -17,6 +20,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import MocapLayout
@@ -38,6 +42,15 @@ Key = int | tuple[str, int]
 
 _MODELS = BodyDescription | SkeletonDescription | AssetDescription
 _EVERY = "all"
+_MOST_COLUMNS = 2000
+"""Columns beside those that rig.toml names; further ones are dropped, for each costs every frame
+its time, and no camera system labels as many."""
+_MOST_NAMED = 50
+"""Names of the server that a complaint lists."""
+_MOST_COMPARED = 500
+"""Names of the server that a misspelt one is compared with."""
+_MOST_SUGGESTED = 3
+"""Misspelt names that are compared."""
 _MEMBER_BITS = 16
 _MEMBER = (1 << _MEMBER_BITS) - 1
 
@@ -98,9 +111,9 @@ def bind(model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str
     body_columns = _columns("rigid body", bodies_found, bodies)
     loose = frozenset(entry.key[0] for entry in markers_found if isinstance(entry.key, tuple))
     known = frozenset(entry.key for entry in (*all_bodies, *all_markers))
-    for names in shared.values():
-        text = f"streaming id shared by {' and '.join(names)}: refused; give each its own"
-        marker_columns.complaints.append(text)
+    for names in list(shared.values())[:_MOST_NAMED]:
+        text = f"streaming id shared by {' and '.join(names[:_MOST_NAMED])}: refused"
+        marker_columns.complaints.append(f"{text}; give each its own")
     return Binding(
         MocapLayout(tuple(marker_columns.names), tuple(body_columns.names)),
         tuple(marker_columns.keys),
@@ -201,38 +214,51 @@ def _columns(what: str, entries: Sequence[Entry], wanted: Mapping[str, str]) -> 
         plain[entry.name].append(entry)
         for spelling in entry.aliases:
             alias[spelling].append(entry)
-    named: set[Key] = set()
+    taken: set[Key] = set()
     problems: list[str] = []
     for name, key in wanted.items():
         fitting = plain.get(name) or alias.get(name) or []
         if len(fitting) == 1:
             found.names.append(name)
             found.keys.append(fitting[0].key)
-            named.add(fitting[0].key)
+            taken.add(fitting[0].key)
         else:
             found.unknown.append(name)
-            problems.append(f"{what} {name!r} (mocap.{key}) " + _problem(name, fitting, plain))
+            known = plain if len(problems) < _MOST_SUGGESTED else {}
+            problems.append(f"{what} {name!r} (mocap.{key}) " + _problem(name, fitting, known))
+
+    used = set(found.names)
+    most = _MOST_COLUMNS + len(used)
     for entry in entries:
-        if entry.key not in named:
-            found.names.append(_unused_name(entry, plain, found.names))
+        if len(used) >= most:
+            text = f"the server names {len(entries)} columns ({what}); {len(used)} are used"
+            found.complaints.append(text)
+            break
+        free = None if entry.key in taken else _unused_name(entry, plain, used)
+        if free is not None:  # else its id is given twice, which columns() refuses in frames
+            found.names.append(free)
             found.keys.append(entry.key)
+            used.add(free)
+            taken.add(entry.key)
+
     if problems:
-        server = ", ".join(sorted(plain)) or "none"
-        found.complaints.append(f"{'; '.join(problems)}. The server has: {server}")
+        server = ", ".join(sorted(plain)[:_MOST_NAMED]) or "none"
+        more = f" and {len(plain) - _MOST_NAMED} more" if len(plain) > _MOST_NAMED else ""
+        found.complaints.append(f"{'; '.join(problems)}. The server has: {server}{more}")
     return found
 
 
 def _problem(name: str, fitting: list[Entry], plain: Mapping[str, list[Entry]]) -> str:
     if fitting:
-        choices = " or ".join(repr(e.aliases[0]) if e.owner else repr(e.name) for e in fitting)
-        return f"is ambiguous: write {choices}"
-    near = get_close_matches(name, plain, n=1, cutoff=0.4)
+        choices = [repr(e.aliases[0]) if e.owner else repr(e.name) for e in fitting[:_MOST_NAMED]]
+        return f"is ambiguous: write {' or '.join(choices)}"
+    near = get_close_matches(name, islice(plain, _MOST_COMPARED), n=1, cutoff=0.4)
     return f"is not in the stream; did you mean {near[0]!r}?" if near else "is not in the stream"
 
 
-def _unused_name(entry: Entry, plain: Mapping[str, list[Entry]], used: list[str]) -> str:
-    """Return the plain name where it is unique, else one with the owner in it."""
+def _unused_name(entry: Entry, plain: Mapping[str, list[Entry]], used: set[str]) -> str | None:
+    """Return the plain name where it is unique, else one with the owner in it; None: all used."""
     full = f"{entry.owner}/{entry.name}" if entry.owner else entry.name
     choices = [entry.name] if len(plain[entry.name]) == 1 else []
     choices += [full, f"{full}#{entry.member}", f"{full}#{entry.key}"]
-    return next(name for name in choices if name not in used)
+    return next((name for name in choices if name not in used), None)

@@ -32,6 +32,8 @@ _HALF = math.sqrt(0.5)
 _NOWHERE: Vector = (math.nan, math.nan, math.nan)
 _UNTURNED: Quaternion = (math.nan, math.nan, math.nan, math.nan)
 _NORM_TOLERANCE = 1e-3
+_FARTHEST_M = 10_000.0
+"""Coordinates beyond this, m, were measured by no camera; NaN compares as beyond."""
 _JUDGED = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
 
 
@@ -94,7 +96,7 @@ class Poses:
             if number not in known:
                 if number >> 16:  # model 0: seen by the cameras, claimed by no model
                     unknown.append(number)
-            elif params & _JUDGED == MARKER_POINT_CLOUD_SOLVED and math.isfinite(x + y + z):
+            elif params & _JUDGED == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
                 if number in seen:
                     twice.add(number)
                 seen[number] = place(x, y, z)
@@ -115,7 +117,7 @@ class Poses:
         for marker_set in frame.marker_sets:
             if marker_set.name in loose:
                 for i, (x, y, z) in enumerate(marker_set.positions):
-                    if (x or y or z) and math.isfinite(x + y + z):
+                    if (x or y or z) and _near(x, y, z):
                         seen[marker_set.name, i] = self._place(x, y, z)
 
     def _bodies(
@@ -141,7 +143,7 @@ class Poses:
     def _pose(self, body: Body) -> tuple[Vector, Quaternion] | None:
         _, x, y, z, qx, qy, qz, qw, _, _ = body
         norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-        if not (abs(norm - 1.0) <= _NORM_TOLERANCE and math.isfinite(x + y + z)):
+        if not (abs(norm - 1.0) <= _NORM_TOLERANCE and _near(x, y, z)):
             return None
         turned = self._turn(qw / norm, qx / norm, qy / norm, qz / norm)
         return self._place(x, y, z), turned
@@ -152,7 +154,12 @@ _ABSENT = (_NOWHERE, _UNTURNED)
 
 def _usable(marker: Marker) -> bool:
     solved = marker.params & _JUDGED == MARKER_POINT_CLOUD_SOLVED
-    return solved and math.isfinite(marker.x + marker.y + marker.z)
+    return solved and _near(marker.x, marker.y, marker.z)
+
+
+def _near(x: float, y: float, z: float) -> bool:
+    """Return whether a position is finite and where cameras can be."""
+    return abs(x) <= _FARTHEST_M and abs(y) <= _FARTHEST_M and abs(z) <= _FARTHEST_M
 
 
 def _all_bodies(frame: FrameOfData) -> Iterable[tuple[int, Body]]:

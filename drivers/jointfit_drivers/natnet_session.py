@@ -1,10 +1,13 @@
-"""One connection to a NatNet server, from CONNECT to silence. Law: asks, listens, decodes little.
+"""One connection to a NatNet server, from CONNECT to silence.
 
 CONNECT, every 0.5 s until SERVERINFO; data socket by what it announces; ten echoes 50 ms apart;
 REQUEST_MODELDEF, every 0.5 s until MODELDEF; then frames, one echo a second, and in unicast one
-KEEPALIVE a second. Every datagram of the server is emitted first and looked at afterwards, so a
-replay sees what was seen live. Frames are decoded by whoever takes the chunks; here only their
-flags are read, and one frame a second is decoded to see that its ids are known.
+KEEPALIVE a second. Every accepted datagram is emitted first and read afterwards, so a replay gets
+the same input. Whoever takes the chunks decodes the frames. Here only their flags are read, and
+one frame a second is decoded, to see that it can be, and that its ids are known.
+
+Invariant: control messages are accepted as answers to open questions only (`natnet_answers`), and
+a server none of whose frames can be decoded is lost, like a silent one.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_drivers.natnet_answers import OpenQuestions
+from jointfit_drivers.natnet_bitstream import Bitstream
 from jointfit_drivers.natnet_link import Link
 from jointfit_drivers.natnet_terms import (
     bitstream_response,
@@ -32,8 +37,6 @@ from jointfit_protocols.natnet_frame import (
     FRAME_BITSTREAM_CHANGED,
     FRAME_MODEL_CHANGED,
     FrameOfData,
-    Version,
-    decode_frame,
 )
 from jointfit_protocols.natnet_messages import (
     Bare,
@@ -43,7 +46,6 @@ from jointfit_protocols.natnet_messages import (
     Request,
     Response,
     ServerInfo,
-    decode,
 )
 from jointfit_protocols.natnet_model import BodyDescription, ModelDefinition
 
@@ -72,11 +74,10 @@ _PARAMS_FROM_END = 6
 """Flags and end tag close every frame, whatever its bitstream."""
 _SHORTEST_FRAME = 4 + 78
 _FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
-_UNTOLD: Version = (0, 0)
 
 
 class Session:
-    """One connection; a lost one is not mended but made anew.
+    """One connection; after a loss, a new one is made.
 
     Parameters
     ----------
@@ -93,8 +94,10 @@ class Session:
         self._name = f"NatNet server {settings.server}:{settings.command_port}"
         self._emit = emit
         self._link = Link(host, settings.command_port, local, self._take)
+        self._questions = OpenQuestions()
         self._info: ServerInfo | None = None
-        self._version = _UNTOLD
+        self._bitstream = Bitstream(settings.wanted_version)
+        self._confirmed = False
         self._known: frozenset[int] | None = None
         self._strange = 0
         self._echoed = 0
@@ -122,23 +125,25 @@ class Session:
     # --- what arrives -------------------------------------------------------------------------
 
     def _take(self, chunk: Chunk) -> None:
-        self._emit(chunk)
         if chunk.data.startswith(_FRAME):
+            self._emit(chunk)
             self._frame(chunk)
-        else:
+        elif self._questions.accept(chunk.data, chunk.t_ns):
+            self._emit(chunk)
             self._message(chunk)
 
     def _frame(self, chunk: Chunk) -> None:
-        self._frame_ns = chunk.t_ns
         if len(chunk.data) >= _SHORTEST_FRAME:
             (params,) = _PARAMS.unpack_from(chunk.data, len(chunk.data) - _PARAMS_FROM_END)
             self._model_wanted |= bool(params & FRAME_MODEL_CHANGED)
             self._greeting_wanted |= bool(params & FRAME_BITSTREAM_CHANGED)
-        if chunk.t_ns < self._look_ns or self._version == _UNTOLD:
+        if chunk.t_ns < self._look_ns or not self._bitstream.known:
+            self._frame_ns = chunk.t_ns
             return
-        frame = decode_frame(chunk.data, self._version)
+
+        frame = self._bitstream.decode(chunk.data)
         if isinstance(frame, FrameOfData):
-            self._misfits = 0
+            self._misfits, self._frame_ns = 0, chunk.t_ns
             self._look_ns = chunk.t_ns + int(EVERY_S * 1e9)
             self._look(frame)
         else:
@@ -150,10 +155,11 @@ class Session:
             self._model_wanted = True
 
     def _message(self, chunk: Chunk) -> None:
-        match decode(chunk.data, self._version):
+        match self._bitstream.decode(chunk.data):
             case ServerInfo() as info:
                 self._model_wanted |= self._info not in (None, info)
-                self._info, self._version = info, info.bitstream
+                self._info = info
+                self._bitstream.announce(info.bitstream)
                 self._greeting_wanted = False
             case ModelDefinition() as model:
                 self._known = frozenset(
@@ -163,7 +169,10 @@ class Session:
             case EchoResponse(stamp, _):
                 self._echoed = stamp
             case Response() as response:
-                self._version = bitstream_response(response.text) or self._version
+                version = bitstream_response(response.text)
+                if version is not None and version == self._settings.wanted_version:
+                    self._bitstream.confirm(version)
+                    self._confirmed = True
             case Corrupt() | Connect():
                 self._strange += 1
             case _:
@@ -176,10 +185,14 @@ class Session:
         """Send `message` every half second until it is answered, at most for `within_s`."""
         until = time.monotonic() + within_s
         while not answered() and time.monotonic() < until:
-            self._link.send(message)
+            self._send(message)
             retry_at = min(until, time.monotonic() + RETRY_S)
             while not answered() and (left := retry_at - time.monotonic()) > 0:
                 await self._link.pause(left)
+
+    def _send(self, message: Message) -> None:
+        self._questions.ask(message, time.monotonic_ns())
+        self._link.send(message)
 
     async def _greet(self) -> ServerInfo:
         await self._ask(greeting(self._settings), CONNECT_S, lambda: self._info is not None)
@@ -190,8 +203,8 @@ class Session:
         raise DeviceLost(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
 
     def _join(self, info: ServerInfo) -> None:
-        check_group(self._name, info)
         port = self._settings.data_port or info.data_port
+        check_group(self._name, info, port)
         try:
             self._link.join(info.group, port)
         except OSError as error:
@@ -203,7 +216,7 @@ class Session:
         wanted = self._settings.wanted_version
         if wanted is not None:
             asked = Request(f"Bitstream,{self._settings.bitstream}")
-            await self._ask(asked, RETRY_S, lambda: self._version == wanted)
+            await self._ask(asked, RETRY_S, lambda: self._confirmed)
 
     async def _first_echoes(self) -> None:
         for _ in range(FIRST_ECHOES):
@@ -213,7 +226,7 @@ class Session:
                 await self._link.pause(left)
 
     def _ask_time(self) -> None:
-        self._link.send(EchoRequest(time.monotonic_ns()))
+        self._send(EchoRequest(time.monotonic_ns()))
 
     async def _learn_model(self) -> None:
         asked = Bare(MessageId.REQUEST_MODELDEF)
@@ -226,7 +239,7 @@ class Session:
         echo_at = alive_at = ask_at = 0.0
         while True:
             now = time.monotonic()
-            self._judge(info, unicast, max(self._frame_ns, began_ns))
+            self._check_alive(info, unicast, max(self._frame_ns, began_ns))
             if now >= echo_at:
                 self._ask_time()
                 echo_at = now + random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
@@ -242,17 +255,23 @@ class Session:
     def _ask_again(self) -> None:
         """Ask for what a frame has announced or made doubtful, until it is answered."""
         if self._greeting_wanted:
-            self._link.send(greeting(self._settings))
+            self._send(greeting(self._settings))
         if self._model_wanted:
-            self._link.send(Bare(MessageId.REQUEST_MODELDEF))
+            self._send(Bare(MessageId.REQUEST_MODELDEF))
 
-    def _judge(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
-        """Raise DeviceLost when frames stay away, or when another server answers in this place."""
+    def _check_alive(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
+        """Raise DeviceLost without readable frames, or when another server answers in its place."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLost(f"{self._name}: another instance answers: {self._info.application}")
         silent_s = (time.monotonic_ns() - heard_ns) / 1e9
         if silent_s < self._settings.silence_s:
             return
+        if self._misfits:
+            version = "{}.{}".format(*self._bitstream.version)
+            raise DeviceLost(
+                f"{self._name}: frames arrive, but for {silent_s:.1f} s none could be decoded as "
+                f"NatNet {version}: check that Motive streams the bitstream it announces"
+            )
         hint = ""
         if unicast == info.multicast:
             announced = "multicast" if info.multicast else "unicast"

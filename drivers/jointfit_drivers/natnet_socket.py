@@ -7,6 +7,8 @@ own.
 
 from __future__ import annotations
 
+import array
+import contextlib
 import fcntl
 import socket
 import struct
@@ -25,6 +27,12 @@ _TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)  # x86-64 and ARM alike
 _IP_RECVERR = 11  # an ICMP refusal becomes an error of this socket, connected or not
 _IP_MULTICAST_ALL = 49  # 0: only groups that this socket joined
 _SIOCGIFADDR = 0x8915
+_ATTACH_FILTER = getattr(socket, "SO_ATTACH_FILTER", 26)
+_INSTRUCTION = struct.Struct("@HBBI")
+_PROGRAM = struct.Struct("@HL")
+_LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # classic BPF
+_SOURCE_ADDRESS = 0xFFF00000 + 12  # SKF_NET_OFF: offset from the IPv4 header
+_WHOLE_PACKET = 0xFFFFFFFF
 _STAMP = struct.Struct("@ll")
 _ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
 
@@ -37,12 +45,25 @@ class Arrival(NamedTuple):
     data: bytes
     host: str
     """Address it came from."""
+    port: int
+    """Port it came from."""
 
 
 class StampedSocket:
-    """A non-blocking UDP socket whose datagrams carry their arrival."""
+    """A non-blocking UDP socket whose datagrams carry their arrival.
 
-    def __init__(self, address: str, port: int, *, shared: bool = False) -> None:
+    Parameters
+    ----------
+    address, port
+        Where it is bound.
+    sender : str
+        Numeric address; the kernel drops datagrams from any other one, so that a flood of them
+        costs the daemon no time.
+    shared : bool
+        Other programs of this host may be bound to the same address and port.
+    """
+
+    def __init__(self, address: str, port: int, *, sender: str, shared: bool = False) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
@@ -51,19 +72,35 @@ class StampedSocket:
             self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
             if shared:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._filter(sender)
             self._socket.bind((address, port))
         except OSError:
             self._socket.close()
             raise
         self._wall = WallClock()
 
+    def _filter(self, sender: str) -> None:
+        """Have the kernel drop what `sender` did not send; whoever reads checks once more."""
+        (address,) = struct.unpack("!I", socket.inet_aton(sender))
+        program = array.array(
+            "B",
+            _INSTRUCTION.pack(_LOAD_WORD, 0, 0, _SOURCE_ADDRESS)
+            + _INSTRUCTION.pack(_JUMP_IF_EQUAL, 0, 1, address)
+            + _INSTRUCTION.pack(_RETURN, 0, 0, _WHOLE_PACKET)
+            + _INSTRUCTION.pack(_RETURN, 0, 0, 0),
+        )
+        start, size = program.buffer_info()
+        described = _PROGRAM.pack(size // _INSTRUCTION.size, start)
+        with contextlib.suppress(OSError):  # a kernel without socket filters
+            self._socket.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, described)
+
     @classmethod
-    def in_group(cls, group: str, port: int, local: str) -> StampedSocket:
-        """Open a socket that hears one multicast group on the network card of address `local`.
+    def in_group(cls, group: str, port: int, local: str, *, sender: str) -> StampedSocket:
+        """Open a socket that receives one multicast group on the network card of `local`.
 
         It is bound to the group itself, so that other groups on the same port stay out.
         """
-        opened = cls(group, port, shared=True)
+        opened = cls(group, port, sender=sender, shared=True)
         try:
             opened._socket.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             member = socket.inet_aton(group) + socket.inet_aton(local)
@@ -108,9 +145,22 @@ class StampedSocket:
                 data, ancillary, _, address = self._socket.recvmsg(MAX_DATAGRAM, _ANCILLARY)
             except BlockingIOError:
                 break
+            except OSError:
+                self._drop_errors()
+                if found:  # a refusal beside datagrams that arrive is forged or stale
+                    break
+                raise
             now_ns = time.monotonic_ns()
-            found.append(Arrival(self._arrival(ancillary, now_ns), data, address[0]))
+            found.append(Arrival(self._arrival(ancillary, now_ns), data, *address))
+        if not found:
+            self._drop_errors()  # woken by a refusal that sending has reported already
         return found
+
+    def _drop_errors(self) -> None:
+        """Empty the error queue of the socket; until then it counts as readable."""
+        with contextlib.suppress(OSError):
+            while True:
+                self._socket.recvmsg(1, 0, socket.MSG_ERRQUEUE)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int) -> int:
         for level, kind, value in ancillary:

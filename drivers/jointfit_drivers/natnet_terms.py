@@ -1,4 +1,7 @@
-"""Which servers we can work with, and the words for those we cannot. Law: pure."""
+"""Servers that the driver can work with, and the messages for those it cannot.
+
+Invariant: pure. Every number of a SERVERINFO that is used later is checked here.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,10 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet_messages import ServerInfo
 
 NEWEST_MAJOR = 4
+LEAST_CLOCK_HZ = 1_000
+"""A slower counter stamps frames too coarsely to be of use."""
+MOST_CLOCK_HZ = 100_000_000_000
+"""Ten times the fastest processor counter."""
 _PLAIN_FORM = 264
 _WANTING_FORM = 271
 _LONGEST_VERSION = len("99.99")
@@ -54,6 +61,11 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         )
     if not info.clock_hz:
         raise DeviceMisconfigured(f"{said} but names no clock frequency: its stamps mean nothing")
+    if usable_hz(info) is None:
+        raise DeviceMisconfigured(
+            f"{said} and names a clock frequency of {info.clock_hz} Hz, expected {LEAST_CLOCK_HZ}"
+            f" to {MOST_CLOCK_HZ}: check that server and command_port lead to Motive"
+        )
     if info.bitstream[0] > NEWEST_MAJOR and settings.wanted_version is None:
         raise DeviceMisconfigured(
             f"{said}, which is newer than this driver:"
@@ -66,8 +78,14 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         )
 
 
-def check_group(name: str, info: ServerInfo) -> None:
-    """Refuse a multicast address that is none.
+def usable_hz(info: ServerInfo) -> int | None:
+    """Return the frequency of the server's counter, Hz; None where no counter has it."""
+    hz = info.clock_hz
+    return hz if hz is not None and LEAST_CLOCK_HZ <= hz <= MOST_CLOCK_HZ else None
+
+
+def check_group(name: str, info: ServerInfo, port: int) -> None:
+    """Refuse a multicast address or port that is none.
 
     Raises
     ------
@@ -78,6 +96,10 @@ def check_group(name: str, info: ServerInfo) -> None:
         raise DeviceMisconfigured(
             f"{name} announces {info.group}, which is no multicast address:"
             " set Motive's multicast interface, or transport = 'unicast'"
+        )
+    if not port:
+        raise DeviceMisconfigured(
+            f"{name} announces data port 0: set mocap.data_port to the one of Motive (1511)"
         )
 
 

@@ -23,6 +23,8 @@ _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_N
 _NS_PER_US, _NS_PER_MS = 1_000, 1_000_000
 _HUNDREDTHS = 100.0 * 180.0 / pi
 """Of a degree in a radian."""
+_EXACT = 2**53 - 1
+"""Largest integer that every JSON reader takes exactly."""
 _NO_ANGLES = (None, None, None)
 _NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
     ("alpha_deg", "beta_deg", "gamma_deg", "joint_deg", "gimbal")
@@ -30,8 +32,15 @@ _NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
 
 
 def encode(payload: Mapping[str, Any]) -> bytes:
-    """Return `payload` as JSON; integers a browser would round are refused with TypeError."""
-    return orjson.dumps(payload, _plain, _OPTIONS)
+    """Return `payload` as JSON.
+
+    An integer that a browser would round is written as null, and a lone surrogate as a question
+    mark. Both can come from a device or a file name, and neither may end the daemon.
+    """
+    try:
+        return orjson.dumps(payload, _plain, _OPTIONS)
+    except TypeError:
+        return orjson.dumps(_writable(payload), _plain, _OPTIONS)
 
 
 def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
@@ -152,6 +161,19 @@ def _rounded(values: Iterable[float] | None, digits: int) -> list[float | None] 
         return None
     scale = 10.0**digits
     return [round(whole) / scale if isfinite(whole := value * scale) else None for value in values]
+
+
+def _writable(value: object) -> object:
+    """Return `value` without the integers and characters that JSON cannot carry exactly."""
+    if isinstance(value, int):
+        return value if abs(value) <= _EXACT else None
+    if isinstance(value, str):
+        return value.encode("utf-8", "replace").decode("utf-8")
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_writable(item) for item in value]
+    if hasattr(value, "items"):
+        return {_writable(key): _writable(item) for key, item in value.items()}
+    return value
 
 
 def _plain(value: object) -> object:

@@ -190,6 +190,8 @@ class DeviceClock:
         if self._echo is None:
             self._echo = EchoFit()
         elif self._echo.contradicts(u, echo.sent_ns, echo.received_ns):
+            if not self._echo.confirms_restart(u, echo.sent_ns, echo.received_ns):
+                return
             off = u - self._echo.device_ns((echo.sent_ns + echo.received_ns) // 2)
             self._begin(clock_news.off_echoes(off))
             u = self._ticks_reader(tick_clock).echo_ns(echo.ticks)

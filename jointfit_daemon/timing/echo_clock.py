@@ -7,6 +7,9 @@ with an error of at most half the round trip ``rho = b - a``. Echoes near the sm
 are kept, and ``theta(m) = theta_0 + s (m - m_0)`` is fitted to them by weighted least squares with
 Huber weights and a prior on s, so that the first seconds give no wild slope. Half the asymmetry of
 the path stays in theta_0: ``bound_ns`` says how much that can be at most.
+
+An answer that contradicts the fit is set aside. Only a second one in a row that agrees with it
+shows that the server's clock began anew: a single wrong or forged answer changes nothing.
 """
 
 from __future__ import annotations
@@ -41,11 +44,12 @@ class EchoFit:
     """Line through the echoes of the last two minutes."""
 
     __slots__ = (
-        "_echoes", "_line", "_ref", "_theta_ref", "bound_ns", "echoes", "slope",
+        "_doubtful", "_echoes", "_line", "_ref", "_theta_ref", "bound_ns", "echoes", "slope",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self._echoes: deque[_Echo] = deque(maxlen=CAPACITY)
+        self._doubtful: _Echo | None = None
         self._ref = self._theta_ref = 0
         self._line = FittedLine(0.0, 0.0, inf, 0.0, SKEW_SD**2)
         self.slope = 0.0
@@ -82,11 +86,22 @@ class EchoFit:
         middle = (sent_ns + received_ns) // 2
         return abs(u - self.device_ns(middle)) > (received_ns - sent_ns) / 2 + JUMP_NS
 
+    def confirms_restart(self, u: int, sent_ns: int, received_ns: int) -> bool:
+        """Take a contradicting answer; return whether it agrees with the one set aside before."""
+        middle = (sent_ns + received_ns) // 2
+        before = self._doubtful
+        self._doubtful = now = _Echo(middle, u - middle, received_ns - sent_ns)
+        if before is None:
+            return False
+        slack_ns = (before.round_trip_ns + now.round_trip_ns) / 2 + JUMP_NS
+        return abs(now.theta_ns - before.theta_ns) <= slack_ns
+
     def feed(self, u: int, sent_ns: int, received_ns: int) -> None:
         """Take one answered echo: host stamps and server time, ns. Impossible ones are ignored."""
         if received_ns < sent_ns:
             return
         middle = (sent_ns + received_ns) // 2
+        self._doubtful = None
         echoes = self._echoes
         echoes.append(_Echo(middle, u - middle, received_ns - sent_ns))
         self.echoes += 1

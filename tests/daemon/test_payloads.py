@@ -153,9 +153,12 @@ def test_no_number_json_does_not_know_gets_out(value: float) -> None:
     json.loads(pose, parse_constant=lambda word: pytest.fail(f"{word} in a pose"))
 
 
-def test_integers_a_browser_would_round_are_refused() -> None:
-    with pytest.raises(TypeError):
-        encode({"t_ns": 2**53 + 1})
+def test_integers_a_browser_would_round_and_surrogates_end_nothing() -> None:
+    payload = {"t_ns": 2**53 + 1, "data": {"name": "a\udcff", "ticks": (-(2**60), 5, True)}}
+    assert orjson.loads(encode(payload)) == {
+        "t_ns": None,
+        "data": {"name": "a?", "ticks": [None, 5, True]},
+    }
 
 
 def test_numpy_and_named_tuples_are_written_as_they_are() -> None:

@@ -219,10 +219,12 @@ def test_a_changed_model_is_announced_once() -> None:
 
 def test_the_bitstream_follows_the_response_and_the_frames_stay_readable() -> None:
     feeder = ready()
-    (setting,) = told(feeder(Response(b"Bitstream,4.1\0")), "setting")
-    assert setting.data["bitstream"] == "4.1"
+    assert feeder(Response(b"Bitstream,4.1\0")) == []
     feeder.version = (4, 1)
-    assert isinstance(feeder(frame(1))[0], MocapFrame)
+    setting, first = feeder(frame(1))
+    assert isinstance(setting, DeviceEvent)
+    assert (setting.kind, setting.data["bitstream"]) == ("setting", "4.1")
+    assert isinstance(first, MocapFrame)
 
 
 def test_frames_in_the_bitstream_asked_for_are_read_though_nobody_confirmed() -> None:

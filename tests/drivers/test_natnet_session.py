@@ -258,7 +258,7 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
 
 
 def test_the_kernel_stamps_datagrams_on_loopback() -> None:
-    opened = StampedSocket("127.0.0.1", 0)
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
     try:
         address = opened._socket.getsockname()
         before = time.monotonic_ns()
@@ -273,7 +273,7 @@ def test_the_kernel_stamps_datagrams_on_loopback() -> None:
 
 
 def test_a_wake_up_drains_at_most_64_datagrams() -> None:
-    opened = StampedSocket("127.0.0.1", 0)
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
     try:
         for _ in range(70):
             opened.send(b"x", opened._socket.getsockname())

@@ -148,7 +148,7 @@ class WithoutStamps:
 
 
 def test_datagrams_that_the_kernel_does_not_stamp() -> None:
-    opened = StampedSocket("127.0.0.1", 0)
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
     actual = opened._socket
     unstamped = WithoutStamps(actual)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,8 +78,22 @@ def test_a_server_that_restarts_is_noticed_by_its_echo() -> None:
     for k in range(20):
         clock.feed_echo(lan.echo(START + k * 50 * MS), SERVER)
     clock.feed_echo(ClockEcho(START + S, START + S + MS, 5), SERVER)
+    clock.feed_echo(ClockEcho(START + 2 * S, START + 2 * S + MS, 5 + SERVER_HZ), SERVER)
     assert clock.epoch == 1
     assert clock.state == "settling"
+
+
+@pytest.mark.parametrize("forged", [0, 5, 2**63 * SERVER_HZ // S])
+def test_one_forged_answer_at_a_time_changes_no_clock(forged: int) -> None:
+    lan, clean, attacked = Lan(0), DeviceClock(PERIOD), DeviceClock(PERIOD)
+    for k in range(40):
+        echo = lan.echo(START + k * 200 * MS)
+        clean.feed_echo(echo, SERVER)
+        attacked.feed_echo(echo, SERVER)
+        if k > 10:
+            attacked.feed_echo(replace(echo, ticks=forged + k * SERVER_HZ), SERVER)
+    assert attacked.epoch == 0
+    assert attacked.host_ns(START) == clean.host_ns(START)
 
 
 def test_echoes_before_anyone_knows_the_tick_rate_are_ignored() -> None:
