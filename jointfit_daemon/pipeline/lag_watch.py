@@ -218,7 +218,9 @@ class LagWatch:
             return _nothing("too few samples of the sensor: check that it streams")
         t_imu = np.array([row[0] for row in samples], dtype=np.int64)
         q_imu = np.array([row[1] for row in samples], dtype=np.float64)
+        yield
         imu = rates_from_orientations(t_imu, q_imu, start_ns)
+        yield
         ref = rates_from_orientations(t_ref, q_ref, start_ns)
         yield
         return (yield from estimate_in_steps(imu, ref, LagSettings()))

@@ -180,7 +180,9 @@ def estimate_in_steps(
     settings = settings or LagSettings()
     cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE / max(imu.period_s, ref.period_s))
     valid = min(imu.valid_share, ref.valid_share)
-    imu, ref = low_pass(imu, cutoff), low_pass(ref, cutoff)
+    imu = low_pass(imu, cutoff)
+    yield
+    ref = low_pass(ref, cutoff)
     if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
         refused = f"no gapless stretch of data: {STAY}"
         return LagEstimate(nan, inf, nan, refused, valid_share=valid)
