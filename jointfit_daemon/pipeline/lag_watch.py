@@ -317,10 +317,14 @@ def _orientations(
             parts.append(q[None])
     else:
         places = [layout.markers.index(m) if m in layout.markers else -1 for m in cluster.markers]
-        columns = np.array(places)
+        unseen = np.full((1, 3), np.nan)  # row -1: a marker that the stream does not name
         for at in range(0, len(rows), _FRAMES_A_STEP):
-            seen = np.stack([frame.markers for _, frame in rows[at : at + _FRAMES_A_STEP]])
-            positions = np.where((columns >= 0)[None, :, None], seen[:, columns], np.nan)
+            positions = np.stack(
+                [
+                    np.concatenate((frame.markers, unseen))[places]
+                    for _, frame in rows[at : at + _FRAMES_A_STEP]
+                ]
+            )
             parts.append(rigid_fit(cluster.template, positions)[0])
             yield
     return np.array([t for t, _ in rows], dtype=np.int64), np.concatenate(parts)

@@ -23,7 +23,6 @@ MS = 1_000_000
 CHAIN = Chain(("hip", "knee"), ("thigh",), (("S1",),))
 NAMES = ("T1", "T2", "T3", "T4")
 PLACES = ((0.1, 0.0, 0.0), (-0.05, 0.08, 0.02), (0.0, -0.07, 0.05), (0.02, 0.03, -0.1))
-LAYOUT = MocapLayout(NAMES, ())
 CALIBRATION = Calibration(
     method="anchored",
     joints=CHAIN.joints,
@@ -61,8 +60,9 @@ def play(
     start_s: float = 0.0,
     epoch: int = 0,
     still: bool = False,
+    named: int = len(NAMES),
 ) -> list[Told]:
-    """Feed both streams at their rates, a step of work every 10 ms."""
+    """Feed both streams at their rates, a step of work every 10 ms; `named` markers are sent."""
     rng = np.random.default_rng(5)
     t_ref = np.arange(start_s, start_s + seconds, 1 / 120)
     t_imu = np.arange(start_s + 0.003, start_s + seconds, 0.01)
@@ -74,9 +74,9 @@ def play(
     for k, t in enumerate(t_imu):
         while at < len(t_ref) and t_ref[at] <= t:
             t_ns = round(t_ref[at] * 1e9)
-            frame = MocapFrame(
-                t_ns, at, None, LAYOUT, markers[at], np.zeros((0, 3)), np.zeros((0, 4))
-            )
+            layout = MocapLayout(NAMES[:named], ())
+            seen = markers[at, :named]
+            frame = MocapFrame(t_ns, at, None, layout, seen, np.zeros((0, 3)), np.zeros((0, 4)))
             watch.add_mocap(t_ns, frame)
             at += 1
         stamp_ns = round(t * 1e9 + lag_ms * MS)
@@ -130,6 +130,15 @@ def test_standing_still_is_refused_with_the_remedy() -> None:
     assert found["lag_source"] == "calibration"
     assert found["lag_ms"] == 2.0
     assert "move faster" in str(found["tracked_refused"])
+
+
+@pytest.mark.parametrize("named", [0, 1, 2])
+def test_lag_watch_refuses_a_stream_that_lacks_the_markers_of_the_segment(named: int) -> None:
+    watch = LagWatch(CHAIN, CALIBRATION)
+    play(watch, 14, 5.0, named=named)
+    health = watch.health()["S1"]
+    assert health["tracked_ms"] is None
+    assert "no gapless stretch of data" in str(health["tracked_refused"])
 
 
 def test_a_configured_lag_beats_the_motion_which_only_contradicts() -> None:
