@@ -36,7 +36,12 @@ class DeviceLost(Exception):  # noqa: N818 - named for what happened, as CONVENT
 
 
 class DeviceMisconfigured(Exception):  # noqa: N818 - named for what happened
-    """The device can never work with these settings: the message says what to change."""
+    """The device cannot work with these settings: the message says what to change.
+
+    The source is stopped until another device is on its port, for a minute, or until a reload.
+    Whatever may pass by itself (a port taken, no descriptor left, a bus that is down) is a
+    ``DeviceLost``.
+    """
 
 
 class Settings(BaseModel):
@@ -110,6 +115,17 @@ class MocapSettings(Settings):
     sync_line: int | None = Field(
         None, description="the sync line that carries an edge at every exposure, if one is wired"
     )
+
+
+def device_path(settings: object) -> str | None:
+    """Return what a driver with `settings` opens: its `port`, or the channel of its bus.
+
+    None where the table names neither, as that of a network device.
+    """
+    found = getattr(settings, "port", None) or getattr(
+        getattr(settings, "can", None), "channel", None
+    )
+    return found if isinstance(found, str) else None
 
 
 class Decoder(Protocol):

@@ -32,6 +32,11 @@ log = logging.getLogger(__name__)
 _READ_BYTES = 65536  # more than any tty buffer holds (4095), so one read empties it
 _WRITE_TIMEOUT_S = 2.0  # 100 bytes at 9600 baud take 0.1 s; a port that takes longer is stuck
 
+_NOT_A_PORT = frozenset(
+    {errno.ENOTTY, errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG}
+)
+"""What a file that is no terminal gives. Any other error is of the system or the hardware."""
+
 _LOST: dict[int, str] = {
     errno.ENOENT: "is not there",
     errno.ENODEV: "is gone",
@@ -41,9 +46,13 @@ _LOST: dict[int, str] = {
     errno.EBUSY: "is used by another program",
     errno.EACCES: "may not be opened by this user",
     errno.EPERM: "may not be opened by this user",
+    errno.EMFILE: "cannot be opened: this process has no file descriptor left",
+    errno.ENFILE: "cannot be opened: this host has no file descriptor left",
+    errno.EPROTO: "gives a USB protocol error",
+    errno.ETIMEDOUT: "does not answer the USB host in time",
 }
-"""Errors that can heal by themselves. Even EACCES: a re-plugged port exists before udev has set
-its group."""
+"""Common errors in words. All may pass by themselves, even EACCES: a re-plugged port exists before
+udev has set its group."""
 
 
 class SerialPort:
@@ -275,8 +284,9 @@ def _opened(path: str, baud: int) -> serial.Serial:
 def _typed(path: str, baud: int, error: Exception) -> DeviceLost | DeviceMisconfigured:
     """Name what happened: thing, found, expected, remedy."""
     number = _errno(error)
-    if number in _LOST:
-        return DeviceLost(f"{path}: {_LOST[number]}{_remedy(path, number)}")
+    if number is not None and number not in _NOT_A_PORT:
+        found = _LOST.get(number, f"cannot be opened ({os.strerror(number)})")
+        return DeviceLost(f"{path}: {found}{_remedy(path, number)}")
     if isinstance(error, ValueError):  # pyserial: the driver of this port refused the speed
         return DeviceMisconfigured(
             f"{path}: cannot run at {baud} baud: set `baud` to a speed that port and device share"
@@ -316,4 +326,6 @@ def _remedy(path: str, number: int) -> str:
             ": plug it in, or set `port` (of an SLCAN adapter: `channel`) to one that is there: "
             f"{there or '/dev/serial/by-id is empty'}"
         )
+    if number in {errno.EMFILE, errno.ENFILE}:
+        return ": raise LimitNOFILE (`ulimit -n`) or find the program that keeps files open"
     return ": check the cable"

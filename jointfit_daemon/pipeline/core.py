@@ -207,17 +207,21 @@ class Core:
 
     def _closed(self, event: SourceClosed) -> list[Output]:
         state = self._sources.get(event.source)
-        level = _CLOSED[event.reason]
-        if state is None or not state.open:
-            return [Notice(event.t_ns, "device", event.source, event.text, level)]
+        notice = Notice(event.t_ns, "device", event.source, event.text, _CLOSED[event.reason])
+        if state is None:
+            return [notice]
+
+        # A source that is retried and fails as before, without a sample, has nothing new to report.
+        repeated = not state.online and event.text == state.closed_text
+        state.closed_text = event.text
+        notices: list[Output] = [] if repeated else [notice]
+        if not state.open:
+            return notices
+
         outputs = self._take(event.source, state, state.closed())
         if state.source.kind == "imu":
             self._aligner.lose(event.source)
-        return [
-            *outputs,
-            DeviceStatus(event.source, online=False),
-            Notice(event.t_ns, "device", event.source, event.text, level),
-        ]
+        return [*outputs, DeviceStatus(event.source, online=False), *notices]
 
     def _chunk(self, event: ChunkArrived) -> list[Output]:
         state = self._sources.get(event.source)

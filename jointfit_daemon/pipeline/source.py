@@ -73,6 +73,8 @@ class SourceState:
     last_arrival_ns: int | None = None
     counts: WireCounts = field(default_factory=WireCounts)
     info: Mapping[str, object] = field(default_factory=dict)
+    closed_text: str = ""
+    """Why it was closed last."""
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
 

@@ -1,7 +1,9 @@
-"""One task a source: retry what may heal, retire what cannot, let bugs through.
+"""One task a source: retry what may heal, pause what needs another device, let bugs through.
 
-Law: a source is opened in the core when its first bytes arrive and closed when its driver ends.
-Whatever else a driver raises is a bug: it ends the daemon with its traceback.
+Invariant: a source is opened in the core when its first bytes arrive and closed when its driver
+ends. No source stops for good: one that is misconfigured pauses until another device is on its
+port, for a minute at most, or until a reload. Whatever else a driver raises is a bug: it ends the
+daemon with its traceback.
 """
 
 from __future__ import annotations
@@ -9,11 +11,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import random
 import time
 from typing import TYPE_CHECKING, Literal
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured, device_path
 from jointfit_daemon.outputs.journal import about
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened
 
@@ -29,10 +32,12 @@ log = logging.getLogger(__name__)
 FIRST_RETRY_S = 0.1  # a re-plugged port is often there again within a blink
 LAST_RETRY_S = 1.0  # the promise is to resume within two seconds of a re-plug
 HEALTHY_S = 5.0  # after this long a loss is a new one, and is tried again at once
+PAUSE_S = 60.0  # a device may be put right without being unplugged
+LOOK_S = 0.5  # between two looks at the port of a source that pauses; one stat(2) each
 
 
 class _Life:
-    """Tells the core about one source: opened with its first bytes, closed once."""
+    """Reports one source to the core: opened with its first bytes, closed once."""
 
     def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
         self._source, self._deliver, self._known = source, deliver, known
@@ -61,10 +66,28 @@ class _Life:
             self._open = False
 
 
+class _Task:
+    """One running source.
+
+    Attributes
+    ----------
+    known
+        Set once the source has sent something or was found absent.
+    paused
+        Whether it waits for another device.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.known = asyncio.Event()
+        self.paused = False
+        self.task: asyncio.Task[None] | None = None
+
+
 async def keep_running(
-    source: Source, deliver: Callable[[Event], None], known: asyncio.Event | None = None
+    source: Source, deliver: Callable[[Event], None], state: _Task | None = None
 ) -> None:
-    """Run one source for ever, or until its settings prove wrong: only a reload tries again.
+    """Run one source for ever.
 
     Parameters
     ----------
@@ -72,35 +95,65 @@ async def keep_running(
         What to run.
     deliver
         Feeds one event to the core.
-    known
-        Set once the source has sent something or was found absent.
+    state
+        Where to report how it runs.
     """
-    life = _Life(source.id, deliver, known or asyncio.Event())
+    state = state or _Task(source)
+    life = _Life(source.id, deliver, state.known)
+    path = device_path(source.settings)
     loop = asyncio.get_running_loop()
     delay = FIRST_RETRY_S
+    reported = ""
     while True:
-        began = loop.time()
+        began, device = loop.time(), _identity(path)
         try:
             await source.driver_class(source.settings).run(life.emit)
             life.closed("lost", "its driver ended by itself")
         except DeviceLost as lost:
             if loop.time() - began > HEALTHY_S:
-                delay = FIRST_RETRY_S
-            life.closed("lost", str(lost))  # the core tells it, on the log too
+                delay, reported = FIRST_RETRY_S, ""
+            life.closed("lost", str(lost))  # the core reports it, on the log too
         except DeviceMisconfigured as wrong:
             life.closed("misconfigured", str(wrong))
-            log.error(  # noqa: TRY400 - it says enough
-                "%s: stopped until the next reload: %s",
-                source.id,
-                wrong,
-                extra=about("device", source.id),
-            )
-            return
+            if str(wrong) != reported:
+                reported = str(wrong)
+                log.error(  # noqa: TRY400 - it says enough
+                    "%s: paused until another device is on its port, or %g s: %s",
+                    source.id,
+                    PAUSE_S,
+                    wrong,
+                    extra=about("device", source.id),
+                )
+            state.paused = True
+            await _until_changed(path, device)
+            state.paused, delay = False, FIRST_RETRY_S
         except asyncio.CancelledError:
             life.removed()
             raise
         await asyncio.sleep(random.uniform(0, delay))  # noqa: S311 - full jitter: no retry in step
         delay = min(2 * delay, LAST_RETRY_S)
+
+
+async def _until_changed(path: str | None, device: object) -> None:
+    """Wait until what is at `path` is no longer `device`; ``PAUSE_S`` at most."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(PAUSE_S):
+            while _identity(path) == device:  # noqa: ASYNC110 - a file system sets no event
+                await asyncio.sleep(LOOK_S)
+
+
+def _identity(path: str | None) -> object:
+    """Return what differs between two devices that are plugged in one after the other.
+
+    None where there is no device. A name without folder is that of a network interface (``can0``).
+    """
+    if path is None:
+        return None
+    try:
+        found = os.stat(path if "/" in path else f"/sys/class/net/{path}")  # noqa: PTH116 - any text
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino, found.st_rdev, found.st_ctime_ns
 
 
 class SourceTasks:
@@ -116,21 +169,20 @@ class SourceTasks:
 
     def __init__(self, tasks: asyncio.TaskGroup, deliver: Callable[[Event], None]) -> None:
         self._tasks, self._deliver = tasks, deliver
-        self._running: dict[str, tuple[Source, asyncio.Task[None]]] = {}
-        self._known: dict[str, asyncio.Event] = {}
+        self._running: dict[str, _Task] = {}
 
     async def retire(self, sources: Iterable[Source]) -> None:
         """Stop those that are not among these; one whose settings are the same keeps its port.
 
-        One that stopped by itself is forgotten: what was wrong may be right now, outside rig.toml.
+        One that pauses is stopped, too: what was wrong may be right now, outside rig.toml.
         """
         wanted = {source.id: source for source in sources}
         gone = [
-            self._running.pop(name)[1]
-            for name, (source, task) in list(self._running.items())
-            if wanted.get(name) != source or task.done()
+            self._running.pop(name)
+            for name, each in list(self._running.items())
+            if wanted.get(name) != each.source or each.paused
         ]
-        await stop(gone)
+        await stop(each.task for each in gone if each.task is not None)
 
     async def apply(self, sources: Iterable[Source]) -> None:
         """Run exactly these."""
@@ -138,11 +190,10 @@ class SourceTasks:
         await self.retire(wanted.values())
         for name, source in wanted.items():
             if name not in self._running:
-                known = self._known[name] = asyncio.Event()
-                task = self._tasks.create_task(
-                    keep_running(source, self._deliver, known), name=f"source {name}"
+                state = self._running[name] = _Task(source)
+                state.task = self._tasks.create_task(
+                    keep_running(source, self._deliver, state), name=f"source {name}"
                 )
-                self._running[name] = (source, task)
 
     async def known(self, within_s: float) -> None:
         """Wait until every source has sent something or was found absent.
@@ -151,13 +202,13 @@ class SourceTasks:
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
-                for known in [self._known[name] for name in self._running]:
-                    await known.wait()
+                for each in list(self._running.values()):
+                    await each.known.wait()
 
     async def stop(self) -> None:
         """Stop all sources and wait until their ports are closed."""
-        gone, self._running = [task for _, task in self._running.values()], {}
-        await stop(gone)
+        gone, self._running = list(self._running.values()), {}
+        await stop(each.task for each in gone if each.task is not None)
 
 
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> None:

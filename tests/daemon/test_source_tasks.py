@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.driver import DeviceMisconfigured
 from jointfit_daemon.pipeline.events import SourceClosed
+from jointfit_daemon.supervisor import sources as sources_module
 from jointfit_daemon.supervisor.sources import SourceTasks
 
 if TYPE_CHECKING:
+    import pytest
+
     from jointfit_daemon.pipeline.events import Event
 
 
@@ -28,6 +31,26 @@ class Refused:
             raise DeviceMisconfigured("no permission: add the user to group dialout")
         type(self).opened += 1
         await asyncio.Event().wait()
+
+
+async def test_a_source_that_paused_is_tried_again_after_a_while_and_reported_once(
+    table: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sources_module, "PAUSE_S", 0.05)
+    driver: Any = type("Port", (Refused,), {})
+    source = parse_rig(table).sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
+    events: list[Event] = []
+    async with asyncio.TaskGroup() as tasks:
+        sources = SourceTasks(tasks, events.append)
+        await sources.apply([source])
+        await asyncio.sleep(0.5)
+        driver.mended = True
+        async with asyncio.timeout(2):
+            while not driver.opened:
+                await asyncio.sleep(0.01)
+        assert [type(event) for event in events] == [SourceClosed]
+        assert caplog.text.count("add the user to group dialout") == 1
+        await sources.stop()
 
 
 async def test_a_source_that_stopped_is_tried_again_at_a_reload(table: dict[str, Any]) -> None:

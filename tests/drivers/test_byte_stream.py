@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
+import termios
 import time
 import tty
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import serial
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
 from jointfit_drivers.byte_stream import SerialPort
@@ -180,6 +183,22 @@ def test_a_forbidden_port_names_the_group_and_the_rule(monkeypatch: pytest.Monke
         pytest.raises(DeviceLost, match=r"dialout.*udev"),
         SerialPort("/dev/ttyUSB0", 9600),
     ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "number",
+    [errno.EMFILE, errno.ENFILE, errno.EPROTO, errno.ETIMEDOUT, errno.ENOMEM, errno.ESHUTDOWN],
+)
+@pytest.mark.parametrize("kind", [OSError, termios.error, serial.SerialException])
+def test_an_error_of_system_or_hardware_may_pass(
+    number: int, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise kind(number, "as the kernel has it")
+
+    monkeypatch.setattr("serial.Serial", refuse)
+    with pytest.raises(DeviceLost, match="/dev/ttyUSB0"), SerialPort("/dev/ttyUSB0", 9600):
         pass
 
 

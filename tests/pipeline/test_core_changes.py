@@ -80,6 +80,17 @@ def test_a_sample_that_a_closing_decoder_gives_up_does_not_bring_the_device_back
     assert [o.online for o in bench.out if isinstance(o, DeviceStatus) and o.id == "S1"][-1] is True
 
 
+def test_a_source_that_fails_again_and_again_without_a_sample_is_reported_once() -> None:
+    bench = Bench()
+    bench.feed([*opening(), *samples(SENSORS, 0, 20)])
+    for number in range(20, 24):
+        bench.feed([SourceClosed(at(number), "S1", "misconfigured", "no such speed")])
+        bench.feed([SourceOpened(at(number), "S1")])
+    bench.feed([*samples(["S1"], 24, 30), SourceClosed(at(31), "S1", "lost", "no such speed")])
+    texts = [o.text for o in bench.out if isinstance(o, Notice)]
+    assert texts.count("no such speed") == 2, "once, and once more after it had streamed"
+
+
 def test_a_reload_that_changes_a_port_keeps_the_counts_in_agreement() -> None:
     bench = Bench()
     bench.feed([*opening(), *samples((*SENSORS, "mocap"), 0, 20)])
