@@ -222,19 +222,21 @@ class LimbFuser:
         for i, name in enumerate(chain.joints):
             position, variance = places[i]
             sd = None if variance is None else sqrt(variance)
-            state = None
-            if 0 < i < len(fused):
-                above, below = fused[i - 1], fused[i]
-                state = read_angles(
-                    above, below, sign=self._signs[i], left=chain.left_side, alike=self._alike[i]
-                )
+            if not 0 < i < len(fused):
+                joints.append(JointState(name, position, sd))
+                continue
+            above, below = fused[i - 1], fused[i]
+            state = read_angles(
+                above, below, sign=self._signs[i], left=chain.left_side, alike=self._alike[i]
+            )
             if state is None:
                 joints.append(JointState(name, position, sd))
                 continue
             if state.gimbal and "gimbal" not in flags:
                 flags.append("gimbal")
             angles, inner, flexion_sd, gimbal = state
-            rates = self._rates.rates(t_ns, name, angles, gimbal=gimbal)
+            measured = angles if above.used and below.used else None  # held angles have no rate
+            rates = self._rates.rates(t_ns, name, measured, gimbal=gimbal)
             joints.append(JointState(name, position, sd, angles, inner, flexion_sd, rates))
         return tuple(joints)
 

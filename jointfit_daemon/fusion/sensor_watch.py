@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 State = Literal["absent", "ok", "lost", "stuck"]
 
-_SILENT: tuple[State, ...] = ("lost", "absent")
 LOST_NS = 200_000_000
 """Silence that is told as a loss."""
 BACK_NS = 2_000_000_000
@@ -64,7 +63,6 @@ class SensorWatch:
         }
         self._items = tuple(self._sensors.items())
         self._frozen = FrozenWatch(chain.sensors)
-        self._heard_ns: int | None = None
         self._untold = False
         """Whether any state is another than what was told."""
 
@@ -80,7 +78,6 @@ class SensorWatch:
         said : mapping of str to Quaternion
             Orientation by sensor, each in its own world; the caller must not change it afterwards.
         """
-        self._heard_ns = now_ns
         stuck = self._frozen.look(t_ns, said)
         for name, one in self._items:
             state: State = "lost" if name not in said else "stuck" if name in stuck else "ok"
@@ -92,23 +89,8 @@ class SensorWatch:
             return said, ()
         return {name: q for name, q in said.items() if name not in stuck}, stuck
 
-    @property
-    def due_ns(self) -> int | None:
-        """Return when silence of all sensors at once becomes news; None if it is, or none spoke."""
-        if self._heard_ns is None:
-            return None
-        for _, one in self._items:  # mostly the first one decides
-            if one.told in _SILENT:
-                continue
-            return self._heard_ns + LOST_NS
-        return None
-
     def news(self, now_ns: int) -> list[SensorNews]:
         """Return what is worth telling at `now_ns`, each change once."""
-        if self._heard_ns is not None and now_ns - self._heard_ns >= LOST_NS:
-            for _, one in self._items:
-                if one.state in ("ok", "stuck"):
-                    one.state, one.since_ns, self._untold = "lost", self._heard_ns, True
         if not self._untold:
             return []
         told = [

@@ -67,6 +67,8 @@ class Core:
         self._unix_offset_ns: int | None = None
         self._now_ns = 0
         self._seq = 0
+        self._empty = 0
+        """Frames that no sensor took part in."""
         self._cameras = CameraUse()
         self._bulletin = Bulletin()
         self._session: CalibrationSession
@@ -107,13 +109,8 @@ class Core:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when the core wants a ``Tick`` at the latest; None while nothing is pending."""
-        if self._rig is None:
-            return None
-        frame_ns, silence_ns = self._aligner.next_deadline_ns, self._fuser.watch.due_ns
-        if frame_ns is None or silence_ns is None:
-            return frame_ns or silence_ns
-        return min(frame_ns, silence_ns)
+        """Return when the core wants a ``Tick`` at the latest; None before it is configured."""
+        return None if self._rig is None else self._aligner.next_deadline_ns
 
     def health(self, now_ns: int) -> dict[str, object]:
         """Return counters and clocks of every device: the part of ``bridge/health`` known here."""
@@ -123,7 +120,11 @@ class Core:
         lags = {} if self._lags is None else self._lags.health()
         return health_of(self._sources, verdicts, self._session, self._fuser, now_ns) | {
             "lags": lags,
-            "frames": {"sent": self._seq, "skipped": self._aligner.skipped_frames},
+            "frames": {
+                "sent": self._seq,
+                "empty": self._empty,
+                "skipped": self._aligner.skipped_frames,
+            },
             "learning": self._session.learned.health(self._learner, now_ns),
         }
 
@@ -151,7 +152,7 @@ class Core:
             outputs.append(Notice(event.t_ns, "reload", rig.name, "configuration reloaded"))
             session.take_over(self._session, same_rig=_worn(before) == _worn(rig))
         if self._grid is None:
-            self._grid = FrameGrid(rig)
+            self._grid = FrameGrid(rig, event.t_ns)
         else:
             self._grid.follow(rig)
         self._aligner = self._grid.aligner
@@ -305,6 +306,7 @@ class Core:
 
     def _fuse(self, frame: AlignedFrame) -> LimbState:
         self._seq += 1
+        self._empty += not frame.orientations
         fresh = self._cameras.fresh(self._now_ns)
         state = self._fuser.fuse(
             frame.t_ns,

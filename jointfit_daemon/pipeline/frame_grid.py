@@ -1,7 +1,8 @@
 """The grid of frames of a rig, and the verdicts on its sensors' samples.
 
-Law: a reload begins a new grid only where it lays frames out anew; samples that waited get their
-verdict then, and counts go on for every sensor that is still there.
+Invariant: frames are owed from the first configuration on, with or without samples, and their
+instants grow across reloads. A reload begins a new grid only where it lays frames out anew; samples
+that waited get their verdict then, and counts go on for every sensor that is still there.
 """
 
 from __future__ import annotations
@@ -23,14 +24,16 @@ class FrameGrid:
     ----------
     rig : Rig
         The first one.
+    begin_ns : int
+        Host time from which on frames are owed, ns.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, begin_ns: int) -> None:
         self._layout = _layout(rig)
         self._names = _sensors(rig)
         self._before: dict[str, dict[str, int]] = {}
         """Counts of aligners that a reload replaced."""
-        self.aligner = _aligner(rig)
+        self.aligner = _aligner(rig, begin_ns)
 
     def follow(self, rig: Rig) -> None:
         """Go on with a rig that was reloaded."""
@@ -38,7 +41,8 @@ class FrameGrid:
             return
         self.aligner.close()
         known = self.verdicts()
-        self.aligner, self._layout, self._names = _aligner(rig), _layout(rig), _sensors(rig)
+        self.aligner = _aligner(rig, self.aligner.next_ns)
+        self._layout, self._names = _layout(rig), _sensors(rig)
         # one that is gone takes its counts along: it may come back, and begins at nothing then
         self._before = {name: known[name] for name in self._names if name in known}
 
@@ -60,10 +64,11 @@ def _sensors(rig: Rig) -> tuple[str, ...]:
     return tuple(source.id for source in rig.sources if source.kind == "imu")
 
 
-def _aligner(rig: Rig) -> FrameAligner:
+def _aligner(rig: Rig, begin_ns: int | None) -> FrameAligner:
     streams = {
         source.id: StreamSpec(round(_NS / source.rate_hz))
         for source in rig.sources
         if source.kind == "imu"
     }
-    return FrameAligner(streams, round(_NS / rig.output_rate_hz), mode=rig.align_mode)
+    period_ns = round(_NS / rig.output_rate_hz)
+    return FrameAligner(streams, period_ns, mode=rig.align_mode, begin_ns=begin_ns)

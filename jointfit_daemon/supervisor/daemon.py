@@ -58,7 +58,7 @@ from jointfit_daemon.supervisor.systemd import SystemdNotifier
 from jointfit_daemon.supervisor.watchdog import Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from jointfit_daemon.config import Rig
@@ -263,7 +263,13 @@ class Daemon:
     def _at_work(self) -> bool:
         health = self._heart.core.health(time.monotonic_ns())
         imus = frozenset(source.id for source in self._rig.sources if source.kind == "imu")
-        return self._progress.made(health, self._heart.states, imus)
+        return self._progress.made(health, self._poses(health), imus)
+
+    def _poses(self, health: Mapping[str, object]) -> int:
+        """Return how many limb states were made from samples."""
+        frames = health.get("frames")
+        empty = frames.get("empty", 0) if isinstance(frames, dict) else 0
+        return self._heart.states - int(empty)
 
     def _tell_health(self) -> None:
         health = self._heart.core.health(time.monotonic_ns())
@@ -272,7 +278,7 @@ class Daemon:
         if self._heart.log is not None:
             health["recording"] = self._heart.log.figures()
         self._reporter.health(health)
-        pace_hz = self._pace.since(self._heart.states, time.monotonic())
+        pace_hz = self._pace.since(self._poses(health), time.monotonic())
         seen = Seen(self._online, phase_of(health), pace_hz, self._link.connected)
         self._systemd.status(status_line(self._rig.sources, seen))
 

@@ -29,7 +29,7 @@ class Progress:
         health
             As the core tells it.
         states
-            Limb states so far.
+            Limb states made from samples so far.
         imus
             Ids of the devices whose samples make limb states.
         """

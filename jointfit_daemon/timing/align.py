@@ -9,6 +9,10 @@ its deadline: each stream's next sample is expected at its usual delay, and is w
 its periods at most. What is lacking then is continued from the last samples for up to 2.5 periods,
 and is missing after that.
 
+Invariant: frames never stop. While no stream can serve them, they go out without orientations, as
+soon as every stream counts as lost, and then at the usual delay. Only frames that nobody asked for
+within a second (the whole process was stopped) are passed over.
+
 In mode ``fast`` a stream is content with a sample one of its own periods before t_k, and what lies
 between is extrapolated: frames leave one period earlier, never before t_k itself.
 """
@@ -29,6 +33,10 @@ __all__ = ["AlignedFrame", "FrameAligner", "Mode", "StreamSpec", "Verdict"]
 Mode = Literal["smooth", "fast"]
 """``smooth`` waits for samples and interpolates; ``fast`` extrapolates by a period at most."""
 
+OWED_NS = 1_000_000_000
+"""Frames without orientations that are older than this are passed over, ns: a process that was
+stopped for an hour would have to send 360 000 of them."""
+
 
 class AlignedFrame(NamedTuple):
     """All streams at one instant."""
@@ -41,7 +49,8 @@ class AlignedFrame(NamedTuple):
     extrapolated: frozenset[str]
     missing: frozenset[str]
     synced: bool
-    """Whether the clocks behind all of `orientations` had settled."""
+    """Whether the clocks behind all of `orientations` had settled; without any, whether those
+    behind the last frame with some had, until a stream ends."""
 
 
 _NONE: frozenset[str] = frozenset()
@@ -60,6 +69,9 @@ class FrameAligner:
         Whether to wait for samples.
     active : bool
         While False samples are counted as idle and no frames come out.
+    begin_ns : int, optional
+        Instant from which on frames are owed, with or without samples, ns; by default that of the
+        first sample.
 
     Raises
     ------
@@ -74,6 +86,7 @@ class FrameAligner:
         *,
         mode: Mode = "smooth",
         active: bool = True,
+        begin_ns: int | None = None,
     ) -> None:
         if period_ns <= 0 or any(spec.period_ns <= 0 for spec in streams.values()):
             raise ValueError("periods must be positive")
@@ -82,16 +95,20 @@ class FrameAligner:
         self._period_ns = period_ns
         self._fast = mode == "fast"
         self._active = active
-        self._next: int | None = None  # number of the next frame; None until a stream begins
+        self._next = None if begin_ns is None else -(-begin_ns // period_ns)
+        """Number of the next frame; None until a stream begins."""
         self._served: int | None = None  # number of a frame some stream is known to serve
+        self._serves_ns: int | None = None  # first instant a stream can serve, if not the next
         self._completed_ns = 0
+        self._synced = False
+        """Whether the clocks behind the last frame had settled."""
         self._deadline_ns: int | None = None
         self._changed = True  # since `_deadline_ns` was worked out
         self._dues: dict[str, int] = {}
         """When each stream is ready for the next frame; empty until that is asked."""
         self.emitted_frames = 0
         self.skipped_frames = 0
-        """Frames never emitted because no stream had anything near them."""
+        """Frames that were passed over, see ``OWED_NS``."""
         self.forced_frames = 0
         """Frames that went out at their deadline."""
 
@@ -147,11 +164,16 @@ class FrameAligner:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when ``advance`` will emit a frame if no sample comes; None: only samples can."""
+        """Return when ``advance`` will emit a frame if no sample comes; None: none is owed yet."""
         if self._changed:
-            self._deadline_ns = self._due() if self._active and self._begin() else None
+            self._deadline_ns = self._due() if self._active else None
             self._changed = False
         return self._deadline_ns
+
+    @property
+    def next_ns(self) -> int | None:
+        """Return the instant of the next frame, ns; None: none is owed yet."""
+        return None if self._next is None else self._next * self._period_ns
 
     def advance(self, now_ns: int, *, complete_only: bool = False) -> list[AlignedFrame]:
         """Return the frames due at `now_ns`, in order.
@@ -169,10 +191,9 @@ class FrameAligner:
         while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
             if complete_only and self._lacks_sample():
                 break
-            frame = self._emit(due_ns)
             self._changed = True
-            if frame is not None:
-                frames.append(frame)
+            if self._served == self._next or not self._pass_over(now_ns):
+                frames.append(self._emit(due_ns))
         return frames
 
     def _lacks_sample(self) -> bool:
@@ -183,26 +204,29 @@ class FrameAligner:
             for _, stream in self._items
         )
 
-    def _begin(self) -> bool:
-        """Choose the next frame; skip those no stream can serve. False if there is none yet."""
-        if self._served is not None and self._served == self._next:
-            return True  # more samples change nothing about that
-        self._dues.clear()
-        starts = self._starts()
-        if not starts:
+    def _pass_over(self, now_ns: int) -> bool:
+        """Go on to what a stream can serve or is not too old; False if the next frame is."""
+        until_ns = now_ns - OWED_NS
+        if self._serves_ns is not None:
+            until_ns = min(until_ns, self._serves_ns)
+        first, following = -(-until_ns // self._period_ns), self._next or 0
+        if first <= following:
             return False
-        first = -(-min(starts) // self._period_ns)
-        if self._next is None:
-            self._next = first
-        elif first > self._next:
-            self.skipped_frames += first - self._next
-            self._next = first
+        self.skipped_frames += first - following
+        self._next = first
         return True
+
+    def _find_servers(self) -> None:
+        """Note whether a stream serves the next frame, else from when on one will."""
+        starts = self._starts()
+        self._serves_ns = min(starts, default=None)
+        if self._next is None and self._serves_ns is not None:
+            self._next = self._served = -(-self._serves_ns // self._period_ns)
 
     def _starts(self) -> list[int]:
         """Return from when on streams can serve; settle those that cannot."""
         starts: list[int] = []
-        t_next, served = self._t_next, False
+        t_next, served = self.next_ns, False
         for _, stream in self._items:
             if served and stream.waited_for:
                 continue  # one is enough, and this one has not ended
@@ -216,22 +240,26 @@ class FrameAligner:
             self._served = self._next
         return starts
 
-    @property
-    def _t_next(self) -> int | None:
-        return None if self._next is None else self._next * self._period_ns
-
-    def _due(self) -> int:
+    def _due(self) -> int | None:
         """Return when the next frame is or was complete, or its deadline if it is not, ns."""
-        if not self._dues:
+        if self._served is None or self._served != self._next:
+            self._dues.clear()
+            self._find_servers()
+        t_k = self.next_ns
+        if t_k is None:
+            return None
+        if self._served != self._next:
+            return max([t_k, *[stream.given_up_ns(t_k) for _, stream in self._items]])
+        if not self._dues:  # else more samples change nothing but their own stream's
             self._dues = {name: self._due_of(stream) for name, stream in self._items}
         latest = max(self._dues.values())
-        return max((self._next or 0) * self._period_ns, latest) if self._fast else latest
+        return max(t_k, latest) if self._fast else latest
 
     def _due_of(self, stream: Stream) -> int:
         t_k = (self._next or 0) * self._period_ns
         return stream.due(t_k - stream.period_ns if self._fast else t_k)
 
-    def _emit(self, due_ns: int) -> AlignedFrame | None:
+    def _emit(self, due_ns: int) -> AlignedFrame:
         number = self._next or 0
         t_k = number * self._period_ns
         self._next = number + 1
@@ -250,9 +278,9 @@ class FrameAligner:
             if stream.extrapolated:
                 extrapolated.append(name)
                 forced = True
-        if not orientations:
-            self.skipped_frames += 1
-            return None
+        if not orientations:  # as before, while no stream has ended: a pause unsettles no clock
+            synced = self._synced and any(stream.waited_for for _, stream in self._items)
+        self._synced = synced
         self.emitted_frames += 1
         self.forced_frames += forced
         return AlignedFrame(

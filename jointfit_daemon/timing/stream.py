@@ -201,6 +201,20 @@ class Stream:
                 return sample.arrival_ns
         return 0
 
+    def given_up_ns(self, t_ns: int) -> int:
+        """Return until when a frame at `t_ns` that no stream can serve waits for this one, ns.
+
+        A stream that still sends is waited for until its usual delay is over, however long that
+        is, and until it counts as lost.
+        """
+        if self.newest_ns >= t_ns:
+            return t_ns
+        delay_ns = self._delay_ns or 0
+        usual_ns = t_ns + min(delay_ns, DELAY_MOST_NS) + self._patience_ns
+        if not self.waited_for:
+            return usual_ns
+        return max(usual_ns, min(t_ns + delay_ns, self.newest_arrival_ns) + self._lost_after_ns)
+
     def at(self, t_ns: int) -> Quaternion | None:
         """Return the orientation at `t_ns`, which grows from call to call; None: missing."""
         self.extrapolated = False

@@ -10,6 +10,11 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
+from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
 from jointfit_daemon.config import MqttSettings, load_rig
 from jointfit_daemon.outputs.mqtt import BrokerLost
 from jointfit_daemon.outputs.mqtt_client import MqttClient
@@ -255,3 +260,16 @@ def unbalanced(devices: dict[str, Any]) -> dict[str, dict[str, int]]:
         for name, device in devices.items()
         if device["received"] != sum(device[key] for key in VERDICTS) or device["pending"]
     }
+
+
+def store_calibration(rig_file: Path, state: Path) -> None:
+    """Store a static calibration of sensors whose axes are those of their segments."""
+    rig = load_rig(rig_file)
+    t_ns = np.arange(400, dtype=np.int64) * 10_000_000
+    still = np.tile((1.0, 0.0, 0.0, 0.0), (len(t_ns), 1))
+    names = [name for group in rig.chain.sensors for name in group]
+    trial = CalibrationTrial({name: SensorTrack(t_ns, still) for name in names}, None)
+    pose = fit_static(trial, rig.calibration, rig.chain)
+    CalibrationStore(state / "calibrations", rig.calibration_store).save(
+        fit_static_only(pose, None, rig.chain)
+    )

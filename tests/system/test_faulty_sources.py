@@ -11,13 +11,8 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
-from jointfit_daemon.calibration.store import CalibrationStore
-from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
-from jointfit_daemon.config import load_rig
 from jointfit_daemon.tools.demo_processes import daemon
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.can_wire import SlcanAdapter
@@ -27,7 +22,14 @@ from jointfit_simulators.natnet_stage import StagedBody
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
-from tests.system.station import BASE, Listener, knee_angles, listening, sensors_in
+from tests.system.station import (
+    BASE,
+    Listener,
+    knee_angles,
+    listening,
+    sensors_in,
+    store_calibration,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -188,19 +190,6 @@ def write_rig(folder: Path, mqtt: int, mocap: int) -> Path:
     return folder / "rig.toml"
 
 
-def calibrate(rig_file: Path, state: Path) -> None:
-    """Store a calibration of sensors that lie along their bones."""
-    rig = load_rig(rig_file)
-    t_ns = np.arange(400, dtype=np.int64) * (10**9 // RATE_HZ)
-    still = np.tile((1.0, 0.0, 0.0, 0.0), (len(t_ns), 1))
-    names = [name for group in rig.chain.sensors for name in group]
-    trial = CalibrationTrial({name: SensorTrack(t_ns, still) for name in names}, None)
-    pose = fit_static(trial, rig.calibration, rig.chain)
-    CalibrationStore(state / "calibrations", rig.calibration_store).save(
-        fit_static_only(pose, None, rig.chain)
-    )
-
-
 EXPECTED = {
     "slow": ("921600 baud but nothing decodes", "set baud = 115200"),
     "gps": ("not an Xbus device", "set `port` to the right one, or `driver`"),
@@ -219,7 +208,7 @@ async def test_each_fault_is_named_with_its_remedy_and_the_rest_runs(
 ) -> None:
     async with plugged_in(tmp_path) as hardware, listening(broker.port) as listener:
         rig = write_rig(tmp_path, broker.port, hardware.server.command_port)
-        calibrate(rig, tmp_path / "state")
+        store_calibration(rig, tmp_path / "state")
         async with daemon(tmp_path, rig) as child:
             await listener.until(
                 lambda: all(listener.said(name, *parts) for name, parts in EXPECTED.items()), 25

@@ -215,12 +215,63 @@ def test_a_frame_does_not_remember_neighbors_that_a_reordered_sample_parted() ->
     assert found[0].orientations == found[1].orientations
 
 
-def test_a_long_silence_of_all_skips_frames() -> None:
+def test_frames_without_orientations_go_on_while_all_streams_are_silent() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    pushes = [
+        *stream("A", 10 * MS, 300, phase=MS, delay=3 * MS, lost=range(100, 200)),
+        *stream("B", 10 * MS, 300, phase=4 * MS, delay=2 * MS, lost=range(100, 200)),
+    ]
+    frames = play(a, pushes)
+    assert [f.t_ns for f in frames] == list(range(T0 + 10 * MS, frames[-1].t_ns + 1, 10 * MS))
+    of = {(f.t_ns - T0) // MS: f for f in frames}
+    assert all(not f.missing for t, f in of.items() if t < 1000 or t > 2010)
+    silent = [f for t, f in of.items() if 1010 < t < 1990]
+    assert all(f.missing == {"A", "B"} and not f.orientations for f in silent)
+    assert all(f.synced for f in silent)  # no stream ended
+    waited = [f.completed_ns - f.t_ns for f in silent]
+    assert waited[0] == 26 * MS  # 50 ms after the last sample both count as lost
+    assert set(waited[1:]) == {17_500_000}  # the usual delay, and one and a half periods
+    assert a.skipped_frames == 0
+    for name in "AB":
+        assert assert_accounted(a, name)["dropped"] == 0
+
+
+def test_frames_begin_before_any_stream_does() -> None:
+    a = FrameAligner({"A": StreamSpec(10 * MS)}, 10 * MS, begin_ns=T0 - 99 * MS)
+    frames = play(a, stream("A", 10 * MS, 20, phase=2 * MS))
+    assert [f.t_ns for f in frames] == list(range(T0 - 90 * MS, frames[-1].t_ns + 1, 10 * MS))
+    early = [f for f in frames if f.t_ns <= T0]
+    assert all(f.missing == {"A"} and not f.synced for f in early)
+    assert all("A" in f.orientations for f in frames if f.t_ns > T0 + 10 * MS)
+
+
+def test_a_closed_stream_leaves_frames_unsynced() -> None:
     a = aligner(A=10 * MS)
-    month = 30 * 86_400_000 * MS  # too many frames to count one by one
-    frames = play(a, stream("A", 10 * MS, 50) + stream("A", 10 * MS, 50, phase=month))
+    play(a, stream("A", 10 * MS, 20))
+    a.lose("A")
+    frames = a.advance(T0 + 500 * MS)
+    assert [f.synced for f in frames if not f.orientations] == [False] * (len(frames) - 2)
+    assert frames[-1].t_ns >= T0 + 480 * MS
+
+
+def test_frames_owed_for_long_are_passed_over() -> None:
+    a = aligner(A=10 * MS)
+    month = 30 * 86_400_000 * MS
+    for k in range(50):
+        a.push("A", T0 + k * 10 * MS, T0 + k * 10 * MS, IDENTITY)
+    last = a.advance(T0 + 490 * MS)[-1]
+    a.push("A", T0 + month, T0 + month, IDENTITY)
+    frames = a.advance(T0 + month)
+    assert last.t_ns < frames[0].t_ns
     assert len(frames) < 110
-    assert a.skipped_frames == pytest.approx(month / (10 * MS) - 50, abs=5)
+    assert a.skipped_frames == pytest.approx(month / (10 * MS) - 150, abs=5)
+
+
+@pytest.mark.parametrize("delay", [300 * MS, 2_000 * MS])
+def test_a_stream_that_is_always_late_is_waited_for_while_it_is_the_only_one(delay: int) -> None:
+    frames = play(aligner(A=10 * MS), stream("A", 10 * MS, 300, phase=2 * MS, delay=delay))
+    assert all(frame.orientations for frame in frames[2:])  # the first have one sample to go by
+    assert len(frames) > 290
 
 
 def test_nothing_is_interpolated_across_an_epoch() -> None:
@@ -229,9 +280,10 @@ def test_nothing_is_interpolated_across_an_epoch() -> None:
     for k in range(20):
         t = T0 + k * 10 * MS + 4 * MS
         a.push("A", t, t, IDENTITY if k < 10 else other, epoch=k // 10)
-        seen += [frame.orientations["A"] for frame in a.advance(t)]
+        seen += [frame.orientations.get("A") for frame in a.advance(t)]
     assert len(seen) > 15
-    assert set(seen) == {IDENTITY, other}
+    assert seen.count(None) == 1
+    assert set(seen) == {IDENTITY, None, other}
     assert assert_accounted(a, "A")["dropped"] <= 2
 
 
@@ -351,7 +403,7 @@ def test_whatever_comes_in_frames_are_in_order_and_samples_accounted(
     for frame in frames:
         assert frame.t_ns > last
         assert frame.t_ns % (10 * MS) == 0
-        assert frame.orientations
+        assert frame.orientations.keys() | frame.missing == {"A", "B", "C"}
         assert frame.completed_ns <= now
         assert not frame.missing & frame.orientations.keys()
         last = frame.t_ns

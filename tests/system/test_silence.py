@@ -1,0 +1,112 @@
+"""Poses go on at the output rate while every IMU is silent, and say so."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
+from jointfit_daemon.pipeline.replay import replay_states
+from tests.system.station import (
+    SENSORS,
+    Listener,
+    Station,
+    listening,
+    sensors_in,
+    stopped,
+    store_calibration,
+    unbalanced,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.tools.demo_processes import Simulator
+    from tests.broker_fixture import Broker
+
+pytestmark = pytest.mark.system
+
+WIRES = ("S1", "S3", "can0")
+PERIOD_US = 10_000
+LOST = ["lost:thigh", "lost:shank"]
+HELD = ["held:thigh", "held:shank"]
+SECOND = 100
+"""Frames a second."""
+
+
+async def all_wires(simulator: Simulator, command: str) -> None:
+    for wire in WIRES:
+        await simulator.say(f"{command} {wire}")
+
+
+def silent_flags(pose: dict[str, Any]) -> list[str]:
+    """Return the flags of segments without a sensor."""
+    return [flag for flag in pose["flags"] if flag.startswith(("held", "lost"))]
+
+
+async def heard_with(listener: Listener, *flags: str) -> dict[str, Any]:
+    """Wait for a pose from now on that has exactly these flags about silent segments."""
+    begin = len(listener.poses)
+
+    def found() -> list[dict[str, Any]]:
+        return [pose for pose in listener.poses[begin:] if silent_flags(pose) == [*flags]]
+
+    await listener.until(found)
+    return found()[0]
+
+
+def is_unknown(pose: dict[str, Any]) -> bool:
+    knee = pose["joints"]["knee"]
+    parts = pose["segments"].values()
+    return knee["inner_deg"] is None and all(part["q"] is None for part in parts)
+
+
+@pytest.mark.timeout(90)
+async def test_poses_go_on_as_held_then_lost_while_all_imus_are_silent(
+    tmp_path: Path, broker: Broker
+) -> None:
+    motion = ("--seed", "1", "--programme", "walk:600")
+    station = Station(tmp_path, broker.port, options=motion, more_toml="[recording]\n")
+    async with station.simulator() as simulator:
+        await all_wires(simulator, "unplug")
+        store_calibration(station.rig, tmp_path / "state")
+        async with station.daemon() as daemon, listening(broker.port) as listener:
+            await listener.connected({"mocap"})
+            assert is_unknown(await heard_with(listener, *LOST))  # no IMU was ever there
+
+            await all_wires(simulator, "plug")
+            await listener.connected(set(SENSORS))
+            await listener.until(lambda: sensors_in(listener.poses[-1]) == set(SENSORS))
+
+            begin = len(listener.poses)
+            await all_wires(simulator, "unplug")
+            await listener.until(lambda: not listener.online & set(SENSORS))
+            await heard_with(listener, *LOST)
+            (held, *_) = [pose for pose in listener.poses[begin:] if silent_flags(pose) == HELD]
+            assert held["joints"]["knee"]["inner_deg"] is not None
+            assert held["joints"]["knee"]["flexion_deg_s"] is None
+            silent = await listener.more_poses(2 * SECOND, 4.0)
+            assert all(is_unknown(pose) and not sensors_in(pose) for pose in silent)
+            assert "imu+mocap" in {pose["mode"] for pose in silent}
+            assert listener.latest["bridge/state"]["state"] == "online"
+
+            await all_wires(simulator, "plug")
+            await listener.until(lambda: sensors_in(listener.poses[-1]) == set(SENSORS))
+            await listener.more_poses(SECOND)
+            await simulator.quit()
+            await listener.until(lambda: not listener.online)
+            devices = await listener.health(lambda d: not any(x["online"] for x in d.values()))
+            code, _ = await stopped(daemon)
+
+    assert code == 0, station.log
+    assert unbalanced(devices) == {}
+    steps = [
+        (b["mono_us"] - a["mono_us"], b["seq"] - a["seq"]) for a, b in pairwise(listener.poses)
+    ]
+    assert all(seq >= 1 and us == PERIOD_US * seq for us, seq in steps), set(steps)
+    (log,) = (tmp_path / "state" / "recordings").iterdir()
+    live = list(read_states(log))
+    assert len(live) > 5 * SECOND
+    assert [encode_state(state) for state in replay_states(read_events(log))] == live
