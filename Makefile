@@ -22,8 +22,8 @@ $(STAMP): pyproject.toml requirements.lock
 demo: $(STAMP)  ## the main job on simulated hardware, with an embedded broker
 	@$(BIN)/jointfit demo $(ARGS)
 
-test: $(STAMP)  ## all tests that this machine can run; what is skipped says why
-	@$(BIN)/python -m pytest $(ARGS)
+test: $(STAMP)  ## all tests that this machine can run, on all cores; what is skipped says why
+	@$(BIN)/python .ci/suite.py $(ARGS)
 
 test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; the .deb under real systemd, with broker and faults
 	@$(BIN)/python .ci/light_vm.py

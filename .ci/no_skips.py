@@ -1,4 +1,4 @@
-"""Fail when a test that CI must run was skipped: `no_skips.py JUNIT.xml`.
+"""Fail when a test that CI must run was skipped: `no_skips.py JUNIT.xml ...`.
 
 Two kinds of test may be skipped in that step. Those of tests/vm: a later step runs them on a kernel
 that has vcan, and fails if one is skipped there. And those that need what nobody can install: the
@@ -18,30 +18,31 @@ NOT_INSTALLABLE = (
 """Reasons of tests that a clean machine may skip; they are counted and told."""
 
 
-def skipped(report: Path) -> list[tuple[str, str]]:
+def skipped(cases: list[ET.Element]) -> list[tuple[str, str]]:
     """Return name and reason of the tests that were skipped, without those of tests/vm."""
     return [
         (name, found.get("message") or "no reason given")
-        for case in ET.parse(report).getroot().iter("testcase")  # noqa: S314 - pytest's, just made
+        for case in cases
         for found in case.iter("skipped")
         if found.get("type") != "pytest.xfail"
         and not (name := f"{case.get('classname')}::{case.get('name')}").startswith(MAY_SKIP)
     ]
 
 
-def main(report: Path) -> int:
-    """Tell what was skipped; 1 if anything was that must not be, or if nothing ran at all."""
-    found = skipped(report)
+def main(reports: list[Path]) -> int:
+    """Print what was skipped; return 1 if anything was that must not be, or if nothing ran."""
+    trees = [ET.parse(report) for report in reports]  # noqa: S314 - pytest's, just made
+    cases = [case for tree in trees for case in tree.getroot().iter("testcase")]
+    found = skipped(cases)
     wrong = [each for each in found if not any(reason in each[1] for reason in NOT_INSTALLABLE)]
     for name, reason in wrong:
         print(f"skipped, but CI must run it: {name}: {reason}")
     for reason in NOT_INSTALLABLE:
         if count := sum(reason in each[1] for each in found):
             print(f"{count} tests skipped: {reason}")
-    ran = sum(1 for _ in ET.parse(report).getroot().iter("testcase"))  # noqa: S314 - as above
-    print(f"{ran} tests, {len(wrong)} wrongly skipped")
-    return 1 if wrong or not ran else 0
+    print(f"{len(cases)} tests, {len(wrong)} wrongly skipped")
+    return 1 if wrong or not cases else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    sys.exit(main([Path(word) for word in sys.argv[1:]]))

@@ -27,8 +27,31 @@ settings.load_profile("ci" if os.environ.get("CI") else "home")
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
 
+PARTS = ("parallel", "alone")
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option with which `make test` runs the suite in two parts."""
+    parser.addoption(
+        "--part",
+        choices=PARTS,
+        help="only the tests with the marker alone, or only the others, which may run in parallel",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect the tests of the other part."""
+    part = config.getoption("part")
+    if part is None:
+        return
+
+    def belongs(item: pytest.Item) -> bool:
+        return (item.get_closest_marker("alone") is not None) is (part == "alone")
+
+    config.hook.pytest_deselected(items=[item for item in items if not belongs(item)])
+    items[:] = [item for item in items if belongs(item)]
 
 
 @pytest.fixture(scope="session")

@@ -37,6 +37,7 @@ def measured(tmp_path: Path, pattern: str, timeout_s: float = 28.0) -> dict[str,
     return {row["name"]: row for bench in told["benches"] for row in bench["rows"]}
 
 
+@pytest.mark.alone
 def test_codecs_keep_their_floors_and_slcan_is_several_times_cheaper_than_python_cans(
     tmp_path: Path,
 ) -> None:
@@ -45,6 +46,7 @@ def test_codecs_keep_their_floors_and_slcan_is_several_times_cheaper_than_python
     assert rows["slcan: ours over python-can's"]["figure"] < 0.5
 
 
+@pytest.mark.alone
 @pytest.mark.timeout(60)
 def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
     rows = measured(tmp_path, "fusion|core", 55.0)
@@ -52,6 +54,7 @@ def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
     assert all(row["ratio"] > 0 for row in rows.values())
 
 
+@pytest.mark.alone
 @pytest.mark.system
 @pytest.mark.timeout(90)
 def test_the_daemon_is_measured_between_hardware_and_broker(tmp_path: Path) -> None:

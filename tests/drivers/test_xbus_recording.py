@@ -36,6 +36,7 @@ class Player(XbusDevice):
             self._line.write(encode(message.mid, message.data, message.bid))
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("speed", [10.0, 1.0])
 async def test_the_recording_played_into_a_pty_gives_92_samples(
     tmp_path: Path, shared_data: Path, speed: float

@@ -279,6 +279,7 @@ def test_chains_of_other_lengths_work(count: int) -> None:
     )
 
 
+@pytest.mark.alone
 def test_a_frame_of_four_sensors_takes_well_under_a_millisecond(
     worn: Calibration, walk: tuple[Motion, Frames]
 ) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.demo_processes import Simulator
     from tests.broker_fixture import Broker
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.alone]
 
 SECOND = 1_000_000
 BLOCK_S = 0.2
