@@ -52,10 +52,10 @@ APART_S = 200.0
 """Between the beginnings of two trials, so that no two of them share noise."""
 TRIALS = {
     "standing": 5.0,
-    "squats": 12.0,
-    "walking": 12.0,
-    "knee_swings": 12.0,
-    "sit_to_stand": 12.0,
+    "squats": 8.0,
+    "walking": 8.0,
+    "knee_swings": 8.0,
+    "sit_to_stand": 8.0,
 }
 """Each trial and its length, s."""
 _MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}

@@ -1,0 +1,181 @@
+"""Every command that a page prints is run as printed, on sample data, with the services it names.
+
+Only two things differ from a reader's machine: the broker listens on a free port, which is written
+into the rig.toml files of the sandbox, and BLAS has one thread.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.documented_commands import (
+    PLACEHOLDER,
+    Block,
+    PageFile,
+    Shell,
+    disagreement,
+    options_of,
+    page_parts,
+    reason_not_to_run,
+    uncommanded,
+)
+from tests.test_docs import PAGES, ROOT, every_page, text_of
+
+if TYPE_CHECKING:
+    from tests.broker_fixture import Broker
+
+COMMANDS = re.compile(
+    r"^ *(jointfit|jointfitd|jointfit-sim|python|make|sudo|pip|mosquitto_\w+) ", re.MULTILINE
+)
+IN_SAMPLE = "`jointfit sample sample && cd sample`"
+"""Pages with these words are read in the folder of sample data."""
+MAN_PAGES = sorted((ROOT / "packaging" / "man").glob("*.1"))
+
+
+def blocks_of(page: Path) -> list[Block]:
+    return [part for part in page_parts(text_of(page)) if isinstance(part, Block)]
+
+
+def runnable(page: Path) -> bool:
+    return any(
+        reason_not_to_run(command) is None
+        for block in blocks_of(page)
+        for command in block.commands
+    )
+
+
+def environment(home: Path) -> dict[str, str]:
+    """Return the environment of a reader who has activated the virtual environment."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    return os.environ | {
+        "HOME": str(home),
+        "PATH": path,
+        "LC_ALL": "C.UTF-8",
+        "COLUMNS": "160",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder in which `jointfit sample sample` was run."""
+    folder = tmp_path_factory.mktemp("reader")
+    subprocess.run(
+        ["jointfit", "sample", "sample"], cwd=folder, env=environment(folder), check=True,
+        capture_output=True,
+    )  # fmt: skip
+    return folder / "sample"
+
+
+def point_at(broker: Broker, folder: Path) -> None:
+    """Write the port of the broker into all rig files that name none, or the usual one."""
+    for rig in folder.rglob("*.toml"):
+        text = rig.read_text(encoding="utf-8")
+        if "[mqtt]" in text and "port = 1883" in text:
+            text = text.replace("port = 1883", f"port = {broker.port}")
+            rig.write_text(text.replace('"localhost"', f'"{broker.host}"'), encoding="utf-8")
+
+
+def point_clients_at(broker: Broker, home: Path) -> None:
+    """Write the port of the broker where mosquitto's clients look for options."""
+    (home / ".config").mkdir()
+    for program in ("mosquitto_sub", "mosquitto_pub"):
+        options = f"-h {broker.host}\n-p {broker.port}\n-V mqttv5\n"
+        (home / ".config" / program).write_text(options, encoding="utf-8")
+
+
+@pytest.mark.system
+@pytest.mark.timeout(900)
+@pytest.mark.skipif(
+    shutil.which("jointfit", path=environment(ROOT)["PATH"]) is None,
+    reason="the commands are not installed in this environment: make .venv/.installed",
+)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if runnable(page)], ids=lambda page: page.name
+)
+def test_every_command_of_a_page_runs_as_printed(
+    page: Path, broker: Broker, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    home, reader, logs = tmp_path / "home", tmp_path / "reader", tmp_path / "logs"
+    for folder in (home, reader, logs):
+        folder.mkdir()
+    if IN_SAMPLE in " ".join(text_of(page).split()):
+        shutil.copytree(request.getfixturevalue("sample"), reader, dirs_exist_ok=True)
+    point_clients_at(broker, home)
+
+    with Shell(reader, environment(home), logs) as shell:
+        for part in page_parts(text_of(page)):
+            if isinstance(part, PageFile):
+                (reader / part.name).write_text(part.text, encoding="utf-8")
+                continue
+            printed = ""
+            for command in part.commands:
+                if reason_not_to_run(command) is None:
+                    point_at(broker, reader)
+                    printed += shell.run(command)
+            if part.output is not None:
+                assert disagreement(part.output, printed) is None, printed
+        shell.stop_services()
+
+
+@every_page
+def test_commands_are_fenced_as_commands_and_hold_no_placeholder(page: Path) -> None:
+    for block in blocks_of(page):
+        assert [c for c in block.commands if PLACEHOLDER.search(c)] == []
+
+    others = uncommanded(text_of(page))
+    assert [body for body in others if COMMANDS.search(body)] == []
+
+
+def bench_commands() -> dict[str, set[str]]:
+    """Return the options that pages give to each script of bench/."""
+    found: dict[str, set[str]] = {}
+    for page in PAGES:
+        for block in blocks_of(page):
+            for command in block.commands:
+                if script := re.search(r"\bbench/\w+\.py", command):
+                    found.setdefault(script[0], set()).update(options_of(command))
+    return found
+
+
+@pytest.mark.parametrize("script", sorted(bench_commands()))
+def test_a_bench_has_the_options_that_pages_give_it(script: str) -> None:
+    helped = subprocess.run(
+        [sys.executable, script, "--help"],
+        cwd=ROOT,
+        env=environment(ROOT) | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert [option for option in bench_commands()[script] if option not in helped.stdout] == []
+
+
+@pytest.mark.parametrize("page", MAN_PAGES, ids=lambda page: page.name)
+def test_a_man_page_names_options_and_commands_that_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8").replace("\\-", "-").replace("\\", "")
+    module = {"jointfit": "jointfit_daemon.tools", "jointfitd": "jointfit_daemon"}
+    words = [sys.executable, "-m", module.get(page.stem, "jointfit_simulators")]
+    wide = environment(ROOT) | {"PYTHONPATH": os.pathsep.join(sys.path)}
+
+    def helped(*command: str) -> str:
+        line = [*words, *command, "--help"]
+        return subprocess.run(line, env=wide, capture_output=True, text=True, check=True).stdout
+
+    named = re.findall(r'^\.TP\n\.BI? "?([a-z-]+)', text, re.MULTILINE)
+    options, subcommands = (
+        [n for n in named if n.startswith("-")],
+        [n for n in named if n[0] != "-"],
+    )
+    if page.stem == "jointfit":
+        assert subcommands
+        assert [name for name in subcommands if not re.search(rf"\b{name}\b", helped())] == []
+    assert [name for name in options if name not in helped()] == []
