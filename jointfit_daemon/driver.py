@@ -47,7 +47,7 @@ class DeviceMisconfigured(Exception):  # noqa: N818 - named for what happened
 class Settings(BaseModel):
     """Base of every table a driver reads from rig.toml: frozen, unknown keys refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CanBusSettings(Settings):

@@ -152,9 +152,11 @@ class Calibration:
         """
         if data.get("schema") != SCHEMA:
             raise UnknownSchema(f"schema {data.get('schema')!r}, this program reads {SCHEMA}")
+        if type(data["schema"]) is not int:
+            raise UnknownSchema(f"schema {data['schema']!r}, expected a whole number")
         try:
             return _from_dict(data)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise UnknownSchema(f"not a calibration: {type(error).__name__}: {error}") from error
 
 

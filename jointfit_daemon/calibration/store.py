@@ -1,31 +1,47 @@
-"""Calibrations on disk: numbered versions, written whole or not at all.
+"""Calibrations on disk: numbered versions, written whole or not at all, with a checksum.
 
-Law: a version, once written, is never touched again; a reader sees a complete file or none. Text
+Invariant: a version, once written, is never changed; a reader sees a complete file or none. Text
 is written aside, flushed to the medium, then linked under its number, which fails if that number
 exists; the directory is flushed last. A stop at any moment leaves the previous version in force.
+
+A file is ``{"sha256": …, "calibration": {…}}``; the checksum is that of the calibration as JSON
+with sorted keys and without blanks. A file whose content cannot be used is renamed to ``….bad``,
+which keeps its number taken, and never deleted.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.calibration.content_check import content_faults
 from jointfit_daemon.calibration.result import Calibration, UnknownSchema
+from jointfit_daemon.files.structured_text import parse_json, plain_fault, read_bounded
+from jointfit_daemon.files.text_table import Malformed
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
+MOST_BYTES = 64 * 1024 * 1024
+"""Size of the largest file that is read; a calibration of four sensors has about 1 MB."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP)
-_NUMBERED = re.compile(r"(\d{4,})\.json")
+_NUMBERED = re.compile(r"(\d{4,9})\.json")
+_TAKEN = re.compile(r"(\d{4,9})\.json(\.bad\d*)?")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 class CalibrationUnreadable(Exception):  # noqa: N818 - named for what happened
     """A stored file is damaged or of another program; the message names the file and the remedy."""
+
+
+class _DamagedError(CalibrationUnreadable):
+    """Its content can never be used by this program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +98,9 @@ class CalibrationStore:
             The medium is full, read-only or gone; nothing was changed then.
         """
         self._directory.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(calibration.to_dict(), allow_nan=False, indent=1) + "\n"
+        content = calibration.to_dict()
+        table = {"sha256": checksum(content), "calibration": content}
+        text = json.dumps(table, allow_nan=False, indent=1) + "\n"
         aside = self._directory / f".writing-{os.getpid()}"
         try:
             with aside.open("w", encoding="utf-8") as file:
@@ -97,7 +115,8 @@ class CalibrationStore:
 
     def _link(self, aside: Path) -> int:
         """Give the file the next free number. A hard link, unlike a rename, never replaces."""
-        version = max(self.versions(), default=0) + 1
+        names = (_TAKEN.fullmatch(path.name) for path in self._directory.iterdir())
+        version = max((int(match[1]) for match in names if match), default=0) + 1
         while True:
             try:
                 os.link(aside, self.path(version))
@@ -127,18 +146,25 @@ class CalibrationStore:
             No such version, or the file is damaged.
         """
         path = self.path(version)
-        try:
-            return Calibration.from_dict(json.loads(path.read_text(encoding="utf-8")))
-        except FileNotFoundError as error:
+        if not path.exists():
             known = ", ".join(map(str, self.versions())) or "none"
-            raise CalibrationUnreadable(f"{path}: no such version; stored: {known}") from error
-        except (UnknownSchema, ValueError, AttributeError, OSError) as error:
-            raise CalibrationUnreadable(
-                f"{path}: cannot be read ({error}); move it away or calibrate again"
+            raise CalibrationUnreadable(f"{path}: no such version; stored: {known}")
+        try:
+            data = read_bounded(path, MOST_BYTES)
+        except Malformed as error:
+            raise CalibrationUnreadable(str(error)) from error
+        try:
+            return _calibration_of(data)
+        except (UnknownSchema, ValueError, RecursionError) as error:
+            raise _DamagedError(
+                f"{path}: cannot be used ({str(error) or type(error).__name__:.300}); "
+                "restore the file from a backup or calibrate again"
             ) from error
 
     def latest(self) -> Stored | None:
-        """Return the newest readable version, with a note for every newer one that is not.
+        """Return the newest usable version, with a note for every newer one that is not.
+
+        Files whose content cannot be used are renamed.
 
         Raises
         ------
@@ -149,8 +175,54 @@ class CalibrationStore:
         for version in reversed(self.versions()):
             try:
                 return Stored(self.load(version), version, tuple(notes))
+            except _DamagedError as error:
+                notes.append(f"{error}; {self._set_aside(version)}; the version before is used")
             except CalibrationUnreadable as error:
                 notes.append(f"{error}; the version before is used")
         if notes:
             raise CalibrationUnreadable("; ".join(notes))
         return None
+
+    def _set_aside(self, version: int) -> str:
+        """Rename a damaged version, so that it is reported once; return what was done."""
+        path = self.path(version)
+        for count in range(1, 100):
+            aside = path.with_name(f"{path.name}.bad{count if count > 1 else ''}")
+            if not aside.exists():
+                try:
+                    path.rename(aside)
+                except OSError as error:
+                    return f"it cannot be renamed: {error.strerror}"
+                return f"set aside as {aside.name}"
+        return "it stays: too many files of this name are set aside"
+
+
+def checksum(content: Mapping[str, object]) -> str:
+    """Return the SHA-256, in hex, of the JSON form of a calibration, whatever its layout."""
+    text = json.dumps(content, allow_nan=False, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _calibration_of(data: bytes) -> Calibration:
+    """Return the calibration in a file.
+
+    Raises
+    ------
+    ValueError, RecursionError
+        It cannot be used; `UnknownSchema` among them.
+    """
+    table = parse_json(data.decode("utf-8-sig"))
+    if not isinstance(table, dict):
+        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - of a file
+    content: object = table if "schema" in table else table.get("calibration")
+    if not isinstance(content, dict):
+        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - as above
+    # A bare calibration was written before there were checksums.
+    if content is not table and table.get("sha256") != checksum(content):
+        raise ValueError("the checksum differs: it was damaged, or edited by hand")
+    if fault := plain_fault(content):
+        raise ValueError(fault)
+    calibration = Calibration.from_dict(content)
+    if faults := content_faults(calibration):
+        raise ValueError("; ".join(faults))
+    return calibration

@@ -28,6 +28,19 @@ _LONGEST_M = 3.0  # no limb is longer; a length in millimetres is
 _LEAST_MARKERS = 3  # fewer do not define an orientation
 
 
+def control_characters(value: object, key: str = "") -> Iterator[Fault]:
+    """Check that no text holds a NUL: no file, port or topic may be named so."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from control_characters(name, f"key {name!r}")
+            yield from control_characters(inner, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for at, inner in enumerate(value):
+            yield from control_characters(inner, f"{key}[{at}]")
+    elif isinstance(value, str) and "\0" in value:
+        yield Fault(key, "must not hold a NUL character", value)
+
+
 def topic_name(key: str, name: str) -> list[Fault]:
     """Check a name that becomes one level of an MQTT topic."""
     if not name.strip():

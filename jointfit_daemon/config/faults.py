@@ -40,6 +40,11 @@ class Fault:
     near: str | None = None
     """Nearest valid spelling."""
 
+    @property
+    def has_value(self) -> bool:
+        """Whether it is about a value that was found, not about one that is missing."""
+        return self.value is not _NO_VALUE
+
     def text(self) -> str:
         """Return one line for people."""
         shown = "" if self.value is _NO_VALUE else f" = {_brief(self.value)}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -13,6 +12,7 @@ from jointfit_daemon.calibration.trial import CalibrationSettings
 from jointfit_daemon.config import checks
 from jointfit_daemon.config.faults import ConfigError, Fault, faults_of, nearest
 from jointfit_daemon.config.rig import MOCAP, Rig, Source
+from jointfit_daemon.config.syntax import read_table
 from jointfit_daemon.config.tables import (
     CalibrationTable,
     ChainTable,
@@ -28,6 +28,7 @@ from jointfit_daemon.driver import (
     driver_names,
     find_driver,
 )
+from jointfit_daemon.files.structured_text import plain_fault
 from jointfit_daemon.model import Chain
 
 if TYPE_CHECKING:
@@ -51,18 +52,9 @@ def load_rig(path: Path) -> Rig:
     ConfigError
         The file cannot be read, is not TOML, or describes no usable rig; lists all faults.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            str(path), [Fault("file", f"cannot be read: {error.strerror}")]
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(str(path), [Fault("file", f"is not UTF-8: {error.reason}")]) from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(str(path), [Fault("TOML", f"{error}")]) from error
+    table, syntax = read_table(path)
     _anchor_files(table, path.absolute().parent)
-    return parse_rig(table, source=str(path))
+    return _rig_of(table, str(path), syntax)
 
 
 def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
@@ -80,10 +72,21 @@ def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
     ConfigError
         Lists every fault of the table.
     """
-    reader = _Reader(deepcopy(dict(table)))
-    rig = reader.rig()
-    if rig is None or reader.faults:
-        raise ConfigError(source, list({fault.text(): fault for fault in reader.faults}.values()))
+    if (fault := plain_fault(table)) is not None:
+        raise ConfigError(source, [Fault("TOML", fault)])
+    return _rig_of(deepcopy(dict(table)), source, [])
+
+
+def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
+    reader = _Reader(table)
+    unusable = list(checks.control_characters(table))
+    reader.faults += unusable
+    rig = None if unusable else reader.rig()
+    faults = [*syntax, *reader.faults]
+    if syntax:  # what seems to be missing may be on a line that could not be parsed
+        faults = [*syntax, *(fault for fault in reader.faults if fault.has_value)]
+    if rig is None or faults:
+        raise ConfigError(source, list({fault.text(): fault for fault in faults}.values()))
     return rig
 
 

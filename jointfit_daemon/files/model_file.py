@@ -7,11 +7,11 @@ All that is wrong is told at once. docs/kinematics.md describes the format.
 from __future__ import annotations
 
 import json
-import tomllib
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, get_args
 
 from jointfit_daemon.files.model_units import in_metres
+from jointfit_daemon.files.structured_text import read_json, read_toml
 from jointfit_daemon.files.text_table import Malformed
 from jointfit_daemon.kinematics.chain_model import (
     ChainModel,
@@ -54,11 +54,7 @@ def read_model(path: Path) -> ChainModel:
         Broken, keys that are not known, values of the wrong kind, segments that make no chain,
         lengths that cannot be metres.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-        data: Any = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except ValueError as error:
-        raise Malformed(f"{path}: {error}") from error
+    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
     wrong = _wrong(data)
     if wrong:
         raise Malformed(f"{path}: {'; '.join(wrong)}")

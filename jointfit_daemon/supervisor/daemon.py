@@ -301,6 +301,10 @@ class Daemon:
                 rig = await asyncio.to_thread(load_rig, self._config)
             except ConfigError as fault:
                 self._tell("reload", f"refused, the running rig stays: {fault}", "error")
+            except Exception as error:
+                log.exception("reload")
+                text = f"refused, the running rig stays: a bug, please report it: {error!r}"
+                self._tell("reload", text, "error")
             else:
                 await self._change_to(rig)
             self._systemd.ready()

@@ -162,7 +162,7 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
             raise ValueError(message)
         try:
             given |= tomllib.loads(f"{key} = {value}")
-        except tomllib.TOMLDecodeError:  # a bare word is meant as text
+        except (ValueError, RecursionError):  # a bare word is meant as text
             given[key] = value
     for key, info in driver.Settings.model_fields.items():
         if info.is_required() and key not in given:

@@ -255,14 +255,14 @@ def _method(name: str) -> Any:
 
 
 def _read_model(path: Path) -> Any:
-    import orjson
-
     from jointfit_daemon.calibration.result import Calibration, UnknownSchema
+    from jointfit_daemon.calibration.store import MOST_BYTES
+    from jointfit_daemon.files.structured_text import read_json
 
+    said = read_json(path, MOST_BYTES)
     try:
-        said = orjson.loads(path.read_bytes())
         return Calibration.from_dict(said if isinstance(said, dict) else {})
-    except (orjson.JSONDecodeError, UnknownSchema) as fault:
+    except UnknownSchema as fault:
         raise ValueError(f"{path}: not a model that `jointfit fuse fit` wrote: {fault}") from fault
 
 

@@ -236,12 +236,13 @@ def _refuse_moving(path: Path, found: Mapping[str, RobustMean]) -> None:
 
 def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
     """Return mounts from a JSON file ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``."""
-    import orjson
+    from jointfit_daemon.files.structured_text import read_json
+    from jointfit_daemon.files.text_table import Malformed
 
     try:
-        said = orjson.loads(path.read_bytes())
-    except orjson.JSONDecodeError as fault:
-        raise Unusable(f"{path}: not JSON: {fault}") from fault
+        said = read_json(path)
+    except Malformed as fault:
+        raise Unusable(str(fault)) from fault
     mounts = said.get("q_bias") if isinstance(said, dict) else None
     if not isinstance(mounts, dict):
         raise Unusable(f'{path}: expected {{"q_bias": {{SENSOR: [w, x, y, z]}}}}')

@@ -18,13 +18,13 @@ z right) are ours renamed; their pelvis turns by tilt, list, rotation in this or
 
 from __future__ import annotations
 
-import tomllib
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from jointfit_daemon.files.sto import read_sto
+from jointfit_daemon.files.structured_text import read_toml
 from jointfit_simulators.limb import ANKLE, HIP, KNEE, PELVIS_POSITION, PELVIS_TURN
 from jointfit_simulators.orientation import Rotation
 from jointfit_simulators.posture import Style, upright
@@ -41,7 +41,7 @@ _PARTS = {**_ANGLES, "position": PELVIS_POSITION}
 
 
 def _read_toml(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    table = read_toml(path)
     keys = table.get("key", [])
     t_s = np.array([key["t_s"] for key in keys], dtype=np.float64)
     angles = {

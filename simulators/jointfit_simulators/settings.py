@@ -8,13 +8,14 @@ leaves all other dice as they fell.
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 import zlib
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from jointfit_daemon.files.structured_text import read_toml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -151,5 +152,5 @@ def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
 
 def knobs_from_toml(path: Path) -> Knobs:
     """Return the knobs of a TOML file of ``name = value`` lines; the rest keep their defaults."""
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    table = read_toml(path)
     return turn(Knobs(), [f"{name}={value}" for name, value in table.items()])

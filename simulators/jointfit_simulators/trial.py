@@ -12,7 +12,6 @@ z]}}``). All of them y up, as OpenSim writes them, but for NPZ that say otherwis
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -25,6 +24,7 @@ from jointfit_daemon.files.npz import (
     vectors_z_up,
 )
 from jointfit_daemon.files.sto import read_orientations_sto
+from jointfit_daemon.files.structured_text import read_json
 from jointfit_daemon.files.trc import MarkerTrajectories, read_trc
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def read_recording(paths: Sequence[Path]) -> Recording:
             case ".trc":
                 markers = read_trc(path)
             case ".json":
-                table = json.loads(path.read_text(encoding="utf-8"))["q_bias"]
+                table = read_json(path)["q_bias"]
                 biases = {name: quaternions_z_up(q) for name, q in table.items()}
             case other:
                 raise ValueError(f"{path}: no trial is read from {other!r} files")

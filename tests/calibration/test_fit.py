@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.content_check import content_faults
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.judgement import better
 from jointfit_daemon.calibration.model_fit import METHODS
@@ -79,6 +80,7 @@ def test_json_is_exact_through_text(clean: tuple[Subject, Calibration]) -> None:
     text = json.dumps(calibration.to_dict(), allow_nan=False)
     again = Calibration.from_dict(json.loads(text))
     assert again == calibration
+    assert content_faults(again) == []
     assert json.dumps(again.to_dict(), allow_nan=False) == text
     assert (again.software, again.created_utc) == ("1.2", "2026-01-01")
     assert len(again.digest) == 64
@@ -215,6 +217,7 @@ def test_without_cameras_the_static_pose_is_the_identity() -> None:
         q = rotation.multiply(standing.sensors[name].q_world_sensor, item.q_sensor_segment)
         assert np.max(rotation.angle_between(q, rotation.IDENTITY)) < np.radians(0.5)
     assert Calibration.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+    assert content_faults(found) == []
 
 
 def test_a_worse_calibration_is_never_better(clean: tuple[Subject, Calibration]) -> None:

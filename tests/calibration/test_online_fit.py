@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jointfit_daemon.calibration.content_check import content_faults
 from jointfit_daemon.calibration.jobs import run_job
 from jointfit_daemon.calibration.memory import MOST, evenly, joined, pack, postures, unpack
 from jointfit_daemon.calibration.online_fit import Fresh, learn
@@ -46,6 +47,7 @@ def test_far_bends_are_learned_and_small_ones_are_not_forgotten(learned: dict[st
 
 def test_only_models_memory_and_figures_change(learned: dict[str, Any]) -> None:
     before, after = calibration(), Calibration.from_dict(learned["calibration"])
+    assert content_faults(after) == []
     blank: dict[str, Any] = {"segment": {}, "quality": {}, "memory": "", "correlations": {}}
     assert replace(before, **blank) == replace(after, **blank)
     assert {n: s.length for n, s in before.segment.items()} == {

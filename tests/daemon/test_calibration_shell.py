@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.supervisor import calibrations
 from jointfit_daemon.supervisor.worker import HEADER
+from tests.calibration.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,21 +26,13 @@ def rig(table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     return parse_rig(table | {"calibration": {"store": "subject-07"}})
 
 
-def calibration_of(rig: Rig, **changed: Any) -> Calibration:
-    chain = rig.chain
-    parts: dict[str, Any] = {
-        "joints": chain.joints, "segments": chain.segments, "chain_sensors": chain.sensors,
-    }  # fmt: skip
-    return Calibration(method="mean", sensor={}, segment={}, joint={}, **(parts | changed))
-
-
 def test_an_empty_store_is_no_trouble(rig: Rig) -> None:
     assert calibrations.stored(rig) == (None, None, ())
 
 
 def test_what_was_saved_is_found_with_its_version_and_date(rig: Rig) -> None:
-    assert calibrations.save(rig, calibration_of(rig)) == 1
-    assert calibrations.save(rig, calibration_of(rig)) == 2
+    assert calibrations.save(rig, plain_calibration(rig.chain)) == 1
+    assert calibrations.save(rig, plain_calibration(rig.chain)) == 2
     found = calibrations.stored(rig)
     assert found.version == 2
     assert found.calibration is not None
@@ -49,18 +41,19 @@ def test_what_was_saved_is_found_with_its_version_and_date(rig: Rig) -> None:
 
 
 def test_a_calibration_of_another_limb_is_not_used(rig: Rig) -> None:
-    calibrations.save(rig, calibration_of(rig, joints=("shoulder", "elbow", "wrist")))
+    calibrations.save(rig, plain_calibration(rig.chain, joints=("shoulder", "elbow", "wrist")))
     found = calibrations.stored(rig)
     assert found.calibration is None
     assert "of another limb" in found.complaints[0]
 
 
 def test_a_damaged_store_is_told_and_survived(rig: Rig, tmp_path: Path) -> None:
-    calibrations.save(rig, calibration_of(rig))
+    calibrations.save(rig, plain_calibration(rig.chain))
     calibrations.store_of(rig).path(1).write_text("{")
     found = calibrations.stored(rig)
     assert found.calibration is None
-    assert "cannot be read" in found.complaints[0]
+    assert "cannot be used" in found.complaints[0]
+    assert "set aside as 0001.json.bad" in found.complaints[0]
 
 
 async def test_a_worker_dies_with_its_parent(tmp_path: Path) -> None:

@@ -267,3 +267,35 @@ def test_the_schema_describes_every_key() -> None:
 def test_in_the_schema_a_bus_is_a_name(fakes: object) -> None:
     can = rig_schema()["$defs"]["FakeCanSettings"]["properties"]["can"]
     assert can["type"] == "string"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"a = " + b"[" * 5000, "nested more than 32 levels deep"),
+        (b'[rig]\nname = "a\\u0000b"', "rig.name = 'a\\x00b': must not hold a NUL"),
+        (b"[rig]\noutput_rate_hz = 1" + b"0" * 5000, "TOML"),
+        (b"\xff\xfe[\0", "is not UTF-8: found UTF-16"),
+        (b"# " * 200_000, "larger than"),
+        (b"[rig]\nname 'x'\noutput_rate_hz = 99,5\n", "line 3 = 'output_rate_hz = 99,5': "),
+        (b"[rig]\noutput_rate_hz = 99,5\n", "decimals take a point, not a comma"),
+    ],
+)
+def test_hostile_text_is_one_clear_fault(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+    assert said in str(caught.value)
+
+
+def test_syntax_errors_and_wrong_values_are_told_together(fakes: object, tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        "[rig]\nname = bench\noutput_rate_hz = 'fast'\n[chain]\njoints = ['hip', 'knee']\n"
+        "segments = ['thigh']\nside = 'lefft'\n[mqtt]\nhost = broker\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+    keys = [fault.key for fault in caught.value.faults]
+    assert keys == ["line 2", "line 9", "rig.output_rate_hz", "chain.side"]

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from jointfit_daemon import __version__
 from jointfit_daemon.__main__ import main
+from jointfit_daemon.calibration.store import checksum
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
 from jointfit_daemon.outputs.mqtt_client import MqttClient
 from jointfit_daemon.pipeline.replay import replay_states
+from tests.calibration.plain_calibration import plain_calibration
 from tests.daemon import fake_drivers
 
 if TYPE_CHECKING:
@@ -173,6 +177,76 @@ def test_a_second_daemon_in_one_state_directory_ends_with_exit_code_3(process: P
     with running(process) as third:  # no stale lock
         time.sleep(1)
         assert third.poll() is None
+
+
+def test_reloads_of_hostile_files_change_nothing(process: Process) -> None:
+    process.write(1)
+    hostile = [
+        b"a = " + b"[" * 5000,
+        b'[rig]\nname = "a\\u0000"\n',
+        b"\xff\xfe",
+        b"x = 1" + b"0" * 5000,
+        b".".join([b"a"] * 3000) + b" = 1",
+    ]
+    with running(process) as daemon:
+        wait_for(process.state / "recordings")
+        time.sleep(0.5)  # the signal handler is in place
+        for content in hostile:
+            process.rig.write_bytes(content)
+            daemon.send_signal(signal.SIGHUP)
+            time.sleep(0.4)
+            assert daemon.poll() is None
+        process.rig.unlink()
+        os.mkfifo(process.rig)
+        daemon.send_signal(signal.SIGHUP)
+        time.sleep(0.4)
+        daemon.send_signal(signal.SIGTERM)
+        _, said = daemon.communicate(timeout=15)
+    assert daemon.returncode == 0, said
+    assert said.count("refused, the running rig stays") == len(hostile) + 1
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"a = " + b"[" * 5000, b'[rig]\nname = "a\\u0000"', b"\xff\xfe", b"a = " + b"1" * 5000],
+)
+def test_a_start_with_a_hostile_file_is_a_clear_message(process: Process, content: bytes) -> None:
+    process.rig.write_bytes(content)
+    with running(process) as daemon:
+        _, said = daemon.communicate(timeout=15)
+    assert daemon.returncode == 2
+    assert "Traceback" not in said
+    assert str(process.rig) in said
+
+
+def test_damaged_calibrations_are_set_aside_and_the_newest_good_one_used(process: Process) -> None:
+    chain = SimpleNamespace(
+        joints=("hip", "knee", "ankle"), segments=("thigh", "shank"), sensors=(("S1",), ("S2",))
+    )
+    good = plain_calibration(chain).to_dict()
+    folder = process.state / "calibrations" / "default"
+    folder.mkdir(parents=True)
+    zero = json.loads(json.dumps(good))
+    zero["sensor"]["S1"]["q_sensor_segment"] = [0.0, 0.0, 0.0, 0.0]
+    for number, content in enumerate((good, {**good, "segment": 3}, zero), 1):
+        table = {"sha256": checksum(content), "calibration": content}
+        (folder / f"{number:04d}.json").write_text(json.dumps(table))
+    process.write(1)
+    with running(process) as daemon:
+        wait_for(process.state / "recordings")
+        time.sleep(1)
+        assert daemon.poll() is None
+        daemon.send_signal(signal.SIGTERM)
+        _, said = daemon.communicate(timeout=15)
+    assert daemon.returncode == 0
+    assert "set aside as 0003.json.bad" in said
+    assert "is no unit quaternion" in said
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "0001.json", "0002.json.bad", "0003.json.bad",
+    ]  # fmt: skip
+    (log,) = (process.state / "recordings").iterdir()
+    assert b'"calibration_version":1' in log.read_bytes()
 
 
 def test_all_it_writes_is_private_whatever_the_umask(process: Process) -> None:

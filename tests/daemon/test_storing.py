@@ -15,6 +15,7 @@ from jointfit_daemon.pipeline.events import CalibrationReady, CalibrationStored,
 from jointfit_daemon.supervisor import calibrations
 from jointfit_daemon.supervisor.daemon import Daemon
 from jointfit_daemon.supervisor.storing import StoreRunner
+from tests.calibration.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,10 +30,7 @@ def rig(table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def calibration_of(rig: Rig, note: str = "") -> Calibration:
-    chain = rig.chain
-    return Calibration(
-        "mean", chain.joints, chain.segments, chain.sensors, {}, {}, {}, notes=(note,)
-    )
+    return plain_calibration(rig.chain, notes=(note,))
 
 
 class SlowDisk:
