@@ -198,12 +198,7 @@ class Core:
         state = self._sources.get(event.source)
         if state is None:
             return []
-        again = state.counts.opened > 0
-        if again:  # what the device did while away is unknown: trust nothing old
-            state.clock.feed_restart()
         state.opened()
-        if again and state.source.kind == "imu":
-            return self._session.restarted(event.t_ns, event.source)
         return []
 
     def _closed(self, event: SourceClosed) -> list[Output]:

@@ -55,7 +55,8 @@ class WireCounts:
     lost: int = 0
     """Samples the device's counter says were sent and never came."""
     restarts: int = 0
-    """Times the device began anew, as it said or its clock showed."""
+    """Times the device restarted: it reported so, its clock showed it, or it was away and nothing
+    shows that it ran on."""
     opened: int = 0
     """Times the source was opened; all but the first are reconnects."""
 
@@ -100,7 +101,15 @@ class SourceState:
         return state
 
     def opened(self) -> None:
-        """Begin anew with a fresh decoder: what was half received will never be completed."""
+        """Begin anew with a fresh decoder: what was half received will never be completed.
+
+        What a sensor did while it was away is shown by its next sample. A camera server's clock
+        settles within a second, so nothing old is trusted.
+        """
+        if self.counts.opened and self.source.kind == "mocap":
+            self.clock.feed_restart()
+        elif self.counts.opened and self.counts.received:
+            self.clock.feed_reopened()
         driver = self.source.driver_class(self.source.settings)
         self._decoder = driver.decoder()
         self.open = True

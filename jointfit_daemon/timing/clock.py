@@ -40,11 +40,17 @@ __all__ = ["DeviceClock", "Stamp"]
 ABSENT_LIMIT = 100
 """Samples in a row without the time they used to carry, before the clock does without it."""
 CAUGHT_UP_NS = 50_000
+AWAY_SLACK_NS = 500_000_000
+"""How far device time may be off after the port was closed, ns: bytes may have waited somewhere."""
+AWAY_TURNS = 20
+"""A reading repeats after so many slacks at the least, else a restarted device may seem to agree:
+by chance in one of ten cases."""
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
 _JITTER_GAIN = 0.01
 _ARRIVAL_SIGMA = 0.1
 _PRIOR_SIGMAS = 4.0
+_AWAY_SHARES = 0.0, 0.02, 0.001  # by kind: what nominal rate and crystal may be off
 _LOOK_EVERY = 256  # samples between two looks at the skew
 
 
@@ -61,8 +67,8 @@ class DeviceClock:
     """
 
     __slots__ = (
-        "_absent", "_arrival_ns", "_direct", "_doubts", "_echo", "_envelope", "_kind",
-        "_line", "_looked", "_period_ns", "_reader", "_refused", "_state_direct",
+        "_absent", "_arrival_ns", "_away_since_ns", "_direct", "_doubts", "_echo", "_envelope",
+        "_kind", "_line", "_looked", "_period_ns", "_reader", "_refused", "_state_direct",
         "_synced", "_tick_clock", "_unix_offset_ns", "_warned", "epoch", "jitter_ns", "latency_ns",
         "latency_sd_ns", "minute", "news", "sigma_ns",
     )  # fmt: skip
@@ -92,6 +98,8 @@ class DeviceClock:
         self._echo: EchoFit | None = None
         self._direct: Direct | None = None
         self._refused = self._state_direct = self._synced = False
+        self._away_since_ns: int | None = None
+        """Last arrival before the port was closed, ns, until a sample shows what happened."""
         self._line.last_u = None
         self._doubts = Plausibility()
 
@@ -166,8 +174,17 @@ class DeviceClock:
         """Take it that the device's clock began anew, or may have."""
         self._begin(None)
 
+    def feed_reopened(self) -> None:
+        """Take it that the port was closed: the next sample shows whether the device ran on."""
+        self._away_since_ns = self._arrival_ns
+        if isinstance(self._reader, TickTime):
+            self._reader.forget_counter()
+
     def _begin(self, news: ClockNews | None) -> None:
-        if self._line.last_u is not None or self._echo is not None:
+        away = self._away_since_ns is not None
+        if away and news is not None and news.kind != "restart":
+            news = clock_news.after_reopening(news)
+        if away or self._line.last_u is not None or self._echo is not None:
             self.epoch += 1
             if news is not None and (self._synced or news is not clock_news.ANOTHER_WAY):
                 self.news.append(news)
@@ -248,6 +265,10 @@ class DeviceClock:
             if u is None
             else self._impossible(u, arrival_ns)
         )
+        if self._away_since_ns is not None and u is not None:
+            news = self._restart_while_away(u, reader, arrival_ns - self._away_since_ns)
+            if news is None:
+                self._away_since_ns = None
         if u is None or news is not None:
             self._begin(news)
             u = self._afresh(ticks, counter, arrival_ns, tick_clock)
@@ -303,6 +324,16 @@ class DeviceClock:
         return arrival_ns if u is None else u
 
     # --- what does not fit -------------------------------------------------------------------
+
+    def _restart_while_away(self, u: int, reader: DeviceTime, elapsed_ns: int) -> ClockNews | None:
+        """Explain why the device may have restarted while its port was closed; None: it ran on."""
+        last_u, turn_ns = self._line.last_u, reader.turn_ns
+        slack_ns = AWAY_SLACK_NS + _AWAY_SHARES[self._kind] * elapsed_ns
+        if last_u is None or turn_ns is None or 0 < turn_ns < AWAY_TURNS * slack_ns:
+            return clock_news.UNKNOWN_WHILE_AWAY
+        if abs(u - last_u - elapsed_ns) > slack_ns:
+            return clock_news.did_not_run_on(u - last_u, elapsed_ns)
+        return None
 
     def _impossible(self, u: int, arrival_ns: int) -> ClockNews | None:
         """Say what contradicts the fit: samples that came before their time, or that stay late."""

@@ -54,6 +54,24 @@ def too_late(late_ns: float, seconds: float) -> ClockNews:
     return ClockNews("clock", text, {"jump_ms": round(-late_ns / _MS, 3)})
 
 
+def after_reopening(news: ClockNews) -> ClockNews:
+    """Return `news` as a restart: of a device that was away, a new time is a new start."""
+    return ClockNews("restart", f"after reconnecting, {news.text}", news.data)
+
+
+UNKNOWN_WHILE_AWAY = ClockNews(
+    "restart",
+    "it reconnected, and nothing in its data shows whether it ran on: taken for a restart",
+    {},
+)
+
+
+def did_not_run_on(step_ns: int, elapsed_ns: int) -> ClockNews:
+    """Explain device time that is not where the time on this host says it must be."""
+    text = f"its time moved by {step_ns / _S:.2f} s in {elapsed_ns / _S:.2f} s: it restarted"
+    return ClockNews("restart", text, {"jump_ms": round((step_ns - elapsed_ns) / _MS, 3)})
+
+
 def off_echoes(off_ns: int) -> ClockNews:
     """Explain an echo that no clock could give that was where it was."""
     text = f"its clock jumped by {off_ns / _MS:.1f} ms against its own echoes: restarted, or set"

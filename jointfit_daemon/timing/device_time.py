@@ -42,6 +42,10 @@ _SILENCE_NS = 2 * NS
 class DeviceTime(Protocol):
     """Reads the time of one device between two restarts."""
 
+    @property
+    def turn_ns(self) -> int | None:
+        """Time after which the readings repeat, ns: 0 if they never do, None if they are none."""
+
     def feed(
         self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope
     ) -> int | None:
@@ -67,6 +71,15 @@ class TickTime:
         self._arrival_ns = self._backward = 0
         self._counter: int | None = None
         self._step: float | None = None  # ticks a count
+
+    @property
+    def turn_ns(self) -> int | None:
+        """Time after which the ticks start again, ns; 0 if they never do."""
+        return self._turn_ns
+
+    def forget_counter(self) -> None:
+        """Compare the next sample by time alone: a device that is configured counts no samples."""
+        self._counter = None
 
     def to_ns(self, ticks: int) -> int:
         """Return unwrapped ticks in ns, by integers only."""
@@ -143,6 +156,11 @@ class CounterTime:
         self._last: int | None = None
         self._raw = self._arrival_ns = self._backward = 0
 
+    @property
+    def turn_ns(self) -> int | None:
+        """Time after which the counter starts again, ns, the shortest that is possible."""
+        return self._period_ns * (self._width or min(w for w in COUNTER_WIDTHS if w > self._raw))
+
     def feed(
         self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope  # noqa: ARG002 - the readers' common shape
     ) -> int | None:  # fmt: skip
@@ -200,6 +218,11 @@ class ArrivalTime:
         self._number = -1
         self._arrival_ns = self._late_ns = self._late_samples = 0
         self._least, self._late_share = 0.0, _LATE_SHARE_FIRST
+
+    @property
+    def turn_ns(self) -> int | None:
+        """Return None: arrivals show nothing of the device's own time."""
+        return None
 
     def feed(
         self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope  # noqa: ARG002 - the readers' common shape

@@ -70,10 +70,15 @@ def orientation(name: str, number: int) -> tuple[float, float, float, float]:
     return math.cos(half), axis[0], axis[1], axis[2]
 
 
+def counter(number: int) -> int:
+    """Return what a device calls its sample `number`."""
+    return number % 65536
+
+
 def xbus_bytes(name: str, number: int) -> bytes:
     """Return sample `number` of an Xbus sensor."""
     items: list[tuple[int, Any]] = [
-        (Item.PACKET_COUNTER, number % 65536),
+        (Item.PACKET_COUNTER, counter(number)),
         (Item.SAMPLE_TIME_FINE, number * 100),
         (Item.QUATERNION, orientation(name, number)),
     ]
@@ -85,7 +90,7 @@ def xcdi_bytes(name: str, number: int, t_ns: int) -> bytes:
     time_id, counter_id, quaternion_id = IDS[name]
     rows = (
         (time_id, DataId.SAMPLE_TIME, (number * 100,)),
-        (counter_id, DataId.GROUP_COUNTER, (number % 65536,)),
+        (counter_id, DataId.GROUP_COUNTER, (counter(number),)),
         (quaternion_id, DataId.QUATERNION, quaternion_counts(orientation(name, number))),
     )
     return pack_frames(

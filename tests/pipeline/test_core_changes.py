@@ -211,17 +211,54 @@ def test_a_reload_goes_on_with_the_same_watch_of_a_limb_that_is_worn_alike() -> 
     assert bench.core._fuser.links is watched
 
 
-def test_a_sensor_that_comes_back_is_said_to_need_a_new_pose() -> None:
+def reconnected(after: Iterable[Event]) -> tuple[Bench, list[Notice]]:
+    """Return a core whose S3 was away for two seconds, and its notices about restarts."""
     bench, _ = calibrated_by_standing(shaped({"S1": "thigh", "S3": "shank"}))
-    told = len(bench.out)
-    bench.feed([SourceClosed(at(721), "S3", "lost", "unplugged"), SourceOpened(at(722), "S3")])
-    (notice,) = [
+    begin = len(bench.out)
+    bench.feed([SourceClosed(at(721), "S3", "lost", "unplugged"), SourceOpened(at(922), "S3")])
+    bench.feed(after)
+    notices = [
         output
-        for output in bench.out[told:]
-        if isinstance(output, Notice) and output.kind == "calibration"
+        for output in bench.out[begin:]
+        if isinstance(output, Notice) and output.kind in {"calibration", "clock"}
     ]
-    assert notice.id == "S3"
-    assert "static" in notice.text
+    return bench, notices
+
+
+def test_a_sensor_that_reconnects_and_ran_on_needs_no_new_pose() -> None:
+    bench, notices = reconnected(samples(["S3"], 922, 960))
+    assert notices == []
+    assert bench.devices()["S3"]["restarts"] == 0
+    assert bench.devices()["S3"]["reconnects"] == 1
+    assert bench.devices()["S3"]["epoch"] == 0
+
+
+def test_a_counter_that_stood_still_while_the_port_was_away_is_no_restart() -> None:
+    """A device that is being configured counts no samples, and its time goes on."""
+    with patch.object(core_feed, "counter", lambda number: number - 60):
+        after = samples(["S3"], 922, 960)
+    bench, notices = reconnected(after)
+    assert notices == []
+    assert bench.devices()["S3"]["restarts"] == 0
+
+
+@pytest.mark.parametrize("begins_at", [0, 5, 600, 850, 1_000])
+def test_a_sensor_that_reconnects_with_another_time_or_counter_needs_a_new_pose(
+    begins_at: int,
+) -> None:
+    later = at(922) - at(begins_at)
+    moved = [
+        ChunkArrived(one.source, Chunk(one.chunk.t_ns + later, one.chunk.data))
+        for one in samples(["S3"], begins_at, begins_at + 40)
+        if isinstance(one, ChunkArrived)
+    ]
+    bench, notices = reconnected(moved)
+    assert bench.devices()["S3"]["restarts"] == 1
+    assert [(notice.id, notice.kind) for notice in notices] == [
+        ("S3", "clock"),
+        ("S3", "calibration"),
+    ]
+    assert "repeat the static pose" in notices[1].text
 
 
 @pytest.mark.parametrize(("params", "mode"), [(0, "imu+mocap"), (4, "imu")])
