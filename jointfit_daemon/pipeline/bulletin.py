@@ -1,6 +1,7 @@
-"""Turns what wires and clocks do into notices, at most one in ten seconds for each kind and device.
+"""Turns what wires and clocks do into notices, at most one a minute for each kind and device.
 
-Law: nothing is lost by the limit: what is held back is summed into the next notice.
+Invariant: nothing is lost by the limit. A condition is reported when it begins, with its sums once
+a minute while it lasts, and when a minute has passed without it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from jointfit_daemon.pipeline.events import Notice
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-QUIET_NS = 10_000_000_000
-"""Every drop-out and every epoch is counted in health; a line each ten seconds, kind and device is
-enough for a log."""
+QUIET_NS = 60_000_000_000
+"""Least time between two notices of a kind and device, ns: health counts every single one."""
+
+_NS_PER_S = 1_000_000_000
 
 STEP_NS = 2_000_000
 """UNIX time set by less is followed and not told of."""
@@ -35,6 +37,8 @@ class _Held:
     told_ns: int
     count: int = 0
     amount: int = 0
+    lasting: bool = False
+    """Whether it was reported more than once, so that its end is worth a notice."""
     text: str = ""
     data: Mapping[str, object] = field(default_factory=dict)
 
@@ -63,11 +67,16 @@ class Bulletin:
         """Return the held-back notices whose quiet time is over."""
         if not self._held:
             return []
-        return [
-            _notice(now_ns, key, held)
-            for key, held in self._held.items()
-            if held.count and now_ns - held.told_ns >= QUIET_NS
-        ]
+        notices = []
+        for key, held in self._held.items():
+            if now_ns - held.told_ns < QUIET_NS:
+                continue
+            if held.count:
+                held.lasting = key[1] not in _OF_CLOCKS
+                notices.append(_notice(now_ns, key, held))
+            elif held.lasting:
+                notices.append(_ended(now_ns, key, held))
+        return notices
 
     def _hold(
         self,
@@ -81,7 +90,10 @@ class Bulletin:
         held.count += 1
         held.amount += amount
         held.text, held.data = text, data
-        return [_notice(now_ns, key, held)] if now_ns - held.told_ns >= QUIET_NS else []
+        if now_ns - held.told_ns < QUIET_NS:
+            return []
+        held.lasting = False
+        return [_notice(now_ns, key, held)]
 
 
 def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
@@ -90,12 +102,28 @@ def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
         return _of_clock(now_ns, source, held)
     if kind == "gap":
         text = f"{held.amount} sample{'s' if held.amount > 1 else ''} lost on the way"
-        data: dict[str, object] = {"gaps": held.count, "lost": held.amount}
     else:
         text = f"{held.amount} bytes made no message: {held.text}"
-        data = {"runs": held.count, "discarded_bytes": held.amount}
+    if held.lasting:
+        text = f"{text}, in the last {(now_ns - held.told_ns) / _NS_PER_S:.0f} s"
+    data = _sums(kind, held)
     held.told_ns, held.count, held.amount = now_ns, 0, 0
     return Notice(now_ns, "wire", source, text, "warning", data)
+
+
+def _ended(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
+    """Return that nothing of a kind happened since the last notice."""
+    source, kind = key
+    what = "no sample was lost" if kind == "gap" else "all bytes made messages"
+    passed_s = (now_ns - held.told_ns) / _NS_PER_S
+    held.told_ns, held.lasting = now_ns, False
+    return Notice(now_ns, "wire", source, f"{what} for {passed_s:.0f} s", "info", _sums(kind, held))
+
+
+def _sums(kind: str, held: _Held) -> dict[str, object]:
+    if kind == "gap":
+        return {"gaps": held.count, "lost": held.amount}
+    return {"runs": held.count, "discarded_bytes": held.amount}
 
 
 def _of_clock(now_ns: int, source: str, held: _Held) -> Notice:

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import random
 import time
 from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured, device_path
-from jointfit_daemon.outputs.journal import about
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened
 
 if TYPE_CHECKING:
@@ -26,8 +24,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Source
     from jointfit_daemon.model import Chunk
     from jointfit_daemon.pipeline.events import Event
-
-log = logging.getLogger(__name__)
 
 FIRST_RETRY_S = 0.1  # a re-plugged port is often there again within a blink
 LAST_RETRY_S = 1.0  # the promise is to resume within two seconds of a re-plug
@@ -103,7 +99,6 @@ async def keep_running(
     path = device_path(source.settings)
     loop = asyncio.get_running_loop()
     delay = FIRST_RETRY_S
-    reported = ""
     while True:
         began, device = loop.time(), _identity(path)
         try:
@@ -111,19 +106,11 @@ async def keep_running(
             life.closed("lost", "its driver ended by itself")
         except DeviceLost as lost:
             if loop.time() - began > HEALTHY_S:
-                delay, reported = FIRST_RETRY_S, ""
+                delay = FIRST_RETRY_S
             life.closed("lost", str(lost))  # the core reports it, on the log too
         except DeviceMisconfigured as wrong:
-            life.closed("misconfigured", str(wrong))
-            if str(wrong) != reported:
-                reported = str(wrong)
-                log.error(  # noqa: TRY400 - it says enough
-                    "%s: paused until another device is on its port, or %g s: %s",
-                    source.id,
-                    PAUSE_S,
-                    wrong,
-                    extra=about("device", source.id),
-                )
+            again = f"tried again with another device on the port, or every {PAUSE_S:g} s"
+            life.closed("misconfigured", f"{wrong} ({again})")
             state.paused = True
             await _until_changed(path, device)
             state.paused, delay = False, FIRST_RETRY_S
