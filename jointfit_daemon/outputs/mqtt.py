@@ -20,6 +20,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from jointfit_daemon.outputs.mqtt_secrets import password_of
 from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context, tls_remedy
+from jointfit_daemon.outputs.packet_limit import PacketLimitSocket
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -32,6 +33,8 @@ PAYLOAD_VERSION = 1
 
 KEEPALIVE_S = 5  # a frozen broker is noticed in half as much again
 ANSWER_S = 3.0  # a broker that takes longer over one packet is no use
+SUBSCRIBED_S = 30.0
+"""Limit of a subscription: a broker may send thousands of stored messages before it confirms."""
 GOODBYE_S = 1.0  # leaving is worth that much
 _Properties: Any = (
     Properties  # its constructor is not annotated, its attributes are made at run time
@@ -40,6 +43,11 @@ _Properties: Any = (
 _INCOMING = 64  # requests are rare; a flood of them must not grow
 _REFUSED = 0x80  # MQTT reason codes from here on are refusals
 _TAKEN_OVER = 0x8E  # reason code "session taken over"
+_CLOSED_EARLY = "the broker closed the connection during the handshake"
+_NOT_STORED = 2
+"""MQTT 5 retain handling: the broker sends no stored message at a subscription."""
+LONGEST_PACKET_BYTES = 32 * 1024
+"""Limit of incoming packets where none is given: a request, or a pose of seventy segments."""
 
 _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # else stalls of 40 ms
@@ -102,6 +110,8 @@ class MqttConnection:
         Client id; a fixed one lets a new connection take over from its own dead predecessor.
     will, farewell
         Published by the broker when we vanish, and by us when we leave.
+    longest_bytes
+        Limit of incoming packets: announced to the broker with MQTT 5, and enforced here.
 
     Raises
     ------
@@ -116,15 +126,17 @@ class MqttConnection:
         *,
         will: Outgoing | None = None,
         farewell: Outgoing | None = None,
+        longest_bytes: int = LONGEST_PACKET_BYTES,
     ) -> None:
         self._settings, self._identifier = settings, identifier
         self._will, self._farewell = will, farewell
+        self._longest_bytes = longest_bytes
         self._modern = settings.version == "5"
         self._cached: dict[int | None, Any] = {}
         self._troubles = _Troubles()
 
     async def __aenter__(self) -> Self:
-        self._client = self._new_client()
+        self._client = await self._new_client()
         task = asyncio.current_task()
         asked_before = task.cancelling() if task else 0  # by others, of tasks that go on
         try:
@@ -164,13 +176,27 @@ class MqttConnection:
                 await self._publish(self._farewell)
             await self._client.__aexit__(None, None, None)
 
-    async def publish(self, message: Outgoing) -> None:
-        """Publish; at QoS 1 returns when the broker has it, at QoS 0 when the kernel has it."""
+    @property
+    def oversized(self) -> int:
+        """Incoming packets that were dropped because they were over the limit."""
+        return self._client.oversized
+
+    async def publish(self, message: Outgoing) -> str | None:
+        """Publish; at QoS 1 returns when the broker has it, at QoS 0 when the kernel has it.
+
+        Returns
+        -------
+        str or None
+            The broker's reason for refusing the message, as far as it gives one: with MQTT 5 and
+            at QoS 1.
+        """
+        self._client.refusal = None
         try:
             await self._publish(message)
         except (aiomqtt.MqttError, ValueError) as error:
             raise BrokerLost(f"{self._place()}: {message.topic}: {error}") from error
         stop_if_cancelled()
+        return self._client.refusal
 
     async def _publish(self, message: Outgoing) -> None:
         await self._client.publish(
@@ -181,20 +207,38 @@ class MqttConnection:
             self._properties(message) if self._modern else None,
         )
 
-    async def subscribe(self, topics: Sequence[str]) -> list[str]:
-        """Subscribe at QoS 1 and return the topics that the broker refused.
+    async def subscribe(self, topics: Sequence[str], *, live: bool = False) -> list[str]:
+        """Subscribe and return the topics that the broker refused.
 
         With MQTT 5 a message that its sender wants retained arrives marked so, even fresh.
+
+        Parameters
+        ----------
+        topics
+            Topics or patterns.
+        live
+            At QoS 0 and, with MQTT 5, without the messages that the broker has stored; else at
+            QoS 1 and with them.
         """
-        options = SubscribeOptions(qos=1, retainAsPublished=True)
-        asked: list[Any] = [(topic, options if self._modern else 1) for topic in topics]
+        qos = 0 if live else 1
+        handling = _NOT_STORED if live else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+        options = SubscribeOptions(qos=qos, retainAsPublished=True, retainHandling=handling)
+        asked: list[Any] = [(topic, options if self._modern else qos) for topic in topics]
         try:
-            codes = await self._client.subscribe(asked)
+            codes = await self._client.subscribe(asked, timeout=SUBSCRIBED_S)
         except aiomqtt.MqttError as error:
             raise BrokerLost(f"{self._place()}: cannot subscribe: {error}") from error
         stop_if_cancelled()
         values = [code if isinstance(code, int) else int(code.value) for code in codes]
         return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
+
+    async def unsubscribe(self, topic: str) -> None:
+        """Unsubscribe from one topic."""
+        try:
+            await self._client.unsubscribe(topic)
+        except aiomqtt.MqttError as error:
+            raise BrokerLost(f"{self._place()}: cannot unsubscribe: {error}") from error
+        stop_if_cancelled()
 
     async def messages(self) -> AsyncIterator[Incoming]:
         """Yield what arrives; beyond 64 unread messages the newest are discarded."""
@@ -217,12 +261,19 @@ class MqttConnection:
 
     # --- making one --------------------------------------------------------------------------
 
-    def _new_client(self) -> _Client:
+    async def _new_client(self) -> _Client:
         settings, will = self._settings, self._will
-        try:
-            context = None if settings.tls is None else tls_context(settings.tls)
-        except TlsFault as fault:
-            raise BrokerLost(f"{self._place()}: [mqtt.tls]: {fault}") from fault
+        context = None
+        if settings.tls is not None:
+            try:  # in a thread: reading the system's certificates takes tens of milliseconds
+                context = await asyncio.to_thread(tls_context, settings.tls)
+            except TlsFault as fault:
+                raise BrokerLost(f"{self._place()}: [mqtt.tls]: {fault}") from fault
+
+        limit: Any = None
+        if self._modern:
+            limit = _Properties(PacketTypes.CONNECT)
+            limit.MaximumPacketSize = self._longest_bytes
         version = aiomqtt.ProtocolVersion.V5 if self._modern else aiomqtt.ProtocolVersion.V311
         return _Client(
             settings.host,
@@ -238,9 +289,10 @@ class MqttConnection:
             timeout=ANSWER_S,
             keepalive=KEEPALIVE_S,
             max_queued_incoming_messages=_INCOMING,
-            socket_options=_SOCKET_OPTIONS,
             tls_context=context,
             logger=self._troubles,
+            properties=limit,
+            longest_bytes=self._longest_bytes,
         )
 
     def _place(self) -> str:
@@ -250,7 +302,7 @@ class MqttConnection:
         met = self._troubles.last or error.__cause__ or error.__context__
         if remedy := tls_remedy(met, self._settings):
             return remedy
-        if self._modern and "timed out" in str(error):
+        if self._modern and ("timed out" in str(error) or _CLOSED_EARLY in str(error)):
             return (
                 " (no answer to MQTT 5; if this broker is older or keeps MQTT 5 on another port, "
                 'set version = "3.1.1" in [mqtt], or that port)'
@@ -296,25 +348,46 @@ class _Troubles(logging.Logger):
 
 
 class _Client(aiomqtt.Client):
-    """aiomqtt's client, which can also be dropped in the middle of connecting."""
+    """aiomqtt's client with a limit on incoming packets and faster notice of failures.
+
+    It can be dropped in the middle of connecting, fails at once if the connection breaks during
+    the handshake, and keeps the reason for which the broker refused a message.
+    """
 
     _abandoned = False
     taken_over = False
 
-    def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
-        self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
-    ) -> None:
-        """Remember the reason: of several tasks that fail, the first may know none."""
-        self.taken_over |= getattr(reason_code, "value", None) == _TAKEN_OVER
-        super()._on_disconnect(client, userdata, flags, reason_code, properties)
+    def __init__(self, *arguments: Any, longest_bytes: int, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.refusal: str | None = None
+        """Why the broker refused the last message; one is under way at a time."""
+        self._longest_bytes = longest_bytes
+        self._limited: PacketLimitSocket | None = None
+        self._disconnected.add_done_callback(self._fail_handshake)
+
+    @property
+    def oversized(self) -> int:
+        """Incoming packets that were over the limit."""
+        return 0 if self._limited is None else self._limited.dropped
+
+    async def __aenter__(self) -> Self:  # type: ignore[explicit-override]  # Python 3.12's
+        """Connect; a connection that ended with its acceptance is no connection.
+
+        aiomqtt forgets such an end, and would wait for messages for ever.
+        """
+        ended = self._disconnected
+        await super().__aenter__()
+        if ended.done():
+            raise aiomqtt.MqttError(_CLOSED_EARLY)
+        return self
 
     def abandon(self) -> None:
         """Close whatever is open, without a word; else a failed connect keeps it for seconds."""
         self._abandoned = True
         if self._misc_task is not None:
             self._misc_task.cancel()
-        opened = self._client.socket()
-        if isinstance(opened, socket.socket) and opened.fileno() >= 0:
+        opened: Any = self._client.socket()
+        if opened is not None and opened.fileno() >= 0:
             self._loop.remove_reader(opened.fileno())
             self._loop.remove_writer(opened.fileno())
             opened.close()
@@ -326,7 +399,35 @@ class _Client(aiomqtt.Client):
         if self._abandoned:
             sock.close()
             return
+        if isinstance(sock, socket.socket):
+            for option in _SOCKET_OPTIONS:  # aiomqtt sets them on plain sockets only
+                sock.setsockopt(*option)
+        self._limited = client._sock = PacketLimitSocket(sock, self._longest_bytes)  # noqa: SLF001 - paho has no other way in
         super()._on_socket_open(client, userdata, sock)
+
+    def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
+    ) -> None:
+        """Remember the reason: of several tasks that fail, the first may know none.
+
+        A connection that ends before its acceptance fails now; aiomqtt would wait for a timeout.
+        """
+        self.taken_over |= getattr(reason_code, "value", None) == _TAKEN_OVER
+        self._fail_handshake()
+        super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
+    def _fail_handshake(self, ended: asyncio.Future[None] | None = None) -> None:
+        if ended is not None and not ended.cancelled():
+            ended.exception()  # seen: aiomqtt reads it only where messages are awaited
+        if not self._connected.done():
+            self._connected.set_exception(aiomqtt.MqttError(_CLOSED_EARLY))
+
+    def _on_publish(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, mid: int, reason_code: Any, properties: Any
+    ) -> None:
+        if reason_code.is_failure:
+            self.refusal = str(reason_code)
+        super()._on_publish(client, userdata, mid, reason_code, properties)
 
 
 class LoopNoise:

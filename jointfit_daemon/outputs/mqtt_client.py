@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 _UNREAD = 2000  # messages kept for a slow reader
+_LONGEST_BYTES = 1024 * 1024
+"""Limit of incoming packets: the qualities of a calibration fill a tenth of it."""
 _EXPIRY_S = 30  # a request nobody took for so long must not run
 
 
@@ -49,7 +51,9 @@ class MqttClient:
         self.dropped = 0
         """Messages that came faster than they were read."""
         self._settings = settings
-        self._connection = MqttConnection(settings)
+        self._connection = MqttConnection(settings, longest_bytes=_LONGEST_BYTES)
+        self._own = uuid.uuid4().hex
+        """Last level of the topics on which this client wants its answers (MQTT 5)."""
         self._unread: deque[Incoming] = deque()
         self._arrived = asyncio.Event()
         self._lost: BrokerLost | None = None
@@ -58,7 +62,8 @@ class MqttClient:
     async def __aenter__(self) -> Self:
         await self._connection.__aenter__()
         self._reader = asyncio.create_task(self._read(), name="mqtt client")
-        await self._connection.subscribe([f"{self.base}/bridge/response/+"])
+        answers = f"{self.base}/bridge/response/+"
+        await self._connection.subscribe([answers, f"{answers}/{self._own}"])
         return self
 
     async def __aexit__(
@@ -106,11 +111,22 @@ class MqttClient:
             payload = self._payload(topic, {**arguments, "transaction": transaction})
             if self._lost is not None:
                 raise self._lost
-            await self._connection.publish(Outgoing(topic, payload, 1, expiry_s=_EXPIRY_S))
+            await self._connection.publish(
+                Outgoing(
+                    topic,
+                    payload,
+                    1,
+                    expiry_s=_EXPIRY_S,
+                    response_topic=f"{self.base}/bridge/response/{command}/{self._own}",
+                )
+            )
             async with asyncio.timeout(timeout_s):
                 return await answer
         except TimeoutError as error:
-            text = f"no daemon answers on {topic}: is jointfitd running, with this base?"
+            text = (
+                f"no daemon answers on {topic}: is jointfitd running, with this base? It ignores "
+                "requests beyond ten a second: is somebody else sending many?"
+            )
             raise NoAnswer(text) from error
         finally:
             del self._waiting[transaction]

@@ -49,7 +49,7 @@ from jointfit_daemon.supervisor.heart import Heart
 from jointfit_daemon.supervisor.last_resort import leave_within
 from jointfit_daemon.supervisor.process import ProcessWatch
 from jointfit_daemon.supervisor.request_guard import RequestGuard
-from jointfit_daemon.supervisor.requests import reply_topic, request_of
+from jointfit_daemon.supervisor.requests import reply_correlation, reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
 from jointfit_daemon.supervisor.state_directory import state_directory
 from jointfit_daemon.supervisor.status import Pace, Seen, phase_of, status_line
@@ -227,6 +227,8 @@ class Daemon:
     def _asked(self, message: Incoming) -> None:
         """Take one request from the broker: answered once, by the core or for it."""
         request = request_of(message, self._guard)
+        if request is None:
+            return
         self._asking = message
         try:
             if isinstance(request, Reply):
@@ -239,8 +241,10 @@ class Daemon:
     def _answer(self, reply: Reply) -> None:
         """Answer where the caller wants it; the core answers while it takes the request."""
         asked = self._asking
-        topic = None if asked is None else reply_topic(asked)
-        self._reporter.reply(reply, topic, None if asked is None else asked.correlation)
+        if asked is None:
+            self._reporter.reply(reply, None, None)
+        else:
+            self._reporter.reply(reply, reply_topic(asked), reply_correlation(asked))
 
     # --- health ------------------------------------------------------------------------------
 

@@ -169,7 +169,7 @@ def test_a_credential_of_the_same_name_is_taken_first(
     assert guard.check(TOPIC, signed(KEY, TOPIC, ASKED)) == ASKED
 
 
-def asked(guard: RequestGuard, request: dict[str, Any]) -> Request | Reply:
+def asked(guard: RequestGuard, request: dict[str, Any]) -> Request | Reply | None:
     return request_of(Incoming(TOPIC, orjson.dumps(request), retained=False), guard)
 
 

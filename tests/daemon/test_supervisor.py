@@ -16,7 +16,7 @@ import pytest
 
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.driver import DeviceLost
-from jointfit_daemon.outputs.mqtt import Incoming, MqttConnection, Outgoing
+from jointfit_daemon.outputs.mqtt import MqttConnection, Outgoing
 from jointfit_daemon.outputs.mqtt_client import MqttClient
 from jointfit_daemon.pipeline.core import Core
 from jointfit_daemon.pipeline.events import (
@@ -33,7 +33,6 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.supervisor.daemon import Daemon
 from jointfit_daemon.supervisor.fits import FitRunner
 from jointfit_daemon.supervisor.heart import HEARTBEAT_NS, Heart
-from jointfit_daemon.supervisor.requests import reply_topic, request_of
 from jointfit_daemon.supervisor.sources import keep_running
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
 from jointfit_daemon.supervisor.watchdog import Progress
@@ -388,39 +387,6 @@ async def test_the_core_hears_its_deadline_in_time() -> None:
     running.cancel()
     await asyncio.wait([running])
     assert 0 <= late_ns < 40_000_000
-
-
-def incoming(payload: bytes, command: str = "calibrate", **more: Any) -> Incoming:
-    return Incoming(f"b/bridge/request/{command}", payload, retained=False, **more)
-
-
-@pytest.mark.parametrize(
-    ("payload", "said"),
-    [
-        (b"{", "is not JSON"),
-        (b"[]", "expected a JSON object"),
-        (b'{"phase":"stand"}', "expected 'align', 'static', 'functional', 'abort' or 'unlearn'"),
-        (b'{"phase":"static","seconds":-1}', "should be greater than 0"),
-        (b'{"phase":"static","force":"yes"}', "should be a valid boolean"),
-        (b'{"phase":"static","transaction":7}', "should be a valid string"),
-        (b'"' + bytes(20_000) + b'"', "longer than"),
-        (b"[" * 5000, "is not JSON"),
-        (b"\xff", "is not JSON"),
-    ],
-)
-def test_a_bad_request_is_told_what_is_wrong(payload: bytes, said: str) -> None:
-    reply = request_of(incoming(payload))
-    assert isinstance(reply, Reply)
-    assert reply.error is not None
-    assert said in str(reply.error["message"])
-
-
-@pytest.mark.parametrize(
-    ("topic", "usable"), [("my/topic", True), ("a/#", False), ("$SYS/x", False), ("", False)]
-)
-def test_an_answer_goes_only_to_a_topic_that_can_be_published_to(topic: str, usable: bool) -> None:
-    asked = incoming(b"{}", response_topic=topic)
-    assert (reply_topic(asked) == topic) is usable
 
 
 @pytest.fixture

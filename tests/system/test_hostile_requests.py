@@ -1,0 +1,212 @@
+"""Requests that no client should send: the daemon lives on, and poses keep their time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import aiomqtt
+import orjson
+import pytest
+from hypothesis import given, seed, settings
+from hypothesis import strategies as st
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from tests.system.station import BASE, SENSORS, Listener, Station, listening, running
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from jointfit_daemon.tools.demo_processes import Child
+    from tests.broker_fixture import Broker
+
+pytestmark = pytest.mark.system
+
+REQUEST = f"{BASE}/bridge/request/calibrate"
+MOST_RSS_BYTES = 20_000_000
+LONGEST_GAP_S = 0.2
+CASES = int(os.environ.get("JOINTFIT_FUZZ_CASES", "300"))
+"""Messages of arbitrary content."""
+MB = 1_000_000
+
+
+def rss_bytes(daemon: Child) -> int:
+    """Return the resident memory of the daemon."""
+    assert daemon.process is not None
+    pages = Path(f"/proc/{daemon.process.pid}/statm").read_text("ascii").split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+def with_properties(**values: Any) -> Properties:
+    """Return properties of a PUBLISH packet."""
+    made: Any = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made  # type: ignore[no-any-return]
+
+
+@contextlib.asynccontextmanager
+async def unharmed(daemon: Child, listener: Listener) -> AsyncIterator[None]:
+    """Require that the block stops no pose, costs no connection and little memory."""
+    await listener.more_poses(20)
+    rss, first = rss_bytes(daemon), len(listener.poses) - 1
+    yield
+    await listener.more_poses(20)
+    daemon.check()
+    assert rss_bytes(daemon) - rss < MOST_RSS_BYTES
+
+    poses = listener.poses[first:]
+    seqs = [pose["seq"] for pose in poses]
+    assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))  # nothing lost, nothing foreign
+    written_us = [pose["t_us"] + 1e3 * pose["age_ms"] for pose in poses]
+    gaps_s = [(b - a) / 1e6 for a, b in pairwise(written_us)]
+    assert max(gaps_s) < LONGEST_GAP_S * load_factor()
+
+
+def load_factor() -> float:
+    """Return how much slower than alone this machine is now, by the processes that want a core."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+async def answers(client: aiomqtt.Client, count: int) -> list[Any]:
+    """Return the next `count` answers on the usual topics."""
+    async with asyncio.timeout(10):
+        return [orjson.loads((await anext(client.messages)).payload) for _ in range(count)]
+
+
+NESTED = b"[" * 1000 + b"]" * 1000
+NESTED_OBJECTS = b'{"a":' * 400 + b"1" + b"}" * 400
+UNKNOWN_KEYS = orjson.dumps({f"k{number}": number for number in range(1500)})
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("signed", [False, True])
+async def test_requests_of_any_shape_are_answered_and_cost_little(
+    tmp_path: Path, broker: Broker, *, signed: bool
+) -> None:
+    (tmp_path / "key").write_bytes(b"k" * 32)
+    line = "health_s = 0.5\n"
+    signing = f'request_key_file = "{tmp_path / "key"}"\n' if signed else ""
+    station = Station(tmp_path, broker.port)
+    async with (
+        station.simulator((line, line + signing)),
+        station.daemon() as daemon,
+        listening(station.port) as listener,
+        aiomqtt.Client(broker.host, broker.port, protocol=aiomqtt.ProtocolVersion.V5) as attacker,
+    ):
+        await listener.connected(set(SENSORS))
+        await attacker.subscribe(f"{BASE}/bridge/response/#")
+        async with unharmed(daemon, listener):
+            for payload in (
+                NESTED,
+                b'{"a":' * 400 + b"1" + b"}" * 400,
+                UNKNOWN_KEYS,
+                b"\xff",
+                b"[]",
+            ):
+                await attacker.publish(REQUEST, payload, 1)
+            found = await answers(attacker, 5)
+            assert {answer["status"] for answer in found} == {"error"}
+
+            for topic in (f"{BASE}/pose", "/".join("a" * 301), f"{BASE}/bridge/response/a/#"):
+                where = with_properties(ResponseTopic=topic)
+                await attacker.publish(REQUEST, b'{"phase":"static"}', 1, properties=where)
+            found = await answers(attacker, 3)
+            assert {answer["error"]["key"] for answer in found} == {"response_topic"}
+
+        async with unharmed(daemon, listener):
+            for number in range(200):
+                await attacker.publish(REQUEST, UNKNOWN_KEYS[: 16_000 + number])
+                await asyncio.sleep(0.01)
+        assert listener.latest["bridge/health"]["link"]["connects"] == 1
+
+
+@pytest.mark.timeout(120)
+async def test_a_message_of_forty_megabytes_is_not_kept(tmp_path: Path, mosquitto: Broker) -> None:
+    async with (
+        running(Station(tmp_path, mosquitto.port)) as (_, daemon, listener),
+        aiomqtt.Client(mosquitto.host, mosquitto.port, timeout=30) as attacker,
+        unharmed(daemon, listener),
+    ):
+        await attacker.publish(REQUEST, bytes(40 * MB), 1)
+
+
+# --- fuzzing --------------------------------------------------------------------------------------
+
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0#+"), max_size=40)
+tables = st.dictionaries(
+    st.sampled_from(["phase", "seconds", "force", "transaction", "nonce", "t_us", "signature"])
+    | texts,
+    st.none() | st.booleans() | st.integers() | st.floats() | texts | st.lists(st.none()),
+)
+payloads = (
+    st.binary(max_size=200)
+    | tables.map(lambda table: json.dumps(table, ensure_ascii=False).encode())
+    | st.integers(0, 40_000).map(lambda size: b"[" * size)
+)
+topics = st.just(REQUEST) | texts.map(lambda level: f"{BASE}/bridge/request/{level}")
+properties = st.fixed_dictionaries(
+    {},
+    optional={
+        "ResponseTopic": texts.map(lambda level: f"{BASE}/bridge/response/{level}") | texts,
+        "CorrelationData": st.binary(max_size=300),
+        "UserProperty": st.lists(st.tuples(texts, texts), min_size=1, max_size=4),
+        "ContentType": texts,
+        "PayloadFormatIndicator": st.integers(0, 1),
+        "MessageExpiryInterval": st.integers(0, 2**32 - 1),
+    },
+)
+
+
+class Fuzzer:
+    """A client that sends anything, and connects again when the broker refuses it."""
+
+    def __init__(self, broker: Broker) -> None:
+        self._broker = broker
+        self.sent = 0
+
+    def connect(self) -> Client:
+        """Return a connected client with its own thread."""
+        client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5)
+        client.connect(self._broker.host, self._broker.port)
+        client.loop_start()
+        return client
+
+    def run(self, examples: int) -> None:
+        """Send `examples` messages with arbitrary topics, payloads and properties."""
+        client = self.connect()
+
+        @seed(0)
+        @settings(max_examples=examples, database=None, deadline=None)
+        @given(topics, payloads, properties, st.sampled_from([(0, False), (1, False), (2, True)]))
+        def send(topic: str, payload: bytes, values: dict[str, Any], how: tuple[int, bool]) -> None:
+            client.publish(topic, payload, *how, with_properties(**values))
+            self.sent += 1
+            time.sleep(0.002)
+
+        try:
+            send()
+        finally:
+            client.disconnect()
+            client.loop_stop()
+
+
+@pytest.mark.timeout(180)
+async def test_any_topic_payload_and_property_leaves_the_daemon_unharmed(
+    tmp_path: Path, broker: Broker
+) -> None:
+    fuzzer = Fuzzer(broker)
+    async with running(Station(tmp_path, broker.port)) as (_, daemon, listener):
+        async with unharmed(daemon, listener):
+            await asyncio.to_thread(fuzzer.run, CASES)
+        assert fuzzer.sent >= CASES
+        assert listener.latest["bridge/health"]["link"]["connects"] == 1
