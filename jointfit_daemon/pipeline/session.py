@@ -223,7 +223,10 @@ class CalibrationSession:
         if wanted not in COLLECTING:
             return "phase", f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
         if self.phase in (*COLLECTING, "fitting"):
-            return "phase", f"the phase {self.phase!r} is running: wait for it or send abort"
+            return "phase", (
+                f"the phase {self.phase!r} is running: wait until it ends, or abort it with"
+                ' `jointfit calibrate RIG.toml --abort` (over MQTT: {"phase":"abort"})'
+            )
         if wanted in ("align", "functional") and not self._mocap:
             return "phase", f"{wanted!r} needs an optical system: add [mocap] to rig.toml"
         unready = self._unmarked(wanted) or (self._unposed() if wanted == "functional" else None)

@@ -1,11 +1,13 @@
 """`jointfit calibrate`: leads through a calibration of a running daemon, over MQTT.
 
-Law: the result alone goes to stdout; prompts, progress and warnings go to stderr.
+Invariants: only the result goes to stdout; prompts, progress and warnings go to stderr. A phase
+that this command started does not outlive it, unless the broker or the daemon is gone.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import sys
 from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
@@ -21,8 +23,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt_client import MqttClient
     from jointfit_daemon.tools.calibration_guide import CalibrationWatch
+    from jointfit_daemon.tools.stop_signals import StopRequest
 
 MISUSE, NOT_TAKEN = 2, 3
+ABORT_S = 2.0
+"""Time for the daemon to answer an abort before the command ends without it."""
 LONGEST_S = 600.0
 ORDER = ("align", "static", "functional")
 AT_ONCE = {
@@ -41,6 +46,18 @@ class NobodyThere(Exception):  # noqa: N818 - named for what happened
     """Standard input has ended: nobody can press Enter."""
 
 
+class OutputLostError(Exception):
+    """Standard error cannot be written any more: the terminal or the reader of the pipe is gone."""
+
+
+class StoppedError(Exception):
+    """A stop signal ended the command."""
+
+    def __init__(self, request: StopRequest) -> None:
+        super().__init__(f"stopped by {request.name}")
+        self.exit_code = request.exit_code
+
+
 def calibrate(
     config: Annotated[Path, typer.Argument(help="The rig.toml of the daemon.")] = Path("rig.toml"),
     *,
@@ -55,16 +72,20 @@ def calibrate(
         float | None,
         typer.Option(help="Length of each phase, s; default: as in rig.toml.", max=LONGEST_S),
     ] = None,
+    abort: Annotated[
+        bool, typer.Option("--abort", help="End the phase that is running, whoever started it.")
+    ] = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace the stored calibration even by a worse one.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before each phase.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the last status as JSON.")] = False,
 ) -> None:
-    """Lead through a calibration of the running daemon; Ctrl-C ends the phase.
+    """Lead through a calibration of the running daemon; Ctrl-C or SIGTERM aborts the phase.
 
-    Exit code 1: a phase was refused or given up; 3: the result is worse than what is stored, which
-    stays (--force takes it).
+    Exit codes: 0 done; 1 no broker, no daemon, or a phase was refused or aborted; 2 wrong options
+    or rig.toml; 3 the result is worse than the stored one, which stays in force (--force replaces
+    it); 128 + N stopped by signal N, after the phase was aborted.
     """
     from jointfit_daemon.config import ConfigError, load_rig
     from jointfit_daemon.outputs.mqtt import BrokerLost
@@ -75,18 +96,27 @@ def calibrate(
     if wrong:
         typer.echo(f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *AT_ONCE))}", err=True)
         raise typer.Exit(MISUSE)
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
+        typer.echo(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}", err=True)
+        raise typer.Exit(MISUSE)
+
     try:
         rig = load_rig(config)
         default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
-        status = asyncio.run(_lead(rig, phase or default, seconds, force=force, ask=not yes))
+        phases = ("abort",) if abort else phase or default
+        status = asyncio.run(_lead(rig, phases, seconds, config, force=force, ask=not yes))
     except ConfigError as fault:
         typer.echo(str(fault), err=True)
         raise typer.Exit(MISUSE) from None
     except NobodyThere:
         typer.echo("jointfit calibrate: nobody can press Enter here: use --yes", err=True)
         raise typer.Exit(MISUSE) from None
+    except StoppedError as stopped:
+        raise typer.Exit(stopped.exit_code) from None
     except (BrokerLost, NoAnswer, PhaseAborted, RequestRefused) as fault:
         typer.echo(f"jointfit calibrate: {fault}", err=True)
+        raise typer.Exit(1) from None
+    except OutputLostError:
         raise typer.Exit(1) from None
     _tell(status, json=json)
 
@@ -108,62 +138,108 @@ def _tell(status: Mapping[str, Any], *, json: bool) -> None:
 
 
 async def _lead(
-    rig: Rig, phases: Sequence[str], seconds: float | None, *, force: bool, ask: bool
+    rig: Rig,
+    phases: Sequence[str],
+    seconds: float | None,
+    config: Path,
+    *,
+    force: bool,
+    ask: bool,
 ) -> dict[str, Any]:
     from rich.console import Console
 
     from jointfit_daemon.outputs.mqtt_client import MqttClient
+    from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
     console = Console(stderr=True)
     status: dict[str, Any] = {}
-    async with MqttClient(rig.mqtt) as client:
-        await client.subscribe(*TOPICS)
-        for name in phases:
-            if ask and name in SAYS:
-                console.print(f"{SAYS[name]} Enter to begin: ", end="", soft_wrap=True)
-                await _enter()
-            arguments: dict[str, object] = {"phase": name, "force": force}
-            if seconds is not None:
-                arguments["seconds"] = seconds
-            async with _watching(client, console) as watch:
-                status = await _phase(client, watch, arguments)
+    with cancel_on_signal() as stop:
+        try:
+            async with MqttClient(rig.mqtt) as client:
+                await client.subscribe(*TOPICS)
+                for name in phases:
+                    if ask and name in SAYS:
+                        console.print(f"{SAYS[name]} Enter to begin: ", end="", soft_wrap=True)
+                        await _enter()
+                    arguments: dict[str, object] = {"phase": name, "force": force}
+                    if seconds is not None:
+                        arguments["seconds"] = seconds
+                    async with _watching(client, console) as watch:
+                        status = await _phase(client, watch, arguments, config)
+        except asyncio.CancelledError:
+            if stop.number is None:
+                raise
+            _note(f"jointfit calibrate: stopped by {stop.name}")
+            raise StoppedError(stop) from None
     return status
 
 
 async def _phase(
-    client: MqttClient, watch: CalibrationWatch, arguments: dict[str, object]
+    client: MqttClient, watch: CalibrationWatch, arguments: dict[str, object], config: Path
 ) -> dict[str, Any]:
     from jointfit_daemon.tools.calibration_guide import RequestRefused
 
     name = str(arguments["phase"])
     watch.begin()
-    answer = await client.request("calibrate", arguments)
-    if answer.get("status") == "error":
-        raise RequestRefused(str((answer.get("error") or {}).get("message")))
-    if name in AT_ONCE:
-        return {"text": AT_ONCE[name] + str(answer.get("data", {}).get("phase"))}
+    # a task of its own: its answer is needed even if a signal cancels this one meanwhile
+    asked = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
     try:
+        answer = await asyncio.shield(asked)
+        if answer.get("status") == "error":
+            raise RequestRefused(str((answer.get("error") or {}).get("message")))
+        if name in AT_ONCE:
+            return {"text": AT_ONCE[name] + str(answer.get("data", {}).get("phase"))}
         ended = await watch.ended(name)
-    except asyncio.CancelledError:  # Ctrl-C: a phase that nobody leads must not run on
-        with suppress(Exception):
-            await client.request("calibrate", {"phase": "abort"}, timeout_s=1.0)
+    except (asyncio.CancelledError, OutputLostError):
+        if name not in AT_ONCE:
+            await _abort_phase(client, name, asked, config)
         raise
     final = name == "align" or ended.get("kept") is not None
     return dict(ended if final else await watch.stored(ended))
 
 
+async def _abort_phase(
+    client: MqttClient, name: str, asked: asyncio.Task[dict[str, Any]], config: Path
+) -> None:
+    """Abort the phase that this command started, and report the outcome; another's is left alone.
+
+    Requests run as tasks of their own because this one is already cancelled.
+    """
+    await asyncio.wait([asked], timeout=ABORT_S)
+    started = asked.done() and not asked.cancelled() and asked.exception() is None
+    if started and asked.result().get("status") == "error":
+        return
+
+    ending = asyncio.create_task(client.request("calibrate", {"phase": "abort"}), name="abort")
+    await asyncio.wait([ending], timeout=ABORT_S)
+    if ending.done() and not ending.cancelled() and ending.exception() is None:
+        _note(f"{name}: aborted")
+    else:
+        ending.cancel()
+        _note(
+            f"{name}: the daemon did not answer the abort within {ABORT_S:g} s, so the phase may"
+            f" still be running. To end it: jointfit calibrate {config} --abort"
+        )
+
+
+def _note(text: str) -> None:
+    """Print a line on standard error, which may be gone."""
+    with suppress(OSError):
+        typer.echo(text, err=True)
+
+
 @asynccontextmanager
 async def _watching(client: MqttClient, console: Console) -> AsyncIterator[CalibrationWatch]:
-    """Show what the daemon says, as a bar on a terminal, else as lines, while the block lasts."""
+    """Show the progress of the daemon: as a bar on a terminal, else as lines now and then."""
     from rich.console import Group
     from rich.live import Live
     from rich.progress import Progress
     from rich.text import Text
 
     from jointfit_daemon.tools.calibration_guide import CalibrationWatch
-    from jointfit_daemon.tools.calibration_report import movement_lines
+    from jointfit_daemon.tools.calibration_report import ProgressLines, movement_lines
 
-    bar, joints = Progress(console=console), Text()
+    bar, joints, lines = Progress(console=console), Text(), ProgressLines()
     task = bar.add_task("", total=1.0)
     screen = Live(Group(bar, joints), console=console, transient=True, auto_refresh=False)
     with screen if console.is_terminal else nullcontext():
@@ -171,10 +247,15 @@ async def _watching(client: MqttClient, console: Console) -> AsyncIterator[Calib
         def show(name: str, done: float, text: str) -> None:
             bar.update(task, completed=done, description=name)
             joints.plain = text
+            lines.update(name, done, text)
 
         def figures(data: Mapping[str, Any]) -> None:
-            joints.plain = "\n".join((joints.plain, *movement_lines(data)))
-            screen.refresh()
+            if console.is_terminal:
+                joints.plain = "\n".join((joints.plain, *movement_lines(data)))
+                screen.refresh()
+                return
+            for line in lines.due(asyncio.get_running_loop().time(), data):
+                typer.echo(line, err=True)
 
         watch = CalibrationWatch(show, figures)
         listening = asyncio.create_task(_listen(client, watch, console), name="calibrate listener")
@@ -194,6 +275,8 @@ async def _listen(client: MqttClient, watch: CalibrationWatch, console: Console)
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
     except BrokerLost as lost:
         watch.lose(lost)
+    except (OSError, SystemExit) as gone:  # rich turns a broken pipe into SystemExit
+        watch.lose(OutputLostError(str(gone)))
 
 
 def _heard(watch: CalibrationWatch, topic: str, payload: dict[str, Any]) -> str | None:

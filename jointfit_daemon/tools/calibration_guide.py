@@ -78,7 +78,8 @@ class CalibrationWatch:
                 if told == phase:
                     began = True
                 elif began and told == "aborted":
-                    raise PhaseAborted(str(status.get("text", "no reason given")))
+                    why = status.get("text", "no reason given")
+                    raise PhaseAborted(f"{phase} was aborted: {why}")
                 elif began and told != "fitting":
                     return status
             self._seen.clear()

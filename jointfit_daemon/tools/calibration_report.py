@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -75,6 +76,30 @@ def movement_lines(data: Mapping[str, Any]) -> list[str]:
         ]
         lines.append(f"{'✔' if joint.get('met') else '…'} {name}: {', '.join(words)}")
     return lines
+
+
+@dataclass(slots=True)
+class ProgressLines:
+    """The progress of a phase as plain lines, for logs and pipes."""
+
+    interval_s: float = 5.0
+    """Least time from one report of a phase to the next, s."""
+    _phase: str = ""
+    _line: str = ""
+    _next_s: float = 0.0
+
+    def update(self, phase: str, share: float, text: str) -> None:
+        """Take the newest progress; `share` is 0 to 1. A new phase is reported at once."""
+        if phase != self._phase:
+            self._phase, self._next_s = phase, float("-inf")
+        self._line = f"{phase}: {100 * share:.0f} %" + (f", {text}" if text else "")
+
+    def due(self, now_s: float, data: Mapping[str, Any]) -> list[str]:
+        """Return the lines to print at `now_s`; none before the interval is over."""
+        if now_s < self._next_s:
+            return []
+        self._next_s = now_s + self.interval_s
+        return [self._line, *(f"  {line}" for line in movement_lines(data))]
 
 
 def _tenth(value: float) -> str:

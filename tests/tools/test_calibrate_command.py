@@ -1,0 +1,131 @@
+"""`jointfit calibrate` as a process, beside the real daemon: signals, lost terminals, progress."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+from jointfit_daemon.tools.calibration_report import ProgressLines
+from jointfit_daemon.tools.embedded_broker import embedded_broker
+from tests.system.station import Station, listening
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from tests.system.station import Listener
+
+STATIC = ("--yes", "--phase", "static", "--seconds", "60")
+
+
+async def calibrate(rig: Path, *options: str) -> asyncio.subprocess.Process:
+    """Start the command with all its output in one pipe."""
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "jointfit_daemon.tools", "calibrate", str(rig), *options),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+
+
+async def line_with(process: asyncio.subprocess.Process, text: str) -> str:
+    """Return the next line of output that holds `text`."""
+    assert process.stdout is not None
+    async with asyncio.timeout(15):
+        while line := (await process.stdout.readline()).decode():
+            if text in line:
+                return line
+    raise AssertionError(f"ended without {text!r}")
+
+
+async def rest_of(process: asyncio.subprocess.Process) -> str:
+    async with asyncio.timeout(15):
+        output, _ = await process.communicate()
+    process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the collector
+    return output.decode()
+
+
+@asynccontextmanager
+async def walking(folder: Path) -> AsyncIterator[tuple[Path, Listener]]:
+    """Yield the rig of a running daemon whose subject never stands still, and a listener."""
+    with embedded_broker(folder) as port:
+        station = Station(folder, port, options=("--no-mocap", "--programme", "walk"))
+        async with station.simulator(), station.daemon(), listening(port) as listener:
+            await listener.connected({"S1", "S2", "S3", "S4"})
+            yield station.rig, listener
+
+
+@pytest.mark.system
+@pytest.mark.timeout(90)
+async def test_a_signal_aborts_the_phase_that_the_command_started(tmp_path: Path) -> None:
+    async with walking(tmp_path) as (rig, listener):
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            process = await calibrate(rig, *STATIC)
+            await line_with(process, "static:")
+            await listener.until(lambda: listener.latest["calibration"]["phase"] == "static")
+            process.send_signal(number)
+            output = await rest_of(process)
+            assert process.returncode == 128 + number, output
+            assert "static: aborted" in output
+            assert f"stopped by {number.name}" in output
+            await listener.until(lambda: listener.latest["calibration"]["phase"] == "aborted")
+
+
+@pytest.mark.system
+@pytest.mark.timeout(90)
+async def test_a_lost_terminal_aborts_the_phase(tmp_path: Path) -> None:
+    async with walking(tmp_path) as (rig, listener):
+        read_end, write_end = os.pipe()
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "jointfit_daemon.tools", "calibrate", str(rig), *STATIC),
+            stdin=asyncio.subprocess.DEVNULL,
+            stderr=write_end,
+        )
+        os.close(write_end)
+        await listener.until(lambda: listener.latest["calibration"]["phase"] == "static")
+        os.close(read_end)
+        async with asyncio.timeout(15):
+            assert await process.wait() == 1
+        await listener.until(lambda: listener.latest["calibration"]["phase"] == "aborted")
+
+
+@pytest.mark.system
+@pytest.mark.timeout(60)
+async def test_a_running_phase_is_named_with_the_command_that_ends_it(tmp_path: Path) -> None:
+    async with walking(tmp_path) as (rig, listener):
+        leading = await calibrate(rig, *STATIC)
+        await line_with(leading, "static:")
+        await line_with(leading, "%")  # progress, although there is no terminal
+
+        second = await calibrate(rig, *STATIC)
+        output = await rest_of(second)
+        assert second.returncode == 1
+        assert "--abort" in output
+        assert listener.latest["calibration"]["phase"] == "static"  # another's phase is left alone
+
+        ending = await calibrate(rig, "--abort")
+        assert "aborted" in await rest_of(ending)
+        assert ending.returncode == 0
+        assert "static was aborted: asked to" in await rest_of(leading)
+        assert leading.returncode == 1
+
+
+def test_progress_is_reported_at_the_start_of_a_phase_and_every_five_seconds() -> None:
+    lines = ProgressLines()
+    found = []
+    for tick in range(120):  # ten seconds and two, ten times a second
+        lines.update("static", tick / 120, "stand still")
+        found += lines.due(100.0 + 0.1 * tick, {})
+    assert found == ["static: 0 %, stand still", "static: 42 %, stand still",
+                     "static: 83 %, stand still"]  # fmt: skip
+    lines.update("functional", 0.0, "")
+    assert lines.due(112.1, {"joints": {"knee": {"met": False, "source": "markers"}}}) == [
+        "functional: 0 %",
+        "  … knee: center unknown",
+    ]
