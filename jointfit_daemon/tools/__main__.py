@@ -17,10 +17,13 @@ from jointfit_daemon.tools import (
     sample,
     schema,
 )
+from jointfit_daemon.tools.command_group import EXIT_CODES, CommandGroup
 
 app = typer.Typer(
     name="jointfit",
+    cls=CommandGroup,
     help="Tools around jointfitd: check a rig, calibrate it, decode captures, see a demo.",
+    epilog=EXIT_CODES,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

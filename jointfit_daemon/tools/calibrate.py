@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from jointfit_daemon.tools.command_group import EXIT_FAILED
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping, Sequence
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.calibration_guide import CalibrationWatch
     from jointfit_daemon.tools.stop_signals import StopRequest
 
-MISUSE, NOT_TAKEN = 2, 3
+NOT_TAKEN = 3
 ABORT_S = 2.0
 """Time for the daemon to answer an abort before the command ends without it."""
 LONGEST_S = 600.0
@@ -42,8 +44,11 @@ SAYS = {
 TOPICS = ("calibration", "calibration/progress", "bridge/event", "bridge/state")
 
 
-class NobodyThere(Exception):  # noqa: N818 - named for what happened
+class NobodyThere(ValueError):  # noqa: N818 - named for what happened
     """Standard input has ended: nobody can press Enter."""
+
+    def __init__(self) -> None:
+        super().__init__("nobody can press Enter here: use --yes")
 
 
 class OutputLostError(Exception):
@@ -87,37 +92,23 @@ def calibrate(
     or rig.toml; 3 the result is worse than the stored one, which stays in force (--force replaces
     it); 128 + N stopped by signal N, after the phase was aborted.
     """
-    from jointfit_daemon.config import ConfigError, load_rig
-    from jointfit_daemon.outputs.mqtt import BrokerLost
-    from jointfit_daemon.outputs.mqtt_client import NoAnswer
-    from jointfit_daemon.tools.calibration_guide import PhaseAborted, RequestRefused
+    from jointfit_daemon.config import load_rig
 
     wrong = [name for name in phase or () if name not in (*ORDER, *AT_ONCE)]
     if wrong:
-        typer.echo(f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *AT_ONCE))}", err=True)
-        raise typer.Exit(MISUSE)
+        raise ValueError(f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *AT_ONCE))}")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
-        typer.echo(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}", err=True)
-        raise typer.Exit(MISUSE)
+        raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
 
+    rig = load_rig(config)
+    default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
+    phases = ("abort",) if abort else phase or default
     try:
-        rig = load_rig(config)
-        default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
-        phases = ("abort",) if abort else phase or default
         status = asyncio.run(_lead(rig, phases, seconds, config, force=force, ask=not yes))
-    except ConfigError as fault:
-        typer.echo(str(fault), err=True)
-        raise typer.Exit(MISUSE) from None
-    except NobodyThere:
-        typer.echo("jointfit calibrate: nobody can press Enter here: use --yes", err=True)
-        raise typer.Exit(MISUSE) from None
     except StoppedError as stopped:
         raise typer.Exit(stopped.exit_code) from None
-    except (BrokerLost, NoAnswer, PhaseAborted, RequestRefused) as fault:
-        typer.echo(f"jointfit calibrate: {fault}", err=True)
-        raise typer.Exit(1) from None
     except OutputLostError:
-        raise typer.Exit(1) from None
+        raise typer.Exit(EXIT_FAILED) from None
     _tell(status, json=json)
 
 

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jointfit_daemon.tools.command_group import EXIT_FAILED
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
     from jointfit_daemon.tools.center_trial import Answer, Reduced
-
-MISUSE = 2
-REFUSED = 1
 
 
 def center(
@@ -52,24 +51,17 @@ def center(
     The parent's markers give the coordinates; the child's move about the center. Ends with 1 where
     every answer had to be refused.
     """
-    from jointfit_daemon.files.c3d import PackageMissing
-    from jointfit_daemon.tools.plotting import PlotMissing
+    from jointfit_daemon.tools.output_files import check_plot
 
-    try:
-        _check_axes(plane=plane, up=up)
-        asked = _names(parent), _names(markers)
-        read, reduced, found = _found(
-            trial, asked, method=method, plane=plane, window=window, up=up
-        )
-        _print(read, asked, reduced, found, as_table=window is not None, as_json=json)
-        if plot is not None:
-            _draw(plot, trial, reduced, asked[1], found)
-    except (OSError, ValueError, PackageMissing, PlotMissing) as fault:
-        why = f"{fault.filename}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
-        typer.echo(f"jointfit center: {why}", err=True)
-        raise typer.Exit(MISUSE) from None
+    _check_axes(plane=plane, up=up)
+    check_plot(plot)
+    asked = _names(parent), _names(markers)
+    read, reduced, found = _found(trial, asked, method=method, plane=plane, window=window, up=up)
+    _print(read, asked, reduced, found, as_table=window is not None, as_json=json)
+    if plot is not None:
+        _draw(plot, trial, reduced, asked[1], found)
     if all(answer.estimate.refused for answer in found):
-        raise typer.Exit(REFUSED)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _check_axes(**axes: str | None) -> None:

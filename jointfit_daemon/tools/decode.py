@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Decoder, Driver
     from jointfit_daemon.model import Decoded
 
-MISUSE = 2
-
 
 @dataclass(slots=True)
 class Summary:
@@ -76,17 +74,12 @@ def decode(
     """Decode a capture of any registered protocol: a table of counts, JSON lines or a summary."""
     import orjson
 
-    from jointfit_daemon.driver import UnknownDriver, find_driver
+    from jointfit_daemon.driver import find_driver
     from jointfit_daemon.files.capture import read_capture
 
-    try:
-        driver = find_driver(protocol)
-        decoder = driver(_settings(driver, protocol, setting or [])).decoder()
-        chunks = read_capture(file, driver.wire)
-    except (UnknownDriver, OSError, ValueError) as fault:
-        why = f"{file}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
-        typer.echo(f"jointfit decode: {why}", err=True)
-        raise typer.Exit(MISUSE) from None
+    driver = find_driver(protocol)
+    decoder = driver(_settings(driver, protocol, setting or [])).decoder()
+    chunks = read_capture(file, driver.wire)
     counts = Summary()
     for item in _items(decoder, chunks):
         counts.add(item)

@@ -1,6 +1,7 @@
 """What the demo shows: the calibration as it goes, then the joint beside the truth.
 
-Law: takes what it shows as arguments; on a terminal it redraws, elsewhere it prints a line a step.
+Invariant: at 80 columns and 24 lines the picture is whole, curves included. It takes what it shows
+as arguments; on a terminal it redraws, elsewhere it prints a line a step.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import math
 import os
 import sys
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console, Group
@@ -21,14 +23,20 @@ from rich.text import Text
 from jointfit_daemon.tools.calibration_report import movement_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
+
+    from rich.console import ConsoleOptions, RenderResult
 
     from jointfit_daemon.tools.demo_score import Truth
 
-WIDTH = 72
+LONGEST_CURVE = 200
+"""Columns of the curves that are kept; a terminal shows as many of the newest as fit."""
 SPARSE = 10
-"""Frames from one column of the curves to the next: seven seconds of 100 Hz fill the width."""
+"""Frames from one column of the curves to the next: seven seconds of 100 Hz fill 70 columns."""
+_WIDE = 76
+"""Columns inside the frame from which on the steps have a bar."""
+_STEP_COLUMNS = 12
 _BARS = "▁▂▃▄▅▆▇█"
 STEPS = ("connect", "align", "static", "functional", "live")
 _SAYS = {
@@ -54,8 +62,8 @@ class Display:
         self._pose: Mapping[str, Any] = {}
         self._truth: Truth | None = None
         self._figures: Mapping[str, object] = {}
-        self._estimated: deque[float] = deque(maxlen=WIDTH)
-        self._true: deque[float] = deque(maxlen=WIDTH)
+        self._estimated: deque[float] = deque(maxlen=LONGEST_CURVE)
+        self._true: deque[float] = deque(maxlen=LONGEST_CURVE)
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -66,6 +74,8 @@ class Display:
         if self._live is not None:
             self._live.update(self.render())
             self._live.stop()
+            if not self._console.is_terminal:
+                self._console.print()  # rich leaves the cursor behind the picture there
 
     def step(self, name: str, done: float, text: str) -> None:
         """Show how far a step is."""
@@ -112,25 +122,38 @@ class Display:
         return Group(self._steps(), self._knee_panel()) if self._pose else Group(self._steps())
 
     def _steps(self) -> Panel:
-        table = Table.grid(padding=(0, 2))
         now = STEPS.index(self._step) if self._step in STEPS else 0
+        known = Text(
+            "\n".join(self._joints),
+            style="cyan" if STEPS[now] == "functional" else "dim",
+            no_wrap=True,
+            overflow="ellipsis",
+        )
+        steps = _FittedSteps(self._step_table(now, bars=True), self._step_table(now, bars=False))
+        shown = Group(steps, known) if self._joints else steps
+        return Panel(shown, title="jointfit demo", title_align="left", border_style="cyan")
+
+    def _step_table(self, now: int, *, bars: bool) -> Table:
+        """Return the steps, one a line whatever the width."""
+        table = Table.grid(padding=(0, 2))
+        table.add_column(no_wrap=True, min_width=_STEP_COLUMNS)
+        if bars:
+            table.add_column(no_wrap=True)
+        table.add_column(no_wrap=True, overflow="ellipsis")
         for k, name in enumerate(STEPS):
             done = 1.0 if k < now else self._done if k == now else 0.0
             style = "bold cyan" if k == now else "green" if k < now else "dim"
             mark = "✔" if k < now else "▶" if k == now else " "
             says = self._text if k == now and self._text else _SAYS[name]
-            table.add_row(
-                Text(f"{mark} {name}", style=style), ProgressBar(1.0, done, width=24), says
-            )
-        known = Text("\n".join(self._joints), style="cyan" if STEPS[now] == "functional" else "dim")
-        shown = Group(table, known) if self._joints else table
-        return Panel(shown, title="jointfit demo", title_align="left", border_style="cyan")
+            bar = [ProgressBar(1.0, done, width=14)] if bars else []
+            table.add_row(Text(f"{mark} {name}", style=style), *bar, says)
+        return table
 
     def _knee_panel(self) -> Panel:
         knee, truth = _knee(self._pose), self._truth
-        table = Table(box=None, padding=(0, 2))
+        table = Table(box=None, padding=(0, 1))
         for column in ("knee", "daemon", "bones", "difference"):
-            table.add_column(column, justify="right" if column != "knee" else "left")
+            table.add_column(column, justify="right" if column != "knee" else "left", no_wrap=True)
         flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
         true = None if truth is None else math.degrees(truth.flexion)
         difference = None if true is None or flexion is None else flexion - true
@@ -138,12 +161,37 @@ class Display:
         for name in ("adduction", "rotation", "inner"):
             table.add_row(name, _deg(knee.get(f"{name}_deg")), "", "")
         curves = Group(
-            Text(f"daemon {_spark(self._estimated)}", style="cyan"),
-            Text(f"bones  {_spark(self._true)}", style="green"),
+            _Curve("daemon", self._estimated, "cyan"), _Curve("bones", self._true, "green")
         )
         figures = "   ".join(f"{key} {value}" for key, value in self._figures.items())
         motion = "" if truth is None else truth.motion
-        return Panel(Group(table, curves, Text(figures, style="dim")), title=f"live · {motion}")
+        line = Text(figures, style="dim", no_wrap=True, overflow="ellipsis")
+        return Panel(Group(table, curves, line), title=f"live · {motion}")
+
+
+@dataclass(frozen=True, slots=True)
+class _FittedSteps:
+    """The steps with bars where there is room, else without."""
+
+    wide: Table
+    narrow: Table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield self.wide if options.max_width >= _WIDE else self.narrow
+
+
+@dataclass(frozen=True, slots=True)
+class _Curve:
+    """One line: a name, and the newest values that fit beside it."""
+
+    name: str
+    values: Iterable[float]
+    style: str
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        label = f"{self.name:6} "
+        room = max(1, options.max_width - len(label))
+        yield Text(label + _spark([*self.values][-room:]), style=self.style, no_wrap=True)
 
 
 def _knee(pose: Mapping[str, Any]) -> dict[str, Any]:
@@ -155,7 +203,7 @@ def _deg(value: object, sign: str = "") -> str:
     return f"{value:{sign}.1f}°" if isinstance(value, int | float) else "—"
 
 
-def _spark(values: deque[float]) -> str:
+def _spark(values: Iterable[float]) -> str:
     low, high = -5.0, 110.0
     steps = len(_BARS) - 1
     return "".join(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import orjson
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import AsyncIterator, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -22,6 +22,29 @@ STOP_S = 10.0
 
 class ProcessEnded(Exception):  # noqa: N818 - named for what happened
     """A process of the demo ended on its own; the text is the end of what it said."""
+
+
+class DemoTimeoutError(Exception):
+    """A step of the demo took too long; the message says which, and what to do."""
+
+
+@contextlib.asynccontextmanager
+async def finished_within(seconds: float, step: str) -> AsyncIterator[None]:
+    """Bound the time of a step.
+
+    Raises
+    ------
+    DemoTimeoutError
+        The block took longer than `seconds`.
+    """
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except TimeoutError as late:
+        raise DemoTimeoutError(
+            f"{step} took longer than {seconds:g} s: is the machine busy? Try again, or look into"
+            " the logs with --keep FOLDER"
+        ) from late
 
 
 @dataclass(slots=True)
@@ -85,7 +108,7 @@ class Simulator(Child):
 
     async def ready(self) -> dict[str, Any]:
         """Wait until the virtual hardware is there; return where it is."""
-        async with asyncio.timeout(READY_S):
+        async with finished_within(READY_S, "the start of the simulator"):
             while True:
                 line = await self.answer()
                 if line.get("ready"):
@@ -112,7 +135,7 @@ class Simulator(Child):
     async def quit(self) -> dict[str, Any]:
         """Stop the streams; return what was sent."""
         await self.say("quit")
-        async with asyncio.timeout(STOP_S):
+        async with finished_within(STOP_S, "the end of the simulator"):
             while True:
                 line = await self.answer()
                 if "sent" in line:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.outputs.mqtt_client import MqttClient
 from jointfit_daemon.tools.calibration_guide import CalibrationWatch, RequestRefused
+from jointfit_daemon.tools.demo_processes import finished_within
 from jointfit_daemon.tools.demo_score import MeanSquare, Score, percentile
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.demo_truth import TruthReader
 
 TOPICS = ("pose", "calibration", "calibration/progress", "bridge/health", "device/+/availability")
-CONNECT_S = 30.0
+CONNECT_S, FINISH_S = 30.0, 15.0
 SETTLE_S = 3.0
 PHASES = (
     ("align", (("plate", 20.0),)),
@@ -60,10 +61,11 @@ class Demo:
     _poses: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
     _judging: bool = False
     _static_ns: int = 0
+    _sent: dict[str, Any] | None = None
     _watch: CalibrationWatch | None = None
 
-    async def run(self, seconds: float) -> dict[str, Any]:
-        """Walk through it all; return the figures."""
+    async def run(self, seconds: float) -> None:
+        """Walk through it all; `figures` has the outcome, also of a run that was interrupted."""
         async with MqttClient(self.rig.mqtt) as client:
             await client.subscribe(*TOPICS)
             listening = asyncio.create_task(self._listen(client), name="demo listener")
@@ -71,11 +73,10 @@ class Demo:
                 await self._connect()
                 await self._calibrate(client)
                 await self._live(seconds)
-                sent = await self._finish()
+                self._sent = await self._finish()
             finally:
                 listening.cancel()
                 await asyncio.wait([listening])
-        return self._figures(sent)
 
     # --- what the daemon says ----------------------------------------------------------------
 
@@ -118,7 +119,7 @@ class Demo:
 
     async def _connect(self) -> None:
         wanted = {source.id for source in self.rig.sources}
-        async with asyncio.timeout(CONNECT_S):
+        async with finished_within(CONNECT_S, "connecting all sources"):
             while not wanted <= self.online:
                 self.daemon.check()
                 self.simulator.check()
@@ -172,7 +173,7 @@ class Demo:
         said = await self.simulator.quit()
         wanted = {source.id for source in self.rig.sources}
         before = self._healths
-        async with asyncio.timeout(15.0):
+        async with finished_within(FINISH_S, "counting the last samples"):
             while self.online & wanted or self._healths < before + 2:  # noqa: ASYNC110 - two facts
                 await asyncio.sleep(0.1)
         sent: dict[str, Any] = said["sent"]
@@ -188,7 +189,8 @@ class Demo:
             "latency": "—" if p50 is None else f"{p50:.1f} ms",
         }
 
-    def _figures(self, sent: dict[str, Any]) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
+        """Return errors, latency and samples; None where the run ended before they were known."""
         devices = self._health.get("devices", {})
         counts = {
             key: sum(int(device.get(key) or 0) for device in devices.values())
@@ -211,8 +213,8 @@ class Demo:
             },
             "samples": counts,
             "corrupt": sum(int(device.get("corrupt") or 0) for device in devices.values()),
-            "sent": sum(sent.values()),
-            "unaccounted": _unaccounted(sent, devices),
+            "sent": None if self._sent is None else sum(self._sent.values()),
+            "unaccounted": None if self._sent is None else _unaccounted(self._sent, devices),
             "within_2_sd_share": _rounded(self.score.covered / max(1, self.score.flexion.n)),
         }
 

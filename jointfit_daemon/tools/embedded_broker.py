@@ -39,6 +39,10 @@ dynamic_filters = true
 """
 
 
+class BrokerMissingError(ImportError):
+    """The embedded broker is not installed; the message says how to get it."""
+
+
 def free_port() -> int:
     """Return a TCP port of the loopback that nobody listens on just now."""
     with socket.socket() as probe:
@@ -52,12 +56,17 @@ def embedded_broker(folder: Path) -> Iterator[int]:
 
     Raises
     ------
-    ModuleNotFoundError
+    BrokerMissingError
         iotcore is not installed: it comes with the extra ``demo``.
     TimeoutError
         It did not listen within ten seconds.
     """
-    from iotcore import Broker
+    try:
+        from iotcore import Broker
+    except ModuleNotFoundError as missing:
+        raise BrokerMissingError(
+            "the demo needs a broker: pip install 'jointfitd[demo]'"
+        ) from missing
 
     port = free_port()
     config = folder / "broker.toml"

@@ -5,19 +5,17 @@ Law: a model file is the calibration of the daemon; applying it runs the daemon'
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from jointfit_daemon.calibration.offline import OfflineTrial
     from jointfit_daemon.tools.fuse_trial import Limb
 
-MISUSE = 2
 UNTAUGHT = ("mean", "single")
 """Methods that need no movement."""
 
@@ -81,25 +79,24 @@ def evaluate(
     ] = None,
 ) -> None:
     """Judge every method where it was not fitted: leave one trial out."""
-    with _told():
-        from jointfit_daemon.calibration import offline
-        from jointfit_daemon.tools import fuse_report
+    from jointfit_daemon.calibration import offline
+    from jointfit_daemon.tools import fuse_report
+    from jointfit_daemon.tools.output_files import check_plot
 
-        limb, read, mounts, doubts = _inputs(
-            trials, segment, joints, static, markers=markers, up=up
-        )
-        _refuse_unmoved(limb, read)
-        found = offline.evaluate(limb.chain, read, mounts, holdout=holdout)
-        _warn(doubts)
-        if json:
-            _echo_json(fuse_report.judgement_json(found) | {"notes": doubts})
-        else:
-            typer.echo(fuse_report.judgement(found))
-        if plot is not None:
-            from jointfit_daemon.tools.fuse_plot import draw_judgement
+    check_plot(plot)
+    limb, read, mounts, doubts = _inputs(trials, segment, joints, static, markers=markers, up=up)
+    _refuse_unmoved(limb, read)
+    found = offline.evaluate(limb.chain, read, mounts, holdout=holdout)
+    _warn(doubts)
+    if json:
+        _echo_json(fuse_report.judgement_json(found) | {"notes": doubts})
+    else:
+        typer.echo(fuse_report.judgement(found))
+    if plot is not None:
+        from jointfit_daemon.tools.fuse_plot import draw_judgement
 
-            draw_judgement(plot, found)
-            typer.echo(f"wrote {plot}", err=True)
+        draw_judgement(plot, found)
+        typer.echo(f"wrote {plot}", err=True)
 
 
 @app.command()
@@ -118,36 +115,36 @@ def fit(
     json: Json = False,
 ) -> None:
     """Fit a model to all trials and write it: a calibration as the daemon keeps it."""
-    with _told():
-        from datetime import UTC, datetime
+    from datetime import UTC, datetime
 
-        from jointfit_daemon import __version__
-        from jointfit_daemon.calibration import offline
-        from jointfit_daemon.tools import fuse_report
+    from jointfit_daemon import __version__
+    from jointfit_daemon.calibration import offline
+    from jointfit_daemon.tools import fuse_report
+    from jointfit_daemon.tools.output_files import check_output
 
-        limb, read, mounts, doubts = _inputs(
-            trials, segment, joints, static, markers=markers, up=up
-        )
-        if (chosen := _method(method)) not in UNTAUGHT:
-            _refuse_unmoved(limb, read)
-        if mounts is None:
-            mounts = {s: mean.q for s, mean in offline.mounts_of(limb.chain, read).items()}
-        calibration = offline.fit_offline(
-            limb.chain,
-            read,
-            mounts,
-            chosen,
-            notes=tuple(doubts),
-            software=__version__,
-            created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
-        )
-        _write_json(out, calibration.to_dict())
-        frames = sum(len(trial.t_s) for trial in read)
-        if json:
-            _echo_json({"model": str(out), "frames": frames, "notes": doubts})
-        else:
-            typer.echo(fuse_report.fitted(calibration, frames))
-            typer.echo(f"wrote {out}", err=True)
+    check_output("--out", out, (".json",))
+    chosen = _method(method)
+    limb, read, mounts, doubts = _inputs(trials, segment, joints, static, markers=markers, up=up)
+    if chosen not in UNTAUGHT:
+        _refuse_unmoved(limb, read)
+    if mounts is None:
+        mounts = {s: mean.q for s, mean in offline.mounts_of(limb.chain, read).items()}
+    calibration = offline.fit_offline(
+        limb.chain,
+        read,
+        mounts,
+        chosen,
+        notes=tuple(doubts),
+        software=__version__,
+        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    _write_json(out, calibration.to_dict())
+    frames = sum(len(trial.t_s) for trial in read)
+    if json:
+        _echo_json({"model": str(out), "frames": frames, "notes": doubts})
+    else:
+        typer.echo(fuse_report.fitted(calibration, frames))
+        typer.echo(f"wrote {out}", err=True)
 
 
 @app.command()
@@ -167,40 +164,23 @@ def apply(
     json: Json = False,
 ) -> None:
     """Fuse the sensors of a trial as the daemon would live, with its uncertainty."""
-    with _told():
-        from jointfit_daemon.tools import fuse_output, fuse_report
-        from jointfit_daemon.tools.fuse_tables import Unusable
-        from jointfit_daemon.tools.fuse_trial import read_worn
+    from jointfit_daemon.tools import fuse_output, fuse_report
+    from jointfit_daemon.tools.fuse_trial import read_worn
+    from jointfit_daemon.tools.output_files import check_output
 
-        if out.suffix.lower() not in fuse_output.ENDINGS:
-            raise Unusable(f"--out {out}: expected a name that ends in .sto, .npz or .csv")
-        axis = _axis(up)
-        calibration = _read_model(model)
-        chain = fuse_output.chain_of(calibration, left=left)
-        table = read_worn(sensors, chain, axis, without or ())
-        found = fuse_output.fuse_trial(calibration, table, left=left)
-        files = fuse_output.write_fused(out, found, table, axis)
-        if json:
-            said = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
-            _echo_json(said | {"files": [str(file) for file in files]})
-        else:
-            typer.echo(fuse_report.applied(found))
-            typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
-
-
-@contextmanager
-def _told() -> Iterator[None]:
-    """Turn what a user can mend into one line on stderr and exit code 2."""
-    from jointfit_daemon.calibration.refused import CalibrationRefused
-    from jointfit_daemon.files.c3d import PackageMissing
-    from jointfit_daemon.tools.plotting import PlotMissing
-
-    try:
-        yield
-    except (OSError, ValueError, CalibrationRefused, PackageMissing, PlotMissing) as fault:
-        why = f"{fault.filename}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
-        typer.echo(f"jointfit fuse: {why}", err=True)
-        raise typer.Exit(MISUSE) from None
+    check_output("--out", out, fuse_output.ENDINGS)
+    axis = _axis(up)
+    calibration = _read_model(model)
+    chain = fuse_output.chain_of(calibration, left=left)
+    table = read_worn(sensors, chain, axis, without or ())
+    found = fuse_output.fuse_trial(calibration, table, left=left)
+    files = fuse_output.write_fused(out, found, table, axis)
+    if json:
+        said = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
+        _echo_json(said | {"files": [str(file) for file in files]})
+    else:
+        typer.echo(fuse_report.applied(found))
+        typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
 
 
 def _inputs(

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from jointfit_daemon.tools.command_group import EXIT_FAILED
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -17,10 +19,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
     from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.tools.markers_trials import Asked
-
-MISUSE = 2
-REFUSED = 1
-
 
 Trials = Annotated[list[Path], typer.Argument(help="Trials to learn from, .trc or .c3d.")]
 Model = Annotated[Path, typer.Option("--model", help="The chain: .toml, .json or OpenSim's .osim.")]
@@ -97,40 +95,34 @@ def markers(
         RefinementSettings,
         Unrefinable,
     )
-    from jointfit_daemon.files.c3d import PackageMissing
     from jointfit_daemon.tools.markers_trials import Asked
-    from jointfit_daemon.tools.plotting import PlotMissing
 
+    _check(method=method, up=up, out=out or [], plot=plot)
+    names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
+    settings = RefinementSettings(
+        cast("RefinementMethod", method),
+        prior,
+        frames=frames,
+        evenness=evenness,
+        holdout_share=holdout,
+    )
     try:
-        _check(method=method, up=up, out=out or [])
-        names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
         chain, remarks, found = _refined(
-            Asked(model, *names, up or None),
-            (trials, validate or []),
-            RefinementSettings(
-                cast("RefinementMethod", method),
-                prior,
-                frames=frames,
-                evenness=evenness,
-                holdout_share=holdout,
-            ),
+            Asked(model, *names, up or None), (trials, validate or []), settings
         )
-        _print(chain, remarks, found, as_json=json)
-        _write(chain, found, out or [], plot)
     except Unrefinable as refused:
         typer.echo(f"jointfit markers: refused: {refused}", err=True)
-        raise typer.Exit(REFUSED) from None
-    except (OSError, ValueError, PackageMissing, PlotMissing) as fault:
-        why = f"{fault.filename}: {fault.strerror}" if isinstance(fault, OSError) else str(fault)
-        typer.echo(f"jointfit markers: {why}", err=True)
-        raise typer.Exit(MISUSE) from None
+        raise typer.Exit(EXIT_FAILED) from None
+    _print(chain, remarks, found, as_json=json)
+    _write(chain, found, out or [], plot)
 
 
-def _check(*, method: str, up: str | None, out: Sequence[Path]) -> None:
+def _check(*, method: str, up: str | None, out: Sequence[Path], plot: Path | None) -> None:
     from typing import get_args
 
     from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
     from jointfit_daemon.tools.markers_write import ENDINGS
+    from jointfit_daemon.tools.output_files import check_output, check_plot
 
     methods = get_args(RefinementMethod)
     if method not in methods:
@@ -138,8 +130,8 @@ def _check(*, method: str, up: str | None, out: Sequence[Path]) -> None:
     if up is not None and up not in ("x", "y", "z"):
         raise ValueError(f"--up is {up!r}, expected x, y or z")
     for path in out:
-        if path.suffix.lower() not in ENDINGS:
-            raise ValueError(f"--out {path}: expected a name that ends in {', '.join(ENDINGS)}")
+        check_output("--out", path, ENDINGS)
+    check_plot(plot)
 
 
 def _refined(

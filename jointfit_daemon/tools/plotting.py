@@ -6,7 +6,10 @@ from typing import Any
 
 
 class PlotMissing(ImportError):  # noqa: N818 - named for what happened
-    """Matplotlib is not installed; says how to get it."""
+    """Matplotlib is not installed; the message says how to get it."""
+
+    def __init__(self) -> None:
+        super().__init__("drawing needs matplotlib: pip install 'jointfitd[plot]'")
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -21,7 +24,7 @@ def new_figure(width: float, height: float) -> Any:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ModuleNotFoundError as missing:
-        raise PlotMissing("drawing needs matplotlib: pip install 'jointfitd[plot]'") from missing
+        raise PlotMissing from missing
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

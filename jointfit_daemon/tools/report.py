@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jointfit_daemon.tools.output_files import check_output
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.center.study import PairMaps, StudySetup
-
-MISUSE = 2
 
 
 def report(
@@ -37,16 +37,13 @@ def report(
 ) -> None:
     """Repeat a published experiment: tables on standard output, figures with --out."""
     if not cor_study:
-        typer.echo("jointfit report: say which report; there is: --cor-study", err=True)
-        raise typer.Exit(MISUSE)
-    try:
-        for folder in (out, json.parent if json else None):
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-        _cor_study(out, json, repeats, seed)
-    except OSError as fault:
-        typer.echo(f"jointfit report: {fault.filename}: {fault.strerror}", err=True)
-        raise typer.Exit(MISUSE) from None
+        raise ValueError("name the report: the only one is --cor-study")
+    for folder in (out, json.parent if json else None):
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+    if json is not None:
+        check_output("--json", json, (json.suffix,))
+    _cor_study(out, json, repeats, seed)
 
 
 def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:

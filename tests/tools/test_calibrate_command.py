@@ -37,7 +37,7 @@ async def calibrate(rig: Path, *options: str) -> asyncio.subprocess.Process:
 async def line_with(process: asyncio.subprocess.Process, text: str) -> str:
     """Return the next line of output that holds `text`."""
     assert process.stdout is not None
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(30):
         while line := (await process.stdout.readline()).decode():
             if text in line:
                 return line
@@ -82,14 +82,16 @@ async def test_a_signal_aborts_the_phase_that_the_command_started(tmp_path: Path
 async def test_a_lost_terminal_aborts_the_phase(tmp_path: Path) -> None:
     async with walking(tmp_path) as (rig, listener):
         read_end, write_end = os.pipe()
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "jointfit_daemon.tools", "calibrate", str(rig), *STATIC),
-            stdin=asyncio.subprocess.DEVNULL,
-            stderr=write_end,
-        )
-        os.close(write_end)
-        await listener.until(lambda: listener.latest["calibration"]["phase"] == "static")
-        os.close(read_end)
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "jointfit_daemon.tools", "calibrate", str(rig), *STATIC),
+                stdin=asyncio.subprocess.DEVNULL,
+                stderr=write_end,
+            )
+            await listener.until(lambda: listener.latest["calibration"]["phase"] == "static", 30)
+        finally:
+            os.close(write_end)
+            os.close(read_end)
         async with asyncio.timeout(15):
             assert await process.wait() == 1
         await listener.until(lambda: listener.latest["calibration"]["phase"] == "aborted")

@@ -1,0 +1,100 @@
+"""How the `jointfit` commands fail: one line on standard error, and an exit code.
+
+Invariant: every command reports through `CommandGroup`. Exceptions that it does not know are bugs
+and keep their traceback.
+"""
+
+from __future__ import annotations
+
+import errno
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+from typing_extensions import override
+
+EXIT_FAILED, EXIT_MISUSE, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 the work failed or its result was refused; 2 wrong options, or a file"
+    " that is missing or broken; 3 calibrate: the stored calibration is better and stays;"
+    " 128 + N stopped by signal N (130: Ctrl-C)."
+)
+_REMEDIES = {
+    errno.ENOENT: "check the path",
+    errno.EACCES: "change its permissions, or choose another path",
+    errno.EPERM: "change its permissions, or choose another path",
+    errno.EISDIR: "expected a file: name one in that folder",
+    errno.ENOTDIR: "a part of the path is a file: check the path",
+    errno.EEXIST: "choose another path, or remove what is there",
+    errno.ENOSPC: "free some space, or choose another path",
+    errno.EROFS: "choose a path on a writable file system",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "the path is a circle of links: check it",
+}
+
+
+class CommandGroup(TyperGroup):
+    """Runs a command and turns the errors that a user can act on into a message."""
+
+    @override
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command; exit with 1, 2 or 130 after a message where it fails."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except Exception as error:
+            known = _known_error(error)
+            if known is None:
+                raise
+            code, text = known
+            bare = ctx.invoked_subcommand is None or _is_config_error(error)
+            typer.echo(text if bare else f"jointfit {ctx.invoked_subcommand}: {text}", err=True)
+            raise typer.Exit(code) from None
+
+
+def _known_error(error: Exception) -> tuple[int, str] | None:
+    """Return exit code and message of an error that is not a bug."""
+    if isinstance(error, BrokenPipeError):  # `jointfit schema | head`: typer ends it quietly
+        return None
+    if isinstance(error, OSError) and error.filename is not None:
+        return EXIT_MISUSE, os_error_text(error)
+    if isinstance(error, OSError | ValueError):
+        return EXIT_MISUSE, str(error)
+    return _known_elsewhere(error)
+
+
+def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
+    """Judge by the classes of modules that are loaded: what is not loaded raised nothing."""
+    for code, module, name in (
+        (EXIT_MISUSE, "jointfit_daemon.config", "ConfigError"),
+        (EXIT_MISUSE, "jointfit_daemon.calibration.refused", "CalibrationRefused"),
+        (EXIT_MISUSE, "jointfit_daemon.files.c3d", "PackageMissing"),
+        (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlotMissing"),
+        (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriver"),
+        (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "BrokerLost"),
+        (EXIT_FAILED, "jointfit_daemon.outputs.mqtt_client", "NoAnswer"),
+        (EXIT_FAILED, "jointfit_daemon.tools.calibration_guide", "PhaseAborted"),
+        (EXIT_FAILED, "jointfit_daemon.tools.calibration_guide", "RequestRefused"),
+        (EXIT_FAILED, "jointfit_daemon.tools.demo_processes", "ProcessEnded"),
+        (EXIT_FAILED, "jointfit_daemon.tools.demo_processes", "DemoTimeoutError"),
+        (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
+    ):
+        loaded = sys.modules.get(module)
+        if loaded is not None and isinstance(error, getattr(loaded, name)):
+            return code, str(error)
+    return None
+
+
+def _is_config_error(error: Exception) -> bool:
+    """Return whether the message already begins with the file's name, fault by fault."""
+    loaded = sys.modules.get("jointfit_daemon.config")
+    return loaded is not None and isinstance(error, loaded.ConfigError)
+
+
+def os_error_text(error: OSError) -> str:
+    """Return path, reason and remedy of an error of the operating system."""
+    remedy = _REMEDIES.get(error.errno or 0, "check the path and the disk")
+    return f"{error.filename}: {error.strerror}: {remedy}"
