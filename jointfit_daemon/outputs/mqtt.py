@@ -1,4 +1,4 @@
-"""One connection to an MQTT broker. Law: the only module that knows aiomqtt and paho.
+"""One connection to an MQTT broker. Law: the only module of the daemon that knows aiomqtt and paho.
 
 Nothing of theirs leaves it: whatever goes wrong with a broker is ``BrokerLost``. A connection is
 used once; whoever wants another makes another.

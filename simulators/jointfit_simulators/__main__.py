@@ -1,7 +1,8 @@
 """``jointfit-sim``: virtual hardware on a command line.
 
 Law: nothing but JSON lines on stdout. One when all is ready, one for every ``status``, ``{"error":
-…}`` for a command that was not understood, and one with the counts of all that was sent at the end.
+…}`` for a command that was not understood, ``{"motion": …}`` for every motion that ``--follow``
+begins, and one with the counts of all that was sent at the end.
 
 ``jointfit-sim play --directory DIR`` reads commands from stdin, one a line: ``play NAME``,
 ``unplug ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``, ``drift ID
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import os
 import selectors
 import signal
 import sys
@@ -26,6 +28,8 @@ import orjson
 
 from jointfit_simulators.clocks import ClockFault
 from jointfit_simulators.motion import MOTIONS
+from jointfit_simulators.phase_follower import PhaseFollower
+from jointfit_simulators.play_directory import play_directory
 from jointfit_simulators.programme import UnknownMotion, parse_programme
 from jointfit_simulators.replayed import Replayed
 from jointfit_simulators.rig_file import RigOptions
@@ -39,6 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_simulators.observation import Subject
+    from jointfit_simulators.play_directory import PlayDirectory
 
 USAGE = 2
 ORIGIN_NS = 100_000_000
@@ -75,6 +80,11 @@ def _parser() -> argparse.ArgumentParser:
         "play", help="play a scene until told to quit", epilog=COMMANDS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
+    _add_play_options(play)
+    return parser
+
+
+def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--directory", type=Path, required=True, help="for ports, rig.toml, truth")
     play.add_argument("--programme", help="NAME:SECONDS,…; the last one goes on (default stand)")
     play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
@@ -83,6 +93,12 @@ def _parser() -> argparse.ArgumentParser:
     play.add_argument("--rate", type=float, help="IMU samples a second")
     play.add_argument("--seed", type=int, help="seed of all dice")
     play.add_argument("--no-mocap", action="store_true", help="no optical system")
+    play.add_argument("--command-port", type=int, metavar="PORT",
+                      help="UDP port of the motion-capture server (default: as in the run before "
+                      "in this directory, else any free one)")  # fmt: skip
+    play.add_argument("--follow", action="store_true",
+                      help="move as the daemon's calibration phase asks: align, static, functional "
+                      "(over MQTT, broker and base as for rig.toml)")  # fmt: skip
     play.add_argument("--can", default="slcan", help="slcan, or INTERFACE:CHANNEL of python-can")
     play.add_argument("--motion", action="append", default=[], metavar="NAME=FILE",
                       help="a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
@@ -105,7 +121,6 @@ def _parser() -> argparse.ArgumentParser:
             default=field.default,
             help=f"for rig.toml (default {field.default})",
         )
-    return parser
 
 
 def _knobs(options: argparse.Namespace) -> Knobs:
@@ -132,10 +147,14 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _say(line: dict[str, object]) -> None:
-    sys.stdout.buffer.write(
-        orjson.dumps(line, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
-    )
-    sys.stdout.buffer.flush()
+    text = orjson.dumps(line, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+    try:
+        sys.stdout.buffer.write(text)
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:  # the reader is gone; the hardware plays on
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 async def _obey(scene: Scene) -> None:
@@ -179,16 +198,48 @@ async def _play(options: argparse.Namespace) -> None:
         ptp=options.ptp,
         sample_log=options.sample_log,
     )
+    if options.follow and options.trial:
+        raise ValueError("--follow needs the motions of the simulator: leave out --trial")
     subject = _subject(options, knobs)
+    with play_directory(hardware.directory) as directory:
+        if hardware.mocap:
+            port = directory.command_port(options.command_port)
+            hardware = dataclasses.replace(hardware, command_port=port)
+        await _run_scene(knobs, subject, hardware, directory, follow=options.follow)
+
+
+async def _run_scene(
+    knobs: Knobs,
+    subject: Subject,
+    hardware: SceneOptions,
+    directory: PlayDirectory,
+    *,
+    follow: bool,
+) -> None:
     # a whole tenth: samples of perfect clocks and lines of the truth then share their instants
     now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS
     scene = Scene(knobs, subject, hardware, now_ns=now_ns)
+    directory.remember(scene.command_port)
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
     async with asyncio.TaskGroup() as tasks:
-        obeying = tasks.create_task(_obey(scene), name="commands")
+        others = [tasks.create_task(_obey(scene), name="commands")]
+        if follow:
+            follower = PhaseFollower(hardware.rig, lambda name: _play_motion(scene, name), _report)
+            others.append(tasks.create_task(follower.run(), name="phase follower"))
         await scene.run(_say)
-        obeying.cancel()
+        for other in others:
+            other.cancel()
+
+
+def _play_motion(scene: Scene, name: str) -> None:
+    """Begin a motion, and report it as JSON like everything else on standard output."""
+    scene.command(f"play {name}")
+    _say({"motion": name})
+
+
+def _report(text: str) -> None:
+    print(f"jointfit-sim: {text}", file=sys.stderr, flush=True)
 
 
 def _punctual_loop() -> asyncio.AbstractEventLoop:

@@ -175,6 +175,7 @@ def optical_server(
     ticker: Ticker,
     *,
     ptp: bool = False,
+    command_port: int = 0,
 ) -> NatNetServer:
     """Return a NatNet server whose project has a body for every cluster of markers.
 
@@ -190,6 +191,8 @@ def optical_server(
         Whose clock is the server's.
     ptp
         Cameras and host are on PTP: frames carry precision timestamps.
+    command_port
+        UDP port of loopback for its clients' commands; 0: any free one.
     """
     owned = {part.capitalize(): names for part, names in clusters.items()}
     owned |= {body: () for body in bodies if body not in owned}
@@ -197,7 +200,11 @@ def optical_server(
         StagedBody(body, names, number) for number, (body, names) in enumerate(owned.items(), 1)
     )
     options = NatNetServerOptions(
-        bodies=staged, rate_hz=knobs.mocap_hz, device_ns=ticker.device_ns, seed=knobs.seed
+        bodies=staged,
+        command_port=command_port,
+        rate_hz=knobs.mocap_hz,
+        device_ns=ticker.device_ns,
+        seed=knobs.seed,
     )
     if ptp:
         options = replace(options, bitstream=(4, 1), precision_ns=_ptp_time())

@@ -60,6 +60,8 @@ class SceneOptions:
     """A wire from the cameras' sync output to the first sync input of every UART sensor."""
     ptp: bool = False
     """Cameras and host are on PTP."""
+    command_port: int = 0
+    """UDP port of the motion-capture server; 0: any free one."""
     sample_log: bool = False
     """Tell the true instant of every sample sent."""
 
@@ -108,8 +110,16 @@ class Scene:
             self._tickers[name].ask(fault, now_ns)
         for stream in self._hardware.streams.values():
             stream.told = told
-        serve = optical_server if options.mocap else _no_server
-        self._server = serve(knobs, subject.clusters, cameras.bodies, ticker, ptp=options.ptp)
+        self._server: NatNetServer | None = None
+        if options.mocap:
+            self._server = optical_server(
+                knobs,
+                subject.clusters,
+                cameras.bodies,
+                ticker,
+                ptp=options.ptp,
+                command_port=options.command_port,
+            )
         self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
         self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
@@ -235,6 +245,11 @@ class Scene:
             return ""
         return mocap_table(self._server, sync_line=self._options.sync_line)
 
+    @property
+    def command_port(self) -> int | None:
+        """Return the UDP port of the motion-capture server; None without one."""
+        return None if self._server is None else self._server.command_port
+
     def command(self, line: str) -> dict[str, object] | None:
         """Obey one line; return the answer of ``status``.
 
@@ -328,10 +343,6 @@ class Scene:
             "refused": {n: s.refused for n, s in streams.items()},
             "unheard": {n: s.unheard for n, s in streams.items()},
         }
-
-
-def _no_server(*_: object, ptp: bool) -> NatNetServer | None:  # noqa: ARG001 - as the other
-    return None
 
 
 def _check_clocks(asked: Mapping[str, ClockFault], known: tuple[str, ...]) -> None:

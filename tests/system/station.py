@@ -247,6 +247,12 @@ async def stopped(daemon: Child, number: signal.Signals = signal.SIGTERM) -> tup
     return code, time.monotonic() - began
 
 
+def restore_signals() -> None:
+    """Let a child process be stopped, whoever started the tests: nohup and `&` ignore signals."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def hang_up(daemon: Child) -> None:
     """Ask for a reload."""
     assert daemon.process is not None

@@ -13,7 +13,7 @@ import pytest
 
 from jointfit_daemon.tools.calibration_report import ProgressLines
 from jointfit_daemon.tools.embedded_broker import embedded_broker
-from tests.system.station import Station, listening
+from tests.system.station import Station, listening, restore_signals
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -31,6 +31,7 @@ async def calibrate(rig: Path, *options: str) -> asyncio.subprocess.Process:
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
+        preexec_fn=restore_signals,
     )
 
 

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.demo import NOTHING_MEASURED, result_line
+from tests.system.station import restore_signals
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,6 +69,7 @@ async def test_ctrl_c_ends_the_demo_with_a_result_line(tmp_path: Path, options: 
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
         start_new_session=True,
+        preexec_fn=restore_signals,
     )
     async with asyncio.timeout(30):
         while not (tmp_path / "rig.toml").exists():

@@ -1,0 +1,183 @@
+"""One simulator a directory, its camera port kept for the next run, motions that follow a phase."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+from jointfit_daemon.tools.embedded_broker import embedded_broker, free_port
+from jointfit_simulators.motion import MOTIONS
+from jointfit_simulators.natnet_port import LOOPBACK
+from jointfit_simulators.phase_follower import MOTIONS_OF_PHASES, PhaseFollower
+from jointfit_simulators.play_directory import (
+    DirectoryInUseError,
+    PortInUseError,
+    play_directory,
+)
+from jointfit_simulators.rig_file import RigOptions
+from tests.system.station import Station, listening, running
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind((LOOPBACK, 0))
+        yield holder.getsockname()[1]
+
+
+def test_a_second_simulator_in_a_directory_is_refused_with_the_process_and_a_remedy(
+    tmp_path: Path,
+) -> None:
+    with (
+        play_directory(tmp_path),
+        pytest.raises(DirectoryInUseError, match=r"process \d+\).*kill \d+.*--directory"),
+        play_directory(tmp_path),
+    ):
+        pass
+    with play_directory(tmp_path):  # the lock went with its owner
+        pass
+
+
+def test_the_command_port_is_that_of_the_run_before_while_it_is_free(
+    tmp_path: Path, taken_port: int
+) -> None:
+    with play_directory(tmp_path) as first:
+        assert first.command_port(None) == 0
+        first.remember(taken_port)
+    with play_directory(tmp_path) as second:
+        assert second.command_port(None) == 0  # taken by another program
+        second.remember(None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOOPBACK, 0))
+        free = probe.getsockname()[1]
+    with play_directory(tmp_path) as third:
+        third.remember(free)
+    with play_directory(tmp_path) as fourth:
+        assert fourth.command_port(None) == free
+        assert fourth.command_port(free) == free
+
+
+@pytest.mark.parametrize("port", [0, -1, 70_000])
+def test_a_number_that_is_no_port_is_refused(tmp_path: Path, port: int) -> None:
+    with play_directory(tmp_path) as directory, pytest.raises(PortInUseError, match="1 to 65535"):
+        directory.command_port(port)
+
+
+def test_a_taken_port_that_was_asked_for_is_refused_with_a_remedy(
+    tmp_path: Path, taken_port: int
+) -> None:
+    with play_directory(tmp_path) as directory, pytest.raises(PortInUseError, match="choose"):
+        directory.command_port(taken_port)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff", b"[]", b'{"command_port":"x"}', b"9" * 5000])
+def test_a_broken_state_file_is_no_obstacle(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / ".jointfit-sim.json").write_bytes(content)
+    with play_directory(tmp_path) as directory:
+        assert directory.command_port(None) == 0
+
+
+async def refused(*options: str) -> tuple[int | None, str]:
+    """Run ``jointfit-sim play``, which is expected to end at once."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "jointfit_simulators", "play", *options),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+    async with asyncio.timeout(20):
+        output, _ = await process.communicate()
+    process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the collector
+    return process.returncode, output.decode()
+
+
+def links_in(folder: Path) -> dict[str, Path]:
+    """Return where the links of the ptys point."""
+    return {path.name: path.readlink() for path in folder.glob("tty*")}
+
+
+@pytest.mark.system
+@pytest.mark.timeout(90)
+async def test_a_running_daemon_finds_its_cameras_after_the_simulator_restarted(
+    tmp_path: Path,
+) -> None:
+    async with AsyncExitStack() as stack:
+        port = stack.enter_context(embedded_broker(tmp_path))
+        station = Station(tmp_path, port)
+        first = await stack.enter_async_context(station.simulator())
+
+        links = links_in(tmp_path)
+        code, output = await refused("--directory", str(tmp_path))
+        assert code == 2, output
+        assert "already plays here" in output
+        assert links_in(tmp_path) == links
+
+        await stack.enter_async_context(station.daemon())
+        listener = await stack.enter_async_context(listening(port))
+        await listener.connected({"mocap"}, 30)
+        assert first.process is not None
+        first.process.terminate()
+        await first.process.wait()
+        await listener.until(lambda: "mocap" not in listener.online, 20)
+        await stack.enter_async_context(station.simulator())
+        await listener.connected({"mocap"}, 20)
+
+
+@pytest.mark.system
+@pytest.mark.timeout(60)
+async def test_the_motion_follows_the_phase_that_the_daemon_publishes(tmp_path: Path) -> None:
+    with embedded_broker(tmp_path) as port:
+        station = Station(tmp_path, port, options=("--follow", "--programme", "walk"))
+        async with running(station, 30) as (simulator, _, listener):
+            assert listener.client is not None
+
+            async def motion() -> str:
+                async with asyncio.timeout(10):
+                    while "motion" not in (line := await simulator.answer()):
+                        pass
+                return str(line["motion"])
+
+            assert await motion() == "stand"  # the daemon is not calibrated
+            await listener.client.request("calibrate", {"phase": "align", "seconds": 20})
+            assert await motion() == "plate"
+            await listener.client.request("calibrate", {"phase": "abort"})
+            assert await motion() == "stand"
+            async with asyncio.timeout(10):  # a motion begins with the next samples
+                await simulator.say("status")
+                while await motion() != "stand":
+                    await simulator.say("status")
+
+
+def test_every_motion_of_a_phase_exists() -> None:
+    played = {name for motions in MOTIONS_OF_PHASES.values() for name, _ in motions}
+    assert played <= set(MOTIONS)
+
+
+async def test_a_phase_with_several_motions_plays_them_in_turn_until_the_next_phase(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    short = {"functional": (("functional", 0.05), ("walk", 0.05)), "align": (("plate", 0.05),)}
+    monkeypatch.setattr("jointfit_simulators.phase_follower.MOTIONS_OF_PHASES", short)
+    played: list[str] = []
+    follower = PhaseFollower(RigOptions(mqtt_port=free_port()), played.append, lambda _: None)
+    following = asyncio.create_task(follower.run())
+    for status in (b'{"phase":"functional"}', b'{"phase":"functional"}', b"[]", b"{", b"\xff"):
+        follower._take(status)
+    async with asyncio.timeout(10):
+        while len(played) < 5:
+            await asyncio.sleep(0.01)
+    assert played[:5] == ["functional", "walk", "functional", "walk", "functional"]
+    follower._take(b'{"phase":"aligned"}')
+    await asyncio.sleep(0.2)
+    assert played[-1] == "stand"
+    following.cancel()
+    await asyncio.wait([following])
