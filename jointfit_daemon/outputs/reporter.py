@@ -124,7 +124,8 @@ class Reporter:
         said: dict[str, Any] = {"phase": status.phase, "text": status.text}
         said |= {"version": status.version, "kept": status.kept, "quality": shown(status.quality)}
         self._outbox.retain(f"{self._base}/calibration", self._stamped(said, status.t_ns))
-        event = Notice(status.t_ns, "calibration", status.phase, status.text)
+        data = {"quality": status.refused} if status.refused else {}
+        event = Notice(status.t_ns, "calibration", status.phase, status.text, status.level, data)
         self.event(event)
 
     def _progress(self, progress: CalibrationProgress) -> None:

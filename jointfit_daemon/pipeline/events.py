@@ -167,6 +167,13 @@ class CalibrationStatus:
     """Figures of what just ended, else of the calibration in force."""
     kept: str | None = None
     """Why the result that just came was not taken and the calibration in force stays."""
+    refused: Mapping[str, object] = field(default_factory=dict)
+    """Figures of the result that was not taken."""
+
+    @property
+    def level(self) -> Literal["info", "warning"]:
+        """Return how much attention it needs: a result that was refused or aborted needs some."""
+        return "warning" if self.phase == "aborted" or self.kept is not None else "info"
 
 
 @dataclass(frozen=True, slots=True)

@@ -216,7 +216,7 @@ class CalibrationSession:
         if found is None:
             return [notice]
         self.calibration, self.version = found, None
-        told = self._tell(event.t_ns, self.phase, notice.text)
+        told = self._tell(event.t_ns, self.phase, "models learned while running are in force")
         return [notice, CalibrationReady(found), told]
 
     def _refusal(self, wanted: str) -> tuple[str, str] | None:
@@ -322,11 +322,7 @@ class CalibrationSession:
         if fit.kind == "static":
             self._static = fit.static if failure is None else None
         if failure is not None:
-            text = f"{fit.kind}: {failure}"
-            return [
-                Notice(event.t_ns, "calibration", "fit", text, "warning"),
-                self._tell(event.t_ns, "aborted", text),
-            ]
+            return [self._tell(event.t_ns, "aborted", f"{fit.kind}: {failure}")]
         return self._finished(event.t_ns, fit.kind, dict(result))
 
     def _finished(self, t_ns: int, kind: str, result: dict[str, Any]) -> list[Output]:
@@ -340,11 +336,7 @@ class CalibrationSession:
         keep = result.get("worse")
         if keep is not None and not self._force:
             text = f"the stored calibration stays, the new one is worse: {keep}; force overrides"
-            data = {"quality": quality}
-            return [
-                Notice(t_ns, "calibration", kind, text, "warning", data),
-                replace(self._tell(t_ns, self.phase, text), kept=str(keep)),
-            ]
+            return [replace(self._tell(t_ns, self.phase, text), kept=str(keep), refused=quality)]
         self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
         if kind == "functional":
             self.learned = Learned()

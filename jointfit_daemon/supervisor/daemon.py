@@ -36,6 +36,7 @@ from jointfit_daemon.outputs.reporter import Reporter
 from jointfit_daemon.pipeline.core import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
+    CalibrationStatus,
     CancelJob,
     Configured,
     DeviceStatus,
@@ -102,6 +103,8 @@ class Daemon:
         self._noise = LoopNoise()
         self._asking: Incoming | None = None
         self._online: set[str] = set()
+        self._version: int | None = None
+        """Of the calibration in force, as logged last."""
         self._health_due_s = 0.0
         self._hung_up = asyncio.Event()
         self._tasks: asyncio.TaskGroup
@@ -214,9 +217,20 @@ class Daemon:
             case Notice():
                 extra = about(output.kind, output.id)
                 log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=extra)
+            case CalibrationStatus():
+                self._log_calibration(output)
             case DeviceStatus():
                 self._came_or_went(output)
         self._reporter.handle(output)
+
+    def _log_calibration(self, status: CalibrationStatus) -> None:
+        """Log a change of the calibration, with its file where it was stored or loaded."""
+        text, extra = status.text, about("calibration", status.phase)
+        if status.version is not None and status.version != self._version:
+            path = calibrations.store_of(self._rig).path(status.version)
+            text = f"{text} (version {status.version} in {path})"
+        self._version = status.version
+        log.log(_LEVELS[status.level], "calibration %s: %s", status.phase, text, extra=extra)
 
     def _came_or_went(self, status: DeviceStatus) -> None:
         (self._online.add if status.online else self._online.discard)(status.id)

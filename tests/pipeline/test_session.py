@@ -187,7 +187,10 @@ def test_a_worse_calibration_is_not_taken_and_the_reason_is_told() -> None:
     )
     assert not only(outputs, CalibrationReady)
     assert one.calibration is None
-    assert any("knee 3.0" in notice.text for notice in only(outputs, Notice))
+    (status,) = only(outputs, CalibrationStatus)
+    assert "knee 3.0" in status.text
+    assert (status.level, status.kept) == ("warning", "knee 3.0 against 1.0 deg")
+    assert not only(outputs, Notice)  # the status is an event, too
 
 
 def test_the_payload_carries_the_alignment_of_this_session() -> None:

@@ -66,6 +66,11 @@ async def test_a_run_with_calibration_reconnect_and_reload_replays_byte_for_byte
         assert listener.latest["bridge/health"]["recording"]["failure"] is None
         code, _ = await stopped(daemon)
         assert code == 0, station.log
+    for line in (
+        "calibration align: ", "calibration aligned: ", "calibration posed: ",
+        "calibration calibrated: calibrated", "stored as version 1 (version 1 in ",
+    ):  # fmt: skip
+        assert station.log.count(line) == 1, (line, station.log)
     assert "the worker said" not in station.log  # fits print nothing
     (log,) = (tmp_path / "state" / "recordings").iterdir()
     events = list(read_events(log))

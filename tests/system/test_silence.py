@@ -109,6 +109,7 @@ async def test_poses_go_on_as_held_then_lost_while_all_imus_are_silent(
             code, _ = await stopped(daemon)
 
     assert code == 0, station.log
+    assert station.log.count("calibration calibrated: stored calibration loaded (version 1 in") == 1
     assert unbalanced(devices) == {}
     steps = [
         (b["mono_us"] - a["mono_us"], b["seq"] - a["seq"]) for a, b in pairwise(listener.poses)
