@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-vm lint types imports bench docs wheel deb sbom audit lock clean
+.PHONY: help demo test fuzz test-vm lint types imports bench docs wheel deb sbom audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
@@ -28,6 +28,13 @@ test: $(STAMP)  ## all tests that this machine can run, on all cores; what is sk
 test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; the .deb under real systemd, with broker and faults
 	@$(BIN)/python .ci/light_vm.py
 	@$(BIN)/python .ci/full_vm.py $(ARGS)
+
+$(VENV)/.fuzz: $(STAMP)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group fuzz
+	@touch $@
+
+fuzz: $(VENV)/.fuzz  ## coverage-guided fuzzing of every entrance, 10^7 cases (hours); ARGS="xbus-bytes --seconds 60"
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format
 	@$(BIN)/ruff check .

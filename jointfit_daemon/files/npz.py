@@ -16,7 +16,9 @@ segments' axes too, which are named like the world's.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
+from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
@@ -32,6 +34,13 @@ if TYPE_CHECKING:
 
 _SENSOR = "_quat"
 _BONE, _ORIGIN = "q_", "p_"
+_KINDS = "biufUS"
+"""Kinds of array elements that are read: booleans, integers, floats and text."""
+_FAULTS = (
+    BadZipFile, zlib.error, EOFError, ValueError, AttributeError, KeyError, TypeError, SyntaxError,
+    MemoryError, OverflowError, RuntimeError, SystemError, TokenError,
+)  # fmt: skip
+"""What zipfile and numpy raise on damaged archives; NotImplementedError is a RuntimeError."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +79,14 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
         # numpy leaves a file open that it opened itself and cannot read
         with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-            return {name: found[name] for name in found.files}
-    except (BadZipFile, EOFError, ValueError, AttributeError) as fault:
+            arrays: dict[str, Any] = {name: found[name] for name in found.files}
+    except _FAULTS as fault:
         raise Malformed(f"{path}: not an NPZ file, or cut off: {fault}") from fault
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in _KINDS:
+            found_type = getattr(array, "dtype", "no array")
+            raise Malformed(f"{path}: {name} holds {found_type}, expected numbers or text")
+    return arrays
 
 
 def read_orientations_npz(path: Path) -> OrientationTrial:
@@ -90,7 +104,13 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
         raise Malformed(
             f"{path}: expected arrays t and ID_quat or q_BONE, found {', '.join(arrays)}"
         )
-    z_up = "up" in arrays and str(arrays["up"]) == "z"
+    try:
+        z_up = "up" in arrays and str(arrays["up"]) == "z"
+    except SystemError as fault:  # code points beyond Unicode
+        raise Malformed(f"{path}: array up: {fault}") from fault
+    for name in (*(n + _SENSOR for n in names), *(_BONE + bone for bone in bones)):
+        if arrays[name].shape[-1:] != (4,):
+            raise Malformed(f"{path}: {name} has shape {arrays[name].shape}, expected (n, 4)")
     turn = _unit if z_up else quaternions_z_up
     move = _plain if z_up else vectors_z_up
     return OrientationTrial(
@@ -103,8 +123,10 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
 
 def _unit(quaternions: ArrayLike) -> NDArray[np.float64]:
     found = np.asarray(quaternions, dtype=np.float64)
-    norms = np.linalg.norm(found, axis=-1, keepdims=True)
-    unit: NDArray[np.float64] = found / np.where(norms > 0.0, norms, np.nan)  # 0 0 0 0: missing
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation is missing
+        norms = np.linalg.norm(found, axis=-1, keepdims=True)
+        usable = (norms > 0.0) & np.isfinite(norms)  # 0 0 0 0: missing
+        unit: NDArray[np.float64] = found / np.where(usable, norms, np.nan)
     return unit
 
 

@@ -137,7 +137,9 @@ def read_xml(path: Path) -> ET.Element:
     parser.CharacterDataHandler = builder.data
     try:
         parser.Parse(data, True)
-    except expat.ExpatError as error:
+    except Malformed:
+        raise
+    except (expat.ExpatError, LookupError, ValueError) as error:  # or an encoding that it lacks
         raise Malformed(f"{path}: {error}") from error
     return builder.close()
 

@@ -58,6 +58,10 @@ class MarkerTrajectories:
     """What the header claims and the rows do not hold."""
 
 
+_MOST_FRAMES = 2.0**53
+"""A frame number beyond it has lost its last digit."""
+
+
 def read_trc(path: Path) -> MarkerTrajectories:
     """Return the trajectories of a TRC file; tab, comma or blanks between cells.
 
@@ -80,7 +84,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
     return MarkerTrajectories(
         names,
         rows[:, 1],
-        rows[:, 0].astype(np.int64),
+        np.clip(np.nan_to_num(rows[:, 0]), -_MOST_FRAMES, _MOST_FRAMES).astype(np.int64),
         rows[:, 2:].reshape(-1, len(names), 3) * METRES[unit],
         float(header["DataRate"]),
         _doubts(header, rows=len(rows), markers=len(names)),
@@ -100,7 +104,7 @@ def _header(path: Path, lines: list[str]) -> dict[str, str]:
 def _doubts(header: dict[str, str], *, rows: int, markers: int) -> tuple[str, ...]:
     counted = {"NumFrames": rows, "NumMarkers": markers}
     return tuple(
-        f"{key} says {header[key]}, counted {count}"
+        f"{key} says {header.get(key, 'nothing')}, counted {count}"
         for key, count in counted.items()
         if header.get(key, "") != str(count)
     )

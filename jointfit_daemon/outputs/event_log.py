@@ -106,8 +106,18 @@ def decode_event(line: dict[str, Any]) -> Event:
     ConfigError
         The rig it was recorded with does not load here (a driver is missing).
     """
+    try:
+        return _decoded(line)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"damaged event: {type(error).__name__}: {error}") from error
+
+
+def _decoded(line: dict[str, Any]) -> Event:
     given = dict(line)
     kind = given.pop("e", None)
+    for key, expected in _FIELD_TYPES.items():
+        if not isinstance(given.get(key, expected()), expected):
+            raise TypeError(f"{key} is {given[key]!r}, expected {expected.__name__}")
     if kind == "chunk":
         return ChunkArrived(given["source"], Chunk(given["t_ns"], bytes.fromhex(given["hex"])))
     if kind == "configured":
@@ -120,6 +130,11 @@ def decode_event(line: dict[str, Any]) -> Event:
     return event
 
 
+_FIELD_TYPES: dict[str, type[int | str]] = {
+    "t_ns": int, "offset_ns": int, "source": str, "hex": str, "command": str, "transaction": str,
+    "job": int, "reason": str, "text": str,
+}  # fmt: skip
+"""Types of the fields that every event of a kind has."""
 _KINDS: dict[str, Any] = {
     "tick": Tick,
     "configured": Configured,

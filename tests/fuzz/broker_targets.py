@@ -1,0 +1,244 @@
+"""Fuzz targets of the broker, the configuration and the state directory."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import orjson
+
+from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
+from jointfit_daemon.calibration.store import CalibrationStore, CalibrationUnreadable
+from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
+from jointfit_daemon.config import MqttSettings, load_rig, parse_rig
+from jointfit_daemon.config.faults import ConfigError
+from jointfit_daemon.model import Chunk
+from jointfit_daemon.outputs.event_log import encode_event, read_events
+from jointfit_daemon.outputs.mqtt import Incoming
+from jointfit_daemon.outputs.mqtt_signature import signed
+from jointfit_daemon.outputs.outbox import Outbox
+from jointfit_daemon.outputs.reporter import Reporter
+from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline.events import (
+    ChunkArrived,
+    Configured,
+    Reply,
+    SourceOpened,
+    Tick,
+)
+from jointfit_daemon.supervisor.request_guard import RequestGuard
+from jointfit_daemon.supervisor.requests import reply_correlation, reply_topic, request_of
+from tests.fuzz.target import Target
+from tests.fuzz.wire_targets import rig
+from tests.pipeline.core_feed import (
+    BEGIN_NS,
+    PERIOD_NS,
+    SENSORS,
+    XBUS,
+    table,
+    xbus_bytes,
+    xcdi_bytes,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.pipeline.events import Event
+
+KEY = b"a key for requests, 32 bytes long"
+TOPIC = "jointfit/fuzz/bridge/request/"
+
+
+@cache
+def folder() -> Path:
+    """Return a directory of this process, in memory where there is one."""
+    shm = Path("/dev/shm")
+    return Path(tempfile.mkdtemp(prefix="jointfit-fuzz-", dir=shm if shm.is_dir() else None))
+
+
+# --- requests ---------------------------------------------------------------------------------
+
+
+@cache
+def guards() -> tuple[RequestGuard | None, ...]:
+    """Return the guards: none, and one with a key."""
+    key_file = folder() / "request.key"
+    key_file.write_bytes(KEY)
+    key_file.chmod(0o600)
+    settings = MqttSettings.model_validate({"host": "127.0.0.1", "request_key_file": str(key_file)})
+    return None, RequestGuard(settings)
+
+
+def run_request(data: bytes) -> None:
+    """Read an input as topic, response topic, correlation and payload, separated by NUL."""
+    parts = data.split(b"\0", 3)
+    topic, response, correlation, payload = (parts + [b""] * 4)[:4]
+    message = Incoming(
+        TOPIC + topic.decode("utf-8", "replace"),
+        payload,
+        retained=False,
+        response_topic=response.decode("utf-8", "replace"),
+        correlation=correlation,
+    )
+    reporter = Reporter(rig(), Outbox("b/bridge/state"))
+    for guard in guards():
+        answer = request_of(message, guard)
+        if isinstance(answer, Reply):
+            reporter.reply(answer, reply_topic(message), reply_correlation(message))
+        elif answer is not None:
+            core = Core()
+            for event in (Configured(BEGIN_NS, rig(), None), answer, Tick(answer.t_ns + 10**9)):
+                for output in core.feed(event):
+                    reporter.handle(output)
+
+
+def seeds_request() -> list[bytes]:
+    """Return requests that are valid, signed, unknown, nested and wrong."""
+    calibrate = {"phase": "static", "seconds": 3.0, "force": True, "transaction": "a"}
+    now_us = time.time_ns() // 1000
+    with_key = signed(
+        KEY, TOPIC + "calibrate", {"phase": "abort", "t_us": now_us, "nonce": "n" * 16}
+    )
+    payloads = [calibrate, {"phase": "abort"}, {"phase": 5, "x": [[[]]]}, with_key]
+    found = [
+        b"calibrate\0jointfit/fuzz/bridge/response/calibrate/a\0\x01\0" + orjson.dumps(item)
+        for item in payloads
+    ]
+    return [*found, b"other\0\0\0{}", b"calibrate\0#\0\0" + b"[" * 900, b"calibrate\0a/b\0\0\xff"]
+
+
+# --- configuration ----------------------------------------------------------------------------
+
+
+def run_rig(data: bytes) -> None:
+    """Load a rig.toml as the daemon does, and publish what it says of itself."""
+    path = folder() / "rig.toml"
+    path.write_bytes(data)
+    loaded = load_rig(path)
+    core, reporter = Core(), Reporter(loaded, Outbox("b/bridge/state"))
+    for output in core.feed(Configured(BEGIN_NS, loaded, None)):
+        reporter.handle(output)
+    encode_event(Configured(BEGIN_NS, loaded, None))
+
+
+def seeds_rig() -> list[bytes]:
+    """Return the examples of the project."""
+    examples = Path(__file__).resolve().parents[2] / "examples"
+    return [path.read_bytes() for path in sorted(examples.glob("*.toml"))]
+
+
+# --- calibrations -----------------------------------------------------------------------------
+
+
+@cache
+def good_calibration() -> Calibration:
+    """Return a calibration of the rig of `core_feed`."""
+    t_ns = np.arange(300, dtype=np.int64) * 10_000_000
+    still = np.tile((1.0, 0.0, 0.0, 0.0), (len(t_ns), 1))
+    trial = CalibrationTrial({name: SensorTrack(t_ns, still) for name in SENSORS}, None)
+    pose = fit_static(trial, rig().calibration, rig().chain)
+    return fit_static_only(pose, None, rig().chain)
+
+
+def use_calibration(calibration: Calibration) -> None:
+    """Run the core with a calibration that was accepted, with samples of every sensor."""
+    core, reporter = Core(), Reporter(rig(), Outbox("b/bridge/state"))
+    events: list[Event] = [Configured(BEGIN_NS, rig(), calibration, 1)]
+    events += [SourceOpened(BEGIN_NS, name) for name in SENSORS]
+    for number in range(12):
+        t_ns = BEGIN_NS + number * PERIOD_NS
+        for name in SENSORS:
+            data = xbus_bytes(name, number) if name in XBUS else xcdi_bytes(name, number, t_ns)
+            events.append(ChunkArrived(name, Chunk(t_ns, data)))
+    for event in events:
+        for output in core.feed(event):
+            reporter.handle(output)
+
+
+def run_calibration(data: bytes) -> None:
+    """Load a stored file; use what is accepted."""
+    store = CalibrationStore(folder(), "fuzz")
+    path = store.path(1)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    use_calibration(store.load(1))
+
+
+def run_calibration_content(data: bytes) -> None:
+    """Change a good calibration as the input says, with a valid checksum, and load it."""
+    content = deepcopy(good_calibration().to_dict())
+    leaves = _leaves(content)
+    for number in range(0, len(data) - 1, 2):
+        parent, key = leaves[data[number] % len(leaves)]
+        parent[key] = VALUES[data[number + 1] % len(VALUES)]
+    run_calibration(json.dumps(content).encode())
+
+
+VALUES: tuple[object, ...] = (
+    None, True, 0, -1, 2**63, 10**400, 0.0, 1e308, float("nan"), float("inf"), "", "x", "\ud800",
+    [], [0.0] * 3, [0.0] * 4, [1.0, 0.0, 0.0, 0.0], [[]], {}, {"a": 1}, ["S1"], "thigh", 1e-300,
+)  # fmt: skip
+"""Values of every type that a damaged file may hold where another one belongs."""
+
+
+def _leaves(node: Any) -> list[tuple[Any, Any]]:
+    """Return every place in nested tables and lists, as the container and the key in it."""
+    found: list[tuple[Any, Any]] = []
+    if isinstance(node, dict | list):
+        pairs = node.items() if isinstance(node, dict) else enumerate(node)
+        for key, value in pairs:
+            found.append((node, key))
+            found += _leaves(value)
+    return found
+
+
+def seeds_calibration() -> list[bytes]:
+    """Return a file as the store writes it."""
+    store = CalibrationStore(folder(), "seed")
+    version = store.save(good_calibration())
+    return [store.path(version).read_bytes()]
+
+
+# --- recordings -------------------------------------------------------------------------------
+
+
+def run_event_log(data: bytes) -> None:
+    """Read a recording and replay its first events."""
+    path = folder() / "events.jsonl"
+    path.write_bytes(b'{"log":1}\n' + data)
+    for number, _ in enumerate(read_events(path)):
+        if number > 200:
+            break
+
+
+def seeds_event_log() -> list[bytes]:
+    """Return events of every kind."""
+    events: list[Event] = [
+        Configured(BEGIN_NS, parse_rig(table()), good_calibration(), 1),
+        SourceOpened(BEGIN_NS, "S1"),
+        ChunkArrived("S1", Chunk(BEGIN_NS, xbus_bytes("S1", 1))),
+        Tick(BEGIN_NS + 1),
+    ]
+    lines = [encode_event(event) for event in events]
+    return [b"\n".join(lines[1:]) + b"\n", b"\n".join(lines) + b"\n"]
+
+
+TARGETS = (
+    Target("mqtt-request", run_request, seeds_request, share=3),
+    Target("rig-toml", run_rig, seeds_rig, (ConfigError,), share=0.1),
+    Target("calibration-file", run_calibration, seeds_calibration, (CalibrationUnreadable,), 0.4),
+    Target(
+        "calibration-content",
+        run_calibration_content,
+        lambda: [bytes(8)],
+        (CalibrationUnreadable,),
+        0.4,
+        32,
+    ),
+    Target("event-log", run_event_log, seeds_event_log, (ValueError, ConfigError), share=0.4),
+)

@@ -1,0 +1,106 @@
+"""What a fuzz target is, and the limits that every case must meet.
+
+A case is one input to one entrance of the program. It may raise the documented exceptions of that
+entrance and no other. Its processor time is bounded per byte, and so is the memory it adds.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+import traceback
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+LEAST_S = 0.15
+"""Processor time that a case of any size may take, s: poses may pause for 0.2 s."""
+PER_BYTE_S = 100e-6
+"""Processor time beyond it for each byte, s: under coverage all code runs several times slower."""
+MOST_GROWTH = 20_000_000
+"""Memory that one case may add to the largest the process ever had, bytes."""
+_REPEATS = 3
+
+
+class UnaccountedError(AssertionError):
+    """Bytes were neither used nor counted as discarded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One entrance.
+
+    Attributes
+    ----------
+    name : str
+        For the table, the corpus and the reproducers.
+    run : callable
+        Takes one input through the entrance.
+    seeds : callable
+        Valid inputs made by the simulators.
+    refusals : tuple of type
+        Exceptions that are documented for bad input.
+    share : float
+        Share of the cases of a run, relative to the other targets.
+    longest : int
+        Largest input under coverage, bytes, or that of the largest seed. Short inputs reach the
+        same code in less time; the tests run long ones.
+    """
+
+    name: str
+    run: Callable[[bytes], None]
+    seeds: Callable[[], list[bytes]]
+    refusals: tuple[type[Exception], ...] = ()
+    share: float = 1.0
+    longest: int = 512
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one case did."""
+
+    seconds: float
+    growth: int
+    finding: str
+    """Empty, or the reason of a failure: its first line identifies it."""
+
+
+def run_case(target: Target, data: bytes) -> Outcome:
+    """Run one case and return what it cost and whether it failed."""
+    seconds, growth, finding = _measured(target, data)
+    allowed_s = LEAST_S + PER_BYTE_S * len(data)
+    if not finding and seconds > allowed_s:
+        # A first slow case may pay for an import or a garbage collection.
+        seconds = min(_measured(target, data)[0] for _ in range(_REPEATS))
+        if seconds > allowed_s:
+            finding = f"slow: {seconds:.2f} s for {len(data)} bytes, allowed {allowed_s:.2f} s"
+    if not finding and growth > MOST_GROWTH:
+        finding = f"memory: grew by {growth / 1e6:.0f} MB for {len(data)} bytes"
+    return Outcome(seconds, growth, finding)
+
+
+def _measured(target: Target, data: bytes) -> tuple[float, int, str]:
+    before, began, finding = _largest_bytes(), time.process_time(), ""
+    try:
+        target.run(data)
+    except target.refusals:
+        pass
+    except Exception as error:  # noqa: BLE001 - whatever else comes is what is looked for
+        finding = _described(error)
+    return time.process_time() - began, _largest_bytes() - before, finding
+
+
+def _largest_bytes() -> int:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def _described(error: Exception) -> str:
+    """Return exception and place, then the traceback; the first line is the same for one fault."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f"{frames[-1].filename.rpartition('/')[2]}:{frames[-1].name}" if frames else "?"
+    ours = [frame for frame in frames if "/jointfit_" in frame.filename]
+    if ours:
+        place = f"{ours[-1].filename.rpartition('/')[2]}:{ours[-1].lineno}"
+    return f"{type(error).__name__} at {place}\n" + "".join(traceback.format_exception(error))

@@ -1,0 +1,302 @@
+"""Fuzz targets of wires: serial bytes, CAN frames and UDP datagrams, up to poses and payloads."""
+
+from __future__ import annotations
+
+import random
+import struct
+from functools import cache
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import Chunk, DeviceEvent
+from jointfit_daemon.outputs.outbox import Outbox
+from jointfit_daemon.outputs.payloads import encode as encode_payload
+from jointfit_daemon.outputs.reporter import Reporter
+from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
+from jointfit_daemon.pipeline.source import SourceState
+from jointfit_drivers.natnet_answers import OpenQuestions
+from jointfit_protocols.can_frame import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.natnet_frame_encode import encode_frame
+from jointfit_protocols.natnet_messages import HEADER, Bare, MessageId, decode
+from jointfit_protocols.natnet_messages import encode as encode_natnet
+from jointfit_protocols.slcan import SlcanDecoder
+from jointfit_protocols.slcan import encode_frame as encode_slcan
+from jointfit_protocols.xbus import MAX_DATA, XbusDecoder, XbusMessage
+from jointfit_protocols.xbus import encode as encode_xbus
+from tests.drivers.natnet_feeder import INFO, MODEL, frame, marker
+from tests.fuzz.target import Target, UnaccountedError
+from tests.pipeline.core_feed import (
+    BEGIN_NS,
+    IDS,
+    PERIOD_NS,
+    camera_hello,
+    table,
+    xbus_bytes,
+    xcdi_bytes,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.pipeline.events import Event
+    from jointfit_protocols.natnet_messages import Message
+
+VERSIONS = ((3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
+ANSWERS = (0x01, 0x0D, 0x13, 0x1D, 0x2D, 0x3E, 0x42, 0x43, 0xC1, 0xED)
+"""Xbus messages that a device sends unasked or as answers."""
+_MS = 1_000_000
+
+
+# --- cutting inputs ---------------------------------------------------------------------------
+
+
+def cut(data: bytes) -> Iterator[bytes]:
+    """Cut a stream in pieces whose lengths follow from its content."""
+    dice = random.Random(len(data) * 256 + data[0] if data else 0)
+    at = 0
+    while at < len(data):
+        size = dice.choice((1, 2, 7, 40, 300, 4096))
+        yield data[at : at + size]
+        at += size
+
+
+def records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Cut an input in records ``u8 kind, u8 length, payload``; the last may be short."""
+    at = 0
+    while at + 2 <= len(data):
+        kind, size = data[at], data[at + 1]
+        yield kind, data[at + 2 : at + 2 + size]
+        at += 2 + size
+
+
+# --- through the core -------------------------------------------------------------------------
+
+
+@cache
+def rig() -> Rig:
+    """Return the rig of `core_feed`."""
+    return parse_rig(table())
+
+
+def feed_core(source: str, chunks: Iterable[bytes]) -> None:
+    """Take chunks through decoder, clock, fusion and payloads of the whole core."""
+    core, reporter = Core(), Reporter(rig(), Outbox("b/bridge/state"))
+    t_ns = BEGIN_NS
+    events: list[Event] = [Configured(t_ns, rig(), None), SourceOpened(t_ns, source)]
+    if source == "mocap":
+        events += camera_hello(t_ns)
+    for event in events:
+        for output in core.feed(event):
+            reporter.handle(output)
+
+    for number, data in enumerate(chunks):
+        t_ns += PERIOD_NS if number % 16 else 700 * _MS
+        for output in core.feed(ChunkArrived(source, Chunk(t_ns, data))):
+            reporter.handle(output)
+
+    reporter.health(core.health(t_ns))
+    for output in core.feed(SourceClosed(t_ns, source, "lost", "over")):
+        reporter.handle(output)
+
+
+def feed_source(source: str, chunks: Iterable[bytes]) -> None:
+    """Take chunks through decoder and clock of one source, and its events to JSON."""
+    (configured,) = (item for item in rig().sources if item.id == source)
+    state = SourceState.of(configured)
+    state.opened()
+    t_ns = BEGIN_NS
+    for event in camera_hello(t_ns) if source == "mocap" else ():
+        if isinstance(event, ChunkArrived):
+            state.feed(event.chunk)
+    for number, data in enumerate(chunks):
+        t_ns += PERIOD_NS if number % 16 else 700 * _MS
+        for item in state.feed(Chunk(t_ns, data)):
+            if isinstance(item, DeviceEvent):
+                encode_payload(item.data)
+    state.closed()
+
+
+# --- serial -----------------------------------------------------------------------------------
+
+
+def run_xbus_bytes(data: bytes) -> None:
+    """Decode serial bytes in pieces; every byte belongs to a message or is counted."""
+    decoder, found = XbusDecoder(), []
+    for piece in cut(data):
+        found += decoder.feed(piece)
+    found += decoder.flush()
+    used = sum(item.size if isinstance(item, XbusMessage) else item.discarded for item in found)
+    if used != len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {used} in messages or discarded")
+
+
+def _xbus_messages(data: bytes) -> list[bytes]:
+    return [encode_xbus(kind, payload[:MAX_DATA]) for kind, payload in records(data)]
+
+
+def run_xbus_source(data: bytes) -> None:
+    """Put records into valid Xbus messages and take them through decoder and clock."""
+    feed_source("S1", _xbus_messages(data))
+
+
+def run_xbus_core(data: bytes) -> None:
+    """Put records into valid Xbus messages and take them through the core."""
+    feed_core("S1", _xbus_messages(data))
+
+
+def run_serial_core(data: bytes) -> None:
+    """Take raw serial bytes through the core."""
+    feed_core("S1", cut(data))
+
+
+def seeds_xbus() -> list[bytes]:
+    """Return a stream of an Xbus sensor."""
+    return [b"".join(xbus_bytes("S1", n) for n in range(count)) for count in (1, 4, 12)]
+
+
+def seeds_xbus_records() -> list[bytes]:
+    """Return measurements, answers and warnings as records."""
+    samples = [xbus_bytes("S1", n) for n in (0, 1, 2, 30, 42_949_672)]
+    packed = b"".join(bytes((data[2], data[3])) + data[4:-1] for data in samples)
+    kinds = [bytes((kind, 6)) + b"\x07MTi-30"[:6] for kind in ANSWERS]
+    return [packed, packed + b"".join(kinds), b"".join(kinds)]
+
+
+def run_slcan(data: bytes) -> None:
+    """Decode the bytes of an SLCAN adapter in pieces, then its frames through the core."""
+    decoder = SlcanDecoder(115_200)
+    frames: list[CanFrame] = []
+    for number, piece in enumerate(cut(data)):
+        found = decoder.feed(piece, BEGIN_NS + number * _MS)
+        frames += [item for item in found if isinstance(item, CanFrame)]
+    decoder.flush()
+    feed_source("S2", [pack_frames([frame]) for frame in frames[:64]])
+
+
+def seeds_slcan() -> list[bytes]:
+    """Return lines of an adapter with and without time stamps."""
+    frames = [
+        item
+        for n in range(4)
+        for item in unpack_frames(xcdi_bytes("S2", n, BEGIN_NS))
+        if isinstance(item, CanFrame)
+    ]
+    plain = b"".join(map(encode_slcan, frames))
+    return [plain, b"".join(encode_slcan(f, n) for n, f in enumerate(frames)), b"\r\x07z\rF00\r"]
+
+
+# --- CAN --------------------------------------------------------------------------------------
+
+
+def run_can_records(data: bytes) -> None:
+    """Unpack records; every byte belongs to a frame or is counted."""
+    found = unpack_frames(data)
+    used = sum(item.discarded if isinstance(item, Corrupt) else RECORD_BYTES for item in found)
+    if used != len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {used} in frames or discarded")
+    feed_source("S2", [data])
+
+
+def _can_frames(data: bytes) -> list[bytes]:
+    ids = (*IDS["S2"], *IDS["S4"])
+    return [
+        pack_frames([CanFrame(BEGIN_NS + n * _MS, ids[kind % len(ids)], payload[:8])])
+        for n, (kind, payload) in enumerate(records(data))
+    ]
+
+
+def run_can_source(data: bytes) -> None:
+    """Put records into CAN frames of a sensor and take them through decoder and clock."""
+    feed_source("S2", _can_frames(data))
+
+
+def run_can_core(data: bytes) -> None:
+    """Put records into CAN frames of a sensor and take them through the core."""
+    feed_core("S2", _can_frames(data))
+
+
+def seeds_can_records() -> list[bytes]:
+    """Return groups of an XCDI sensor as records of the recording format."""
+    return [b"".join(xcdi_bytes("S2", n, BEGIN_NS) for n in range(count)) for count in (1, 5)]
+
+
+def seeds_can_core() -> list[bytes]:
+    """Return groups of an XCDI sensor: time, counter, quaternion."""
+    found = b""
+    for n in (0, 1, 2, 3, 500, 501, 65_535, 0):
+        for kind, item in enumerate(unpack_frames(xcdi_bytes("S2", n, BEGIN_NS))):
+            if isinstance(item, CanFrame):
+                found += bytes((kind, len(item.data))) + item.data
+    return [found, found[:40]]
+
+
+# --- UDP --------------------------------------------------------------------------------------
+
+
+def run_natnet_codec(data: bytes) -> None:
+    """Decode one datagram in every bitstream."""
+    for version in VERSIONS:
+        found = decode(data, version)
+        if isinstance(found, Corrupt) and found.discarded != len(data):
+            raise UnaccountedError(f"{len(data)} bytes, {found.discarded} discarded")
+
+
+def run_natnet_source(data: bytes) -> None:
+    """Put records of 16-bit length into datagrams and take them through decoder and clock."""
+    feed_source("mocap", _datagrams(data))
+
+
+def run_natnet_core(data: bytes) -> None:
+    """Put records of 16-bit length into datagrams and take them through the core."""
+    feed_core("mocap", _datagrams(data))
+
+
+def _datagrams(data: bytes) -> list[bytes]:
+    questions = OpenQuestions()
+    questions.ask(Bare(MessageId.REQUEST_MODELDEF), BEGIN_NS)
+    datagrams, at = [], 0
+    while at + 3 <= len(data):
+        kind, size = struct.unpack_from("<BH", data, at)
+        payload = data[at + 3 : at + 3 + size]
+        datagrams.append(HEADER.pack(kind, len(payload)) + payload)
+        questions.accept(datagrams[-1], BEGIN_NS)
+        at += 3 + size
+    return datagrams
+
+
+def _answers() -> list[bytes]:
+    frames = [frame(n, markers=(marker(65537, (1.0, 2.0, 3.0)),)) for n in (1, 2, 5)]
+    messages: list[Message] = [INFO, MODEL, *frames]
+    plain = [encode_natnet(item) for item in messages]
+    named = [HEADER.pack(7, len(body := encode_frame(frames[0], (4, 1)))) + body]
+    echo = [bytes.fromhex("0d0010004e669a10000000000485e4cd49010000")]
+    return plain + named + echo + [HEADER.pack(3, 14) + b"Bitstream,4.1\0"]
+
+
+def seeds_natnet() -> list[bytes]:
+    """Return every kind of datagram that a server sends."""
+    return _answers()
+
+
+def seeds_natnet_core() -> list[bytes]:
+    """Return a whole session as records."""
+    packed = [struct.pack("<BH", data[0], len(data) - 4) + data[4:] for data in _answers()]
+    return [b"".join(packed), *packed]
+
+
+TARGETS = (
+    Target("xbus-bytes", run_xbus_bytes, seeds_xbus, share=40),
+    Target("xbus-source", run_xbus_source, seeds_xbus_records, share=4),
+    Target("xbus-core", run_xbus_core, seeds_xbus_records, share=0.4),
+    Target("serial-core", run_serial_core, seeds_xbus, share=0.4),
+    Target("slcan-source", run_slcan, seeds_slcan, share=4),
+    Target("can-records", run_can_records, seeds_can_records, share=3),
+    Target("can-source", run_can_source, seeds_can_core, share=4),
+    Target("can-core", run_can_core, seeds_can_core, share=0.4),
+    Target("natnet-codec", run_natnet_codec, seeds_natnet, share=30, longest=1500),
+    Target("natnet-source", run_natnet_source, seeds_natnet_core, share=2, longest=1500),
+    Target("natnet-core", run_natnet_core, seeds_natnet_core, share=0.4, longest=1500),
+)
