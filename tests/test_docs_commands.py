@@ -40,7 +40,7 @@ COMMANDS = re.compile(
 )
 IN_SAMPLE = "`jointfit sample sample && cd sample`"
 """Pages with these words are read in the folder of sample data."""
-SHORT_PHASES = "--align-s 8 --static-s 2 --functional-s 12"
+SHORT_PHASES = "--align-s 5 --static-s 2 --functional-s 8"
 MAN_PAGES = sorted((ROOT / "packaging" / "man").glob("*.1"))
 
 
