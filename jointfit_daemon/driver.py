@@ -167,7 +167,10 @@ class Driver(Protocol):
         """Return a fresh decoder."""
 
     async def run(self, emit: Emit) -> None:
-        """Open, configure, read until cancelled; raise DeviceLost or DeviceMisconfigured."""
+        """Open, configure, read until cancelled; raise DeviceLost or DeviceMisconfigured.
+
+        Called again, on the same object, for every further attempt.
+        """
 
 
 class UnknownDriver(LookupError):  # noqa: N818 - named for what happened

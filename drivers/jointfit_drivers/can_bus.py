@@ -15,7 +15,7 @@ import asyncio
 import time
 from collections import deque
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 from weakref import WeakKeyDictionary
 
@@ -35,6 +35,10 @@ CanKey = tuple[int, bool]
 
 _UNCLAIMED = 512  # frames nobody wanted yet: a third of a second of four sensors at 400 Hz
 _CLAIM_NS = 300_000_000  # older ones belong to nobody; the devices of a rig begin together
+_SEEN = 64  # identifiers that are remembered of those no device claims
+_NAMED = 8  # of them in a message
+_SAMPLES = 4  # frames of each that are looked at
+_EARLY = 16  # chunks that wait for the first frame with data that a device cannot do without
 
 
 class Backend(Protocol):
@@ -45,8 +49,8 @@ class Backend(Protocol):
     ) -> None:
         """Begin to read; raise DeviceLost or DeviceMisconfigured. Errors later go to `failed`."""
 
-    def listen(self, ids: Collection[CanKey]) -> None:
-        """Let these identifiers through; more may come."""
+    def listen(self, ids: Collection[CanKey] | None) -> None:
+        """Let these identifiers through; more may come. None: all."""
 
     async def close(self) -> None:
         """Release everything; also after a failure, also twice."""
@@ -62,17 +66,39 @@ class _Subscriber:
     ended: asyncio.Future[None]
     limit: asyncio.Timeout
     silence_s: float
+    needed: CanKey
+    others: int
+    """Frames of all devices that had come when it subscribed."""
+    arrived: set[CanKey] = field(default_factory=set)
+    """Which of its identifiers came since it subscribed."""
+    early: deque[Chunk] = field(default_factory=lambda: deque(maxlen=_EARLY))
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether what it cannot do without has come."""
+        return self.needed in self.arrived
 
     def take(self, t_ns: int, frames: list[CanFrame]) -> None:
-        """Hand `frames` on; what goes wrong there ends this device's pump and no other's."""
+        """Hand `frames` on; what goes wrong there ends this device's pump and no other's.
+
+        Before the first frame that it needs only errors are handed on: the others wait.
+        """
         if self.ended.done():
             return
+        keys = {(frame.can_id, frame.extended) for frame in frames if not frame.error}
+        self.arrived |= keys
+        chunk = Chunk(t_ns, pack_frames(frames))
+        if keys and not self.is_complete:
+            self.early.append(chunk)
+            return
         try:
-            self.emit(Chunk(t_ns, pack_frames(frames)))
+            while self.is_complete and self.early:
+                self.emit(self.early.popleft())
+            self.emit(chunk)
         except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
             self.ended.set_exception(error)
             return
-        if not all(frame.error for frame in frames) and not self.limit.expired():
+        if self.needed in keys and not self.limit.expired():
             self.limit.reschedule(asyncio.get_running_loop().time() + self.silence_s)
 
 
@@ -87,6 +113,8 @@ class SharedBus:
         self._backend: Backend | None = None
         self._failed: Exception | None = None
         self._unclaimed: deque[tuple[int, CanFrame]] = deque(maxlen=_UNCLAIMED)
+        self._others = 0  # frames that devices of the rig got
+        self._seen: dict[CanKey, deque[bytes]] = {}  # the last data of identifiers nobody claims
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
         self._users = 0
         self._subscribers: list[_Subscriber] = []
@@ -116,7 +144,14 @@ class SharedBus:
                 await self._close()
 
     async def pump(
-        self, name: str, ids: Mapping[CanKey, str], emit: Emit, silence_s: float
+        self,
+        name: str,
+        ids: Mapping[CanKey, str],
+        emit: Emit,
+        silence_s: float,
+        *,
+        needed: CanKey,
+        resembles: Callable[[bytes], bool] = lambda _: False,
     ) -> None:
         """Hand `emit` every frame with one of `ids`, in chunks of records, until cancelled.
 
@@ -132,19 +167,23 @@ class SharedBus:
         emit
             What it raises ends the pump and reaches the caller.
         silence_s
-            No frame of these identifiers for this long is a lost device, s.
+            No frame with the identifier `needed` for this long is a lost device, s.
+        needed
+            The one of `ids` that carries measurements.
+        resembles
+            Whether the data of a frame look like those of `needed`, for a hint.
 
         Raises
         ------
         DeviceLost
-            The bus failed, or the device is silent while the bus is well.
+            The bus failed, or nothing with the identifier `needed` comes while the bus is well.
         DeviceMisconfigured
             Another device of the rig claims one of the identifiers.
         """
         self._refuse_taken(name, ids)
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         limit = asyncio.timeout(silence_s)
-        subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s)
+        subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s, needed, self._others)
         if self._failed is not None:
             raise DeviceLost(str(self._failed))
         self._subscribers.append(subscriber)
@@ -152,38 +191,63 @@ class SharedBus:
             async with limit:
                 self._route()
                 self._claim(subscriber)
+                self._filter()
                 await ended
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
                 raise
-            raise DeviceLost(self._silent(name, ids, silence_s)) from error
+            raise DeviceLost(self._explain_silence(subscriber, resembles)) from error
         finally:
             self._subscribers.remove(subscriber)
             self._route()
             if ended.done() and not ended.cancelled():
                 ended.exception()  # seen, should a cancellation have overtaken it
 
-    def _silent(self, name: str, ids: Mapping[CanKey, str], silence_s: float) -> str:
-        listed = ", ".join(f"0x{number:03X}" for number, _ in sorted(ids))
-        return (
-            f"{name} ({self.channel}): silent for {silence_s:g} s: no frame with identifier "
-            f"{listed}; {self.foreign} frames with others came: check power, bit rate and `ids`"
-        )
+    def _explain_silence(self, subscriber: _Subscriber, resembles: Callable[[bytes], bool]) -> str:
+        """Return what is missing and what comes instead; the same text as long as that is so."""
+        ids, needed = subscriber.ids, subscriber.needed
+        what = ids[needed]
+        others = sorted(subscriber.arrived - {needed})
+        found = [f"{ids[key]} ({_hex(key)})" for key in others]
+        text = f"{subscriber.name} ({self.channel}): no {what} ({_hex(needed)}) comes"
+        if found:
+            text += f", though {', '.join(found)} {'do' if len(found) > 1 else 'does'}"
+        unclaimed = sorted(self._seen)
+        if unclaimed:
+            named = ", ".join(map(_hex, unclaimed[:_NAMED]))
+            more = f" and {len(unclaimed) - _NAMED} more" if len(unclaimed) > _NAMED else ""
+            text += f"; identifiers on the bus that no sensor claims: {named}{more}"
+        alike = [key for key in unclaimed if all(map(resembles, self._seen[key]))]
+        if alike:
+            return (
+                f"{text}; the data of {_hex(alike[0])} look like a {what}: set `ids.{what}` to it"
+            )
+        if found or unclaimed:
+            return f"{text}: set `ids`, or switch this output on (over UART, Xsens MT Manager)"
+        if self._others > subscriber.others:
+            return f"{text}, while other sensors send: check its power and wiring, and `ids`"
+        return f"{text}, and nothing else on the bus: check power, wiring and bit rate"
 
     def _refuse_taken(self, name: str, ids: Mapping[CanKey, str]) -> None:
         for key, carries in ids.items():
             other = self._routes.get(key)
             if other is not None:
                 raise DeviceMisconfigured(
-                    f"{name} ({self.channel}): CAN identifier 0x{key[0]:03X} ({carries}) is also "
+                    f"{name} ({self.channel}): CAN identifier {_hex(key)} ({carries}) is also "
                     f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
                     "(over UART, Xsens MT Manager) and set `ids` of both"
                 )
 
     def _route(self) -> None:
         self._routes = {key: each for each in self._subscribers for key in each.ids}
+        self._seen = {key: seen for key, seen in self._seen.items() if key not in self._routes}
+        self._filter()
+
+    def _filter(self) -> None:
+        """Leave frames that no device wants to the kernel, once every device has what it needs."""
         if self._backend is not None and self._failed is None:
-            self._backend.listen(self._routes)
+            complete = all(each.is_complete for each in self._subscribers)
+            self._backend.listen(self._routes if complete else None)
 
     def _claim(self, subscriber: _Subscriber) -> None:
         """Give a device what came for it just before it began to listen.
@@ -214,10 +278,25 @@ class SharedBus:
             if subscriber is None or frame.remote:
                 self.foreign += 1
                 self._unclaimed.append((t_ns, frame))
+                self._remember(frame)
             else:
                 shares.setdefault(subscriber, []).append(frame)
         for subscriber, mine in shares.items():
+            self._others += len(mine)
+            was_complete = subscriber.is_complete
             subscriber.take(t_ns, mine)
+            if subscriber.is_complete != was_complete:
+                self._filter()
+
+    def _remember(self, frame: CanFrame) -> None:
+        """Keep the last data of an identifier that no device claims, for messages."""
+        key = (frame.can_id, frame.extended)
+        seen = self._seen.get(key)
+        if seen is None:
+            if len(self._seen) >= _SEEN:
+                return
+            seen = self._seen[key] = deque(maxlen=_SAMPLES)
+        seen.append(frame.data)
 
     def _fail(self, error: Exception) -> None:
         """End every device's pump; the bus is closed by the first to leave."""
@@ -231,6 +310,11 @@ class SharedBus:
         backend, self._backend, self._failed = self._backend, None, None
         if backend is not None:
             await backend.close()
+
+
+def _hex(key: CanKey) -> str:
+    number, extended = key
+    return f"0x{number:08X}" if extended else f"0x{number:03X}"
 
 
 _BUSES: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, SharedBus]] = WeakKeyDictionary()

@@ -93,13 +93,15 @@ class PythonCanBus:
 
         loop.add_reader(fd, readable)
 
-    def listen(self, ids: Collection[tuple[int, bool]]) -> None:
+    def listen(self, ids: Collection[tuple[int, bool]] | None) -> None:
         """Filter in the kernel (or in python-can, where the backend has no filter)."""
         if self._bus is None:
             return
         with suppress(can.CanError, OSError):  # a filter saves work; frames are sorted here as well
             self._bus.set_filters(
-                [
+                None
+                if ids is None
+                else [
                     {"can_id": number, "can_mask": EXTENDED_MAX, "extended": True}
                     if extended
                     else {"can_id": number, "can_mask": STANDARD_MAX, "extended": False}

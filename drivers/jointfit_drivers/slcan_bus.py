@@ -81,7 +81,7 @@ class SlcanBus:
             self._read(deliver, failed), name=f"slcan {self._settings.channel}"
         )
 
-    def listen(self, ids: Collection[tuple[int, bool]]) -> None:
+    def listen(self, ids: Collection[tuple[int, bool]] | None) -> None:
         """Take everything: the acceptance filter of SLCAN cannot hold a list."""
 
     async def close(self) -> None:

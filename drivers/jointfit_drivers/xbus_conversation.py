@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from jointfit_drivers.byte_stream import SerialPort
 
 REPLY_S = 0.5
+OUTSTANDING_S = 2.0
+"""A device that sends anything at all has so long to answer one GoToConfig. Some take 1.5 s, and
+further requests would queue behind the first."""
+_MOST_REPLY_S = 8.0
 _QUIET_S = 0.1
 """A pause this long ends what a broken length made the decoder wait for."""
 _KNOWN = frozenset(map(int, MessageId))
@@ -48,6 +52,8 @@ class Conversation:
         self._t_ns = 0
         self.heard = 0
         """Bytes heard so far."""
+        self.reply_s = REPLY_S
+        """How long to wait for a reply; longer for a device that acknowledged late."""
         self.understood = 0
         """Messages so far that only an Xbus device sends: noise passes a checksum now and then."""
 
@@ -61,30 +67,61 @@ class Conversation:
         """Send one message."""
         await self._port.write(encode(mid, data))
 
-    async def ask(
-        self, mid: int, data: bytes = b"", *, tries: int = 2, wait_s: float = REPLY_S
-    ) -> XbusMessage | None:
+    async def ask(self, mid: int, data: bytes = b"", *, tries: int = 2) -> XbusMessage | None:
         """Send a request until its reply, or an error, comes; None if neither does."""
         for _ in range(tries):
             await self.send(mid, data)
-            reply = await self.hear({mid + 1, MessageId.ERROR}, wait_s)
+            reply = await self.hear({mid + 1, MessageId.ERROR}, self.reply_s)
             if reply is not None:
                 return reply
         return None
 
-    async def enter_config(self, *, tries: int = 3, wait_s: float = REPLY_S) -> bool:
-        """Send GoToConfig until it is acknowledged; from then on everything is emitted."""
-        for _ in range(tries):
-            await self.send(MessageId.GOTO_CONFIG)
-            wanted = {MessageId.GOTO_CONFIG_ACK, MessageId.WAKE_UP}
+    async def enter_config(
+        self,
+        *,
+        tries: int = 3,
+        wait_s: float = REPLY_S,
+        late_s: float = 0.0,
+        late_if_silent: bool = False,
+    ) -> bool:
+        """Send GoToConfig until it is acknowledged; from then on everything is emitted.
+
+        Parameters
+        ----------
+        tries
+            Requests at most.
+        wait_s
+            From one request to the next on a silent line, s.
+        late_s
+            How long an acknowledgement may be late, s. Then a device that sends anything has one
+            request at a time, ``OUTSTANDING_S`` apart.
+        late_if_silent
+            Whether to wait `late_s` also where nothing at all comes.
+        """
+        loop = asyncio.get_running_loop()
+        began = asked = loop.time()
+        sent = before = 0
+        wanted = {MessageId.GOTO_CONFIG_ACK, MessageId.WAKE_UP}
+        start = self.heard
+        while True:
+            now = loop.time()
+            late = late_s if late_if_silent or self.heard > start else 0.0
+            if now >= began + tries * wait_s + late:
+                return False
+            waits = late_s > 0 and self.heard > before and now < asked + OUTSTANDING_S
+            if sent == 0 or (sent < tries and not waits):
+                asked, before, sent = now, self.heard, sent + 1
+                await self.send(MessageId.GOTO_CONFIG)
             reply = await self.hear(wanted, wait_s)
             if reply is not None and reply.mid == MessageId.WAKE_UP:
                 await self.send(MessageId.WAKE_UP_ACK)  # just powered up: it asks what to do
                 await self.send(MessageId.GOTO_CONFIG)
                 reply = await self.hear({MessageId.GOTO_CONFIG_ACK}, wait_s)
             if reply is not None:
+                took = loop.time() - began
+                if took > wait_s and late_s:  # what was asked in vain may yet be answered, in turn
+                    self.reply_s = min((sent + 1) * took, _MOST_REPLY_S)
                 return True
-        return False
 
     async def hear(self, mids: Collection[int], wait_s: float) -> XbusMessage | None:
         """Return the first message of `mids`; None if none comes in `wait_s` seconds."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
 from jointfit_drivers import xbus_sync
-from jointfit_drivers.xbus_conversation import Conversation
+from jointfit_drivers.xbus_conversation import OUTSTANDING_S, Conversation
 from jointfit_drivers.xbus_needs import ORIENTATION, message_bytes, needs_of
 from jointfit_protocols import xbus_messages as setup
 from jointfit_protocols.mtdata2 import Item, real_id
@@ -93,7 +93,7 @@ class Handshake:
 
     async def _ensure_config(self) -> bool:
         """Return whether the device is in configuration mode."""
-        if await self._talk.enter_config():
+        if await self._talk.enter_config(late_s=OUTSTANDING_S, late_if_silent=self._hunt):
             return True
         if not self._settings.reset_if_stuck or not self._talk.understood:
             return False

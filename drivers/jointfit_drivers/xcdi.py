@@ -14,11 +14,10 @@ from pydantic import Field, model_validator
 from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
 from jointfit_drivers.can_bus import shared_bus
 from jointfit_drivers.xcdi_events import XcdiEvents
-from jointfit_protocols.can_frame import (
-    EXTENDED_MAX,
-    unpack_frames,
-)
-from jointfit_protocols.xcdi import DataId, XcdiIds
+from jointfit_protocols.can_frame import EXTENDED_MAX, STANDARD_MAX, unpack_frames
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.orientation import OrientationGate
+from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_LONGEST_SILENCE_S = 30.0  # a sensor that is away stays on the bus's list, and is heard at once
 _RAW_FRAMES = 20  # logged at debug level, so that a first real device can be judged from its log
 
 
@@ -104,6 +104,18 @@ class XcdiSettings(ImuSettings):
     )
     byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
 
+    @model_validator(mode="after")
+    def _fits_its_identifiers(self) -> Self:
+        """Refuse 11-bit identifiers that no frame can carry."""
+        for name, number in self.ids:
+            if number is not None and number > STANDARD_MAX and not self.extended_ids:
+                raise ValueError(
+                    f"ids.{name} = 0x{number:X} is above 0x{STANDARD_MAX:X}, the greatest 11-bit "
+                    "identifier: correct it, or set extended_ids = true if the sensor sends 29-bit "
+                    "identifiers"
+                )
+        return self
+
 
 class XcdiImu:
     """Xsens IMU on a CAN bus: orientation, device time and counter, as three frames a sample."""
@@ -114,6 +126,7 @@ class XcdiImu:
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings
         self._ids = settings.ids.resolved(extended=settings.extended_ids)
+        self._silent_s = settings.silence_s  # listening on costs nothing; opening the bus anew does
 
     def decoder(self) -> XcdiEvents:
         """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
@@ -132,10 +145,33 @@ class XcdiImu:
         DeviceMisconfigured
             No such bus here, or another sensor of the rig claims the same identifiers.
         """
-        settings = self._settings
-        ids = {key: data_id.name.lower() for key, data_id in self._ids.by_id().items()}
+        settings, by_id = self._settings, self._ids.by_id()
+        ids = {key: data_id.name.lower() for key, data_id in by_id.items()}
+        (needed,) = (key for key, data_id in by_id.items() if data_id is DataId.QUATERNION)
+
+        def emit_sample(chunk: Chunk) -> None:
+            self._silent_s = settings.silence_s
+            emit(chunk)
+
+        silence_s = self._silent_s
+        self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
         async with shared_bus(settings.can) as bus:
-            await bus.pump(settings.id, ids, self._logged(emit), settings.silence_s)
+            await bus.pump(
+                settings.id,
+                ids,
+                self._logged(emit_sample),
+                silence_s,
+                needed=needed,
+                resembles=self._resembles,
+            )
+
+    def _resembles(self, data: bytes) -> bool:
+        """Whether `data` could be a quaternion: four integers of norm 1."""
+        counts = decode(DataId.QUATERNION, data, self._settings.byte_order)
+        if isinstance(counts, Corrupt):
+            return False
+        w, x, y, z = (count * QUATERNION_SCALE for count in counts)
+        return OrientationGate().admit((w, x, y, z)) is not None
 
     def _logged(self, emit: Emit) -> Emit:
         """Return `emit`, with the first frames written to the log at debug level."""

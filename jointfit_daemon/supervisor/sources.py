@@ -96,13 +96,14 @@ async def keep_running(
     """
     state = state or _Task(source)
     life = _Life(source.id, deliver, state.known)
+    driver = source.driver_class(source.settings)  # one: it may learn from attempts that failed
     path = device_path(source.settings)
     loop = asyncio.get_running_loop()
     delay = FIRST_RETRY_S
     while True:
         began, device = loop.time(), _identity(path)
         try:
-            await source.driver_class(source.settings).run(life.emit)
+            await driver.run(life.emit)
             life.closed("lost", "its driver ended by itself")
         except DeviceLost as lost:
             if loop.time() - began > HEALTHY_S:

@@ -11,6 +11,7 @@ import pytest
 from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
+from jointfit_protocols.can_frame import CanFrame
 from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.can_wire import SlcanAdapter
 from jointfit_simulators.pty_line import PtyLine
@@ -154,7 +155,7 @@ async def test_a_silent_sensor_is_lost_alone_and_told_what_else_came(tmp_path: P
             await asyncio.sleep(0.01)
         told = await lost(silent)
         assert "S4" in told
-        assert "silent for 0.4 s" in told
+        assert "no quaternion (0x221) comes, while other sensors send" in told
         assert not heard.task.done()
         await heard.cancel()
 
@@ -168,8 +169,64 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
         for number in range(10):
             device.push(number * 10_000_000, IDENTITY)
         told = await lost(run)
-    assert "40 frames with others came" in told
-    assert "`ids`" in told
+    assert "no quaternion (0x321) comes" in told
+    assert "that no sensor claims: 0x005, 0x006, 0x011, 0x021" in told
+    assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
+
+
+async def test_a_quaternion_that_never_comes_is_missed_though_time_and_counter_do(
+    tmp_path: Path,
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        ids = XcdiIdSettings(quaternion=0x121)
+        driver = XcdiImu(
+            XcdiSettings(id="S3", segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=0.5)
+        )
+        run = Running(driver)
+        await opened(adapter)
+        sending = asyncio.create_task(send_on(device))
+        told = await lost(run, 2.0)
+        assert run.chunks == [], "a sensor without orientation is not there"
+        again = Running(driver)
+        assert await lost(again, 3.0) == told, "the same text, which is reported once"
+        sending.cancel()
+    assert "no quaternion (0x121) comes, though sample_time (0x005), group_counter (0x006)" in told
+    assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
+
+
+async def send_on(device: XcdiDevice) -> None:
+    number = 0
+    while True:
+        number += 1
+        device.push(number * 10_000_000, IDENTITY)
+        await asyncio.sleep(0.01)
+
+
+async def test_a_quaternion_that_stops_is_missed_though_time_and_counter_go_on(
+    tmp_path: Path,
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    async with serving(adapter):
+        run = Running(driver_of("S3", bus, silence_s=0.5))
+        await opened(adapter)
+        for number in range(200):
+            if run.task.done():
+                break
+            time_and_counter = [
+                CanFrame(0, 0x05, number.to_bytes(4, "big")),
+                CanFrame(0, 0x06, number.to_bytes(2, "big")),
+            ]
+            adapter.send(time_and_counter)
+            if number < 5:
+                adapter.send([CanFrame(0, 0x21, bytes.fromhex("7fff000000000000"))])
+            await asyncio.sleep(0.01)
+        told = await lost(run)
+        assert len(run.samples) == 5
+    assert (
+        "no quaternion (0x021) comes, though sample_time (0x005), group_counter (0x006) do" in told
+    )
 
 
 async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None:

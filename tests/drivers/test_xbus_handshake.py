@@ -222,6 +222,37 @@ async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(
     assert "set baud = 9600" in said
 
 
+class Queueing(XbusDevice):
+    """Works off its requests one after the other, each GoToConfig in 1.5 s."""
+
+    asked = 0
+    free_s = 0.0
+
+    @override
+    def _answer(self, message: XbusMessage) -> None:
+        loop = asyncio.get_running_loop()
+        self.asked += message.mid == MessageId.GOTO_CONFIG
+        took_s = 1.5 if message.mid == MessageId.GOTO_CONFIG else 0.0
+        self.free_s = max(self.free_s, loop.time()) + took_s
+        loop.call_at(self.free_s, super()._answer, message)
+
+
+@pytest.mark.parametrize("streams", [True, False])
+async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
+    tmp_path: Path, streams: bool
+) -> None:
+    device = Queueing(tmp_path / "imu", options=XbusDeviceOptions(measures_at_once=streams))
+    async with powered(device, feeding=True):
+        assert len(await chunks_of(make(tmp_path))) >= 5
+        assert device.asked == 1 or not streams, "one request at a time"
+
+
+async def test_a_device_that_begins_anew_with_every_request_comes_up(tmp_path: Path) -> None:
+    options = XbusDeviceOptions(measures_at_once=True, config_delay_s=1.5)
+    async with powered(XbusDevice(tmp_path / "imu", options=options), feeding=True):
+        assert len(await chunks_of(make(tmp_path))) >= 5
+
+
 async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_path: Path) -> None:
     class Late(XbusDevice):  # over USB, where any speed will do
         awake_s: float | None = None
@@ -230,7 +261,7 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
         def _answer(self, message: XbusMessage) -> None:
             loop = asyncio.get_running_loop()
             if self.awake_s is None:
-                self.awake_s = loop.time() + 1.6  # between the last try and the next speed's end
+                self.awake_s = loop.time() + 3.6  # between the last try and the next speed's end
             loop.call_at(self.awake_s, super()._answer, message)
 
     device = Late(tmp_path / "imu")

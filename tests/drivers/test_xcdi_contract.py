@@ -72,7 +72,15 @@ class TestXcdiWith29BitIdsInMicrosecondsOverAMuteAdapter(TestXcdiOverSlcan):
         ids = XcdiIdSettings(
             sample_time=0x19FF0005, group_counter=0x19FF0006, quaternion=0x19FF0021
         )
-        return XcdiImu(settings("slcan", str(folder / "adapter"), ids=ids, byte_order="little"))
+        return XcdiImu(
+            settings(
+                "slcan",
+                str(folder / "adapter"),
+                ids=ids,
+                extended_ids=True,
+                byte_order="little",
+            )
+        )
 
 
 class TestXcdiOnABusWithoutDescriptor(DriverContract):

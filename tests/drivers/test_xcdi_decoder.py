@@ -360,6 +360,7 @@ def test_identifiers_left_out_move_with_their_block() -> None:
         ({"sample_time": 0x130}, "sample_time < group_counter < quaternion"),
         ({"error": 0x05}, "found one twice"),
         ({"quaternion": 2**29}, "less than or equal"),
+        ({"quaternion": 0x821}, "ids.quaternion = 0x821 is above 0x7FF.*extended_ids = true"),
         ({"quaternions": 3}, "Extra inputs"),
     ],
 )

@@ -197,7 +197,7 @@ EXPECTED = {
     "absent": ("is not there", "plug it in, or set `port`"),
     "modem": ("bytes made no message",),
     "twin": ("two sensors send with the same CAN identifiers", "set `ids`"),
-    "mute": ("silent for 1 s", "0x321", "check power, bit rate and `ids`"),
+    "mute": ("no quaternion (0x321) comes", "check its power and wiring, and `ids`"),
     "mocap": ("marker 'Thigh3' (mocap.markers.thigh) is not in the stream", "The server has", "T3"),
 }
 
