@@ -88,6 +88,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _start_logging(level: str, rig: str) -> None:
+    from jointfit_daemon.outputs.printable_text import PrintableRecord
+
+    logging.setLogRecordFactory(PrintableRecord)
     faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
     logging.basicConfig(
         level=level.upper(), handlers=[_log_handler(rig, all_of_it=level == "debug")]

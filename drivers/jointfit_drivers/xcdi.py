@@ -131,9 +131,7 @@ class XcdiImu:
     def decoder(self) -> XcdiEvents:
         """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
         settings = self._settings
-        return XcdiEvents(
-            self._ids, settings.rate_hz, settings.sample_time_unit, settings.byte_order
-        )
+        return XcdiEvents(self._ids, settings.sample_time_unit, settings.byte_order)
 
     async def run(self, emit: Emit) -> None:
         """Read the bus until cancelled.

@@ -1,17 +1,22 @@
-"""Counter and time of an XCDI sensor: what was lost, whether it restarted, whether there are two.
+"""Counter and time of an XCDI sensor: lost groups, restarts, and two sensors on one identifier.
 
-Law: integers in, verdicts out. With d the step of SampleTime and c the step of GroupCounter since
-the previous group, both modulo their widths, and P the step of one group as the stream showed it:
+Invariant: integers in, steps out; any input is accepted. With d the step of SampleTime and c the
+step of GroupCounter since the previous group, both modulo their widths, and P the step of one group
+as the stream showed it:
 
-| seen                                                    | verdict                             |
+| found                                                   | outcome                             |
 |---------------------------------------------------------|-------------------------------------|
 | c = round(d / P) within 1 % and a few counts            | same clock; c - 1 groups were lost  |
-| no counter, d forward and under an hour                 | same clock; round(d / P) - 1 lost   |
-| d or c backward, one still and the other not, or at odds| restart                             |
-| three restarts, or ten broken groups, within 20 groups  | two sensors share the identifiers   |
+| no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
+| d or c backward, one still and the other not, or at odds| contradiction: the group is held    |
+| the next group goes on from the held one                | restart, unless time went on        |
+| the next group goes on from the last accepted one       | the held one was damaged            |
+| three contradictions that go on from each other, or     | two sensors share the identifiers   |
+| 14 broken groups, within 20 groups                      |                                     |
 
-A sensor that is reset restarts once. Two sensors contradict each other for ever: their groups
-cannot be told apart, so nothing of them may be used.
+A line to an adapter has no checksum, so a single group proves no restart. A sensor that is reset
+contradicts what was before once. Two sensors contradict each other for ever: their groups cannot be
+told apart, so nothing of them may be used.
 """
 
 from __future__ import annotations
@@ -23,12 +28,15 @@ from typing import NamedTuple
 from jointfit_protocols.xcdi import COUNTER_MODULUS, TICKS_MODULUS
 
 _LEARNED = 10  # steps that show the stream's own period
-_SLACK_COUNTS = 4
+_SLACK_COUNTS = 2
+_NEAR = 10  # counts that damage of counter and time may seem to take
 _SLACK_SHARE = 0.01
-_LONGEST_GAP_S = 3600.0
+_LONGEST = 20_000  # groups of a gap: over more the slack would let any pair agree
+_BLIND = 100  # groups of a gap that time alone may show, once the next group confirms it
 _WINDOW = 20  # groups
-_RESTARTS = 3
-_BROKEN = 10
+_CONTRADICTIONS = 3
+_BROKEN = 14
+_ASTRAY = 8  # contradictions in a row that no sensor explains: the period is another than it was
 
 
 class Step(NamedTuple):
@@ -36,47 +44,43 @@ class Step(NamedTuple):
 
     lost: int = 0
     restarted: bool = False
+    """The sensor restarted before the held group."""
     shared: bool = False
-    """Two sensors speak: this group may be a mixture."""
+    """Two sensors send: this group may be a mixture."""
+    held: bool = False
+    """Hold this group until the next."""
+    confirmed: bool = False
+    """The held group is good and comes first; else a held one is dropped."""
 
 
 _GOES_ON = Step()
+_HELD = Step(held=True)
 
 
 class Continuity:
-    """Follows the groups of one sensor.
+    """Follows the groups of one sensor."""
 
-    Parameters
-    ----------
-    rate_hz
-        Nominal rate; it only bounds how long a gap may be.
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self._longest = _LONGEST_GAP_S * rate_hz
-        self._ticks: int | None = None
-        self._counter: int | None = None
-        self._groups = 0  # since the last group that had time, as the counter says
-        self._uncounted = 0  # groups that came, or are known lost, since the last counter
-        self._counted = False  # every group since then had a counter
-        self._steps: list[float] = []
-        self._period: float | None = None
-        self._restarts: deque[bool] = deque(maxlen=_WINDOW)
+    def __init__(self) -> None:
+        self._track = _Track()
+        self._held: _Track | None = None
+        self._rival: _Track | None = None  # of the contradictions before
+        self._astray = 0
+        self._contradictions: deque[bool] = deque(maxlen=_WINDOW)
         self._broken: deque[bool] = deque(maxlen=_WINDOW)
-        self._quiet = 0  # groups since one that restarted or was broken
+        self._quiet = 0  # groups since a contradiction or a broken one
         self.shared = False
 
     def group(self, ticks: int | None, counter: int | None, *, broken: bool) -> Step:
         """Take one group; `broken`: it, or what came before it, was incomplete."""
-        step = self._step(ticks, counter)
-        self._restarts.append(step.restarted)
+        step, rivals = self._step(ticks, counter)
+        self._contradictions.append(rivals)
         self._broken.append(broken)
-        self._quiet = 0 if step.restarted or broken else self._quiet + 1
+        self._quiet = 0 if rivals or broken else self._quiet + 1
         was_shared = self.shared
         if self._quiet >= _WINDOW and not was_shared:
             return step  # as nearly always: both windows hold nothing
-        contradictions = sum(self._restarts)
-        if contradictions >= _RESTARTS or sum(self._broken) >= _BROKEN:
+        contradictions = sum(self._contradictions)
+        if contradictions >= _CONTRADICTIONS or sum(self._broken) >= _BROKEN:
             self.shared = True
         elif not contradictions and not any(self._broken):
             self.shared = False
@@ -84,28 +88,110 @@ class Continuity:
             return Step(shared=True)
         return Step(restarted=True) if was_shared else step  # what comes now is one sensor again
 
-    def _step(self, ticks: int | None, counter: int | None) -> Step:
+    def _step(self, ticks: int | None, counter: int | None) -> tuple[Step, bool]:
+        """Return the step, and whether the group continues earlier contradictions."""
+        if self._track.continues(ticks, counter):
+            self._held, self._astray = None, 0
+            lost = self._track.take(ticks, counter)
+            return (Step(lost) if lost else _GOES_ON), False
+        held, self._held = self._held, None
+        if held is not None and held.continues(ticks, counter):
+            self._astray = 0
+            groups, settled = self._track.groups_to(held), self._track.settled
+            lost = held.take(ticks, counter) + (groups or 1) - 1
+            self._track, self._rival = held, None
+            return Step(lost, restarted=groups is None and settled, confirmed=True), False
+
+        self._astray += 1
+        rival = self._rival
+        rivals = rival is not None and rival.continues(ticks, counter)
+        if rival is None or not rivals:
+            rival = self._rival = _Track(self._track.period)
+        rival.take(ticks, counter)
+        if self._astray >= _ASTRAY:
+            self._astray = 0
+            self._track = _Track()
+            self._track.take(ticks, counter)
+            return Step(restarted=True), rivals
+        self._held = _Track(self._track.period)
+        self._held.take(ticks, counter)
+        return _HELD, rivals
+
+
+class _Track:
+    """Groups that go on from each other.
+
+    Parameters
+    ----------
+    period
+        Ticks of one group, where it is known beforehand.
+    """
+
+    def __init__(self, period: float | None = None) -> None:
+        self.period = period
+        self.settled = period is not None
+        """Whether enough steps showed the period."""
+        self._ticks: int | None = None
+        self._counter: int | None = None
+        self._groups = 0  # since the last group that had time, as the counter says
+        self._uncounted = 0  # groups that came, or are known lost, since the last counter
+        self._counted = False  # every group since then had a counter
+        self._steps: list[float] = []
+
+    def continues(self, ticks: int | None, counter: int | None) -> bool:
+        """Whether a group may be the next one of this sensor."""
         count = self._count(counter)
         if count is not None and count > COUNTER_MODULUS // 2:
-            return self._restart(ticks, counter)
+            return False
+        if ticks is None or self._ticks is None:
+            few = self._uncounted + (_BLIND if self._ticks is None else _SLACK_COUNTS)
+            return count is None or count <= 1 + few
+        d = (ticks - self._ticks) % TICKS_MODULUS
+        groups = self._groups + count if self._counted and count is not None else None
+        if d >= TICKS_MODULUS // 2 or (groups is not None and (d == 0) != (groups == 0)):
+            return False
+        if self.period is None:
+            return count is None or count <= 1 + self._uncounted + _SLACK_COUNTS
+        expected = round(d / self.period)
+        if groups is None and count is not None:
+            groups = count - self._uncounted
+        if groups is None:
+            return expected <= 1 + _SLACK_COUNTS
+        if expected > _LONGEST:
+            return False
+        off = abs(groups - expected) % COUNTER_MODULUS
+        return min(off, COUNTER_MODULUS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
+
+    def groups_to(self, later: _Track) -> int | None:
+        """Return the groups between this track and a later one that does not continue it.
+
+        None where time leapt, or the counter did: small differences of either are damage.
+        """
+        if self._ticks is None or later._ticks is None or self.period is None:  # noqa: SLF001 - same class
+            return None
+        half = TICKS_MODULUS // 2
+        passed = round(((later._ticks - self._ticks + half) % TICKS_MODULUS - half) / self.period)  # noqa: SLF001
+        count = self._count(later._counter)  # noqa: SLF001 - same class
+        off = 0 if count is None else abs(count - passed) % COUNTER_MODULUS
+        is_near = min(off, COUNTER_MODULUS - off) <= _NEAR
+        if abs(passed) > _BLIND or not is_near:
+            return None
+        return max(passed, 1) if count is None else 1
+
+    def take(self, ticks: int | None, counter: int | None) -> int:
+        """Take a group that continues this track; return the groups lost before it."""
+        count = self._count(counter)
         lost = 0 if count is None else max(count - 1 - self._uncounted, 0)
         self._groups += count or 0
         self._counted = self._counted and count is not None
-        if ticks is None or self._ticks is None:
-            return self._remember(ticks, counter, lost)
-        d = (ticks - self._ticks) % TICKS_MODULUS
-        groups = self._groups if self._counted else None
-        if d >= TICKS_MODULUS // 2 or (groups is not None and (d == 0) != (groups == 0)):
-            return self._restart(ticks, counter)
-        if self._period is None:
-            self._learn(d, groups)
-            return self._remember(ticks, counter, lost)
-        expected = round(d / self._period)
-        if not self._agree(expected, groups):
-            return self._restart(ticks, counter)
-        if count is None:
-            lost = max(expected - 1, 0)
-        return self._remember(ticks, counter, lost)
+        if ticks is not None and self._ticks is not None:
+            d = (ticks - self._ticks) % TICKS_MODULUS
+            if not self.settled:
+                self._learn(d, self._groups if self._counted else None)
+            if count is None and self.settled and self.period:
+                lost = max(round(d / self.period) - 1, 0)
+        self._remember(ticks, counter, lost)
+        return lost
 
     def _count(self, counter: int | None) -> int | None:
         """Return the step of the counter; None where either end is missing."""
@@ -113,26 +199,14 @@ class Continuity:
             return None
         return (counter - self._counter) % COUNTER_MODULUS
 
-    def _agree(self, expected: int, groups: int | None) -> bool:
-        """Whether a time step worth `expected` groups can be that of `groups` counts."""
-        if groups is None:
-            return expected <= self._longest
-        off = abs(groups - expected) % COUNTER_MODULUS
-        return min(off, COUNTER_MODULUS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
-
     def _learn(self, d: int, groups: int | None) -> None:
         self._steps.append(d / groups if groups else d)
+        self.period = median(self._steps) or None
         if len(self._steps) >= _LEARNED:
-            self._period = median(self._steps) or None
+            self.settled = True
             self._steps.clear()
 
-    def _restart(self, ticks: int | None, counter: int | None) -> Step:
-        self._ticks = self._counter = self._period = None
-        self._steps.clear()
-        self._remember(ticks, counter, 0)
-        return Step(restarted=True)
-
-    def _remember(self, ticks: int | None, counter: int | None, lost: int) -> Step:
+    def _remember(self, ticks: int | None, counter: int | None, lost: int) -> None:
         if counter is None:
             self._uncounted += 1 + lost  # its next step includes them
         else:
@@ -140,4 +214,3 @@ class Continuity:
         if ticks is not None:
             self._ticks, self._groups = ticks, 0
             self._counted = counter is not None
-        return Step(lost) if lost else _GOES_ON

@@ -33,6 +33,7 @@ from jointfit_protocols.xcdi_unit import TICK_NS, TickUnit
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_protocols.orientation import Quaternion
     from jointfit_protocols.xcdi import ByteOrder, XcdiIds
 
 _UNDECIDED = 100  # groups after which an undecided unit is worth a warning
@@ -47,24 +48,23 @@ class XcdiEvents:
     ----------
     ids
         Its identifiers.
-    rate_hz
-        Nominal rate; it only bounds how long a gap may be.
     unit
         ``100us`` or ``1us``, or ``auto``: decided from what arrives.
     byte_order
         Of the payloads.
     """
 
-    def __init__(self, ids: XcdiIds, rate_hz: float, unit: str, byte_order: ByteOrder) -> None:
+    def __init__(self, ids: XcdiIds, unit: str, byte_order: ByteOrder) -> None:
         self._xcdi = XcdiDecoder(ids, byte_order)
-        self._continuity = Continuity(rate_hz)
+        self._continuity = Continuity()
+        self._held: XcdiGroup | None = None
         self._gate = OrientationGate()
         self._unit = TickUnit()
         self._configured = TICK_NS.get(unit)
         self._tick_clock = (
             None if self._configured is None else TickClock(self._configured, TICKS_MODULUS)
         )
-        self._measured = self._has_time = False
+        self._measured = self._has_time = self._has_counter = False
         self._incomplete = self._timed = self._told_at_ns = 0
         self._refused = 0
         self._discarded = 0
@@ -122,32 +122,55 @@ class XcdiEvents:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Give up waiting for the rest of a group."""
+        """Give up waiting for the rest of a group, and for what would confirm one."""
         self._xcdi.flush()
-        return []
+        out: list[Decoded] = []
+        self._drop_held(out)
+        return out
 
     def _group(self, group: XcdiGroup, out: list[Decoded]) -> None:
-        """Append the sample of `group`, after what its counter and time say."""
+        """Append the sample of `group`, after what its counter and time show."""
         ticks, counter = group.ticks, group.counter
         self._has_time = self._has_time or ticks is not None
-        torn = ticks is None and self._has_time
+        self._has_counter = self._has_counter or counter is not None
+        torn = ticks is None and (self._has_time or (counter is None and self._has_counter))
         broken = torn or self._xcdi.incomplete != self._incomplete
         self._incomplete = self._xcdi.incomplete
         step = self._continuity.group(ticks, counter, broken=broken)
+        held = self._held
+        if held is not None and not step.confirmed:
+            self._drop_held(out)
         if step.shared:
             self._refuse("two sensors share these identifiers", out)
             out += self._once("warning", "shared", _SHARED)
             return
         self._said.discard("shared")
+        self._held = group if step.held else None
+        if step.held:
+            return
+        first = held if held is not None and step.confirmed else group
         if step.restarted:
             self._gate.forget()
             self._unit.restart()
-            out.append(DeviceEvent("restart", f"its clock began anew at {ticks} ticks"))
-        elif step.lost:
+            out.append(DeviceEvent("restart", f"its clock began anew at {first.ticks} ticks"))
+        if first is not group:
+            self._sample(first, out)
+        if step.lost:
             out.append(DeviceEvent("gap", f"{step.lost} groups lost", {"lost": step.lost}))
-        a, b, c, d = group.quaternion
-        s = QUATERNION_SCALE
-        native = (a * s, b * s, c * s, d * s)
+        self._sample(group, out)
+
+    def _drop_held(self, out: list[Decoded]) -> None:
+        """Discard a group that nothing confirmed."""
+        held, self._held = self._held, None
+        if held is not None:
+            self._gate.admit(_native(held))  # a wrong byte order makes time and counter leap, too
+            self._judge_norm(out)
+            self._refuse("counter and time contradict the others", out)
+
+    def _sample(self, group: XcdiGroup, out: list[Decoded]) -> None:
+        """Append the sample of a group that belongs to the stream."""
+        ticks = group.ticks
+        native = _native(group)
         q = self._gate.admit(native)
         if q is None:
             self._refuse("quaternion norm is not 1", out)
@@ -157,7 +180,7 @@ class XcdiEvents:
             self._timeless(out)
         elif not self._measured:
             self._measure(ticks, group.t_ns, out)
-        out.append(ImuSample(group.t_ns, q, native, ticks, counter, group.status))
+        out.append(ImuSample(group.t_ns, q, native, ticks, group.counter, group.status))
 
     def _measure(self, ticks: int, t_ns: int, out: list[Decoded]) -> None:
         """Decide the unit of SampleTime, or check the one that was configured."""
@@ -235,6 +258,12 @@ class XcdiEvents:
     def _lose(self, count: int, reason: str) -> Corrupt:
         self._discarded += count
         return Corrupt(count, reason)
+
+
+def _native(group: XcdiGroup) -> Quaternion:
+    a, b, c, d = group.quaternion
+    s = QUATERNION_SCALE
+    return (a * s, b * s, c * s, d * s)
 
 
 _SHARED = (

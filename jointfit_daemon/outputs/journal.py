@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from typing_extensions import override
 
 from jointfit_daemon.outputs.log_limit import BURST, RATE_HZ, Allowance, LimitedHandler
+from jointfit_daemon.outputs.printable_text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -41,7 +42,7 @@ def about(kind: str, name: str) -> dict[str, dict[str, str]]:
     name
         Id of the device, or what else it is about.
     """
-    return {FIELDS: {"JOINTFIT_KIND": kind, "JOINTFIT_ID": name}}
+    return {FIELDS: {"JOINTFIT_KIND": printable(kind), "JOINTFIT_ID": printable(name)}}
 
 
 def is_journal(stream: TextIO) -> bool:

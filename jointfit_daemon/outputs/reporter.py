@@ -16,6 +16,7 @@ from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.figures import shown
 from jointfit_daemon.outputs.mqtt import PAYLOAD_VERSION
 from jointfit_daemon.outputs.payloads import encode, encode_joint, encode_pose
+from jointfit_daemon.outputs.printable_text import printable, printable_data
 from jointfit_daemon.outputs.publisher import OFFLINE, ONLINE
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
@@ -93,7 +94,8 @@ class Reporter:
                 topic = f"{self._base}/device/{name}/availability"
                 self._outbox.retain(topic, ONLINE if online else OFFLINE)
             case DeviceInfo(name, data):
-                self._outbox.retain(f"{self._base}/device/{name}/info", self._stamped(data, None))
+                info = self._stamped(printable_data(data), None)
+                self._outbox.retain(f"{self._base}/device/{name}/info", info)
             case CalibrationStatus():
                 self._calibration(output)
             case CalibrationProgress():
@@ -116,8 +118,8 @@ class Reporter:
     def event(self, notice: Notice, level: str | None = None) -> None:
         """Publish one change of state on ``bridge/event``, at its own level or at `level`."""
         said = {"kind": notice.kind, "id": notice.id, "level": level or notice.level}
-        said |= {"text": notice.text}
-        payload = self._stamped(said | {"data": notice.data}, notice.t_ns)
+        said |= {"text": printable(notice.text), "data": printable_data(notice.data)}
+        payload = self._stamped(said, notice.t_ns)
         self._outbox.event(f"{self._base}/bridge/event", payload)
 
     def _calibration(self, status: CalibrationStatus) -> None:

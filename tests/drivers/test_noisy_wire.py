@@ -10,8 +10,13 @@ import pytest
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
 from jointfit_daemon.timing.clock import DeviceClock
 from jointfit_drivers.xbus_events import XbusEvents
+from jointfit_drivers.xcdi_events import XcdiEvents
+from jointfit_protocols.can_frame import CanFrame, pack_frames
 from jointfit_protocols.mtdata2 import Item, encode_items
+from jointfit_protocols.slcan import SlcanDecoder, encode_frame
 from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xcdi import DataId, XcdiIds, quaternion_counts
+from jointfit_protocols.xcdi import encode as xcdi_encode
 from jointfit_simulators.contract_scene import orientation
 
 if TYPE_CHECKING:
@@ -81,6 +86,44 @@ def with_damage_that_passes(chance: random.Random, number: int) -> bytes:
 def wires(damage: Callable[[random.Random, int], bytes], seed: int) -> list[bytes]:
     chance = random.Random(seed)
     return [damage(chance, number) for number in range(MESSAGES)]
+
+
+def lines(chance: random.Random, number: int, share: float) -> bytes:
+    """Return a group of a sensor on an SLCAN adapter, whose line has no checksum.
+
+    One digit is changed in `share` of the lines.
+    """
+    values = (
+        (DataId.SAMPLE_TIME, (500_000 + 100 * number,)),
+        (DataId.GROUP_COUNTER, (number % 65536,)),
+        (DataId.QUATERNION, quaternion_counts(orientation(number))),
+    )
+    group = b""
+    for data_id, counts in values:
+        line = bytearray(encode_frame(CanFrame(0, int(data_id), xcdi_encode(data_id, counts))))
+        if chance.random() < share:
+            line[chance.randrange(1, len(line) - 1)] = ord(chance.choice("0123456789ABCDEF"))
+        group += line
+    return group
+
+
+def xcdi_outcome(seed: int, share: float) -> Outcome:
+    slcan, chance = SlcanDecoder(None), random.Random(seed)  # noqa: S311 - the same wire every run
+    chunks = []
+    for number in range(MESSAGES):
+        t_ns = (number + 1) * PERIOD_NS
+        found = slcan.feed(lines(chance, number, share), t_ns)
+        chunks.append(pack_frames(item for item in found if isinstance(item, CanFrame)))
+    return outcome(XcdiEvents(XcdiIds(), "100us", "big"), chunks)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_line_without_checksum_makes_no_restart_and_few_losses(seed: int, share: float) -> None:
+    found = xcdi_outcome(seed, share)
+    assert found.restarts == 0, found
+    assert found.lost <= 1.5 * (MESSAGES - found.received) + 5, found
+    assert found.received > (1 - 4 * share) * MESSAGES, found
 
 
 @pytest.mark.parametrize("seed", SEEDS)

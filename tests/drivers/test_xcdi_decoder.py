@@ -62,7 +62,7 @@ class Tape:
 
 
 def events(unit: str = "100us", ids: XcdiIds | None = None) -> XcdiEvents:
-    return XcdiEvents(ids or XcdiIds(), 100.0, unit, "big")
+    return XcdiEvents(ids or XcdiIds(), unit, "big")
 
 
 def decoded(tape: Tape, decoder: XcdiEvents | None = None) -> list[Any]:
@@ -288,7 +288,7 @@ def test_a_wrong_byte_order_is_named_after_a_hundred_samples() -> None:
     device = XcdiDevice(tape)
     for number in range(150):
         device.push(number * 10 * MS, (0.5, -0.5, 0.1, 0.7))
-    found = XcdiEvents(XcdiIds(), 100.0, "100us", "little").feed(Chunk(0, pack_frames(tape.frames)))
+    found = XcdiEvents(XcdiIds(), "100us", "little").feed(Chunk(0, pack_frames(tape.frames)))
     assert not samples(found)
     told = [event for event in of_kind(found, "warning") if "byte_order" in event.text]
     assert len(told) == 1
