@@ -157,21 +157,20 @@ class _Track:
             groups = count - self._uncounted
         if groups is None:
             return expected <= 1 + _SLACK_COUNTS
-        if expected > _LONGEST:
-            return False
         off = abs(groups - expected) % COUNTER_MODULUS
-        return min(off, COUNTER_MODULUS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
+        near = min(off, COUNTER_MODULUS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
+        return near and expected <= _LONGEST
 
     def groups_to(self, later: _Track) -> int | None:
         """Return the groups between this track and a later one that does not continue it.
 
         None where time leapt, or the counter did: small differences of either are damage.
         """
-        if self._ticks is None or later._ticks is None or self.period is None:  # noqa: SLF001 - same class
+        if self._ticks is None or later._ticks is None or self.period is None:
             return None
         half = TICKS_MODULUS // 2
-        passed = round(((later._ticks - self._ticks + half) % TICKS_MODULUS - half) / self.period)  # noqa: SLF001
-        count = self._count(later._counter)  # noqa: SLF001 - same class
+        passed = round(((later._ticks - self._ticks + half) % TICKS_MODULUS - half) / self.period)
+        count = self._count(later._counter)
         off = 0 if count is None else abs(count - passed) % COUNTER_MODULUS
         is_near = min(off, COUNTER_MODULUS - off) <= _NEAR
         if abs(passed) > _BLIND or not is_near:

@@ -108,7 +108,7 @@ def lines(chance: random.Random, number: int, share: float) -> bytes:
 
 
 def xcdi_outcome(seed: int, share: float) -> Outcome:
-    slcan, chance = SlcanDecoder(None), random.Random(seed)  # noqa: S311 - the same wire every run
+    slcan, chance = SlcanDecoder(None), random.Random(seed)
     chunks = []
     for number in range(MESSAGES):
         t_ns = (number + 1) * PERIOD_NS
