@@ -9,6 +9,8 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+from typing_extensions import override
+
 LONGEST = 2000
 """Characters of a text; the longest message of ours has about 600."""
 _DEEPEST = 4
@@ -50,7 +52,8 @@ class PrintableRecord(logging.LogRecord):
     Installed by ``logging.setLogRecordFactory``, so that it holds for every handler.
     """
 
-    def getMessage(self) -> str:  # noqa: N802 - logging's name
+    @override
+    def getMessage(self) -> str:
         """Return the message, its lines printable."""
         lines = super().getMessage().splitlines()
         return "\n  | ".join(map(printable, lines))
