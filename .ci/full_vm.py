@@ -22,6 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import debian_root
 import uml
 import vm_image
 from uml import say
@@ -60,7 +61,7 @@ def main() -> int:
         work = Path(scratch)
         try:
             disk = given.image or vm_image.image()
-        except vm_image.CannotMake as error:
+        except debian_root.CannotMake as error:
             say(str(error))
             return uml.CANNOT_START
         share = (given.out or work / "share").resolve()

@@ -8,13 +8,11 @@ the row says so and is left out.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
-from shutil import which
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -66,8 +64,6 @@ class Experiment:
     """Folders it reads there."""
     packages: tuple[str, ...] = ()
     """What must be installed beside the project."""
-    programs: tuple[str, ...] = ()
-    """What it runs as a process."""
     long: bool = False
     """Takes longer than a test may: a shorter one stands for it among the tests."""
     timed: bool = False
@@ -84,8 +80,6 @@ class Experiment:
         if absent:
             return f"recordings are not here: {', '.join(str(data / name) for name in absent)}"
         uninstalled = [name for name in self.packages if find_spec(name) is None]
-        path = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
-        uninstalled += [name for name in self.programs if which(name, path=path) is None]
         return f"not installed: {', '.join(uninstalled)}" if uninstalled else None
 
 

@@ -159,7 +159,7 @@ class EmbeddedBroker(Broker):
 [router]
 id = 0
 max_connections = 1000
-max_outgoing_packet_count = 10000
+max_outgoing_packet_count = 200
 max_segment_size = 104857600
 max_segment_count = 10
 """

@@ -56,7 +56,7 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Fi
 
 EXPERIMENTS = (
     Experiment("E2E-squats", "squats hold-out, bytes to MQTT", _beside("squats", METHODS),
-               (FOLDER,), programs=("mosquitto",), long=True),
+               (FOLDER,), long=True),
     Experiment("E2E-walk", "walking, bytes to MQTT, trained on squats",
-               _beside("walking", WALKERS), (FOLDER,), programs=("mosquitto",), long=True),
+               _beside("walking", WALKERS), (FOLDER,), long=True),
 )  # fmt: skip

@@ -1,0 +1,181 @@
+"""Run the tests and the demo on a fresh minimal Debian, as a stranger would, without root.
+
+    .ci/minimal_root.py [--out DIR] [-- SHELL COMMAND]
+
+The system is mmdebstrap's minbase with `PACKAGES`: no broker, no name localhost.
+It is entered as an ordinary user, in namespaces of its own, on a clone of this checkout's last
+commit, with an uptime of one minute where the kernel has time namespaces. Only setting it up needs
+root (or sudo). The configuration of pip, the files that it names, and the network are those of the
+host. DIR gets the JUnit reports (default: ``build/minimal``).
+
+Exit status: that of the command; 2 if the system cannot be set up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from debian_root import CACHE, SEARCH, CannotMake, bootstrap, kept, run
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
+COMMAND = "make test && make demo ARGS='--headless --seconds 20'"
+UPTIME_S = 60
+HOME = Path("/home/stranger")
+PIP_CONFIGURATIONS = (
+    (Path("/etc/pip.conf"), Path("/etc/pip.conf")),
+    (Path("/etc/xdg/pip/pip.conf"), Path("/etc/xdg/pip/pip.conf")),
+    (Path.home() / ".pip/pip.conf", HOME / ".pip/pip.conf"),
+    (Path.home() / ".config/pip/pip.conf", HOME / ".config/pip/pip.conf"),
+)
+"""Where pip looks on the host, and where it looks inside."""
+PASSED = re.compile(
+    r"PIP_(?!CACHE_DIR)\w+|(https?|no)_proxy|SSL_CERT_FILE|REQUESTS_CA_BUNDLE", re.IGNORECASE
+)
+"""Environment variables that pip needs inside."""
+ABSOLUTE = re.compile(r"(file://)?(/[^\s,;\"']+)")
+
+SET_UP = """\
+set -eu
+root={work}/root
+mkdir "$root"
+tar -xf {tar} -C "$root" --numeric-owner
+echo stranger:x:1000:1000::{home}:/bin/sh >> "$root/etc/passwd"
+echo stranger:x:1000: >> "$root/etc/group"
+mkdir -p "$root{home}"
+mv {work}/checkout "$root{home}/jointfitd"
+cp -L /etc/resolv.conf "$root/etc/resolv.conf"
+
+# Devices: what programs of a user need, and terminals that are not the host's.
+mount -t proc proc "$root/proc"
+mount --rbind /sys "$root/sys"
+mount -t tmpfs -o mode=755 dev "$root/dev"
+for name in null zero full random urandom tty; do
+  : > "$root/dev/$name"
+  mount --bind "/dev/$name" "$root/dev/$name"
+done
+mkdir "$root/dev/pts" "$root/dev/shm"
+mount -t devpts -o newinstance,ptmxmode=0666,mode=0620 devpts "$root/dev/pts"
+mount -t tmpfs -o mode=1777 shm "$root/dev/shm"
+ln -s pts/ptmx "$root/dev/ptmx"
+ln -s /proc/self/fd "$root/dev/fd"
+
+share() {{
+  if [ -d "$1" ]; then mkdir -p "$root$2"; else mkdir -p "$(dirname "$root$2")"; : >> "$root$2"; fi
+  mount --bind "$1" "$root$2"
+  mount -o remount,ro,bind "$root$2"
+}}
+{shares}
+chown -R 1000:1000 "$root{home}" 2>/dev/null || true  # but what is shared is read-only
+
+inside() {{ chroot --userspec=1000:1000 --groups= "$root" env -i {environment} sh -c "$1"; }}
+echo "minimal root: Debian $(cat "$root/etc/debian_version"), minbase and" \\
+  "$(chroot "$root" dpkg-query -W -f='${{Package}} ${{Version}}, ' {packages})" \\
+  "$(chroot "$root" dpkg-query -W | wc -l) packages in all; uptime $(cut -d. -f1 /proc/uptime) s"
+inside "id; cat /etc/hosts 2>/dev/null || echo no hosts file"
+status=0
+inside {command} || status=$?
+cp "$root{home}"/jointfitd/build/tests/*.xml {out}/ 2>/dev/null || true
+chown {owner} {out}/*.xml 2>/dev/null || true
+exit $status
+"""
+
+
+def main() -> int:
+    """Set the system up and run the command in it; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=CHECKOUT / "build" / "minimal", metavar="DIR")
+    parser.add_argument("command", nargs="*", help=f"default: {COMMAND}")
+    given = parser.parse_args()
+    command = " ".join(given.command) or COMMAND
+
+    given.out.mkdir(parents=True, exist_ok=True)
+    for old in given.out.glob("*.xml"):
+        old.unlink()
+    root = [] if os.geteuid() == 0 else ["sudo", "-n"]
+    try:
+        tar = kept(
+            "minimal.tar", " ".join(PACKAGES), {"mmdebstrap": "mmdebstrap"},
+            lambda work: bootstrap(PACKAGES, (), work),
+        )  # fmt: skip
+        work = Path(tempfile.mkdtemp(prefix="minimal-run-", dir=CACHE))
+        try:
+            run(["git", "clone", "-q", "--depth=1", f"file://{CHECKOUT}", "checkout"], work)
+            script = _script(work, tar, given.out.resolve(), command)
+            ended = subprocess.run(  # noqa: S603 - our own script
+                [*root, *_namespaces(root), "sh", "-c", script],
+                check=False, stdin=subprocess.DEVNULL, env=os.environ | {"PATH": SEARCH},
+            )  # fmt: skip
+        finally:
+            run([*root, "rm", "-rf", "--one-file-system", str(work)], CACHE)
+    except CannotMake as error:
+        print(f"minimal_root: {error}", file=sys.stderr)
+        return 2
+    return ended.returncode
+
+
+def _namespaces(root: list[str]) -> list[str]:
+    """Return the command that enters new namespaces; nothing inside outlives it."""
+    enter = ["unshare", "--mount", "--propagation=private", "--pid", "--fork", "--kill-child"]
+    monotonic = UPTIME_S - int(time.clock_gettime(time.CLOCK_MONOTONIC))
+    boottime = UPTIME_S - int(time.clock_gettime(time.CLOCK_BOOTTIME))
+    clocks = ["--time", f"--monotonic={monotonic}", f"--boottime={boottime}"]
+    tried = subprocess.run(  # noqa: S603 - as below
+        [*root, *enter, *clocks, "true"],
+        check=False, capture_output=True, env=os.environ | {"PATH": SEARCH},
+    )  # fmt: skip
+    if tried.returncode == 0:
+        return [*enter, *clocks]
+    print("minimal_root: this kernel allows no time namespace; the uptime is the host's")
+    return enter
+
+
+def _script(work: Path, tar: Path, out: Path, command: str) -> str:
+    environment = {name: text for name, text in os.environ.items() if PASSED.fullmatch(name)}
+    shared = _shared([*environment.values(), *_read_configurations()])
+    shares = [*((path, path) for path in shared), *_configurations()]
+    environment |= {
+        "HOME": str(HOME), "PATH": "/usr/bin:/bin", "LANG": "C.UTF-8", "CI": "true",
+        "PIP_DISABLE_PIP_VERSION_CHECK": "1", "OPENBLAS_NUM_THREADS": "1",
+    }  # fmt: skip
+    return SET_UP.format(
+        work=shlex.quote(str(work)), tar=shlex.quote(str(tar)), out=shlex.quote(str(out)),
+        shares="\n".join(f"share {shlex.join(map(str, pair))}" for pair in shares),
+        environment=shlex.join(f"{name}={text}" for name, text in environment.items()),
+        home=HOME, packages=" ".join(PACKAGES), owner=f"{os.getuid()}:{os.getgid()}",
+        command=shlex.quote(f"cd {HOME}/jointfitd && {command}"),
+    )  # fmt: skip
+
+
+def _configurations() -> list[tuple[Path, Path]]:
+    return [(host, inside) for host, inside in PIP_CONFIGURATIONS if host.is_file()]
+
+
+def _read_configurations() -> list[str]:
+    named = os.environ.get("PIP_CONFIG_FILE")
+    files = [host for host, _ in _configurations()] + ([Path(named)] if named else [])
+    return [file.read_text(encoding="utf-8") for file in files if file.is_file()]
+
+
+def _shared(texts: list[str]) -> list[Path]:
+    """Return the existing files and folders that settings of pip name, in order of depth."""
+    found = set()
+    for scheme, name in (match.groups() for text in texts for match in ABSOLUTE.finditer(text)):
+        path = Path(name)
+        if scheme and path.parent != Path("/"):  # an index links to files that lie beside it
+            path = path.parent
+        if path.exists() and not path.samefile(os.devnull):
+            found.add(path)
+    return sorted(found, key=lambda path: len(path.parts))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
