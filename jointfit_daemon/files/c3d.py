@@ -7,12 +7,13 @@ follow the frame numbers: frame 1 is at 0 s, as in a TRC of the same trial.
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.files.text_table import Malformed
+from jointfit_daemon.files.text_table import Malformed, refuse_device
 from jointfit_daemon.files.trc import METRES, MarkerTrajectories
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
         raise PackageMissing(
             f"{path}: reading C3D needs a package: pip install 'jointfitd[c3d]'"
         ) from missing
+    refuse_device(path)
     with path.open("rb") as handle, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of every file without analog channels
         try:
@@ -61,21 +63,25 @@ def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
         except Malformed:
             raise
         except Exception as fault:
-            raise Malformed(f"{path}: not a C3D file, or a broken one: {fault}") from fault
+            raise Malformed(f"{path}: not a C3D file, or cut off: export it again") from fault
 
 
 def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
     names = tuple(_labels(reader))[: reader.point_used]
     if not names:
-        raise Malformed(f"{path}: no points with labels in this C3D file")
+        raise Malformed(f"{path}: no points with labels in this C3D file: export it with markers")
     unit = (_text(reader, "POINT:UNITS") or "mm").lower()
     if unit not in METRES:
         raise Malformed(f"{path}: POINT:UNITS is {unit!r}, expected one of {', '.join(METRES)}")
     frames = [points[: len(names), :4].copy() for _, points, _ in reader.read_frames(copy=False)]
+    if not frames:
+        raise Malformed(f"{path}: a header without frames: export the trial again")
     cells = np.array(frames, dtype=np.float64).reshape(-1, len(names), 4)
     first, rate_hz = int(reader.first_frame), float(reader.point_rate)
-    if rate_hz <= 0.0:
-        raise Malformed(f"{path}: POINT:RATE is {rate_hz:g} Hz")
+    if not 0.0 < rate_hz < math.inf:
+        raise Malformed(
+            f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
+        )
     numbers = np.arange(first, first + len(cells), dtype=np.int64)
     trajectories = MarkerTrajectories(
         names,

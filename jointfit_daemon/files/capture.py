@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.files.candump import RECORD_BYTES, is_candump, read_candump
 from jointfit_daemon.files.packet_capture import PCAP_MAGICS, PCAPNG_MAGIC, read_udp
+from jointfit_daemon.files.text_table import refuse_device
 from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
@@ -56,14 +57,21 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
     OSError
         The file cannot be read.
     """
+    refuse_device(path)
     data = path.read_bytes()
     if data.startswith(PCAPNG_MAGIC) or data[:4] in PCAP_MAGICS:
         if wire != "datagram":
-            raise CaptureUnreadable(f"{path}: a network capture, where a {wire} is expected")
+            raise CaptureUnreadable(
+                f"{path}: a network capture, where a {wire} is expected: name the driver of the"
+                " device that was recorded"
+            )
         return _datagrams(data, port)
     if is_candump(data):
         if wire != "can":
-            raise CaptureUnreadable(f"{path}: candump text, where a {wire} is expected")
+            raise CaptureUnreadable(
+                f"{path}: candump text, where a {wire} is expected: name the driver of the device"
+                " that was recorded"
+            )
         return read_candump(data)
     return _raw(data, wire, path)
 
@@ -81,7 +89,8 @@ def _raw(data: bytes, wire: Wire, path: Path) -> Iterator[Chunk]:
         return _pieces(data, PIECE)
     if len(data) % RECORD_BYTES:
         raise CaptureUnreadable(
-            f"{path}: neither `candump -L` text nor CAN records of {RECORD_BYTES} bytes"
+            f"{path}: neither `candump -L` text nor CAN records of {RECORD_BYTES} bytes: record"
+            " with `candump -L can0`"
         )
     return _pieces(data, PIECE // RECORD_BYTES * RECORD_BYTES)
 

@@ -55,7 +55,7 @@ class MarkerTrial:
         wanted = [self._index(name) for name in names]
         unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
         if unknown:
-            raise UnknownMarker(self._explain(unknown))
+            raise UnknownMarker(self._explain(unknown, taken=set(names)))
         return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
@@ -72,9 +72,12 @@ class MarkerTrial:
         bare = [at for at, full in enumerate(self.trajectories.names) if _bare(full) == name]
         return bare[0] if len(bare) == 1 else None
 
-    def _explain(self, unknown: Sequence[str]) -> str:
-        """Name the nearest of each, and all there are, once, where one has none near."""
-        hints = [(name, self._near(name)) for name in unknown]
+    def _explain(self, unknown: Sequence[str], taken: set[str]) -> str:
+        """Name the nearest of each, and all there are, once, where one has none near.
+
+        Markers that are asked for anyway (`taken`) are not what a misspelt name meant.
+        """
+        hints = [(name, self._near(name, taken)) for name in unknown]
         said = [
             f"no marker {name!r}" + (f": did you mean {' or '.join(near)}?" if near else "")
             for name, near in hints
@@ -83,8 +86,8 @@ class MarkerTrial:
             return "; ".join(said)
         return f"{'; '.join(said)}; there are: {', '.join(self.trajectories.names)}"
 
-    def _near(self, name: str) -> list[str]:
-        known = self.trajectories.names
+    def _near(self, name: str, taken: set[str]) -> list[str]:
+        known = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
         folded = {full.lower(): full for full in known}
         folded |= {_bare(full).lower(): _bare(full) for full in known}
         return [folded[key] for key in get_close_matches(name.lower(), folded, n=3, cutoff=_NEAR)]

@@ -16,31 +16,28 @@ segments' axes too, which are named like the world's.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
-from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
-from jointfit_daemon.files.text_table import Malformed
+from jointfit_daemon.files.text_table import Malformed, refuse_device, require_times
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
+    from zipfile import ZipInfo
 
     from numpy.typing import ArrayLike, NDArray
 
+_GIB = 1 << 30
+LARGEST = _GIB
+"""Bytes of all arrays of a file, unpacked: 15 hours of four sensors at 100 Hz."""
+_KINDS = "biufU"
+"""Kinds of arrays that are read: truth values, numbers, text (``up``)."""
 _SENSOR = "_quat"
 _BONE, _ORIGIN = "q_", "p_"
-_KINDS = "biufUS"
-"""Kinds of array elements that are read: booleans, integers, floats and text."""
-_FAULTS = (
-    BadZipFile, zlib.error, EOFError, ValueError, AttributeError, KeyError, TypeError, SyntaxError,
-    MemoryError, OverflowError, RuntimeError, SystemError, TokenError,
-)  # fmt: skip
-"""What zipfile and numpy raise on damaged archives; NotImplementedError is a RuntimeError."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +71,49 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     Malformed
-        It is none, is cut off, or holds what only Python could read.
+        It is none, is cut off, unpacks to more than `LARGEST`, or holds Python objects.
     """
-    try:
-        # numpy leaves a file open that it opened itself and cannot read
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-            arrays: dict[str, Any] = {name: found[name] for name in found.files}
-    except _FAULTS as fault:
-        raise Malformed(f"{path}: not an NPZ file, or cut off: {fault}") from fault
-    for name, array in arrays.items():
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in _KINDS:
-            found_type = getattr(array, "dtype", "no array")
-            raise Malformed(f"{path}: {name} holds {found_type}, expected numbers or text")
-    return arrays
+    refuse_device(path)
+    with path.open("rb") as file:
+        try:
+            with ZipFile(file) as archive:
+                return _arrays(path, archive)
+        except Malformed:
+            raise
+        except Exception as fault:  # zipfile and its codecs raise ten kinds for broken archives
+            raise Malformed(f"{path}: not an NPZ file, or cut off: export it again") from fault
+
+
+def _arrays(path: Path, archive: ZipFile) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an archive; never reads a pickle, never more than the members hold."""
+    members = archive.infolist()
+    unpacked = sum(member.file_size for member in members)
+    if unpacked > LARGEST:
+        raise Malformed(
+            f"{path}: {unpacked / _GIB:.1f} GiB when unpacked, at most {LARGEST / _GIB:g} GiB are"
+            " read: split the trial"
+        )
+    return {
+        member.filename.removesuffix(".npy"): _array(path, archive, member) for member in members
+    }
+
+
+def _array(path: Path, archive: ZipFile, member: ZipInfo) -> NDArray[Any]:
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, by_columns, dtype = read_header(file)
+        if dtype.kind not in _KINDS:
+            raise Malformed(
+                f"{path}: array {member.filename} holds {dtype.name} values, expected numbers:"
+                " save it without Python objects"
+            )
+        data = file.read()
+    flat = np.frombuffer(data, dtype=dtype)
+    return flat.reshape(shape, order="F" if by_columns else "C").copy()
 
 
 def read_orientations_npz(path: Path) -> OrientationTrial:
@@ -101,32 +128,49 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]
     bones = [n.removeprefix(_BONE) for n in arrays if n.startswith(_BONE)]
     if "t" not in arrays or not (names or bones):
+        found = ", ".join(arrays) or "none"
         raise Malformed(
-            f"{path}: expected arrays t and ID_quat or q_BONE, found {', '.join(arrays)}"
+            f"{path}: arrays t and ID_quat or q_BONE are missing: found {found}; rename or add them"
         )
-    try:
-        z_up = "up" in arrays and str(arrays["up"]) == "z"
-    except SystemError as fault:  # code points beyond Unicode
-        raise Malformed(f"{path}: array up: {fault}") from fault
-    for name in (*(n + _SENSOR for n in names), *(_BONE + bone for bone in bones)):
-        if arrays[name].shape[-1:] != (4,):
-            raise Malformed(f"{path}: {name} has shape {arrays[name].shape}, expected (n, 4)")
+    z_up = "up" in arrays and str(arrays["up"]) == "z"
     turn = _unit if z_up else quaternions_z_up
     move = _plain if z_up else vectors_z_up
+
+    t_s = _numbers(path, arrays, "t", None)
+    require_times(path, t_s)
+    count = len(t_s)
     return OrientationTrial(
-        np.asarray(arrays["t"], dtype=np.float64),
-        {name: turn(arrays[name + _SENSOR]) for name in names},
-        {bone: turn(arrays[_BONE + bone]) for bone in bones},
-        {bone: move(arrays[_ORIGIN + bone]) for bone in bones if _ORIGIN + bone in arrays},
+        t_s,
+        {n: turn(_numbers(path, arrays, n + _SENSOR, (count, 4))) for n in names},
+        {b: turn(_numbers(path, arrays, _BONE + b, (count, 4))) for b in bones},
+        {
+            b: move(_numbers(path, arrays, _ORIGIN + b, (count, 3)))
+            for b in bones
+            if _ORIGIN + b in arrays
+        },
     )
+
+
+def _numbers(
+    path: Path, arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, int] | None
+) -> NDArray[np.float64]:
+    """Return an array of `shape` (None: of one dimension) as numbers; `Malformed` otherwise."""
+    array = arrays[name]
+    if array.dtype.kind == "U":
+        raise Malformed(f"{path}: {name} holds text, expected numbers: save it as float64")
+    if array.shape != shape and not (shape is None and array.ndim == 1):
+        wanted = "(n,)" if shape is None else str(shape)
+        raise Malformed(
+            f"{path}: {name} has shape {array.shape}, expected {wanted}: one row for each instant"
+            " of t; gaps are NaN"
+        )
+    return array.astype(np.float64)
 
 
 def _unit(quaternions: ArrayLike) -> NDArray[np.float64]:
     found = np.asarray(quaternions, dtype=np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation is missing
-        norms = np.linalg.norm(found, axis=-1, keepdims=True)
-        usable = (norms > 0.0) & np.isfinite(norms)  # 0 0 0 0: missing
-        unit: NDArray[np.float64] = found / np.where(usable, norms, np.nan)
+    norms = np.linalg.norm(found, axis=-1, keepdims=True)
+    unit: NDArray[np.float64] = found / np.where(norms > 0.0, norms, np.nan)  # 0 0 0 0: missing
     return unit
 
 

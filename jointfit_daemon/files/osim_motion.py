@@ -134,10 +134,10 @@ def _custom(axis: Element) -> tuple[str, Array, Function]:
 def _function(element: Element) -> Function:
     kind = element.tag
     if kind == "Constant":
-        value = float(text_of(element, "value", "0"))
+        value = _scalar(element, "value", 0.0)
         return lambda q: np.full(len(q), value)
     if kind == "MultiplierFunction":
-        scale = float(text_of(element, "scale", "1"))
+        scale = _scalar(element, "scale", 1.0)
         inner = element.find("function/*")
         if inner is None:
             raise ValueError("a MultiplierFunction without a function")
@@ -149,6 +149,10 @@ def _function(element: Element) -> Function:
     if kind in {"SimmSpline", "NaturalCubicSpline", "PiecewiseLinearFunction"}:
         return _through_points(element)
     raise ValueError(f"function {kind} is not known here")
+
+
+def _scalar(element: Element, tag: str, default: float) -> float:
+    return default if element.find(tag) is None else float(numbers_of(element, tag, 1)[0])
 
 
 def _through_points(element: Element) -> Function:

@@ -13,7 +13,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from jointfit_daemon.files.text_table import Malformed
+from jointfit_daemon.files.text_table import Malformed, refuse_device
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -122,14 +122,18 @@ def read_document(path: Path) -> OsimDocument:
 
 def read_xml(path: Path) -> ET.Element:
     """Return the root of an XML file without a document type; `Malformed` otherwise."""
+    refuse_device(path)
+    if path.stat().st_size > LARGEST:
+        raise Malformed(f"{path}: more than {LARGEST} bytes, which no model has: check the path")
     data = path.read_bytes()
-    if len(data) > LARGEST:
-        raise Malformed(f"{path}: {len(data)} bytes, expected at most {LARGEST}")
     builder = ET.TreeBuilder()
     parser = expat.ParserCreate()
 
     def refuse(*_: object) -> None:
-        raise Malformed(f"{path}: has a document type declaration, which no OpenSim file has")
+        raise Malformed(
+            f"{path}: has a document type declaration, which no OpenSim file has: save the model"
+            " from OpenSim again"
+        )
 
     parser.StartDoctypeDeclHandler = refuse
     parser.StartElementHandler = builder.start
@@ -137,10 +141,15 @@ def read_xml(path: Path) -> ET.Element:
     parser.CharacterDataHandler = builder.data
     try:
         parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise Malformed(
+            f"{path}: not XML, or cut off, at line {error.lineno}, column {error.offset}: save the"
+            " model from OpenSim again"
+        ) from error
     except Malformed:
         raise
-    except (expat.ExpatError, LookupError, ValueError) as error:  # or an encoding that it lacks
-        raise Malformed(f"{path}: {error}") from error
+    except (ValueError, LookupError) as error:  # an encoding that Python does not know
+        raise Malformed(f"{path}: unknown text encoding: save the file as UTF-8") from error
     return builder.close()
 
 
@@ -151,7 +160,11 @@ def text_of(element: ET.Element, tag: str, default: str = "") -> str:
 
 def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array:
     """Return the numbers in a child's text; `ValueError` if there are others than `count`."""
-    values = np.array([float(cell) for cell in text_of(element, tag).split()])
+    try:
+        values = np.array([float(cell) for cell in text_of(element, tag).split()])
+    except ValueError:
+        values = np.array([np.nan])
+        count = count or 0  # what holds no numbers is wrong, however many were expected
     if count is not None and (values.size != count or not np.isfinite(values).all()):
         name = element.get("name", element.tag)
         raise ValueError(f"{name}: {tag} is {text_of(element, tag)!r}, expected {count} numbers")
@@ -219,5 +232,7 @@ def _coordinate(coordinate: ET.Element) -> Coordinate:
         else (-np.pi, np.pi)
     )
     locked = "true" in {text_of(coordinate, "locked"), text_of(coordinate, "prescribed")}
-    default = float(text_of(coordinate, "default_value", "0"))
+    default = 0.0
+    if coordinate.find("default_value") is not None:
+        (default,) = numbers_of(coordinate, "default_value", 1).tolist()
     return Coordinate(coordinate.get("name", ""), default, float(low), float(high), locked)

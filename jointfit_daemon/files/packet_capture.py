@@ -149,7 +149,7 @@ class _Fragments:
     """Puts the fragments of IPv4 datagrams together; what never completes is forgotten."""
 
     def __init__(self) -> None:
-        self._pending: dict[tuple[bytes, int], dict[int, tuple[bytes, bool]]] = {}
+        self._pending: dict[tuple[bytes, int], _Parts] = {}
 
     def segment(self, packet: bytes) -> bytes | None:
         """Return the UDP segment that `packet` holds or completes, if any."""
@@ -161,24 +161,36 @@ class _Fragments:
         if not more and not offset:
             return body
         key = (packet[12:20], number)
-        parts = self._pending.setdefault(key, {})
-        parts[offset] = (body, more)
+        parts = self._pending.setdefault(key, _Parts())
         if len(self._pending) > _MAX_PENDING:
             del self._pending[next(iter(self._pending))]
-        whole = _join(parts)
-        if whole is not None:
-            self._pending.pop(key, None)
-        return whole
-
-
-def _join(parts: dict[int, tuple[bytes, bool]]) -> bytes | None:
-    """Return the bytes of all fragments if there is no gap and the last one is there."""
-    whole = b""
-    for offset in sorted(parts):
-        body, more = parts[offset]
-        if offset != len(whole):
+        if not parts.add(offset, body, more=more):
             return None
-        whole += body
+        self._pending.pop(key, None)
+        return parts.join()
+
+
+class _Parts:
+    """The fragments of one datagram."""
+
+    def __init__(self) -> None:
+        self._bodies: dict[int, bytes] = {}
+        self._held = 0
+        self._end: int | None = None
+
+    def add(self, offset: int, body: bytes, *, more: bool) -> bool:
+        """Take a fragment; return whether as many bytes came as the datagram has."""
+        self._held += len(body) - len(self._bodies.get(offset, b""))
+        self._bodies[offset] = body
         if not more:
-            return whole
-    return None
+            self._end = offset + len(body)
+        return self._end is not None and self._held >= self._end
+
+    def join(self) -> bytes | None:
+        """Return the whole datagram; None if fragments overlap or do not meet."""
+        whole = bytearray()
+        for offset, body in sorted(self._bodies.items()):
+            if offset != len(whole):
+                return None
+            whole += body
+        return bytes(whole) if len(whole) == self._end else None

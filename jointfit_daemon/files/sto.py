@@ -15,7 +15,10 @@ import numpy as np
 from jointfit_daemon.files.text_table import (
     Malformed,
     cells_of,
+    number,
     read_lines,
+    refuse_vast,
+    require_times,
     rows_of_numbers,
     separator_of,
     without_trailing_blanks,
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 _ROW_KEYS = ("nrows", "datarows")
 _COLUMN_KEYS = ("ncolumns", "datacolumns")
 _QUATERNION = 4
+_SHOWN = 60  # characters of a cell in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +77,11 @@ def read_sto(path: Path) -> TimeTable:
     Raises
     ------
     Malformed
-        No ``endheader``, no column row, or a first column that is not time.
+        No ``endheader``, no column row, no rows of data, or a first column that is not time.
     """
     name, header, columns, separator, body = _open(path)
     rows = rows_of_numbers(path, body, separator, len(columns))
+    require_times(path, rows[:, 0])
     counted = {_ROW_KEYS: len(rows), _COLUMN_KEYS: len(columns)}
     doubts = tuple(
         f"{key} says {header[key]}, counted {count}"
@@ -98,24 +103,49 @@ def read_orientations_sto(path: Path) -> OrientationTable:
     """
     _, header, columns, separator, body = _open(path)
     if header.get("datatype", "").lower() != "quaternion" or separator == ",":
-        raise Malformed(f"{path}: not a table of orientations (DataType=Quaternion, tabs)")
-    times, found = [], []
+        raise Malformed(
+            f"{path}: not a table of orientations: expected DataType=Quaternion in the header and"
+            " tabs between the cells"
+        )
+    times, found, characters = [], [], 0
     for at, line in body:
         cells = without_trailing_blanks(cells_of(line, separator))
         if not cells:
             continue
-        times.append(float(cells[0]))
+        times.append(number(path, at, cells[0]))
         found.append([_quaternion(path, at, cell) for cell in cells[1 : len(columns)]])
-    rate = float(header["datarate"]) if "datarate" in header else None
-    quaternions = np.array(found, dtype=np.float64).reshape(len(times), -1, _QUATERNION)
-    return OrientationTable(columns[1:], np.array(times), quaternions, rate)
+        characters += len(line)
+    t_s = np.array(times, dtype=np.float64)
+    require_times(path, t_s)
+    refuse_vast(
+        path,
+        rows=len(found),
+        columns=_QUATERNION * (len(columns) - 1),
+        characters=characters,
+    )
+
+    quaternions = np.full((len(times), len(columns) - 1, _QUATERNION), np.nan)
+    for to, row in zip(quaternions, found, strict=True):
+        to[: len(row)] = row or np.empty((0, _QUATERNION))
+    rate_hz = number(path, 1, header["datarate"]) if "datarate" in header else None
+    return OrientationTable(columns[1:], t_s, quaternions, rate_hz)
 
 
 def _quaternion(path: Path, at: int, cell: str) -> list[float]:
+    if not cell:
+        return [np.nan] * _QUATERNION
     parts = cell.split(",")
-    if cell and len(parts) != _QUATERNION:
-        raise Malformed(f"{path}, line {at}: {cell!r} is not w,x,y,z")
-    return [float(part) for part in parts] if cell else [np.nan] * _QUATERNION
+    if len(parts) > _QUATERNION:
+        raise Malformed(
+            f"{path}, line {at}: {cell[:_SHOWN]!r} is more than w,x,y,z: if it has decimal"
+            " commas, export the table with decimal points"
+        )
+    if len(parts) != _QUATERNION:
+        raise Malformed(
+            f"{path}, line {at}: {cell[:_SHOWN]!r} is not w,x,y,z: correct the cell, or leave it"
+            " empty"
+        )
+    return [number(path, at, part) for part in parts]
 
 
 def _open(
@@ -133,13 +163,13 @@ def _open(
         if equals:
             header[key.strip().lower()] = value.strip()
     else:
-        raise Malformed(f"{path}: not a STO or MOT file (no endheader line)")
+        raise Malformed(f"{path}: not a STO or MOT file (no endheader line): export it again")
     if end + 1 >= len(lines):
-        raise Malformed(f"{path}: no column names after endheader")
+        raise Malformed(f"{path}: no column names after endheader: export it again")
     separator = separator_of(lines[end + 1])
     columns = tuple(without_trailing_blanks(cells_of(lines[end + 1], separator)))
     if not columns or columns[0].lower() != "time":
-        raise Malformed(f"{path}, line {end + 2}: the first column must be time")
+        raise Malformed(f"{path}, line {end + 2}: the first column must be called time: name it so")
     body = enumerate(lines[end + 2 :], start=end + 3)
     return lines[0].rstrip(", \t"), header, columns, separator, body
 

@@ -1,7 +1,8 @@
 """Rows of numbers in text files, whoever wrote them: tab, comma or blanks between cells.
 
-Law: an empty cell, or anything that spells "not a number", is missing (NaN). Declared counts are
-hints: real files carry wrong ones, so rows are counted, never believed.
+Invariants: every fault of a file is `Malformed`; memory grows with the size of the file, whatever
+its header claims. An empty cell, or anything that spells "not a number", is missing (NaN). Declared
+counts are hints: real files carry wrong ones, so rows are counted, never believed.
 """
 
 from __future__ import annotations
@@ -17,6 +18,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+_CELLS_PER_CHARACTER = 16
+_FEW_CELLS = 1_000_000
+"""Tables up to this size may have rows that are mostly missing; larger ones must hold data."""
+_SHOWN = 40  # characters of a cell in a message
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+
 DIGITS = 8
 """Significant digits of what is written."""
 
@@ -26,8 +33,32 @@ class Malformed(ValueError):  # noqa: N818 - named for what happened
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file without their ends; bytes that are no UTF-8 are replaced."""
-    return path.read_text(encoding="utf-8", errors="replace").splitlines()
+    """Return the lines of a text file without their ends; bytes that are no UTF-8 are replaced.
+
+    A byte order mark is left out.
+
+    Raises
+    ------
+    Malformed
+        A device instead of a file, or UTF-16.
+    """
+    refuse_device(path)
+    data = path.read_bytes()
+    if data.startswith(_UTF_16):
+        raise Malformed(f"{path}: is UTF-16 text, expected UTF-8: save it as UTF-8")
+    return data.decode("utf-8-sig", errors="replace").splitlines()
+
+
+def refuse_device(path: Path) -> None:
+    """Refuse devices and sockets, which may never end.
+
+    Raises
+    ------
+    Malformed
+        `path` is one.
+    """
+    if path.is_char_device() or path.is_block_device() or path.is_socket():
+        raise Malformed(f"{path}: is a device or a socket, expected a file: check the path")
 
 
 def separator_of(line: str) -> str | None:
@@ -50,9 +81,60 @@ def without_trailing_blanks(cells: Sequence[str]) -> list[str]:
     return list(cells[:end])
 
 
-def number(cell: str) -> float:
-    """Return the number in a cell; NaN if it is empty or says so."""
-    return float(cell) if cell else math.nan
+def number(path: Path, at: int, cell: str) -> float:
+    """Return the number in a cell of line `at`; NaN if it is empty or says so.
+
+    Raises
+    ------
+    Malformed
+        It is none; a decimal comma is named as such.
+    """
+    try:
+        return float(cell) if cell else math.nan
+    except ValueError:
+        shown = cell if len(cell) <= _SHOWN else f"{cell[:_SHOWN]}…"
+        remedy = "correct the cell, or leave it empty"
+        if "," in cell and _is_number(cell.replace(",", ".", 1)):
+            remedy = "it has a decimal comma: export the table with decimal points"
+        raise Malformed(f"{path}, line {at}: {shown!r} is no number: {remedy}") from None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def refuse_vast(path: Path, *, rows: int, columns: int, characters: int) -> None:
+    """Refuse a table that would take far more memory than its file.
+
+    Raises
+    ------
+    Malformed
+        Nearly all cells are missing.
+    """
+    if rows * columns > max(_FEW_CELLS, _CELLS_PER_CHARACTER * characters):
+        raise Malformed(
+            f"{path}: {rows} rows for {columns} columns, nearly all of them empty: does the row of"
+            " names belong to this table?"
+        )
+
+
+def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
+    """Refuse a table without rows, or with a time that is missing.
+
+    Raises
+    ------
+    Malformed
+        Either is so.
+    """
+    if not len(t_s):
+        raise Malformed(f"{path}: a header without rows of data: export the trial again")
+    if not np.isfinite(t_s).all():
+        row = int(np.argmin(np.isfinite(t_s))) + 1
+        raise Malformed(f"{path}: row {row} of the data has no time: correct it, or leave it out")
 
 
 def rows_of_numbers(
@@ -74,19 +156,21 @@ def rows_of_numbers(
     Raises
     ------
     Malformed
-        A cell is neither empty nor a number.
+        A cell is neither empty nor a number; nearly all cells are missing.
     """
     rows: list[list[float]] = []
+    characters = 0
     for at, line in lines:
         cells = cells_of(line, separator)[:width]
-        if not any(cells):
-            continue
-        try:
-            row = [number(cell) for cell in cells]
-        except ValueError as error:
-            raise Malformed(f"{path}, line {at}: {error}") from error
-        rows.append(row + [math.nan] * (width - len(row)))
-    return np.array(rows, dtype=np.float64).reshape(-1, width)
+        if any(cells):
+            rows.append([number(path, at, cell) for cell in cells])
+            characters += len(line)
+    refuse_vast(path, rows=len(rows), columns=width, characters=characters)
+
+    table = np.full((len(rows), width), np.nan)
+    for to, row in zip(table, rows, strict=True):
+        to[: len(row)] = row
+    return table
 
 
 def written(value: float) -> str:

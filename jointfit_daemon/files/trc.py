@@ -14,6 +14,7 @@ rows::
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,9 @@ import numpy as np
 from jointfit_daemon.files.text_table import (
     Malformed,
     cells_of,
+    number,
     read_lines,
+    require_times,
     rows_of_numbers,
     separator_of,
     without_trailing_blanks,
@@ -35,6 +38,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEADER_ROWS = 5
+_MOST_FRAMES = 2.0**53
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Units of length that marker files use."""
 _KEYS = (
@@ -68,37 +72,45 @@ def read_trc(path: Path) -> MarkerTrajectories:
     Raises
     ------
     Malformed
-        Not a TRC file, or a unit that is no length.
+        Not a TRC file, one without markers or rows, or a unit that is no length.
     """
     lines = read_lines(path)
     if len(lines) < _HEADER_ROWS or not lines[0].startswith("PathFileType"):
-        raise Malformed(f"{path}: not a TRC file (its first cell must be PathFileType)")
+        raise Malformed(
+            f"{path}: not a TRC file (its first cell must be PathFileType): export it again"
+        )
     separator = separator_of(lines[3])
-    header = _header(path, lines)
+    header, rate_hz = _header(path, lines)
     names = tuple(without_trailing_blanks(cells_of(lines[3], separator))[2::3])
+    if not names:
+        raise Malformed(f"{path}, line 4: no marker names after Frame# and Time: export it again")
     body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)
     rows = rows_of_numbers(path, body, separator, 2 + 3 * len(names))
     unit = header.get("Units", "mm").lower()
     if unit not in METRES:
         raise Malformed(f"{path}: Units is {unit!r}, expected one of {', '.join(METRES)}")
+    require_times(path, rows[:, 1])
+    if not (np.abs(rows[:, 0]) < _MOST_FRAMES).all():
+        raise Malformed(f"{path}: the first column must hold frame numbers: export it again")
     return MarkerTrajectories(
         names,
         rows[:, 1],
         np.clip(np.nan_to_num(rows[:, 0]), -_MOST_FRAMES, _MOST_FRAMES).astype(np.int64),
         rows[:, 2:].reshape(-1, len(names), 3) * METRES[unit],
-        float(header["DataRate"]),
+        rate_hz,
         _doubts(header, rows=len(rows), markers=len(names)),
     )
 
 
-def _header(path: Path, lines: list[str]) -> dict[str, str]:
+def _header(path: Path, lines: list[str]) -> tuple[dict[str, str], float]:
+    """Return the values by key, and the rate, Hz."""
     separator = separator_of(lines[1])
     header = dict(zip(cells_of(lines[1], separator), cells_of(lines[2], separator), strict=False))
-    try:
-        float(header["DataRate"])
-    except (KeyError, ValueError) as error:
-        raise Malformed(f"{path}, line 3: no DataRate: {error}") from error
-    return header
+    rate_hz = number(path, 3, header.get("DataRate", ""))
+    if not 0.0 < rate_hz < math.inf:
+        found = header.get("DataRate", "missing")
+        raise Malformed(f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)")
+    return header, rate_hz
 
 
 def _doubts(header: dict[str, str], *, rows: int, markers: int) -> tuple[str, ...]:
