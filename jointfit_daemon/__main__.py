@@ -74,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jointfitd",
         description="Reads IMUs and motion capture, publishes joint angles over MQTT.",
+        epilog="Exit codes: 0 stopped as asked, 1 a bug, 2 wrong options or rig.toml.",
     )
     parser.add_argument("--config", type=Path, required=True, metavar="rig.toml", help="the rig")
     parser.add_argument("--check", action="store_true", help="check the rig and end")

@@ -18,6 +18,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from jointfit_daemon.outputs.broker_faults import broker_fault
 from jointfit_daemon.outputs.mqtt_secrets import password_of
 from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context, tls_remedy
 from jointfit_daemon.outputs.packet_limit import PacketLimitSocket
@@ -145,7 +146,8 @@ class MqttConnection:
                 stop_if_cancelled()
         except aiomqtt.MqttError as error:
             self._client.abandon()
-            raise BrokerLost(f"{self._place()}: {error}{self._hint(error)}") from error
+            why = f"{broker_fault(error)}{self._hint(error)}"
+            raise BrokerLost(f"{self._place()}: {why}") from error
         except BaseException:
             self._client.abandon()
             raise
@@ -247,9 +249,10 @@ class MqttConnection:
             try:
                 message = await anext(arriving)
             except aiomqtt.MqttError as error:
-                raise BrokerLost(f"{self._place()}: {error.__cause__ or error}") from error
+                why = broker_fault(error.__cause__ or error)
+                raise BrokerLost(f"{self._place()}: {why}") from error
             except OSError as error:  # what the reader met
-                raise BrokerLost(f"{self._place()}: {error}") from error
+                raise BrokerLost(f"{self._place()}: {broker_fault(error)}") from error
             stop_if_cancelled()
             yield Incoming(
                 message.topic.value,

@@ -126,9 +126,16 @@ def reduce(
         )
     template = template @ _own_axes(template)
     poses, rms = _poses(template, seen)
+    if not visible(poses.t).any():
+        raise Unanswerable(
+            f"--parent: {', '.join(parent)} are not rigid in any frame (more than"
+            f" {1000 * MAX_FIT_RMS_M:g} mm RMS off their shape): name markers of one segment"
+        )
     other = None
     if len(markers) >= MIN_MARKERS and visible(child).all(axis=1).any():
-        shape = np.nanmedian(child - np.nanmean(child, axis=1, keepdims=True), axis=0)
+        seen_at_all = child[visible(child).any(axis=1)]
+        middle = np.nanmean(seen_at_all, axis=1, keepdims=True)
+        shape = np.nanmedian(seen_at_all - middle, axis=0)
         other = None if is_line(shape) else _poses(moving_template(child), child)[0]
     movement = Movement(poses.to_body(child), poses, other, template, interval=interval)
     return Reduced(movement, rms, poses, np.eye(3))

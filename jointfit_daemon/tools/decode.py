@@ -88,6 +88,11 @@ def decode(
             sys.stdout.buffer.write(row + b"\n")
     if jsonl and not summary:
         return
+    if not decoder.messages and not summary:
+        raise ValueError(
+            f"{file}: nothing in it is of the protocol {protocol}, or it is empty: name the driver"
+            " of the recorded device; CAN ids and other settings are given with --set"
+        )
     found = _found(decoder, counts)
     if summary:
         typer.echo(orjson.dumps(found))
@@ -112,8 +117,6 @@ def _cell(value: object) -> str:
 
 def _remark(found: Mapping[str, object]) -> str | None:
     """Return what a table of zeros means."""
-    if not found["messages"]:
-        return "nothing in the file is of this protocol, or the file is empty"
     if not found["quaternions"]:
         return "no message holds an orientation: the device was not set to send quaternions"
     return None

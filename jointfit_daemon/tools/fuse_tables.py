@@ -121,7 +121,9 @@ def _refuse_other_times(path: Path, t_s: Array) -> None:
 def sensors_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Array]:
     """Return the sensors of a table; `Unusable` names who is not there, or says nothing at all."""
     if missing := [name for name in names if name not in table.q]:
-        raise Unusable(f"{path}: {'; '.join(unknown('sensor', n, table.q) for n in missing)}")
+        free = [name for name in table.q if name not in names]
+        said = "; ".join(unknown("sensor", name, table.q, free) for name in missing)
+        raise Unusable(f"{path}: {said}")
     silent = [name for name in names if not np.isfinite(table.q[name]).all(axis=1).any()]
     if silent:
         raise Unusable(
@@ -142,9 +144,17 @@ def bones_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Array]
     return {name: table.bones[name] for name in names}
 
 
-def unknown(what: str, name: str, known: Sequence[str] | Mapping[str, object]) -> str:
-    """Say that a name is not there, with the nearest that is."""
-    folded = {other.casefold(): other for other in known}
+def unknown(
+    what: str,
+    name: str,
+    known: Sequence[str] | Mapping[str, object],
+    free: Sequence[str] | None = None,
+) -> str:
+    """Return a sentence that a name is not there, with the nearest that is.
+
+    `free` are the names that are not asked for already: only these can have been meant.
+    """
+    folded = {other.casefold(): other for other in (known if free is None else free)}
     near = get_close_matches(name.casefold(), list(folded), n=1)
     hint = f"did you mean {folded[near[0]]!r}? " if near else ""
     return f"no {what} {name!r}; {hint}there are: {', '.join(known) or 'none'}"

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import math
 import os
 import selectors
 import signal
@@ -65,7 +66,9 @@ COMMANDS = """commands, one a line on standard input:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="jointfit-sim", description="Virtual hardware: a moving leg as real bytes."
+        prog="jointfit-sim",
+        description="Virtual hardware: a moving leg as real bytes.",
+        epilog="Exit codes: 0 stopped as asked, 1 a bug, 2 wrong options, files or ports.",
     )
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("knobs", help="list every knob with its default")
@@ -127,6 +130,8 @@ def _knobs(options: argparse.Namespace) -> Knobs:
     knobs = knobs_from_toml(options.knobs) if options.knobs else Knobs()
     if options.perfect:
         knobs = perfect(knobs)
+    if options.rate is not None and not 0.0 < options.rate < math.inf:
+        raise ValueError(f"--rate {options.rate:g}: expected samples a second above 0")
     named = {"rate_hz": options.rate, "seed": options.seed}
     settings = [f"{name}={value}" for name, value in named.items() if value is not None]
     return turn(knobs, settings + options.settings)
@@ -137,13 +142,34 @@ def _subject(options: argparse.Namespace, knobs: Knobs) -> Subject:
     if options.trial:
         recording = read_recording(options.trial)
         return Replayed(recording, SENSORS, steps, transition_s=knobs.transition_s)
-    files = dict(_pairs(options.motion))
+    files = dict(_pairs("--motion", options.motion))
     return Wearer(knobs, steps, motion_files={name: Path(path) for name, path in files.items()})
 
 
-def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
+def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
     """Split ``A=B`` words; ValueError for one that is none."""
-    return [(a, b) for a, b in (word.split("=", 1) for word in words)]
+    found = [word.partition("=") for word in words]
+    if wrong := [a for a, equals, _ in found if not equals]:
+        raise ValueError(f"{option} {wrong[0]}: expected two parts, A=B: see --help")
+    return [(a, b) for a, _, b in found]
+
+
+def _clock(name: str, text: str) -> ClockFault:
+    try:
+        return ClockFault.parse(text)
+    except ValueError as error:
+        raise ValueError(
+            f"--clock {name}={text}: expected numbers, PPM or PPM,UP_S, as in {name}=50"
+        ) from error
+
+
+def _due(at_s: str, command: str) -> tuple[float, str]:
+    try:
+        return float(at_s), command
+    except ValueError as error:
+        raise ValueError(
+            f"--at {at_s}={command}: expected seconds before the command, as in 12.5=quit"
+        ) from error
 
 
 def _say(line: dict[str, object]) -> None:
@@ -192,8 +218,8 @@ async def _play(options: argparse.Namespace) -> None:
         mocap=not options.no_mocap,
         can=options.can,
         rig=rig,
-        clocks={name: ClockFault.parse(text) for name, text in _pairs(options.clock)},
-        script=tuple((float(at_s), command) for at_s, command in _pairs(options.at)),
+        clocks={name: _clock(name, text) for name, text in _pairs("--clock", options.clock)},
+        script=tuple(_due(*pair) for pair in _pairs("--at", options.at)),
         sync_line=options.sync_line,
         ptp=options.ptp,
         sample_log=options.sample_log,
@@ -263,7 +289,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 0
             with asyncio.Runner(loop_factory=_punctual_loop) as runner:
                 runner.run(_play(options))
-        except (ValueError, UnknownMotion, OSError) as error:
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            why = error.strerror or error
+            print(f"jointfit-sim: {where}{why}: check the path", file=sys.stderr)
+            return USAGE
+        except (ValueError, UnknownMotion) as error:
             print(f"jointfit-sim: {error}", file=sys.stderr)
             return USAGE
     return 0

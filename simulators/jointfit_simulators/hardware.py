@@ -136,7 +136,13 @@ def _bus(hardware: Hardware, knobs: Knobs, directory: Path, can: str) -> CanWire
         port = directory / "ttyCAN0"
         wire, channel = SlcanAdapter(port, wire_noise=line_noise(knobs, BUS)), str(port)
     else:
-        wire = PythonCanWire(interface, channel)
+        try:
+            wire = PythonCanWire(interface, channel)
+        except OSError as error:
+            raise ValueError(
+                f"--can {can}: cannot be opened ({error.strerror}): is the interface there, and up"
+                " (ip link)?"
+            ) from error
     hardware.ports[BUS] = channel
     hardware.tables.append(f'[can.{BUS}]\ninterface = "{interface}"\nchannel = "{channel}"\n')
     return wire

@@ -42,7 +42,10 @@ def parse_programme(text: str) -> tuple[Step, ...]:
     steps = []
     for part in text.split(","):
         name, _, seconds = part.strip().partition(":")
-        length = float(seconds) if seconds else 10.0
+        try:
+            length = float(seconds) if seconds else 10.0
+        except ValueError:
+            length = 0.0
         if not name or not length > 0:
             raise ValueError(f"programme step {part!r}: expected NAME:SECONDS, such as walk:60")
         steps.append(Step(name, length))
