@@ -75,7 +75,7 @@ class Gateway:
             elif topic == "bridge/health":
                 self.health = payload
             elif topic.endswith("/availability"):
-                online = payload == {"state": "online"}
+                online = payload == {"v": 1, "state": "online"}
                 (self.online.add if online else self.online.discard)(topic.split("/")[1])
 
     async def connected(self, settle_s: float = SETTLE_S) -> None:

@@ -75,7 +75,7 @@ class Heard:
             elif topic == "bridge/state":
                 self.running_s = self.running_s or time.monotonic()
             else:
-                there = payload == {"state": "online"}
+                there = payload == {"v": 1, "state": "online"}
                 (self.online.add if there else self.online.discard)(topic.split("/")[1])
 
 

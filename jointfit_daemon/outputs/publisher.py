@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-ONLINE, OFFLINE = b'{"state":"online"}', b'{"state":"offline"}'
+ONLINE, OFFLINE = b'{"v":1,"state":"online"}', b'{"v":1,"state":"offline"}'
 ECHO_S = 5.0  # own "online" comes back within this, or the broker does not let it pass
 REQUEST_RATE_HZ = 10.0
 """Requests handed on a second; a person sends one in several seconds."""

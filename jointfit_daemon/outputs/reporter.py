@@ -138,7 +138,7 @@ class Reporter:
     def reply(self, reply: Reply, response_topic: str | None, correlation: bytes | None) -> None:
         """Answer one request, where it wants the answer or on ``bridge/response/COMMAND``."""
         topic = response_topic or f"{self._base}/bridge/response/{reply.command}"
-        said = {"transaction": reply.transaction, "status": reply.status}
+        said = {"v": PAYLOAD_VERSION, "transaction": reply.transaction, "status": reply.status}
         payload = encode(said | {"data": reply.data, "error": reply.error})
         self._outbox.event(topic, payload, correlation=correlation)
 
@@ -175,6 +175,13 @@ def _info(rig: Rig) -> dict[str, Any]:
             for source in rig.sources
         },
         "quaternions": "Hamilton, scalar first, segment to world",
-        "world": "east, north, up; metres",
+        "world": _world(rig),
         "pose_bin": None,
     }
+
+
+def _world(rig: Rig) -> str:
+    """Return in words which axes positions and orientations refer to."""
+    if any(source.kind == "mocap" for source in rig.sources):
+        return "z up; x, y and origin of the motion capture, once calibrated with it; metres"
+    return "z up; x east and y north, where the sensors know north; metres"

@@ -329,8 +329,10 @@ class CalibrationSession:
         quality = result.get("quality", {})
         if kind == "align":
             self._alignment = result["alignment"]
-            said = self._tell(t_ns, "aligned", "worlds aligned", quality)
+            said = self._tell(t_ns, "aligned", "worlds aligned", {"alignment": quality})
             return [*_notes(t_ns, kind, result["alignment"].get("notes", ())), said]
+        if kind == "static":
+            quality = {"static": quality}
         if "calibration" not in result:
             return [self._tell(t_ns, "posed", "static pose taken", quality)]
         keep = result.get("worse")

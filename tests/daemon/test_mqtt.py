@@ -353,7 +353,7 @@ async def test_a_client_gets_the_answer_to_its_own_request(broker: Broker) -> No
         assert reply["data"]["phase"] == "static"
         await client.subscribe("bridge/state")
         async with asyncio.timeout(5):
-            assert await anext(client.messages()) == ("bridge/state", {"state": "online"})
+            assert await anext(client.messages()) == ("bridge/state", {"v": 1, "state": "online"})
 
 
 async def test_a_client_that_nobody_answers_says_so(broker: Broker) -> None:

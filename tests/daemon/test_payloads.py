@@ -221,8 +221,8 @@ async def test_devices_are_absent_until_heard_and_cleared_when_gone(
     reporter.handle(DeviceStatus("S1", online=True))
     reporter.handle(DeviceInfo("S2", {"model": "fake"}))
     found = await sent(outbox)
-    assert found["device/S1/availability"] == [{"state": "online"}]
-    assert found["device/S2/availability"] == [{"state": "offline"}]
+    assert found["device/S1/availability"] == [{"v": 1, "state": "online"}]
+    assert found["device/S2/availability"] == [{"v": 1, "state": "offline"}]
     assert found["device/S2/info"] == [{"v": 1, "model": "fake"}]
     del table["imu"][1]
     reporter.configure(parse_rig(rig_table(table)))
@@ -269,6 +269,7 @@ async def test_an_answer_goes_where_the_caller_wants_it(
     own, _ = await outbox.next()
     assert usual.topic == "b/bridge/response/calibrate"
     assert orjson.loads(usual.payload) == {
-        "transaction": "7", "status": "accepted", "data": {"phase": "static"}, "error": None,
+        "v": 1, "transaction": "7", "status": "accepted", "data": {"phase": "static"},
+        "error": None,
     }  # fmt: skip
     assert (own.topic, own.correlation, own.expiry_s) == ("my/answers", b"9", 30)

@@ -306,7 +306,7 @@ async def test_a_reload_to_another_base_takes_the_retained_state_along(
             found = {}
             async for topic, payload in client.messages():
                 found[topic] = payload
-                if len(found) == 4 and found["bridge/state"] == {"state": "online"}:
+                if len(found) == 4 and found["bridge/state"] == {"v": 1, "state": "online"}:
                     break
     assert found["calibration"]["phase"] == "uncalibrated"
 
@@ -323,7 +323,7 @@ async def test_requests_are_answered_once_and_all_their_faults_told(
         await client.subscribe("bridge/state")
         async with asyncio.timeout(5):
             async for _, state in client.messages():
-                if state == {"state": "online"}:
+                if state == {"v": 1, "state": "online"}:
                     break
         await asyncio.sleep(0.3)
         good = await client.request("calibrate", {"phase": "static", "seconds": 3.0})

@@ -85,7 +85,7 @@ class Listener:
         return {
             topic.split("/")[1]
             for topic, payload in self.latest.items()
-            if topic.endswith("/availability") and payload == {"state": "online"}
+            if topic.endswith("/availability") and payload == {"v": 1, "state": "online"}
         }
 
     def said(self, device: str, *parts: str) -> dict[str, Any] | None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.system
 
 EVERYONE = {*SENSORS, "mocap"}
-OFFLINE, ONLINE = {"state": "offline"}, {"state": "online"}
+OFFLINE, ONLINE = {"v": 1, "state": "offline"}, {"v": 1, "state": "online"}
 
 
 async def retained(port: int, count: int) -> dict[str, Any]:

@@ -94,7 +94,9 @@ def test_a_rig_with_a_key_takes_signed_requests_only(machine: None, key: bytes) 
         )
     )
     run("systemctl", "start", UNIT)
-    eventually(lambda: messages("bridge/state", seconds=2) == [{"state": "online"}], "online")
+    eventually(
+        lambda: messages("bridge/state", seconds=2) == [{"v": 1, "state": "online"}], "online"
+    )
     refused = answer("calibrate", phase="abort")
     assert refused["error"]["key"] == "signature"
     request = signed({"phase": "abort", "transaction": "1"})

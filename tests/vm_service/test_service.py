@@ -46,7 +46,7 @@ def missing() -> set[str]:
 
 
 def online() -> bool:
-    return messages("bridge/state", seconds=2) == [{"state": "online"}]
+    return messages("bridge/state", seconds=2) == [{"v": 1, "state": "online"}]
 
 
 def test_installing_gives_a_rig_to_edit_and_starts_nothing() -> None:
@@ -108,7 +108,7 @@ def test_a_start_is_ready_at_once_and_a_stop_takes_less_than_three_seconds(since
     run("systemctl", "stop", UNIT)
     assert time.monotonic() - began < 3.0 * slowness()
     assert show("Result") == "success"
-    assert messages("bridge/state", seconds=2) == [{"state": "offline"}]
+    assert messages("bridge/state", seconds=2) == [{"v": 1, "state": "offline"}]
 
 
 def test_a_hung_daemon_is_killed_by_the_watchdog_and_starts_again(service: int, since: str) -> None:
