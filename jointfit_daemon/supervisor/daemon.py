@@ -12,6 +12,7 @@ this file moves them.
     recording        writes the event log                              when the disk is full
     fit KIND         one calibration fit in a worker process           with its result
     store            writes one calibration                            when it is on disk
+    state check      tries to write to the state directory             when it has
     reload           reads rig.toml again on SIGHUP                    never
 """
 
@@ -23,6 +24,7 @@ import logging
 import math
 import signal
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import ConfigError, load_rig
@@ -52,7 +54,7 @@ from jointfit_daemon.supervisor.process import ProcessWatch
 from jointfit_daemon.supervisor.request_guard import RequestGuard
 from jointfit_daemon.supervisor.requests import reply_correlation, reply_topic, request_of
 from jointfit_daemon.supervisor.sources import SourceTasks, stop
-from jointfit_daemon.supervisor.state_directory import state_directory
+from jointfit_daemon.supervisor.state_directory import state_directory, writing_fault
 from jointfit_daemon.supervisor.status import Pace, Seen, phase_of, status_line
 from jointfit_daemon.supervisor.storing import StoreRunner
 from jointfit_daemon.supervisor.systemd import SystemdNotifier
@@ -105,12 +107,15 @@ class Daemon:
         self._online: set[str] = set()
         self._version: int | None = None
         """Of the calibration in force, as logged last."""
+        self._state_fault: str | None = None
+        self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
         self._hung_up = asyncio.Event()
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._fits: FitRunner
         self._stores: StoreRunner
+        self._state_check: asyncio.Task[None]
         self._mqtt: asyncio.Task[None]
         self._use_broker(rig)
 
@@ -152,6 +157,7 @@ class Daemon:
                     await asyncio.Event().wait()
                 finally:
                     self._systemd.stopping()
+                    self._stores.stop()
                     await self._sources.stop()
                     await self._link.emptied(FAREWELL_S)  # that the devices went, among others
         finally:
@@ -161,10 +167,9 @@ class Daemon:
     async def _start(self, tasks: asyncio.TaskGroup) -> None:
         self._sources = SourceTasks(tasks, self._heart.feed)
         self._fits = FitRunner(tasks, self._heart.feed)
-        self._stores = StoreRunner(
-            tasks, self._heart.feed, lambda text: self._tell("calibration", text, "error")
-        )
+        self._stores = StoreRunner(tasks, self._heart.feed, self._tell_not_stored)
         self._open_log(tasks)
+        self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
         self._configure(self._rig)
         tasks.create_task(self._heart.run(), name="core time")
@@ -193,6 +198,30 @@ class Daemon:
             log.info("recording events in %s", self._heart.log.path)
             tasks.create_task(self._heart.log.run(), name="recording")
 
+    async def _check_state(self) -> None:
+        """Report a state directory that cannot be written before a calibration needs it."""
+        folder = state_directory() / "calibrations"
+        before, fault = self._state_fault, await asyncio.to_thread(writing_fault, folder)
+        self._state_fault = fault
+        if fault is not None:
+            self._tell(
+                "state",
+                f"state directory cannot be written: {fault}. A calibration will be used and "
+                "published, but a restart forgets it: check the mount, rights and free space, or "
+                "set STATE_DIRECTORY",
+                "error",
+            )
+        elif before is not None:
+            self._tell("state", "state directory can be written again")
+        self._stores.retry()
+
+    def _tell_not_stored(self, text: str) -> None:
+        if self._calibration is None:
+            self._tell("calibration", text, "error")
+        else:
+            now_ns = time.monotonic_ns()
+            self._send(replace(self._calibration, t_ns=now_ns, text=text, level="error"))
+
     def _log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
         self._reporter.log_line(level, name, text, suppressed)
 
@@ -218,6 +247,7 @@ class Daemon:
                 extra = about(output.kind, output.id)
                 log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=extra)
             case CalibrationStatus():
+                self._calibration = output
                 self._log_calibration(output)
             case DeviceStatus():
                 self._came_or_went(output)
@@ -249,6 +279,10 @@ class Daemon:
                 self._answer(request)
             else:
                 self._heart.feed(request)
+                if self._state_check.done():  # one at a time, however many requests come
+                    self._state_check = self._tasks.create_task(
+                        self._check_state(), name="state check"
+                    )
         finally:
             self._asking = None
 
@@ -293,6 +327,7 @@ class Daemon:
         health = self._heart.core.health(time.monotonic_ns())
         health["process"] = self._process.figures()
         health["link"] = self._link.figures() | {"noise": self._noise.dropped}
+        health["state"] = {"fault": self._state_fault, "not_stored": self._stores.fault}
         if self._heart.log is not None:
             health["recording"] = self._heart.log.figures()
         self._reporter.health(health)
@@ -341,6 +376,7 @@ class Daemon:
         self._online &= {source.id for source in rig.sources}
         await self._stores.settle()  # else the store would not have what is in force
         self._configure(rig)
+        await self._check_state()
         await self._sources.apply(rig.sources)
         log.info("%s: reloaded, %d sources", rig.name, len(rig.sources))
 

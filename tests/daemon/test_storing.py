@@ -11,8 +11,15 @@ import pytest
 
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.config import Rig, parse_rig
-from jointfit_daemon.pipeline.events import CalibrationReady, CalibrationStored, Configured, Request
-from jointfit_daemon.supervisor import calibrations
+from jointfit_daemon.outputs.mqtt import Incoming
+from jointfit_daemon.pipeline.events import (
+    CalibrationReady,
+    CalibrationStatus,
+    CalibrationStored,
+    Configured,
+    Request,
+)
+from jointfit_daemon.supervisor import calibrations, storing
 from jointfit_daemon.supervisor.daemon import Daemon
 from jointfit_daemon.supervisor.storing import StoreRunner
 from tests.calibration.plain_calibration import plain_calibration
@@ -104,7 +111,10 @@ class ReadyCore:
 
     def feed(self, event: Event) -> list[Output]:
         self.events.append(event)
-        return [CalibrationReady(self.calibration)] if isinstance(event, Request) else []
+        if isinstance(event, Request) and not event.arguments:
+            status = CalibrationStatus(event.t_ns, "calibrated", "calibrated")
+            return [CalibrationReady(self.calibration), status]
+        return []
 
     def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
         return {"devices": {}, "frames": {}}
@@ -129,6 +139,67 @@ async def test_a_reload_while_a_calibration_is_written_finds_it(
     configured = [event for event in core.events if isinstance(event, Configured)]
     assert configured[-1].calibration is not None
     assert configured[-1].calibration_version == 1
+
+
+async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_stored_later(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    blocked = tmp_path / "blocked"
+    blocked.write_text("")
+    monkeypatch.setenv("STATE_DIRECTORY", str(blocked / "state"))
+    core = ReadyCore(calibration_of(rig, "new"))
+    daemon = Daemon(tmp_path / "rig.toml", rig, core)
+    running = asyncio.create_task(daemon.run())
+    async with asyncio.timeout(20):
+        while "state directory cannot be written" not in caplog.text:
+            await asyncio.sleep(0.01)
+        assert f"{blocked}/state/calibrations: Not a directory" in caplog.text
+
+        daemon._heart.feed(Request(1, "calibrate", "t", {}))
+        while daemon._stores.fault is None:
+            await asyncio.sleep(0.01)
+        published = daemon._outbox.retained
+        assert b"in force but not stored" in published["jointfit/bench-1/calibration"]
+        daemon._tell_health()
+        assert b'"not_stored":"' in daemon._outbox.retained["jointfit/bench-1/bridge/health"]
+
+        blocked.unlink()
+        daemon._asked(Incoming("x/calibrate", b'{"phase":"abort"}', retained=False))
+        while not any(isinstance(event, CalibrationStored) for event in core.events):
+            await asyncio.sleep(0.01)
+    assert "can be written again" in caplog.text
+    running.cancel()
+    await asyncio.wait([running])
+    found = calibrations.stored(rig).calibration
+    assert found is not None
+    assert found.notes == ("new",)
+
+
+async def test_what_could_not_be_written_is_tried_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(storing, "RETRY_S", 0.05)
+    save, failures = calibrations.save, ["disk full", "disk full", "gone"]
+
+    def failing(*given: Any) -> int:
+        if failures:
+            raise OSError(failures.pop(0))
+        return save(*given)
+
+    monkeypatch.setattr(calibrations, "save", failing)
+    events: list[Event] = []
+    complaints: list[str] = []
+    async with asyncio.TaskGroup() as tasks, asyncio.timeout(5):
+        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner.start(rig, calibration_of(rig, "new"))
+        while not events:
+            await asyncio.sleep(0.01)
+    assert [complaint.split(": ")[1] for complaint in complaints] == [
+        "disk full; tried again every 0.05 s", "gone; tried again every 0.05 s",
+    ]  # fmt: skip
+    found = runner.found(rig)
+    assert (found.version, found.complaints) == (1, ())
 
 
 @pytest.mark.parametrize(
