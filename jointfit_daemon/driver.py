@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, cast
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from jointfit_daemon.model import Chunk
 
@@ -29,6 +29,10 @@ Emit = Callable[[Chunk], None]
 
 Wire = Literal["stream", "datagram", "can"]
 """How chunks are cut: any cut of a byte stream, one datagram each, or runs of CAN records."""
+
+
+SLOWEST_BAUD, FASTEST_BAUD = 300, 12_000_000
+"""Speeds of serial ports, baud; no adapter is faster."""
 
 
 class DeviceLost(Exception):  # noqa: N818 - named for what happened, as CONVENTIONS.md asks
@@ -50,6 +54,23 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+_SLCAN_BITRATES = (
+    10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
+)  # fmt: skip
+_LONGEST_INTERFACE = 15  # bytes: IFNAMSIZ of the kernel, less its NUL
+NO_INTERFACE = (
+    "expected the name of a network interface, as `ip link` shows it: up to "
+    f"{_LONGEST_INTERFACE} bytes without slash or space"
+)
+
+
+def is_interface_name(name: str) -> bool:
+    """Return whether the kernel allows `name` for a network interface."""
+    if name in {"", ".", ".."} or any(letter in "/:" or letter.isspace() for letter in name):
+        return False
+    return len(name.encode()) <= _LONGEST_INTERFACE
+
+
 class CanBusSettings(Settings):
     """One ``[can.NAME]`` table: a bus that several devices may share."""
 
@@ -60,13 +81,39 @@ class CanBusSettings(Settings):
         "socketcan", description="python-can interface, or `slcan` (our own codec)"
     )
     channel: str = Field(description="`can0`, or the serial port of an SLCAN adapter")
-    bitrate: int = Field(1_000_000, gt=0, description="bit/s; ignored where the kernel set it")
-    baud: int = Field(115_200, gt=0, description="speed of an SLCAN adapter's serial port, baud")
+    bitrate: int = Field(
+        1_000_000, ge=10_000, le=1_000_000, description="bit/s; ignored where the kernel set it"
+    )
+    baud: int = Field(
+        115_200,
+        ge=SLOWEST_BAUD,
+        le=FASTEST_BAUD,
+        description="speed of an SLCAN adapter's serial port, baud",
+    )
     transport: Literal["usb", "uart"] = Field(
         "usb",
         description="what an SLCAN adapter's port is: on `usb` bytes take no time, whatever `baud` "
         "says; on a real `uart` stamps are back-dated by the bytes that came, at `baud`",
     )
+
+    @field_validator("channel")
+    @classmethod
+    def _channel_that_can_exist(cls, channel: str, info: ValidationInfo) -> str:
+        """Refuse what no kernel interface can be called."""
+        if not channel:
+            raise ValueError("must not be empty")
+        if info.data.get("interface") == "socketcan" and not is_interface_name(channel):
+            raise ValueError(f'{NO_INTERFACE}; a serial adapter needs interface = "slcan"')
+        return channel
+
+    @field_validator("bitrate")
+    @classmethod
+    def _bitrate_of_the_adapter(cls, bitrate: int, info: ValidationInfo) -> int:
+        """Refuse what an SLCAN adapter has no command for."""
+        if info.data.get("interface") == "slcan" and bitrate not in _SLCAN_BITRATES:
+            known = ", ".join(map(str, _SLCAN_BITRATES))
+            raise ValueError(f"no such bit rate in SLCAN: expected one of {known}")
+        return bitrate
 
 
 class ImuSettings(Settings):
@@ -90,6 +137,16 @@ class ImuSettings(Settings):
         "it is known: it is used as it is, and the motion only checks it",
     )
     lag_sd_ms: float = Field(0.1, gt=0, le=100, description="standard deviation of `lag_ms`, ms")
+
+    @property
+    def serial_bits_per_s(self) -> float | None:
+        """What its samples need of a serial line of its own at `baud`; None: no limit is known."""
+        return None
+
+    @property
+    def can_frames(self) -> tuple[tuple[int, bool], ...]:
+        """Frames of one sample on a CAN bus: data bytes, and whether its identifier has 29 bit."""
+        return ()
 
 
 class MocapSettings(Settings):

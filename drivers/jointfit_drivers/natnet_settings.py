@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from jointfit_daemon.driver import MocapSettings
+from jointfit_daemon.driver import NO_INTERFACE, MocapSettings, is_interface_name
 
 
 class NatNetSettings(MocapSettings):
@@ -45,6 +45,14 @@ class NatNetSettings(MocapSettings):
         37, ge=0, le=100, description="leap seconds by which PTP time is ahead of UTC"
     )
     silence_s: float = Field(5.0, gt=0, description="no frame for this long is a lost server, s")
+
+    @field_validator("interface")
+    @classmethod
+    def _interface_that_can_exist(cls, interface: str | None) -> str | None:
+        """Refuse what is neither an address nor a name the kernel allows."""
+        if interface is not None and not is_interface_name(interface):
+            raise ValueError(f"{NO_INTERFACE}; or an IPv4 address")
+        return interface
 
     @property
     def wanted_version(self) -> tuple[int, int] | None:

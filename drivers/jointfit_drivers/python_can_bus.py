@@ -259,8 +259,13 @@ def _require_interface(name: str) -> None:
 
 def _unknown(kind: str, error: Exception) -> str:
     """Say why the interface `kind` cannot be had."""
-    if kind in can.VALID_INTERFACES:
-        return f"interface {kind!r} cannot be loaded: {error}"
+    return unknown_kind(kind) or f"interface {kind!r} cannot be loaded: {error}"
+
+
+def unknown_kind(kind: str) -> str | None:
+    """Return why no bus of this kind can be opened here, or None."""
+    if kind == "slcan" or kind in can.VALID_INTERFACES:
+        return None
     known = sorted({*can.VALID_INTERFACES, "slcan"})
     near = get_close_matches(kind, known, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""

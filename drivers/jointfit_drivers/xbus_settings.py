@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 from pydantic import Field, ValidationInfo, field_validator
+from typing_extensions import override
 
-from jointfit_daemon.driver import ImuSettings
+from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings
 from jointfit_drivers import gateway_orientation
+from jointfit_drivers.xbus_needs import message_bytes, needs_of
 from jointfit_drivers.xbus_sync import XbusSyncSettings  # noqa: TC001 - pydantic reads it
 
 MAX_RATE_HZ = 400
@@ -17,7 +19,9 @@ class XbusSettings(ImuSettings):
     """One Xsens / Movella IMU on a serial port or USB."""
 
     port: str = Field(description="serial port, best a link under /dev/serial/by-id")
-    baud: int = Field(115_200, gt=0, description="speed the device runs at, baud")
+    baud: int = Field(
+        115_200, ge=SLOWEST_BAUD, le=FASTEST_BAUD, description="speed the device runs at, baud"
+    )
     transport: Literal["uart", "usb"] = Field(
         "uart",
         description="`uart`: a line at `baud`, also behind a USB bridge; stamps are back-dated by "
@@ -58,6 +62,20 @@ class XbusSettings(ImuSettings):
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"
     )
+
+    @property
+    @override
+    def serial_bits_per_s(self) -> float | None:
+        if self.transport == "usb":
+            return None
+        return self.rate_hz * 10 * message_bytes(needs_of(self))
+
+    @field_validator("port")
+    @classmethod
+    def _port_with_a_name(cls, port: str) -> str:
+        if not port.strip():
+            raise ValueError("must not be empty")
+        return port
 
     @field_validator("rate_hz")
     @classmethod

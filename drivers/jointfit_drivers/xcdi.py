@@ -9,10 +9,12 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
+from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
 from jointfit_drivers.can_bus import shared_bus
+from jointfit_drivers.python_can_bus import unknown_kind
 from jointfit_drivers.xcdi_events import XcdiEvents
 from jointfit_protocols.can_frame import EXTENDED_MAX, STANDARD_MAX, unpack_frames
 from jointfit_protocols.corrupt import Corrupt
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _LONGEST_SILENCE_S = 30.0  # a sensor that is away stays on the bus's list, and is heard at once
+_SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
 _RAW_FRAMES = 20  # logged at debug level, so that a first real device can be judged from its log
 
 
@@ -115,6 +118,23 @@ class XcdiSettings(ImuSettings):
                     "identifiers"
                 )
         return self
+
+    @field_validator("can")
+    @classmethod
+    def _bus_of_a_known_kind(cls, can: CanBusSettings) -> CanBusSettings:
+        if (fault := unknown_kind(can.interface)) is not None:
+            raise ValueError(fault)
+        return can
+
+    @property
+    @override
+    def can_frames(self) -> tuple[tuple[int, bool], ...]:
+        ids = self.ids.resolved(extended=self.extended_ids)
+        return tuple(
+            (_SAMPLE_BYTES[data_id], extended)
+            for (_, extended), data_id in ids.by_id().items()
+            if data_id in _SAMPLE_BYTES
+        )
 
 
 class XcdiImu:

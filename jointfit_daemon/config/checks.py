@@ -16,7 +16,7 @@ from jointfit_daemon.config.faults import Fault, nearest
 from jointfit_daemon.config.rig import MOCAP
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from jointfit_daemon.config.rig import Source
     from jointfit_daemon.config.tables import ChainTable
@@ -71,21 +71,26 @@ def folder_name(key: str, name: str) -> list[Fault]:
 
 
 def chain(table: ChainTable) -> Iterator[Fault]:
-    """Check the limb: its names, and that joints and segments alternate."""
+    """Check the limb: its names, and that joints and segments alternate.
+
+    Keys of `table` that had faults are None.
+    """
     for key in ("joints", "segments"):
-        names = getattr(table, key)
+        names = getattr(table, key) or ()
         for name in names:
             yield from topic_name(f"chain.{key}", name)
         yield from _repeated(f"chain.{key}", names)
-    if len(table.joints) != len(table.segments) + 1:
+    found = [len(names) for names in (table.joints, table.segments) if names]
+    if len(found) == 2 and found[0] != found[1] + 1:  # noqa: PLR2004 - both could be read
         yield Fault(
             "chain.joints",
             f"expected {len(table.segments) + 1} joints, one more than segments",
             list(table.joints),
         )
     yield from _neighbours(table)
-    for name, length in table.lengths_m.items():
-        yield from known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
+    for name, length in (table.lengths_m or {}).items():
+        if table.segments:
+            yield from known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
         if not 0 < length < _LONGEST_M:
             yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
 
@@ -96,16 +101,19 @@ def _neighbours(table: ChainTable) -> Iterator[Fault]:
         if name is None:
             continue
         yield from topic_name(f"chain.{key}", name)
-        if name in table.segments:
+        if name in (table.segments or ()):
             yield Fault(f"chain.{key}", "is already a segment", name)
 
 
-def known_name(key: str, name: str, known: Sequence[str], what: str) -> list[Fault]:
-    """Check that `name` is one of `known`."""
+def known_name(
+    key: str, name: str, known: Sequence[str], what: str, taken: Collection[str] = ()
+) -> list[Fault]:
+    """Check that `name` is one of `known`; propose none of `taken`."""
     if name in known:
         return []
     choices = ", ".join(known) or "none"
-    return [Fault(key, f"no such {what}; known: {choices}", name, nearest(name, known))]
+    near = nearest(name, [other for other in known if other not in taken])
+    return [Fault(key, f"no such {what}; known: {choices}", name, near)]
 
 
 def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
@@ -122,7 +130,7 @@ def sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iter
         yield from topic_name(f"imu[{name}].id", name)
         if name == MOCAP:
             yield Fault(f"imu[{name}].id", "is the name of the optical source", name)
-    if table is None:
+    if table is None or not table.segments:
         return
     worn = [imu["segment"] for imu in imus if isinstance(imu.get("segment"), str)]
     for at, imu in enumerate(imus, 1):
@@ -135,25 +143,26 @@ def sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iter
 
 
 def markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
-    """Check the markers and rigid bodies of ``[mocap]``."""
+    """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
     for kind in ("markers", "rigid_body"):
-        for part in getattr(settings, kind):
-            if table is not None:
+        for part in getattr(settings, kind) or ():
+            if table is not None and table.segments:
                 parts = [*table.segments, *filter(None, (table.proximal, table.distal))]
-                yield from known_name(f"mocap.{kind}.{part}", part, parts, "segment")
-    for part, names in settings.markers.items():
+                taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
+                yield from known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
+    for part, names in (settings.markers or {}).items():
         key = f"mocap.markers.{part}"
         yield from _repeated(key, names)
         if len(set(names)) < _LEAST_MARKERS:
             yield Fault(key, "expected at least three different markers", list(names))
-        if part in settings.rigid_body:
+        if part in (settings.rigid_body or {}):
             yield Fault(f"mocap.rigid_body.{part}", "has markers already; give one of the two")
     yield from _shared_markers(settings)
 
 
 def _shared_markers(settings: MocapSettings) -> Iterator[Fault]:
     owners: dict[str, str] = {}
-    for part, names in settings.markers.items():
+    for part, names in (settings.markers or {}).items():
         for name in dict.fromkeys(names):
             if (owner := owners.setdefault(name, part)) != part:
                 yield Fault(f"mocap.markers.{part}", f"is a marker of {owner!r} already", name)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from jointfit_daemon.calibration.trial import CalibrationSettings
-from jointfit_daemon.config import checks
+from jointfit_daemon.config import bandwidth, checks
 from jointfit_daemon.config.faults import ConfigError, Fault, faults_of, nearest
 from jointfit_daemon.config.rig import MOCAP, Rig, Source
 from jointfit_daemon.config.syntax import read_table
@@ -90,6 +91,23 @@ def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
     return rig
 
 
+def _partial(table: Mapping[str, Any], model: type[Model], error: ValidationError) -> Model:
+    """Return a model that is None at the keys that have faults."""
+    wrong = {detail["loc"][0] for detail in error.errors() if detail["loc"]}
+    values = {
+        name: None
+        if field.is_required() or name in wrong
+        else field.get_default(call_default_factory=True)
+        for name, field in model.model_fields.items()
+    }
+    for name in values.keys() & table.keys() - wrong:
+        text = json.dumps(table[name], default=str)
+        annotation: Any = model.model_fields[name].annotation
+        with contextlib.suppress(ValidationError):
+            values[name] = TypeAdapter(annotation).validate_json(text, strict=True)
+    return model.model_construct(**values)
+
+
 def _anchor_files(table: dict[str, Any], folder: Path) -> None:
     mqtt = table.get("mqtt")
     if isinstance(mqtt, dict):
@@ -110,6 +128,10 @@ class _Reader:
     def __init__(self, table: dict[str, Any]) -> None:
         self.table = table
         self.faults: list[Fault] = []
+        self.partial: dict[str, Any] = {}
+        """Tables with faults, by key: models of what is right in them, for the cross-checks."""
+        self.seen: list[Source] = []
+        """The IMUs, also those with faults, as far as they could be read."""
         for key in table:
             if key not in SECTIONS:
                 known = f"no such table; known: {', '.join(SECTIONS)}"
@@ -125,19 +147,19 @@ class _Reader:
             self._section("recording", RecordingSettings) if "recording" in self.table else None
         )
         buses = self._buses()
-        sources = self._imus(chain, buses)
-        mocap = self._mocap(chain, head)
-        self.faults += checks.ports(sources, buses)
-        self.faults += checks.can_ids(sources)
-        self.faults += self._rig_name()
-        if chain is not None:
-            self.faults += checks.chain(chain)
-        if calibration is not None:
-            self.faults += checks.folder_name("calibration.store", calibration.store)
+        limb = chain or self.partial.get("chain")
+        sources = self._imus(limb, buses)
+        mocap = self._mocap(limb, head)
+        self.faults += checks.ports(self.seen, buses)
+        self.faults += checks.can_ids(self.seen)
+        self.faults += bandwidth.serial_lines(sources)
+        self.faults += bandwidth.can_buses(sources, buses)
+        self.faults += self._names()
+        if limb is not None:
+            self.faults += checks.chain(limb)
         if head is None or chain is None or calibration is None or mqtt is None or self.faults:
             return None
         base = mqtt.base or f"jointfit/{head.name}"
-        self.faults += checks.topic_base("mqtt.base", base)
         return Rig(
             name=head.name,
             output_rate_hz=head.output_rate_hz,
@@ -151,11 +173,19 @@ class _Reader:
             table=self.table,
         )
 
-    def _rig_name(self) -> list[Fault]:
-        """Check the name even where another key of ``[rig]`` is wrong."""
-        head = self.table.get("rig")
-        name = head.get("name") if isinstance(head, dict) else None
-        return checks.topic_name("rig.name", name) if isinstance(name, str) else []
+    def _names(self) -> list[Fault]:
+        """Check the names of topics and folders even where another key of their table is wrong."""
+        faults: list[Fault] = []
+        for section, key, check in (
+            ("rig", "name", checks.topic_name),
+            ("calibration", "store", checks.folder_name),
+            ("mqtt", "base", checks.topic_base),
+        ):
+            table = self.table.get(section)
+            name = table.get(key) if isinstance(table, dict) else None
+            if isinstance(name, str) and (name or key != "base"):
+                faults += check(f"{section}.{key}", name)
+        return faults
 
     def _section(self, key: str, model: type[Model], *, needed: bool = False) -> Model | None:
         if key not in self.table and needed:
@@ -171,6 +201,7 @@ class _Reader:
             return model.model_validate_json(json.dumps(table, default=str), strict=True)
         except ValidationError as error:
             self.faults += faults_of(error, model, key)
+            self.partial[key] = _partial(table, model, error)
             return None
 
     def _buses(self) -> dict[str, CanBusSettings]:
@@ -197,6 +228,9 @@ class _Reader:
             settings = self._settings(key, table, driver, ImuSettings)
             if driver is not None and settings is not None:
                 found.append(_imu_source(imu["driver"], settings, driver))
+            known = settings or self.partial.get(key)
+            if driver is not None and known is not None and known.id is not None:
+                self.seen.append(_imu_source(imu["driver"], known, driver))
         return found
 
     def _with_bus(
@@ -250,10 +284,10 @@ class _Reader:
             return None
         driver = self._driver(MOCAP, table, MocapSettings) if isinstance(table, dict) else None
         settings = self._settings(MOCAP, table, driver, MocapSettings)
-        if settings is None:
-            return None
-        self.faults += checks.markers(settings, chain)
-        if driver is None or head is None:
+        known = settings or self.partial.get(MOCAP)
+        if known is not None:
+            self.faults += checks.markers(known, chain)
+        if settings is None or driver is None or head is None:
             return None
         rate = getattr(settings, "rate_hz", None) or head.output_rate_hz
         return Source(MOCAP, "mocap", table["driver"], rate, None, settings, driver)

@@ -14,7 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.config import ConfigError, MqttSettings, load_rig, parse_rig, rig_schema
-from jointfit_daemon.driver import CanBusSettings
+from jointfit_daemon.driver import _SLCAN_BITRATES, CanBusSettings
+from jointfit_drivers.python_can_bus import PythonCanBus
+from jointfit_drivers.slcan_bus import SlcanBus
+from jointfit_protocols.slcan import BITRATES, bitrate_code
 from jointfit_simulators.rig_file import RigOptions
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -299,3 +302,176 @@ def test_syntax_errors_and_wrong_values_are_told_together(fakes: object, tmp_pat
         load_rig(path)
     keys = [fault.key for fault in caught.value.faults]
     assert keys == ["line 2", "line 9", "rig.output_rate_hz", "chain.side"]
+
+
+FIFTEEN_MISTAKES = """
+[rig]
+name = "bench/1"
+output_rate_hz = "fast"
+[chain]
+joints = ["hip", "knee"]
+segments = ["thigh", "shank"]
+side = "middle"
+lengths_m = { shnak = 0.4 }
+[[imu]]
+id = "S1"
+segment = "tigh"
+driver = "fake"
+port = "/dev/a"
+rate_hz = "fast"
+[[imu]]
+id = "S2"
+segment = "shank"
+driver = "fake"
+port = "/dev/a"
+silence_s = inf
+[[imu]]
+id = "S3"
+segment = "shank"
+driver = "fakecan"
+can = "can0"
+rate_hz = -1
+[[imu]]
+id = "S4"
+segment = "shank"
+driver = "fakecan"
+can = "can0"
+[can.can0]
+channel = "can0"
+[calibration]
+store = "../elsewhere"
+method = "patent21"
+[mqtt]
+base = "a//b"
+port = 99999
+[mocap]
+driver = "fakemocap"
+up_axis = "w"
+markers.thigh = ["T1", "T1"]
+markers.thihg = ["T2", "T3", "T4"]
+"""
+
+
+def test_one_pass_finds_what_is_wrong_in_and_between_tables(fakes: object, tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(FIFTEEN_MISTAKES, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+    text = str(caught.value)
+    for line in (
+        "rig.name = 'bench/1': must not hold /",
+        "rig.output_rate_hz = 'fast'",
+        "chain.joints = ['hip', 'knee']: expected 3 joints",
+        "chain.side = 'middle'",
+        "chain.lengths_m.shnak = 'shnak': no such segment",
+        "imu[S1].segment = 'tigh': no such segment",
+        "imu: no sensor is on segment 'thigh'",
+        "imu[S1].rate_hz = 'fast'",
+        "imu[S2].port = '/dev/a': is the port of imu[S1] already",
+        "imu[S2].silence_s = inf",
+        "imu[S3].rate_hz = -1",
+        "imu[S4].ids.quaternion: id 0x21 on this bus is taken by S3",
+        "calibration.store = '../elsewhere': must be the plain name",
+        "calibration.method = 'patent21'",
+        "mqtt.base = 'a//b': must not be empty",
+        "mqtt.port = 99999",
+        "mocap.up_axis = 'w'",
+        "mocap.markers.thigh = ['T1', 'T1']: expected at least three",
+    ):
+        assert line in text
+    (part,) = [fault for fault in caught.value.faults if fault.key == "mocap.markers.thihg"]
+    assert part.near != "thigh"
+
+
+def real_rig(**changed: Any) -> Table:
+    """Return a rig of the drivers that come with the project: one IMU on a UART, two on CAN."""
+    xbus = {"id": "S1", "segment": "thigh", "driver": "xbus", "port": "/dev/ttyUSB0"}
+    xcdi = {"segment": "shank", "driver": "xcdi", "can": "can0"}
+    ids = {"sample_time": 0x105, "group_counter": 0x106, "quaternion": 0x121}
+    return {
+        "rig": {"name": "bench"},
+        "chain": {"joints": ["hip", "knee", "ankle"], "segments": ["thigh", "shank"]},
+        "imu": [
+            xbus | changed.get("xbus", {}),
+            xcdi | {"id": "S3"} | changed.get("xcdi", {}),
+            xcdi | {"id": "S4", "ids": ids} | changed.get("xcdi", {}),
+        ],
+        "can": {"can0": {"channel": "can0"} | changed.get("can", {})},
+    }
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"xbus": {"baud": 9600}},
+         "imu[S1].baud = 9600: 100 Hz need 36000 bit/s, the line carries 9600: set baud = 38400 or "
+         "more here and on the device, or set rate_hz = 26 or less"),
+        ({"xbus": {"baud": 10**12}}, "imu[S1].baud"),
+        ({"xbus": {"port": ""}}, "imu[S1].port = '': must not be empty"),
+        ({"can": {"channel": "/dev/ttyACM0"}}, 'a serial adapter needs interface = "slcan"'),
+        ({"can": {"channel": "a" * 16}}, "up to 15 bytes without slash or space"),
+        ({"can": {"channel": "can 0"}}, "expected the name of a network interface"),
+        ({"can": {"channel": ""}}, "can.can0.channel = '': must not be empty"),
+        ({"can": {"interface": "slcan", "bitrate": 123_456}},
+         "no such bit rate in SLCAN: expected one of 1"),
+        ({"can": {"interface": "socketcn"}}, "did you mean 'socketcan'?"),
+        ({"can": {"bitrate": 125_000}, "xcdi": {"rate_hz": 400}},
+         "can.can0.bitrate = 125000: S3, S4 need 244000 bit/s at most, the bus carries 125000: "
+         "set bitrate = 250000"),
+        ({"can": {"interface": "slcan", "transport": "uart"}, "xcdi": {"rate_hz": 200}},
+         "can.can0.baud = 115200: S3, S4 need 184000 bit/s as SLCAN"),
+    ],
+)  # fmt: skip
+def test_what_a_line_cannot_carry_or_be_called_is_refused(
+    changed: dict[str, Any], said: str
+) -> None:
+    assert any(said in line for line in complaints(real_rig(**changed))), complaints(
+        real_rig(**changed)
+    )
+
+
+def test_lines_that_carry_the_data_are_accepted() -> None:
+    parse_rig(real_rig())
+    parse_rig(real_rig(xbus={"baud": 9600, "rate_hz": 26}))
+    parse_rig(real_rig(xbus={"baud": 9600, "transport": "usb"}))
+    parse_rig(real_rig(can={"bitrate": 500_000}, xcdi={"rate_hz": 400}))
+
+
+def test_the_bit_rates_of_slcan_are_those_of_its_codec() -> None:
+    assert _SLCAN_BITRATES == BITRATES
+
+
+@given(
+    xbus=st.fixed_dictionaries(
+        {},
+        optional={
+            "baud": st.integers(-1, 10**7) | st.sampled_from([9600, 115_200, 921_600]),
+            "rate_hz": st.integers(0, 500) | st.floats(0.1, 400),
+            "transport": st.sampled_from(["uart", "usb"]),
+            "port": st.text(max_size=20),
+        },
+    ),
+    can=st.fixed_dictionaries(
+        {},
+        optional={
+            "interface": st.sampled_from(["socketcan", "slcan", "virtual", "pcan"]),
+            "channel": st.text(max_size=18) | st.just("can0"),
+            "bitrate": st.integers(0, 2_000_000) | st.sampled_from([125_000, 500_000]),
+            "baud": st.integers(0, 10**7),
+        },
+    ),
+    rate_hz=st.integers(1, 2000),
+)
+def test_what_the_check_accepts_the_drivers_take(
+    xbus: dict[str, Any], can: dict[str, Any], rate_hz: int
+) -> None:
+    try:
+        rig = parse_rig(real_rig(xbus=xbus, can=can, xcdi={"rate_hz": rate_hz}))
+    except ConfigError:
+        return
+    for source in rig.sources:
+        source.driver_class(source.settings).decoder()
+    bus = rig.sources[1].settings.can
+    (SlcanBus if bus.interface == "slcan" else PythonCanBus)(bus)
+    assert bus.interface != "slcan" or bitrate_code(bus.bitrate) is not None
+    assert bus.interface != "socketcan" or len(bus.channel.encode()) < 16

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from pydantic import ValidationError
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
@@ -284,8 +285,11 @@ async def test_the_adapter_is_told_the_bit_rate(tmp_path: Path) -> None:
 
 
 async def test_a_bit_rate_slcan_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match=r"no such bit rate in SLCAN.*1000000"):
+        bus_at(tmp_path, bitrate=83_333)
+    unchecked = bus_at(tmp_path).model_copy(update={"bitrate": 83_333})
     with pytest.raises(DeviceMisconfigured, match=r"bit rate 83333.*1000000"):
-        await driver_of("S3", bus_at(tmp_path, bitrate=83_333)).run(lambda _: None)
+        await driver_of("S3", unchecked).run(lambda _: None)
 
 
 async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import can
 import pytest
+from pydantic import ValidationError
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
@@ -111,8 +112,11 @@ async def test_what_a_pump_thread_meets_reaches_the_driver(
 
 async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
     bus = CanBusSettings(interface="socketcna", channel="can0")
+    with pytest.raises(ValidationError, match="did you mean 'socketcan'"):
+        driver_of("S3", bus)
     with pytest.raises(DeviceMisconfigured, match="did you mean 'socketcan'"):
-        await driver_of("S3", bus).run(lambda _: None)
+        async with shared_bus(bus):
+            pass
 
 
 async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
