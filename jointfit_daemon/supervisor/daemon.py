@@ -216,11 +216,10 @@ class Daemon:
         self._stores.retry()
 
     def _tell_not_stored(self, text: str) -> None:
-        if self._calibration is None:
-            self._tell("calibration", text, "error")
-        else:
+        self._tell("calibration", text, "error")
+        if self._calibration is not None:
             now_ns = time.monotonic_ns()
-            self._send(replace(self._calibration, t_ns=now_ns, text=text, level="error"))
+            self._reporter.handle(replace(self._calibration, t_ns=now_ns, text=text))
 
     def _log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
         self._reporter.log_line(level, name, text, suppressed)
