@@ -6,12 +6,9 @@ DeltaV) serve as well as rates where the device is set to them already.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 from jointfit_protocols.mtdata2 import Item, reals_in
-
-if TYPE_CHECKING:
-    from jointfit_drivers.xbus_settings import XbusSettings
 
 _FRAME_BYTES = 5 + 5 + 7  # frame, packet counter, time
 _ITEM_HEAD, _FLOAT = 3, 4
@@ -33,7 +30,19 @@ _FELT = (
 _FIELD = Need((Item.MAGNETIC_FIELD,), "magnetic field", "magnetic fields")
 
 
-def needs_of(settings: XbusSettings) -> tuple[Need, ...]:
+class OrientationSettings(Protocol):
+    """The keys of a device's table that decide which outputs it needs."""
+
+    @property
+    def orientation(self) -> str:
+        """``device`` or ``gateway``."""
+
+    @property
+    def magnetometer(self) -> bool:
+        """Whether the gateway reads it."""
+
+
+def needs_of(settings: OrientationSettings) -> tuple[Need, ...]:
     """Return what a device with these settings must send."""
     if settings.orientation == "device":
         return ORIENTATION
