@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -44,6 +45,8 @@ class Tally:
     """What the cases of one target did so far."""
 
     target: Target
+    folders: tuple[Path, ...]
+    """Removed at the end."""
     cases: int = 0
     began: float = field(default_factory=time.monotonic)
     growth: int = 0
@@ -71,8 +74,14 @@ class Tally:
         first_line = finding.partition("\n")[0]
         self.findings[first_line.split(":")[0]] = f"{path}: {first_line}"
         if len(self.findings) >= MOST_FINDINGS:
-            self.report()
-            os._exit(0)
+            self.end()
+
+    def end(self) -> None:
+        """Report and end the process: libFuzzer runs no exit handlers of Python."""
+        self.report()
+        for folder in self.folders:
+            shutil.rmtree(folder, ignore_errors=True)
+        os._exit(0)
 
     def report(self) -> None:
         """Write the result where the parent process reads it."""
@@ -92,6 +101,7 @@ def fuzz_one(name: str, cases: int, seconds: float) -> None:
     import atheris
 
     with atheris.instrument_imports(include=PACKAGES, enable_loader_override=False):
+        from tests.fuzz.broker_targets import folder
         from tests.fuzz.inventory import TARGETS, reproducers
 
     target = TARGETS[name]
@@ -104,14 +114,13 @@ def fuzz_one(name: str, cases: int, seconds: float) -> None:
     for seed in seeds:
         with contextlib.suppress(Exception):
             target.run(seed)
-    tally = Tally(target)
+    tally = Tally(target, (corpus, folder()))
     until = tally.began + seconds
 
     def case(data: bytes) -> None:
         tally.case(data)
         if tally.cases >= cases or time.monotonic() > until:
-            tally.report()
-            os._exit(0)
+            tally.end()
 
     longest = max(target.longest, *map(len, seeds))
     options = [sys.argv[0], "-runs=-1", f"-max_len={longest}", "-verbosity=0"]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import json
+import shutil
 import tempfile
 import time
 from copy import deepcopy
@@ -56,9 +58,11 @@ TOPIC = "jointfit/fuzz/bridge/request/"
 
 @cache
 def folder() -> Path:
-    """Return a directory of this process, in memory where there is one."""
+    """Return a directory of this process, in memory where possible; removed at its end."""
     shm = Path("/dev/shm")
-    return Path(tempfile.mkdtemp(prefix="jointfit-fuzz-", dir=shm if shm.is_dir() else None))
+    made = Path(tempfile.mkdtemp(prefix="jointfit-fuzz-", dir=shm if shm.is_dir() else None))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
 
 
 # --- requests ---------------------------------------------------------------------------------
