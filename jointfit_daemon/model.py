@@ -144,8 +144,8 @@ class DeviceEvent:
     """Something a device said or did that is not a measurement.
 
     Kinds: ``info`` (data: model, serial, firmware, settings read back), ``restart`` (the device
-    began anew), ``clock`` (its time did), ``gap`` (data: lost), ``setting`` (changed while
-    running), ``warning``, ``error``.
+    began anew), ``clock`` (its time did), ``gap`` (data: lost), ``counter`` (it jumped
+    and nothing was lost), ``setting`` (changed while running), ``warning``, ``error``.
     """
 
     kind: str

@@ -11,7 +11,8 @@ foreign time (GNSS).
 | does not follow                                    | held until the next one                    |
 | the next one follows the last accepted one         | the held one was damaged and is dropped    |
 | the next one follows the held one                  | both accepted; a restart if time leapt,    |
-|                                                    | against the counter and the arrivals       |
+|                                                    | against the counter and the arrivals; a    |
+|                                                    | counter jump if time went on by one period |
 | the next one follows neither                       | the held one is dropped, the next one held |
 
 An eight-bit checksum passes one damaged message in 256, so a single message proves neither a loss
@@ -48,6 +49,8 @@ class Step(NamedTuple):
     """The held one is good and comes first; else a held one is dropped."""
     lost_since: int = 0
     """Messages lost between a confirmed one and this one."""
+    counter_jumped: bool = False
+    """The counter alone jumped before the held one: nothing was lost."""
 
 
 class _Point(NamedTuple):
@@ -121,27 +124,27 @@ class Continuity:
     def _confirm(self, last: _Point, held: _Point, point: _Point) -> Step:
         """Accept `held` and `point`, which belong together and not to `last`."""
         trusted, self._held = self._trusted, None
-        lost, restarted = self._classify(last, held) if trusted else (0, False)
-        if restarted or not trusted:
+        step = self._classify(last, held) if trusted else _GOES_ON
+        if step.restarted or not trusted:
             self._sum_ticks = self._sum_counts = 0
         since = self._accept(held, point).lost
-        return Step(lost, restarted, confirmed=True, lost_since=since)
+        return step._replace(confirmed=True, lost_since=since)
 
-    def _classify(self, last: _Point, held: _Point) -> tuple[int, bool]:
-        """Return the messages lost between two that do not follow, and whether it was a restart."""
+    def _classify(self, last: _Point, held: _Point) -> Step:
+        """Return what happened between two that do not follow."""
         ticks, counts = self._ticks(last, held), _counts(last, held)
         if ticks is None:  # the counter alone: it may fall only by a restart
             fell = counts is not None and counts > _DISTINCT
-            return (0, True) if fell else (_lost(last, held), False)
+            return Step(restarted=True) if fell else Step(_lost(last, held))
         plausible = 0 <= ticks <= _PLAUSIBLE_GAP
         if counts is not None and plausible and self._agree(ticks, counts):
             turns = round((ticks / self._period - counts) / _COUNTS)
-            return _lost(last, held) + max(turns, 0) * _COUNTS, False
+            return Step(_lost(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
-            return 0, False
+            return Step(counter_jumped=counts is not None)
         # Both ends may be damaged a little. A clock that kept pace with the arrivals went on.
         off_ns = abs(held.arrival_ns - last.arrival_ns - ticks * TICK_NS)
-        return 0, off_ns > _PACE_NS
+        return Step(restarted=off_ns > _PACE_NS)
 
     def _follows(self, last: _Point, point: _Point) -> bool:
         ticks, counts = self._ticks(last, point), _counts(last, point)

@@ -195,6 +195,9 @@ class XbusEvents:
             self._forget_orientation()
             text = f"its clock began anew at {held.values.get(_TIME)} ticks"
             out.append(DeviceEvent("restart", text))
+        if step.counter_jumped and held is not None:
+            text = f"its counter jumped to {held.values.get(_COUNTER)} while its time went on"
+            out.append(DeviceEvent("counter", text))
         out += _gap(step.lost)
         if held is not None and step.confirmed:
             out += self._measured(held)

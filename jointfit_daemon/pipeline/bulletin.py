@@ -29,7 +29,8 @@ _LEVELS: dict[str, Level] = {
     "warning": "warning",
     "error": "error",
 }
-_OF_CLOCKS = frozenset({"restart", "clock"})
+_JUMPS = {"restart": "clock", "clock": "clock", "counter": "wire"}
+"""Kind of the notice for each device event that is reported by its last text and its number."""
 
 
 @dataclass(slots=True)
@@ -58,7 +59,7 @@ class Bulletin:
             return self._hold(
                 now_ns, (source, "gap"), lost if isinstance(lost, int) else 1, item.text
             )
-        if item.kind in _OF_CLOCKS:
+        if item.kind in _JUMPS:
             return self._hold(now_ns, (source, item.kind), 1, item.text, item.data)
         level: Level = _LEVELS.get(item.kind, "info")
         return [Notice(now_ns, "device", source, item.text, level, dict(item.data))]
@@ -72,7 +73,7 @@ class Bulletin:
             if now_ns - held.told_ns < QUIET_NS:
                 continue
             if held.count:
-                held.lasting = key[1] not in _OF_CLOCKS
+                held.lasting = key[1] not in _JUMPS
                 notices.append(_notice(now_ns, key, held))
             elif held.lasting:
                 notices.append(_ended(now_ns, key, held))
@@ -98,8 +99,8 @@ class Bulletin:
 
 def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
     source, kind = key
-    if kind in _OF_CLOCKS:
-        return _of_clock(now_ns, source, held)
+    if kind in _JUMPS:
+        return _jump(now_ns, key, held)
     if kind == "gap":
         text = f"{held.amount} sample{'s' if held.amount > 1 else ''} lost on the way"
     else:
@@ -126,14 +127,15 @@ def _sums(kind: str, held: _Held) -> dict[str, object]:
     return {"runs": held.count, "discarded_bytes": held.amount}
 
 
-def _of_clock(now_ns: int, source: str, held: _Held) -> Notice:
+def _jump(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
     """Return the last of what was held back, and how often there was something of its kind."""
+    source, kind = key
     text, data = held.text, dict(held.data)
     if held.count > 1:
         text = f"{text} (the last of {held.count} such events)"
         data["events"] = held.count
     held.told_ns, held.count, held.amount = now_ns, 0, 0
-    return Notice(now_ns, "clock", source, text, "warning", data)
+    return Notice(now_ns, _JUMPS[kind], source, text, "warning", data)
 
 
 def unix_time_set(now_ns: int, step_ns: int) -> list[Notice]:

@@ -254,8 +254,18 @@ def test_a_counter_that_begins_again_alone_is_neither_a_loss_nor_a_restart() -> 
     wires = [message(number, 100 * number) for number in range(1, 20)]
     wires += [message(number - 19, 100 * number) for number in range(20, 40)]
     events = fed(decoder(), *wires)
-    assert told(events) == []
+    assert told(events) == [("counter", {})]
     assert len(samples(events)) == 39
+
+
+def test_a_counter_jump_is_reported_where_it_was_and_names_the_new_value() -> None:
+    wires = [message(number, 100 * number) for number in range(1, 20)]
+    wires += [message(number + 500, 100 * number) for number in range(20, 22)]
+    follow = decoder()
+    assert told(fed(follow, *wires[:-1])) == []
+    jumped, *went_on = fed(follow, wires[-1])
+    assert jumped == DeviceEvent("counter", "its counter jumped to 520 while its time went on")
+    assert [sample.counter for sample in samples(went_on)] == [520, 521]
 
 
 def test_a_gap_of_hours_is_counted_whole() -> None:

@@ -89,3 +89,12 @@ def test_a_single_gap_is_reported_once() -> None:
     bulletin = Bulletin()
     assert len(bulletin.add(0, "S1", DeviceEvent("gap", "counter", {"lost": 1}))) == 1
     assert [bulletin.due(tick * S) for tick in range(1, 200)] == [[]] * 199
+
+
+def test_jumps_of_a_counter_are_notices_of_the_wire_one_a_minute() -> None:
+    bulletin = Bulletin()
+    told = [bulletin.add(n, "S1", DeviceEvent("counter", f"jumped to {n}")) for n in range(100)]
+    assert [n.kind for notices in told for n in notices] == ["wire"]
+    (rest,) = bulletin.due(61 * S)
+    assert (rest.kind, rest.data["events"]) == ("wire", 99)
+    assert rest.text == "jumped to 99 (the last of 99 such events)"
