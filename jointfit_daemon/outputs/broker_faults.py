@@ -31,13 +31,15 @@ _CREDENTIALS = (
     "the broker refuses user name or password: correct username and password_file in [mqtt]"
 )
 _RIGHTS = "the broker does not authorize this user: correct username in [mqtt], or the broker's ACL"
+_CONNECTION = "the connection was lost: is the broker running, and the network up?"
 _OF_MQTT = {
     1: 'the broker does not speak this version of MQTT: set version = "3.1.1" or "5" in [mqtt]',
     2: "the broker refuses the client id: is another program connected with it?",
     3: "the broker is not available: look into its log",
     4: _CREDENTIALS,
     5: _RIGHTS,
-    7: "the connection was lost: is the broker running, and the network up?",
+    7: _CONNECTION,
+    128: _CONNECTION,
     132: 'the broker does not speak this version of MQTT: set version = "3.1.1" or "5" in [mqtt]',
     133: "the broker refuses the client id: is another program connected with it?",
     134: _CREDENTIALS,
@@ -48,6 +50,8 @@ _OF_MQTT = {
     159: "the broker limits the rate of connections: wait, or look into its configuration",
 }
 """By the reason code of MQTT 3.1.1 (below 128) or MQTT 5."""
+_SESSION_LOST = (4, 7, 128)
+"""Numbers of paho for "not connected" and "connection lost", and its reason for want of one."""
 
 
 def broker_fault(error: BaseException) -> str:
@@ -57,4 +61,17 @@ def broker_fault(error: BaseException) -> str:
         return _OF_THE_SYSTEM.get(int(found[1]), text)
     if found := _CODE.search(text):
         return _OF_MQTT.get(int(found[1]), text)
+    return text
+
+
+def session_fault(error: BaseException) -> str:
+    """Return the fault of an operation on an established connection, and its remedy.
+
+    The numbers are those of paho there, of which 4 is "not connected" and not a wrong password.
+    """
+    text = str(error)
+    if text == "Operation timed out":
+        return "the broker does not answer in time: look into its log, and at the network"
+    if (found := _CODE.search(text)) and int(found[1]) in _SESSION_LOST:
+        return _CONNECTION
     return text

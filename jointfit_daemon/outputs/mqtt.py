@@ -18,7 +18,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from jointfit_daemon.outputs.broker_faults import broker_fault
+from jointfit_daemon.outputs.broker_faults import broker_fault, session_fault
 from jointfit_daemon.outputs.mqtt_secrets import password_of
 from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context, tls_remedy
 from jointfit_daemon.outputs.packet_limit import PacketLimitSocket
@@ -196,7 +196,8 @@ class MqttConnection:
         try:
             await self._publish(message)
         except (aiomqtt.MqttError, ValueError) as error:
-            raise BrokerLost(f"{self._place()}: {message.topic}: {error}") from error
+            why = session_fault(error)
+            raise BrokerLost(f"{self._place()}: {message.topic}: {why}") from error
         stop_if_cancelled()
         return self._client.refusal
 
@@ -229,7 +230,8 @@ class MqttConnection:
         try:
             codes = await self._client.subscribe(asked, timeout=SUBSCRIBED_S)
         except aiomqtt.MqttError as error:
-            raise BrokerLost(f"{self._place()}: cannot subscribe: {error}") from error
+            why = session_fault(error)
+            raise BrokerLost(f"{self._place()}: cannot subscribe: {why}") from error
         stop_if_cancelled()
         values = [code if isinstance(code, int) else int(code.value) for code in codes]
         return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
@@ -239,7 +241,8 @@ class MqttConnection:
         try:
             await self._client.unsubscribe(topic)
         except aiomqtt.MqttError as error:
-            raise BrokerLost(f"{self._place()}: cannot unsubscribe: {error}") from error
+            why = session_fault(error)
+            raise BrokerLost(f"{self._place()}: cannot unsubscribe: {why}") from error
         stop_if_cancelled()
 
     async def messages(self) -> AsyncIterator[Incoming]:
@@ -455,4 +458,7 @@ class LoopNoise:
 
 
 def _is_mqtt(context: dict[str, Any]) -> bool:
-    return "aiomqtt" in repr(context.get("handle", "")) + repr(context.get("future", ""))
+    """Return whether a function of aiomqtt is called, or passed on, by the handle of `context`."""
+    handle = context.get("handle")
+    functions = (getattr(handle, "_callback", None), *(getattr(handle, "_args", None) or ()))
+    return any(str(getattr(f, "__module__", "")).startswith("aiomqtt") for f in functions)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 import time
 from typing import TYPE_CHECKING, Any
 
 import aiomqtt
 import orjson
 import pytest
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
 
 from jointfit_daemon.config import MqttSettings
+from jointfit_daemon.outputs.broker_faults import broker_fault, session_fault
 from jointfit_daemon.outputs.mqtt import (
     BrokerLost,
     Incoming,
@@ -58,6 +62,39 @@ async def running(link: Link) -> AsyncIterator[Link]:
         task.cancel()
         await asyncio.wait([task])
         assert task.cancelled()
+
+
+async def test_a_socket_closed_before_its_turn_leaves_no_traceback_in_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    noise, client = LoopNoise(), aiomqtt.Client("127.0.0.1")
+    asyncio.get_running_loop().set_exception_handler(noise)
+    with socket.socket() as sock:
+        client._on_socket_register_write(client._client, None, sock)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert noise.dropped == 1
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("error", "fault"),
+    [
+        (aiomqtt.MqttCodeError(4), "connection was lost"),  # paho: not connected
+        (aiomqtt.MqttError("Operation timed out"), "does not answer in time"),
+        (aiomqtt.MqttError("something else"), "something else"),
+    ],
+)
+def test_the_end_of_a_session_is_named_without_the_numbers_of_a_library(
+    error: aiomqtt.MqttError, fault: str
+) -> None:
+    assert fault in session_fault(error)
+    assert "code:" not in session_fault(error)
+
+
+def test_a_connection_that_ended_without_a_reason_is_reported_as_lost() -> None:
+    ended = aiomqtt.MqttCodeError(ReasonCode(PacketTypes.DISCONNECT, "Unspecified error"))
+    assert "connection was lost" in broker_fault(ended)
 
 
 async def test_a_stop_that_comes_with_the_brokers_first_word_is_not_lost(
