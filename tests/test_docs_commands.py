@@ -1,8 +1,7 @@
 """Every command that a page prints is run as printed, on sample data, with the services it names.
 
 Only this differs from a reader's machine: the broker listens on a free port, which options of
-mosquitto's clients and of ``jointfit-sim play`` name; the phases of a calibration are short; and
-BLAS has one thread.
+mosquitto's clients and of ``jointfit-sim play`` name; and the phases of a calibration are short.
 """
 
 from __future__ import annotations
@@ -66,7 +65,6 @@ def environment(home: Path) -> dict[str, str]:
         "PATH": path,
         "LC_ALL": "C.UTF-8",
         "COLUMNS": "160",
-        "OPENBLAS_NUM_THREADS": "1",
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,8 +46,6 @@ def report(
 
 
 def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:
-    # many small products: threads of the linear algebra would only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from jointfit_daemon.calibration.center.study import StudySetup
     from jointfit_daemon.tools.report_tables import as_json, tables
 
