@@ -30,7 +30,10 @@ _OF_THE_SYSTEM = {
 _CREDENTIALS = (
     "the broker refuses user name or password: correct username and password_file in [mqtt]"
 )
-_RIGHTS = "the broker does not authorize this user: correct username in [mqtt], or the broker's ACL"
+_RIGHTS = (  # mosquitto answers so to a wrong password, too
+    "the broker does not authorize this user: correct username and password_file in [mqtt], or the"
+    " broker's ACL"
+)
 _CONNECTION = "the connection was lost: is the broker running, and the network up?"
 _OF_MQTT = {
     1: 'the broker does not speak this version of MQTT: set version = "3.1.1" or "5" in [mqtt]',

@@ -283,6 +283,8 @@ def _heard(watch: CalibrationWatch, topic: str, payload: dict[str, Any]) -> str 
     elif topic == "bridge/state" and payload.get("state") != "online":
         watch.lose(PhaseAborted("the daemon is not running, or lost its broker"))
     elif topic == "bridge/event" and _matters(payload):
+        if text == watch.status.get("text") and not sys.stderr.isatty():
+            return None  # printed with the status
         return f"{payload.get('id')}: {text}"
     return None
 

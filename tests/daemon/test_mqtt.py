@@ -92,6 +92,11 @@ def test_the_end_of_a_session_is_named_without_the_numbers_of_a_library(
     assert "code:" not in session_fault(error)
 
 
+@pytest.mark.parametrize("code", [5, 135])
+def test_a_wrong_password_that_mosquitto_calls_not_authorized_is_hinted_at(code: int) -> None:
+    assert "password_file" in broker_fault(aiomqtt.MqttCodeError(code))
+
+
 def test_a_connection_that_ended_without_a_reason_is_reported_as_lost() -> None:
     ended = aiomqtt.MqttCodeError(ReasonCode(PacketTypes.DISCONNECT, "Unspecified error"))
     assert "connection was lost" in broker_fault(ended)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import sys
+from types import SimpleNamespace
 
 import pytest
 
-from jointfit_daemon.tools import calibration_guide
+from jointfit_daemon.tools import calibrate, calibration_guide
 from jointfit_daemon.tools.calibration_guide import CalibrationWatch, PhaseAborted
 from jointfit_daemon.tools.calibration_report import movement_lines, report
 
@@ -105,3 +107,17 @@ def test_figures_follow_the_progress_they_came_with() -> None:
     one = CalibrationWatch(lambda *said: told.append(said), told.append)
     one.on_progress({"phase": "functional", "progress": 0.5, "text": "on", "data": {"joints": {}}})
     assert told == [("functional", 0.5, "on"), {"joints": {}}]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_result_that_is_not_stored_is_printed_once(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: terminal))
+    one, text = watch(), "in force but not stored: no space left"
+    event = {"kind": "calibration", "level": "error", "id": "bench", "text": text}
+    printed = [
+        calibrate._heard(one, "calibration", {"phase": "calibrated", "text": text}),
+        calibrate._heard(one, "bridge/event", event),
+    ]
+    assert sum(line is not None for line in printed) == 1
