@@ -6,11 +6,10 @@ After an error the line is left out and the rest parsed again, so that one slip 
 from __future__ import annotations
 
 import re
-import tomllib
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config.faults import ConfigError, Fault
-from jointfit_daemon.files.structured_text import DEEPEST, plain_fault, read_text
+from jointfit_daemon.files.structured_text import DEEPEST, parse_toml, plain_fault, read_text
 from jointfit_daemon.files.text_table import Malformed
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
     last, opened = -1, False
     while len(faults) < _MOST_ERRORS:
         try:
-            return tomllib.loads("\n".join(lines)), faults
+            return parse_toml("\n".join(lines)), faults
         except ValueError as error:  # an integer of 5000 digits is a plain ValueError
             found = _AT_LINE.fullmatch(str(error))
             number = int(found[2]) if found else 0

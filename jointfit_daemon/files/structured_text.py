@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import tomllib
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,11 @@ _KINDS = {
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
 }
+_PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*')"""
+_DEEP_KEY = re.compile(
+    rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{DEEPEST}}}{_PART}", re.MULTILINE
+)
+"""A dotted key of more than `DEEPEST` parts, as the key of a value or of a table."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -41,7 +47,7 @@ def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     Malformed
         It cannot be read, is no regular file, too large, not UTF-8 or not TOML.
     """
-    table: dict[str, Any] = _parsed(path, "TOML", tomllib.loads, read_text(path, most_bytes))
+    table: dict[str, Any] = _parsed(path, "TOML", parse_toml, read_text(path, most_bytes))
     return table
 
 
@@ -103,6 +109,22 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     if len(data) > most_bytes:
         raise Malformed(f"{path}: larger than {most_bytes} bytes: is it the right file?")
     return data
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the table of a TOML text.
+
+    Raises
+    ------
+    ValueError
+        Not TOML.
+    RecursionError
+        Nested too deeply.
+    """
+    # tomllib needs time and memory that grow with the square of the parts of a dotted key.
+    if _DEEP_KEY.search(text):
+        raise RecursionError(f"a key of more than {DEEPEST} parts")
+    return tomllib.loads(text)
 
 
 def parse_json(text: str) -> Any:

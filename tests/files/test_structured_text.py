@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import os
 import time
+import tomllib
+import tracemalloc
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jointfit_daemon.files.structured_text import MOST_BYTES, read_bounded, read_json, read_toml
+from jointfit_daemon.config import ConfigError, load_rig
+from jointfit_daemon.files.structured_text import (
+    MOST_BYTES,
+    parse_toml,
+    read_bounded,
+    read_json,
+    read_toml,
+)
 from jointfit_daemon.files.text_table import Malformed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 @pytest.mark.parametrize(
@@ -34,6 +47,40 @@ def test_hostile_toml_is_one_fault(tmp_path: Path, content: bytes, said: str) ->
     with pytest.raises(Malformed, match=said) as caught:
         read_toml(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("read", [read_toml, load_rig])
+@pytest.mark.parametrize(
+    "text", ["a." * 5000 + "b = 1", "x = {" + '"a" . ' * 5000 + "b = 1}", "[" + "a." * 5000 + "b]"]
+)
+def test_a_key_of_many_parts_costs_little_memory(
+    tmp_path: Path, text: str, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text(text)
+
+    tracemalloc.start()
+    try:
+        with pytest.raises((Malformed, ConfigError), match="nested more than 32 levels deep"):
+            read(path)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert peak_bytes < 20_000_000
+
+
+@given(st.text("a\"'\\., =[{#\n", max_size=60))
+def test_dotted_text_that_is_no_deep_key_is_read(text: str) -> None:
+    try:
+        expected: object = tomllib.loads(text)
+    except ValueError:
+        expected = None
+    try:
+        found: object = parse_toml(text)
+    except ValueError:
+        found = None
+    assert found == expected
 
 
 @pytest.mark.parametrize("content", [b"[" * 100_000, b"NaN", b"[1e999]" * 2, b"1" * 5000, b"\xff"])
