@@ -78,6 +78,7 @@ class PtyLine:
             return
         if self._loop is not None:
             self._loop.remove_reader(self._fds[0])
+            self._loop.remove_writer(self._fds[0])
         for fd in self._fds:
             os.close(fd)
         self._fds, self._rest = None, b""
@@ -96,6 +97,10 @@ class PtyLine:
         if self._rest and self._fds is not None:
             with suppress(BlockingIOError):
                 self._rest = self._rest[os.write(self._fds[0], self._rest) :]
+            if self._loop is not None:  # the last write of all has none after it that would go on
+                self._loop.remove_writer(self._fds[0])
+                if self._rest:
+                    self._loop.add_writer(self._fds[0], self._flushed)
         return not self._rest
 
     async def serve(self, take: Callable[[bytes], None]) -> None:
@@ -117,6 +122,7 @@ class PtyLine:
         finally:
             if self._fds is not None:
                 self._loop.remove_reader(self._fds[0])
+                self._loop.remove_writer(self._fds[0])
             self._loop, self._take = None, _ignore
 
     def _readable(self) -> None:
