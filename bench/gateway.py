@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import json
 import os
+import sys
 import time
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -18,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.harness import loop_s
+from bench.request_flood import SECONDS
 from bench.worn import bench_rig, fitted
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig
@@ -28,10 +31,14 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.tools.demo_processes import Simulator
 
 SETTLE_S = 4.0
 """Clocks settle meanwhile; not measured."""
 CONNECT_S, END_S = 40.0, 20.0
+FLOOD_START_S = 0.5
+"""The flooding process imports and connects meanwhile; not measured."""
+ROOT = Path(__file__).resolve().parents[1]
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
 TOPICS = ("pose", "bridge/health", "bridge/state", "device/+/availability")
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -107,8 +114,95 @@ def calibration() -> Calibration:
     return fitted(bench_rig())
 
 
+@dataclass(frozen=True, slots=True)
+class FloodFigures:
+    """Latencies of every frame of one run, before and during a flood of requests."""
+
+    quiet_ms: list[float]
+    flooded_ms: list[float]
+    quiet_cpu_s: float
+    flooded_cpu_s: float
+    """CPU time of the daemon in each part."""
+    seconds: float
+    """Length of each part."""
+    requests: int
+    """Requests sent in that time."""
+    ignored: int
+    """Requests that the daemon counted as ignored."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Gateway:
+    """Running hardware and daemon, and their subscriber."""
+
+    hardware: Simulator
+    pid: int
+    heard: Heard
+    began_s: float
+    """When the daemon was started, monotonic."""
+
+
 async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
     """Start everything, settle, measure for `seconds`, stop the hardware, account for samples."""
+    async with _gateway(folder, port, load) as gateway:
+        heard = gateway.heard
+        measured = await _measure(gateway.pid, heard, seconds)
+        sent = (await gateway.hardware.quit())["sent"]
+        devices = await _last_health(heard)
+        return Figures(
+            *measured,
+            _unaccounted(sent, devices),
+            sum(device["received"] for device in devices.values()),
+            (heard.running_s or 0.0) - gateway.began_s,
+            (heard.first_pose_s or 0.0) - gateway.began_s,
+        )
+
+
+async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
+    """Start everything, settle, measure without requests and then under a flood of them."""
+    async with _gateway(folder, port, load) as gateway:
+        heard, pid = gateway.heard, gateway.pid
+        quiet_ms, _, quiet_cpu, *_ = await _measure(pid, heard, SECONDS)
+
+        async with flooder(port, f"jointfit/{folder.name}", SECONDS) as flood:
+            await asyncio.sleep(FLOOD_START_S)
+            flooded_ms, seconds, flooded_cpu, *_ = await _measure(pid, heard, SECONDS)
+            sent = await flood
+        heard.health.clear()
+        async with asyncio.timeout(END_S):
+            while not heard.health:  # noqa: ASYNC110 - as in _last_health
+                await asyncio.sleep(0.05)
+        ignored = heard.health["link"]["ignored_requests"]
+        return FloodFigures(quiet_ms, flooded_ms, quiet_cpu, flooded_cpu, seconds, sent, ignored)
+
+
+@asynccontextmanager
+async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio.Task[int]]:
+    """Run a process that floods the daemon; yield a task that returns how many requests it sent."""
+    words = ("-m", "bench.request_flood", str(port), base, "--seconds", str(seconds))
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, *words, cwd=ROOT, stdout=asyncio.subprocess.PIPE
+    )
+
+    async def ended() -> int:
+        said, _ = await process.communicate()
+        report = json.loads(said)
+        assert report["seconds"] < seconds + 2.0, f"the flood was too slow: {report}"
+        sent: int = report["sent"]
+        return sent
+
+    task = asyncio.create_task(ended(), name="flooder")
+    try:
+        yield task
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await asyncio.wait([task])
+
+
+@asynccontextmanager
+async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gateway]:
+    """Start hardware, subscriber and daemon; ready when all sources are online and settled."""
     base = f"jointfit/{folder.name}"
     CalibrationStore(folder / "state" / "calibrations", "demo").save(calibration())
     async with simulator(folder, port, base, load.options) as hardware:
@@ -116,7 +210,7 @@ async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
         rig = load_rig(rig_file)
         assert calibration().fits(rig.chain)
         wanted = {source.id for source in rig.sources}
-        async with _subscriber(rig.mqtt) as heard:
+        async with subscriber(rig.mqtt) as heard:
             began = time.monotonic()
             async with daemon(folder, rig_file) as process:
                 assert process.process is not None
@@ -125,20 +219,12 @@ async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
                         process.check()
                         await asyncio.sleep(0.05)
                 await asyncio.sleep(SETTLE_S)
-                measured = await _measure(process.process.pid, heard, seconds)
-                sent = (await hardware.quit())["sent"]
-                devices = await _last_health(heard)
-            return Figures(
-                *measured,
-                _unaccounted(sent, devices),
-                sum(device["received"] for device in devices.values()),
-                (heard.running_s or 0.0) - began,
-                (heard.first_pose_s or 0.0) - began,
-            )
+                yield _Gateway(hardware, process.process.pid, heard, began)
 
 
 @asynccontextmanager
-async def _subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
+async def subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
+    """Yield what a subscriber receives from the daemon, until the block ends."""
     heard = Heard()
     async with MqttClient(settings) as client:
         await client.subscribe(*TOPICS)

@@ -1,27 +1,36 @@
-"""A socket that drops incoming MQTT packets over a size limit.
+"""A socket that drops incoming MQTT packets over a size limit, and messages that are not admitted.
 
-Invariant: a packet over the limit costs time, no memory. paho stores a packet whole before it
-decodes it, and asks the kernel for all of it at once. MQTT 5 lets a client announce a maximum
-packet size; MQTT 3.1.1 does not, and not every broker respects the announcement.
+Invariant: a packet over the limit costs time, no memory, and a message that is not admitted is
+dropped before it is decoded. paho stores a packet whole before it decodes it, and asks the kernel
+for all of it at once. MQTT 5 lets a client announce a maximum packet size; MQTT 3.1.1 does not, and
+not every broker respects the announcement.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _DISCARDED_BYTES = 64 * 1024
 """Read and discarded in one turn of the event loop: other tasks run in between."""
+_DROPPED_AT_ONCE = 16
+"""Packets dropped in one turn of the event loop, at 10 µs each."""
 _MORE = 0x80
 """Bit of a length byte: another one follows."""
 _SHORTEST_HEADER, _LONGEST_HEADER = 2, 5
 """Bytes: packet type and up to four bytes of remaining length (MQTT 5.0, section 2.1.4)."""
+_TYPE, _PUBLISH, _RETAIN = 0xF0, 0x30, 0x01
+"""Bits of the first byte: packet type, its value for a message, and the retain flag."""
+_TOPIC_LENGTH_BYTES = 2
 
 
 class PacketLimitSocket:
     """Wraps a connected, non-blocking socket.
 
-    Everything but ``recv`` is the socket's own. Bytes are not buffered beyond a packet's header,
-    so the readiness of the socket stays the readiness of this object.
+    Everything but ``recv`` is the socket's own. Bytes of the packets behind the current one are not
+    buffered, so the readiness of the socket stays the readiness of this object.
 
     Parameters
     ----------
@@ -29,34 +38,42 @@ class PacketLimitSocket:
         A ``socket.socket`` or ``ssl.SSLSocket``.
     longest_bytes
         Greatest remaining length of a packet that is passed on.
+    admit
+        Called with the topic of each message within the limit, and whether it is marked as
+        retained; the message is dropped if it returns False. A dropped message is not
+        acknowledged: only for subscriptions at QoS 0.
     """
 
-    def __init__(self, wrapped: Any, longest_bytes: int) -> None:
-        self.dropped = 0
+    def __init__(
+        self,
+        wrapped: Any,
+        longest_bytes: int,
+        admit: Callable[[str, bool], bool] | None = None,
+    ) -> None:
+        self.oversized = 0
         """Packets that were over the limit."""
-        self._wrapped, self._longest_bytes = wrapped, longest_bytes
+        self._wrapped, self._longest_bytes, self._admit = wrapped, longest_bytes, admit
         self._header = b""
         """Of the packet being read; complete before any of it is passed on."""
+        self._start = b""
+        """What was read behind the header to know the topic."""
         self._ready = b""
-        """What is left of a complete header."""
+        """What is left to pass on of a header and what was read with it."""
         self._body_bytes = self._excess_bytes = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._wrapped, name)
 
     def recv(self, size: int) -> bytes:
-        """Return up to `size` bytes of packets within the limit; empty: the peer closed.
+        """Return up to `size` bytes of packets that are passed on; empty: the peer closed.
 
         Raises
         ------
         BlockingIOError
             Nothing to pass on yet.
         """
-        within_packet = self._ready or self._body_bytes or self._excess_bytes
-        if not within_packet and not self._read_header():
+        if not self._ready and not self._body_bytes and not self._find_packet():
             return b""
-        if self._excess_bytes:
-            return self._discard()
         if self._ready:
             passed, self._ready = self._ready[:size], self._ready[size:]
             return passed
@@ -64,28 +81,76 @@ class PacketLimitSocket:
         self._body_bytes -= len(data)
         return data
 
+    def _find_packet(self) -> bool:
+        """Read up to a packet that is passed on; return False if the peer closed."""
+        for _ in range(_DROPPED_AT_ONCE):
+            if self._excess_bytes and not self._discard():
+                return False
+            if not self._read_header():
+                return False
+            length = sum((byte & 0x7F) << 7 * place for place, byte in enumerate(self._header[1:]))
+            if length > self._longest_bytes:
+                self.oversized += 1
+                self._header, self._excess_bytes = b"", length
+                continue
+
+            asks = self._admit is not None and self._header[0] & _TYPE == _PUBLISH
+            if asks and not self._read_topic(length):
+                return False
+            header, start = self._header, self._start
+            self._header = self._start = b""
+            if asks and not self._is_admitted(header, start):
+                self._excess_bytes = length - len(start)
+                continue
+            self._ready, self._body_bytes = header + start, length - len(start)
+            return True
+        raise BlockingIOError
+
     def _read_header(self) -> bool:
-        """Read up to the end of the next header; return False if the peer closed."""
-        while len(self._header) < _SHORTEST_HEADER or self._header[-1] & _MORE:
+        """Read up to the end of the header; return False if the peer closed."""
+        while (missing := _SHORTEST_HEADER - len(self._header)) > 0 or self._header[-1] & _MORE:
             if len(self._header) == _LONGEST_HEADER:
                 break  # malformed: paho reports it
-            byte: bytes = self._wrapped.recv(1)
-            if not byte:
+            data: bytes = self._wrapped.recv(max(1, missing))
+            if not data:
                 return False
-            self._header += byte
-
-        header, self._header = self._header, b""
-        length = sum((byte & 0x7F) << 7 * place for place, byte in enumerate(header[1:]))
-        if length > self._longest_bytes:
-            self.dropped += 1
-            self._excess_bytes = length
-        else:
-            self._ready, self._body_bytes = header, length
+            self._header += data
         return True
 
-    def _discard(self) -> bytes:
+    def _read_topic(self, length: int) -> bool:
+        """Read up to the end of the topic or more of the packet; return False if the peer closed.
+
+        Parameters
+        ----------
+        length
+            Remaining length of the packet; a topic that is longer is malformed, and cut off.
+        """
+        while len(self._start) < min(length, _topic_end(self._start)):
+            data: bytes = self._wrapped.recv(length - len(self._start))
+            if not data:
+                return False
+            self._start += data
+        return True
+
+    def _is_admitted(self, header: bytes, start: bytes) -> bool:
+        topic = start[_TOPIC_LENGTH_BYTES : _topic_end(start)].decode(errors="replace")
+        return self._admit is None or self._admit(topic, bool(header[0] & _RETAIN))
+
+    def _discard(self) -> bool:
+        """Read what is left of a dropped packet; return False if the peer closed.
+
+        Raises
+        ------
+        BlockingIOError
+            More of it is left than is read in one turn.
+        """
         data = self._wrapped.recv(min(self._excess_bytes, _DISCARDED_BYTES))
-        if not data:
-            return b""
         self._excess_bytes -= len(data)
-        raise BlockingIOError
+        if data and self._excess_bytes:
+            raise BlockingIOError
+        return bool(data)
+
+
+def _topic_end(start: bytes) -> int:
+    """Return where the topic ends in the body of a PUBLISH packet, as far as `start` shows it."""
+    return _TOPIC_LENGTH_BYTES + int.from_bytes(start[:_TOPIC_LENGTH_BYTES], "big")

@@ -182,7 +182,9 @@ class MqttPublisher:
         life = self._outbox.life
         will = Outgoing(life, OFFLINE, 1, retain=True)
         name = client_id(self._settings.base)
-        async with MqttConnection(self._settings, name, will=will, farewell=will) as connection:
+        async with MqttConnection(
+            self._settings, name, will=will, farewell=will, admit=self._admit
+        ) as connection:
             self._connection = connection
             self.connects, self.connected, self._said = self.connects + 1, True, ""
             log.info("mqtt: connected to %s:%d", self._settings.host, self._settings.tcp_port)
@@ -248,12 +250,20 @@ class MqttPublisher:
         async for message in connection.messages():
             if message.topic in self._echoes:
                 await self._take_echo(connection, message)
-            elif message.retained:
-                self._ignore("it is retained and would run at every start; do not retain requests")
-            elif not self._allowance.take(self._loop.time()):
-                self._ignore(f"more than {REQUEST_RATE_HZ:g} a second arrive")
             else:
                 self._on_request(message)
+
+    def _admit(self, topic: str, retained: bool) -> bool:
+        """Return whether a message may pass; count a request that may not."""
+        if topic in self._echoes:
+            return True
+        if retained:
+            self._ignore("it is retained and would run at every start; do not retain requests")
+            return False
+        if not self._allowance.take(self._loop.time()):
+            self._ignore(f"more than {REQUEST_RATE_HZ:g} a second arrive")
+            return False
+        return True
 
     async def _take_echo(self, connection: MqttConnection, message: Incoming) -> None:
         if message.retained and not self._modern:

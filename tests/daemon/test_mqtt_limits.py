@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.outputs.mqtt import BrokerLost, MqttConnection, Outgoing
+from jointfit_daemon.outputs.mqtt import BrokerLost, Incoming, MqttConnection, Outgoing
 from jointfit_daemon.outputs.packet_limit import PacketLimitSocket
 from jointfit_daemon.outputs.publisher import REQUEST_BURST, REQUEST_RATE_HZ
 from tests.daemon.test_mqtt import BASE, LIFE, Link, running, settings, until
@@ -39,17 +39,26 @@ def packet(length: int, first: int = 0x30) -> bytes:
             return bytes(header) + bytes(length)
 
 
-def passed_on(sent: bytes, chunk: int) -> bytes:
+def message(topic: str, payload: bytes, *, retained: bool) -> bytes:
+    """Return an MQTT 3.1.1 PUBLISH packet at QoS 0."""
+    body = struct.pack(">H", len(topic)) + topic.encode() + payload
+    return packet(len(body), 0x31 if retained else 0x30)[: -len(body)] + body
+
+
+def passed_on(sent: bytes, chunk: int, admit: Callable[[str, bool], bool] | None = None) -> bytes:
     """Return the bytes a reader gets, which reads as paho does: header byte by byte, then all."""
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.setblocking(False)
-        limited, found = PacketLimitSocket(ours, LIMIT), b""
+        limited, found = PacketLimitSocket(ours, LIMIT, admit), b""
         for start in range(0, len(sent), chunk):
             theirs.sendall(sent[start : start + chunk])
-            for _ in range(2 * chunk + 9):
-                with contextlib.suppress(BlockingIOError):
+            idle = 0
+            while idle < 9:  # beyond the limit, several packets are dropped in one call
+                try:
                     found += limited.recv(1 if len(found) % 2 else 1000)
+                except BlockingIOError:
+                    idle += 1
         return found
 
 
@@ -58,6 +67,35 @@ def test_exactly_the_packets_within_the_limit_are_passed_on(lengths: list[int], 
     sent = b"".join(packet(length) for length in lengths)
     kept = b"".join(packet(length) for length in lengths if length <= LIMIT)
     assert passed_on(sent, chunk) == kept
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["", "a", "a/b", "c" * 200]), st.integers(0, 400), st.booleans())
+    ),
+    st.integers(1, 5000),
+)
+def test_exactly_the_admitted_messages_are_passed_on(
+    sent: list[tuple[str, int, bool]], chunk: int
+) -> None:
+    asked: list[tuple[str, bool]] = []
+
+    def admit(topic: str, retained: bool) -> bool:
+        asked.append((topic, retained))
+        return topic.startswith("a") and not retained
+
+    other = packet(7, 0xD0)  # not a message: passed on without a question
+    arriving = passed = b""
+    within: list[tuple[str, bool]] = []
+    for topic, length, retained in sent:
+        one = message(topic, bytes(length), retained=retained)
+        arriving += one + other
+        if 2 + len(topic) + length <= LIMIT:
+            within.append((topic, retained))
+            passed += one if topic.startswith("a") and not retained else b""
+        passed += other
+    assert passed_on(arriving, chunk, admit) == passed
+    assert asked == within
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
@@ -115,6 +153,29 @@ async def test_requests_are_handed_on_at_a_bounded_rate(
         allowed = REQUEST_BURST + REQUEST_RATE_HZ * (time.monotonic() - began)
         assert REQUEST_BURST <= len(link.requests) <= allowed + 1
     assert caplog.text.count("ignored a request") <= 1 + (time.monotonic() - began) / 10
+
+
+async def test_requests_beyond_the_rate_are_dropped_before_they_are_decoded(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded = 0
+    messages = MqttConnection.messages
+
+    async def counted(connection: MqttConnection) -> AsyncIterator[Incoming]:
+        nonlocal decoded
+        async for found in messages(connection):
+            decoded += found.topic == REQUEST
+            yield found
+
+    monkeypatch.setattr(MqttConnection, "messages", counted)
+    async with running(Link(broker.port)) as link:
+        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        async with MqttConnection(settings(broker.port)) as attacker:
+            for number in range(500):
+                await attacker.publish(Outgoing(REQUEST, b"[[", qos=number % 2))
+        await until(lambda: link.publisher.ignored_requests + len(link.requests) == 500)
+        assert decoded == len(link.requests)
+        assert link.publisher.connects == 1
 
 
 # --- refusals ---------------------------------------------------------------------------------
