@@ -183,6 +183,11 @@ class MqttConnection:
             await self._client.__aexit__(None, None, None)
 
     @property
+    def opened(self) -> bool:
+        """Whether a socket was opened, and its TLS handshake, if any, completed."""
+        return self._limited is not None
+
+    @property
     def oversized(self) -> int:
         """Incoming packets that were dropped because they were over the limit."""
         return self._client.oversized
@@ -311,7 +316,7 @@ class MqttConnection:
 
     def _hint(self, error: Exception) -> str:
         met = self._troubles.last or error.__cause__ or error.__context__
-        if remedy := tls_remedy(met, self._settings):
+        if remedy := tls_remedy(met, self._settings, established=self._client.opened):
             return remedy
         if self._modern and ("timed out" in str(error) or _CLOSED_EARLY in str(error)):
             return (

@@ -78,14 +78,30 @@ def _no_passphrase() -> str:
     return ""
 
 
-def tls_remedy(error: BaseException | None, settings: MqttSettings) -> str:
-    """Return what to do about a connection that `error` kept from being made; empty: unknown."""
+def tls_remedy(
+    error: BaseException | None, settings: MqttSettings, *, established: bool = False
+) -> str:
+    """Return what to do about a connection that `error` kept from being made; empty: unknown.
+
+    Parameters
+    ----------
+    error
+        What ended it.
+    settings
+        Of the broker.
+    established
+        Whether our side of the TLS handshake completed. A broker that ends the connection after
+        that has refused our certificate: in TLS 1.3 it checks it last, and the alert that says so is
+        lost if the connection is reset at once.
+    """
     if isinstance(error, ssl.SSLCertVerificationError):
         return f" ({_distrust(error.verify_code, settings)})"
     if isinstance(error, ssl.SSLError) and "ALERT" in str(error.reason):
         return f" ({_refused(settings)})"
     plain = isinstance(error, ssl.SSLError) and error.reason in _PLAIN_ANSWERS
     cut = isinstance(error, ssl.SSLEOFError | ConnectionResetError)
+    if settings.tls is not None and cut and established:
+        return f" ({_refused(settings)})"
     if settings.tls is not None and (plain or cut):
         port = settings.tcp_port
         return f" (port {port} does not answer to TLS: set the port of the broker's TLS listener)"

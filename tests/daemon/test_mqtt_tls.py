@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.config.tables import TlsSettings
 from jointfit_daemon.outputs.mqtt import BrokerLost, MqttConnection
-from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context
+from jointfit_daemon.outputs.mqtt_tls import TlsFault, tls_context, tls_remedy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -177,3 +177,10 @@ def test_a_broker_on_this_machine_needs_neither(host: str) -> None:
 def test_a_key_without_its_certificate_is_a_fault() -> None:
     with pytest.raises(ValidationError, match="set cert, too"):
         TlsSettings(key="x")
+
+
+def test_tls_remedy_names_the_certificate_if_the_handshake_was_completed() -> None:
+    secure = MqttSettings(host="127.0.0.1", base="jointfit/t", tls=TlsSettings())
+    reset = ConnectionResetError()
+    assert "does not answer to TLS" in tls_remedy(reset, secure)
+    assert "asks for a certificate of ours" in tls_remedy(reset, secure, established=True)
