@@ -183,11 +183,6 @@ class MqttConnection:
             await self._client.__aexit__(None, None, None)
 
     @property
-    def opened(self) -> bool:
-        """Whether a socket was opened, and its TLS handshake, if any, completed."""
-        return self._limited is not None
-
-    @property
     def oversized(self) -> int:
         """Incoming packets that were dropped because they were over the limit."""
         return self._client.oversized
@@ -386,6 +381,11 @@ class _Client(aiomqtt.Client):
         self._longest_bytes, self._admit = longest_bytes, admit
         self._limited: PacketLimitSocket | None = None
         self._disconnected.add_done_callback(self._fail_handshake)
+
+    @property
+    def opened(self) -> bool:
+        """Whether a socket was opened, and its TLS handshake, if any, completed."""
+        return self._limited is not None
 
     @property
     def oversized(self) -> int:

@@ -91,8 +91,8 @@ def tls_remedy(
         Of the broker.
     established
         Whether our side of the TLS handshake completed. A broker that ends the connection after
-        that has refused our certificate: in TLS 1.3 it checks it last, and the alert that says so is
-        lost if the connection is reset at once.
+        that has refused our certificate: in TLS 1.3 it is checked last, and the alert that says so
+        is lost if the connection is reset at once.
     """
     if isinstance(error, ssl.SSLCertVerificationError):
         return f" ({_distrust(error.verify_code, settings)})"
