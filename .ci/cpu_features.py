@@ -38,7 +38,8 @@ def main(arguments: list[str]) -> int:
         began = time.monotonic()
         command = [
             sys.executable, "-m", "pytest", "-q", "-n", str(len(os.sched_getaffinity(0))),
-            "--dist", "worksteal", "--part", "parallel", *(arguments or [*TESTS, f"--ignore={TOO_LONG}"]),
+            "--dist", "worksteal", "--part", "parallel",
+            *(arguments or [*TESTS, f"--ignore={TOO_LONG}"]),
         ]  # fmt: skip
         status = subprocess.run(  # noqa: S603 - our own command
             command, check=False, env=os.environ | {name: text}
