@@ -7,11 +7,13 @@ each other in ways that only they know.
 from __future__ import annotations
 
 from base64 import b64decode
-from math import isfinite, sqrt
+from dataclasses import fields, is_dataclass
+from math import inf, isfinite, sqrt
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from jointfit_daemon.calibration.patent import Reading
 from jointfit_daemon.calibration.trial import Method
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ _LONGEST_M = 10.0
 _FARTHEST_M = 1000.0
 _LONGEST_LAG_NS = 10**10
 _LARGEST_SD = 1e3
+_LARGEST = 1e12
+"""No coefficient of a model is larger."""
 _POLYNOMIALS = 10
 _COMPONENTS = {"pair": 3, "joint": 1}
 _HALF = sqrt(0.5)
@@ -65,6 +69,7 @@ def _faults(c: Calibration) -> Iterator[str]:
     yield from _clusters(c)
     for link in c.links:
         yield from _link(link, worn)
+    yield from _quality(c.quality)
     for name, rho in c.correlations.items():
         if name not in c.joints or not _number(rho, -1.0, 1.0):
             yield f"correlations.{name}: {rho!r}"
@@ -89,8 +94,43 @@ def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
         sensors, bar, other = key.partition("|")
         if not bar:
             yield f"segment.{name}.models: {key!r} names no set of sensors"
+        elif wrong := [*_wrong_types(model)]:
+            yield f"segment.{name}.models[{key}]: wrong type of {', '.join(wrong)}"
         elif fault := _model(model, len(sensors.split("+")), has_other=bool(other)):
             yield f"segment.{name}.models[{key}]: {fault}"
+
+
+def _wrong_types(model: Any) -> Iterator[str]:
+    """Yield the fields of a model whose values are not of the annotated type.
+
+    Evaluating a model does not reach all of them: some count only after a sensor was lost.
+    """
+    for field in fields(model):
+        value = getattr(model, field.name)
+        if field.name.startswith("_"):  # derived from the others
+            continue
+        if is_dataclass(value):
+            yield from (f"{field.name}.{name}" for name in _wrong_types(value))
+        elif not _is_of(value, str(field.type)):
+            yield field.name
+
+
+def _is_of(value: object, annotation: str) -> bool:
+    if annotation == "bool":
+        return isinstance(value, bool)
+    if annotation == "int":
+        return isinstance(value, int) and _number(value, 0, _LARGEST)
+    if annotation == "Reading":
+        return value in get_args(Reading)
+    if annotation == "float":
+        return _number(value, -_LARGEST, _LARGEST)
+    return isinstance(value, tuple) and all(_is_numeric(item) for item in value)
+
+
+def _is_numeric(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(_is_numeric(item) for item in value)
+    return _number(value, -_LARGEST, _LARGEST)
 
 
 def _model(model: SegmentModel, count: int, *, has_other: bool) -> str | None:
@@ -105,6 +145,24 @@ def _model(model: SegmentModel, count: int, *, has_other: bool) -> str | None:
         if not _is_unit(found.q) or not all(_number(sd, 0.0, _LARGEST_SD) for sd in sds):
             return "gives no orientation with a standard deviation"
     return None if _number(model.residual_sd, 0.0, _LARGEST_SD) else "residual_sd is no number"
+
+
+def _quality(quality: Mapping[str, Any]) -> Iterator[str]:
+    """Check the figures that the program itself reads; the others are published as they are."""
+    for key, section in quality.items():
+        if not (section is None or isinstance(section, dict)):
+            yield f"quality.{key}: expected a table"
+            return
+    for key in ("segments", "flexion"):
+        for name, figures in (quality.get("holdout", {}).get(key) or {}).items():
+            if not isinstance(figures, dict):
+                yield f"quality.holdout.{key}.{name}: expected a table"
+    for name, lag in (quality.get("lag") or {}).items():
+        if not (isinstance(lag, dict) and _number_or_none(lag.get("sigma_ns"), 0.0, inf)):
+            yield f"quality.lag.{name}: expected a table with sigma_ns"
+    rounds = (quality.get("online") or {}).get("rounds", 0)
+    if not _is_of(rounds, "int"):
+        yield f"quality.online.rounds: {rounds!r}"
 
 
 def _joints(c: Calibration) -> Iterator[str]:

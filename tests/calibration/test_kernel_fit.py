@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from jointfit_daemon.calibration.content_check import _wrong_types
 from jointfit_daemon.calibration.held_out_spread import measure_spread
 from jointfit_daemon.calibration.kernel_expert import LARGEST
 from jointfit_daemon.calibration.kernel_model import KernelModel, fit_kernel
@@ -209,6 +210,16 @@ def test_a_model_of_an_earlier_version_has_no_trend_and_still_works() -> None:
     old = KernelModel.read(data)
     inside = old.predict(knee.sensors, knee.other)
     assert knee.error(inside) < 1.2 * knee.error(model.predict(knee.sensors, knee.other))
+
+
+def test_a_stored_model_with_wrong_types_is_found_wherever_they_are() -> None:
+    data = fit_kernel(Knee().training()).to_dict()
+    assert [*_wrong_types(KernelModel.read(data))] == []
+
+    data["mean_sd"] = {}
+    data["tilted"] |= {"tilted": "yes", "carried": ["", 1.0, 1.0]}
+    found = {*_wrong_types(KernelModel.read(data))}
+    assert found == {"mean_sd", "tilted.tilted", "tilted.carried"}
 
 
 def test_who_stands_still_and_straight_for_most_of_the_time_still_gets_a_fit() -> None:
