@@ -21,8 +21,6 @@ from pathlib import Path
 from numpy._core import _multiarray_umath as umath  # type: ignore[attr-defined]  # no stub
 
 TESTS = [f"tests/{name}" for name in ("timing", "kinematics", "calibration", "fusion", "pipeline")]
-TOO_LONG = "tests/calibration/test_simulated_person.py"
-"""Left out: as long as all the others together, and its bounds are far from last bits."""
 CORE_TYPES = {"Nehalem": "sse4_2", "Haswell": "avx2", "SkylakeX": "avx512f", "Zen": "avx2"}
 """Kernels of OpenBLAS, and the flag of /proc/cpuinfo that a processor needs for them."""
 
@@ -39,7 +37,7 @@ def main(arguments: list[str]) -> int:
         command = [
             sys.executable, "-m", "pytest", "-q", "-n", str(len(os.sched_getaffinity(0))),
             "--dist", "worksteal", "--part", "parallel",
-            *(arguments or [*TESTS, f"--ignore={TOO_LONG}"]),
+            *(arguments or TESTS),
         ]  # fmt: skip
         status = subprocess.run(  # noqa: S603 - our own command
             command, check=False, env=os.environ | {name: text}

@@ -27,28 +27,29 @@ settings.load_profile("ci" if os.environ.get("CI") else "home")
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
 
-PARTS = ("parallel", "alone")
+PARTS = ("parallel", "alone", "figures")
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option with which `make test` runs the suite in two parts."""
+    """Add the option with which the Makefile runs the suite in parts."""
     parser.addoption(
         "--part",
         choices=PARTS,
-        help="only the tests with the marker alone, or only the others, which may run in parallel",
+        help="only the tests with the marker alone or figures, or only the others (parallel)",
     )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests of the other part."""
+    """Deselect the tests of the other parts."""
     part = config.getoption("part")
     if part is None:
         return
 
     def belongs(item: pytest.Item) -> bool:
-        return (item.get_closest_marker("alone") is not None) is (part == "alone")
+        marked = [name for name in PARTS if item.get_closest_marker(name) is not None]
+        return part == (marked[0] if marked else "parallel")
 
     config.hook.pytest_deselected(items=[item for item in items if not belongs(item)])
     items[:] = [item for item in items if belongs(item)]

@@ -182,8 +182,10 @@ def _clusters(c: Calibration) -> Iterator[str]:
         yield from _names(f"{key}.markers", cluster.markers)
         if not (cluster.body is None or _is_text(cluster.body)):
             yield f"{key}.body: {cluster.body!r}"
-        if cluster.markers or cluster.template:
-            yield from _finite(f"{key}.template", cluster.template, (len(cluster.markers), 3))
+        # A rigid body is followed by its own orientation, whatever its template holds.
+        count = len(cluster.markers) if cluster.body is None else len(cluster.template)
+        if count or cluster.template:
+            yield from _finite(f"{key}.template", cluster.template, (count, 3))
         yield from _finite(f"{key}.origin", cluster.origin, (3,))
         yield from _unit(f"{key}.q_body", cluster.q_body)
 

@@ -8,6 +8,7 @@ from bench.experiment import DATA, Experiment
 from bench.joint_center_rows import a_planar, a_planar_oriented
 from bench.planar_runs import runs_on, share_covered
 
+pytestmark = pytest.mark.figures
 EXPERIMENTS = (*a_planar.EXPERIMENTS, *a_planar_oriented.EXPERIMENTS)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from bench.experiment import find_experiments
 
+pytestmark = pytest.mark.figures
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -6,6 +6,8 @@ import pytest
 
 from bench.accuracy_rows.e_simulated_limb import people
 
+pytestmark = pytest.mark.figures
+
 
 @pytest.mark.timeout(180)
 def test_the_demos_person_is_measured_to_three_degrees() -> None:

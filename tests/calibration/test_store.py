@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from jointfit_daemon.calibration.content_check import content_faults
 from jointfit_daemon.calibration.result import (
     Calibration,
     JointCalibration,
@@ -206,6 +207,12 @@ def nested(levels: int) -> Any:
     for _ in range(levels):
         value = {"a": value}
     return value
+
+
+def test_a_rigid_body_may_have_a_template_without_markers(tmp_path: Path) -> None:
+    content = stored_table(tmp_path)["calibration"]
+    first(content["clusters"]).update(markers=[], body="Thigh")
+    assert content_faults(Calibration.from_dict(content)) == []
 
 
 @pytest.mark.parametrize("name", WRONG)

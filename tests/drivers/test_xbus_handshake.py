@@ -237,6 +237,7 @@ class Queueing(XbusDevice):
         loop.call_at(self.free_s, super()._answer, message)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("streams", [True, False])
 async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
     tmp_path: Path, streams: bool

@@ -7,6 +7,8 @@ import pytest
 from bench.experiment import DATA, Experiment
 from bench.joint_center_rows.b_spatial import AT_20, AT_45, EXPERIMENTS, ball_joint
 
+pytestmark = pytest.mark.figures
+
 
 @pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if not e.long], ids=lambda e: e.id)
 def test_every_spatial_figure_keeps_its_goal(experiment: Experiment) -> None:
