@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     def belongs(item: pytest.Item) -> bool:
         marked = [name for name in PARTS if item.get_closest_marker(name) is not None]
-        return part == (marked[0] if marked else "parallel")
+        return bool(part == (marked[0] if marked else "parallel"))
 
     config.hook.pytest_deselected(items=[item for item in items if not belongs(item)])
     items[:] = [item for item in items if belongs(item)]

@@ -69,8 +69,8 @@ class _Subscriber:
     needed: CanKey
     others: int
     """Frames of all devices that had come when it subscribed."""
-    arrived: set[CanKey] = field(default_factory=set)
-    """Which of its identifiers came since it subscribed."""
+    arrived: dict[CanKey, int] = field(default_factory=dict)
+    """Which of its identifiers came since it subscribed, and when the last time, ns."""
     early: deque[Chunk] = field(default_factory=lambda: deque(maxlen=_EARLY))
 
     @property
@@ -86,7 +86,7 @@ class _Subscriber:
         if self.ended.done():
             return
         keys = {(frame.can_id, frame.extended) for frame in frames if not frame.error}
-        self.arrived |= keys
+        self.arrived |= dict.fromkeys(keys, t_ns)
         chunk = Chunk(t_ns, pack_frames(frames))
         if keys and not self.is_complete:
             self.early.append(chunk)
@@ -207,7 +207,15 @@ class SharedBus:
         """Return what is missing and what comes instead; the same text as long as that is so."""
         ids, needed = subscriber.ids, subscriber.needed
         what = ids[needed]
-        others = sorted(subscriber.arrived - {needed})
+        since_ns = time.monotonic_ns() - round(subscriber.silence_s * 1e9)
+        others = sorted(
+            key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
+        )
+        if subscriber.is_complete and not others:  # its settings are right: it sent all it should
+            return (
+                f"{subscriber.name} ({self.channel}): silent for {subscriber.silence_s:g} s: "
+                "check its power and wiring"
+            )
         found = [f"{ids[key]} ({_hex(key)})" for key in others]
         text = f"{subscriber.name} ({self.channel}): no {what} ({_hex(needed)}) comes"
         if found:
