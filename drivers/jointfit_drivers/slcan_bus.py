@@ -48,6 +48,7 @@ class SlcanBus:
         baud = settings.baud if settings.transport == "uart" else None
         self._decoder = SlcanDecoder(baud, bitrate=settings.bitrate)
         self._understood = 0  # frames and answers of the handshake
+        self._early: list[tuple[int, list[CanFrame]]] = []  # read together with the answer to `O`
         self._is_open = False
         self._reading: asyncio.Task[None] | None = None
 
@@ -125,6 +126,8 @@ class SlcanBus:
                 deliver(chunk.t_ns, frames)
 
         try:
+            while self._early:
+                deliver(*self._early.pop(0))
             await self._port.pump(take, None)  # silence is each subscriber's own matter
         except Exception as error:  # noqa: BLE001 - handed to every subscriber, who raises it
             failed(error)
@@ -138,6 +141,7 @@ class SlcanBus:
                 break
         self._port.flush_input()
         self._decoder.flush()
+        self._early.clear()
         await self._ask(b"V\r", "V")
         if await self._ask(b"S%d\r" % code) == "\a":
             raise DeviceMisconfigured(
@@ -170,7 +174,10 @@ class SlcanBus:
         found = self._decoder.feed(chunk.data, chunk.t_ns)
         lines = [item for item in found if isinstance(item, SlcanLine)]
         # A bare CR proves nothing: everything that answers in lines of text sends some.
-        self._understood += sum(isinstance(item, CanFrame) for item in found)
+        frames = [item for item in found if isinstance(item, CanFrame)]
+        if frames:  # they follow the answer to `O`: the bus was closed before
+            self._early.append((chunk.t_ns, frames))
+        self._understood += len(frames)
         self._understood += sum(line.letter != "" for line in lines)
         return lines
 

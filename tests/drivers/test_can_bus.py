@@ -8,19 +8,23 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from pydantic import ValidationError
+from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can_frame import CanFrame
+from jointfit_protocols.slcan import encode_frame
 from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.can_wire import SlcanAdapter
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterable
     from pathlib import Path
+
+    from jointfit_protocols.slcan import SlcanLine
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -119,6 +123,43 @@ async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> 
         await runs[1].cancel()
         await asyncio.sleep(0.05)
         assert not adapter.is_open, "the last one out closes it"
+
+
+class Eager(SlcanAdapter):
+    """Sends the first group of a sensor in the same write as its answer to `O`."""
+
+    sensor: XcdiDevice
+    group: list[CanFrame] | None = None
+
+    @override
+    def send(self, frames: Iterable[CanFrame]) -> bool:
+        if self.group is None:
+            return super().send(frames)
+        self.group += frames
+        return True
+
+    @override
+    def _obey(self, line: SlcanLine) -> bytes:
+        answer = super()._obey(line)
+        if line.letter != "O":
+            return answer
+        self.group = []
+        self.sensor.push(0, IDENTITY)
+        frames, self.group = self.group, None
+        return answer + b"".join(encode_frame(frame, None) for frame in frames)
+
+
+async def test_slcan_bus_delivers_frames_that_come_with_the_answer_to_open(tmp_path: Path) -> None:
+    adapter, bus = Eager(tmp_path / "adapter"), bus_at(tmp_path)
+    device, _ = two_sensors(adapter)
+    adapter.sensor = device
+    async with serving(device):
+        run = Running(driver_of("S3", bus, 0x100))
+        await opened(adapter)
+        device.push(10_000_000, IDENTITY)
+        await run.wait_for(2)
+        await run.cancel()
+    assert [sample.counter for sample in run.samples] == [0, 1]
 
 
 async def test_an_unplugged_adapter_loses_all_and_gives_all_back(tmp_path: Path) -> None:
