@@ -112,7 +112,7 @@ def bench_rig(rate_hz: float = 100.0) -> Rig:
     for number, (name, segment) in enumerate(SENSORS.items(), 1):
         head = f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\nrate_hz = {rate_hz:g}\n'
         if number % 2:
-            tables.append(f'{head}driver = "xbus"\nport = "/dev/{name}"\n')
+            tables.append(f'{head}driver = "xbus"\nport = "/dev/{name}"\nbaud = 921600\n')
             continue
         block = number << 8
         ids = f"sample_time = {block + 5}, group_counter = {block + 6}, quaternion = {block + 33}"

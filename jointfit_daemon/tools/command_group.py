@@ -7,7 +7,9 @@ and keep their traceback.
 from __future__ import annotations
 
 import errno
+import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -53,6 +55,18 @@ class CommandGroup(TyperGroup):
             bare = ctx.invoked_subcommand is None or _is_config_error(error)
             typer.echo(text if bare else f"jointfit {ctx.invoked_subcommand}: {text}", err=True)
             raise typer.Exit(code) from None
+        finally:
+            _drop_lost_output()
+
+
+def _drop_lost_output() -> None:
+    """Discard what an output that is gone did not take: Python would end with 120 for it."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            with Path(os.devnull).open("wb") as nowhere:
+                os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _known_error(error: Exception) -> tuple[int, str] | None:
