@@ -44,6 +44,7 @@ VERSION = (3, 1)
 PATH_NS = 400_000
 """Least time of a datagram from one end to the other."""
 BAUD = 115_200
+"""Speed of the serial lines: `bench_rig` configures the same."""
 ON_UART = ("S1", "S3")
 REBOOTED, INTERRUPTED = "S3", "S2"
 DOWN_NS = 1_500_000_000
