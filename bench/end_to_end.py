@@ -30,13 +30,10 @@ from tests.broker_fixture import chosen_broker
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.tools.demo_processes import Simulator
-
-    Array = NDArray[np.float64]
 
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
 SETTLE_S, STATIC_S = 3.0, 3.5

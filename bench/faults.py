@@ -26,14 +26,11 @@ from jointfit_simulators.wearer import SENSORS, Wearer
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion import LimbFuser
     from jointfit_daemon.fusion.sensor_watch import SensorNews
     from jointfit_daemon.model import LimbState
-
-    Array = NDArray[np.float64]
 
 BEGIN_S = 100.0
 """Errors and skin wander with time: the live part is later than all of the calibration."""

@@ -21,12 +21,10 @@ from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from bench.semireal import KneeTrial
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.segment_model import SegmentModel
 
-    Array = NDArray[np.float64]
     Predict = Callable[[KneeTrial], tuple[Array, Array]]
 
 METHODS = ("single", "mean", "markley", "patent6", "patent12", "linear", "anchored")

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.movement import BodyPoses
 from jointfit_daemon.calibration.center.parent_noise import spatial_noise
@@ -17,9 +16,9 @@ from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
 
-Array = NDArray[np.float64]
 
 CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])
 """m, shape (4, 3)."""

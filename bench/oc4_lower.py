@@ -18,9 +18,7 @@ from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, JointKind,
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 FOLDER = "opencap_subject4"
 TRIALS = ("static1", "walking1", "squats1", "DJ1", "STS1")

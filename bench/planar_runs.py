@@ -7,16 +7,16 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.bounds import circle_rms_bound
 from jointfit_daemon.calibration.center.circle import Method, fit_circles
 from jointfit_daemon.calibration.center.moments import GATE, ellipse_scale
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 _AT_ONCE = 2000
 

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.driver import Decoder
-
-    Array = NDArray[np.float64]
 
 TRIALS = ("02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B")
 RATE_HZ = 286

@@ -26,9 +26,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 SUBJECT = "opencap_subject4"
 MODEL = "optimized_scale_and_markers.osim"

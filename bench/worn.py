@@ -28,11 +28,10 @@ from jointfit_simulators.wearer import SENSORS, Wearer
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 NS = 1_000_000_000
 MOVES = ("functional", "walk", "squat", "sit_to_stand")

@@ -16,9 +16,7 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 TRIALS = ("02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B")
 INFINITY = float("inf")

@@ -23,11 +23,8 @@ from jointfit_daemon.kinematics.joint_angles import joint_rotation
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from bench.semireal import KneeTrial
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 JOINT_GOALS = {"hold-out": 1.2, "walking": 3.0, "drop jump": 4.3}
 NORMALIZED = (0.5, 1.3)

@@ -20,11 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.trial import Method
-
-    Array = NDArray[np.float64]
 
 NAMES = ("thigh", "shank", "flexion")
 THIGH, SHANK = (0, 1), (2, 3)

@@ -34,14 +34,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import LimbState, Quaternion
-
-    Array = NDArray[np.float64]
 
 SEEDS = tuple(range(1, 9))
 """The first one is the demo's."""

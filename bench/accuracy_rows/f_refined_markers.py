@@ -23,16 +23,13 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from bench.accuracy_rows.e_simulated_limb import Live
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.alignment_phase import Alignment
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.static_pose import StaticPose
     from jointfit_daemon.calibration.trial import CalibrationTrial
     from jointfit_daemon.config import Rig
-
-    Array = NDArray[np.float64]
 
 KNOCKED = {"thigh": "T2", "shank": "C2"}
 KNOCKED_M = 0.015

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
     Errors = tuple[float, float, float]
 
 NAMES = ("thigh", "shank", "flexion")

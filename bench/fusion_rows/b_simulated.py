@@ -29,9 +29,7 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 SEEDS = tuple(range(1, 21))
 SEGMENTS = ("thigh", "shank")

@@ -25,12 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion.sensor_watch import SensorNews
-
-    Array = NDArray[np.float64]
 
 SEEDS = (1, 2, 5, 6, 7, 8)
 RATE_HZ = 50.0

@@ -25,10 +25,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from bench.faults import Worn
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.model import LimbState
-
-    Array = NDArray[np.float64]
 
 PEOPLE = (*SEEDS, 11, 12, 13, 14)
 """Four more than those the limits were found with."""

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 SEEDS = (1, 2, 5, 6, 7, 8)
 SEGMENTS = ("thigh", "shank")

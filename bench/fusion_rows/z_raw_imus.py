@@ -19,6 +19,8 @@ from jointfit_drivers.gateway_orientation import SETTLE_S
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from jointfit_daemon.arrays import Array
+
 GOALS_DEG = dict(zip(raw_wires.TRIALS, (1.5, 1.9), strict=True))
 FAST = raw_wires.TRIALS[1]
 STARTS = 20
@@ -45,7 +47,7 @@ def raw_orientation(data: Path) -> list[Figure]:
     return figures
 
 
-def _from_package(trial: raw_wires.BoardTrial, said: raw_wires.Array | None, kind: str) -> float:
+def _from_package(trial: raw_wires.BoardTrial, said: Array | None, kind: str) -> float:
     """Return the largest angle between the driver's orientations and the package's, deg."""
     felt = trial.felt if said is not None else trial.felt[:2]
     if said is None:
@@ -63,8 +65,8 @@ def begun_in_motion(data: Path) -> list[Figure]:
     rng = np.random.default_rng(0)
     last = len(trial.moving) - 8 * SECOND
     chosen = rng.choice(np.flatnonzero(trial.moving[:last]), STARTS, replace=False)
-    at_once: list[raw_wires.Array] = []
-    settled: list[raw_wires.Array] = []
+    at_once: list[Array] = []
+    settled: list[Array] = []
     for start in chosen:
         part = slice(int(start), int(start) + 7 * SECOND)
         felt = [values[part] for values in trial.felt]
@@ -83,7 +85,7 @@ def begun_in_motion(data: Path) -> list[Figure]:
     ]
 
 
-def _rms_deg(errors: list[raw_wires.Array], second: int) -> float:
+def _rms_deg(errors: list[Array], second: int) -> float:
     part = np.concatenate([e[second * SECOND : (second + 1) * SECOND] for e in errors])
     return float(np.rad2deg(np.sqrt(np.nanmean(part**2))))
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from jointfit_daemon.calibration.center.result import Array
+    from jointfit_daemon.arrays import Array
 
 WIDE = Limits(0.0, (0.0, np.inf), 0.0, np.inf)
 

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bench.experiment import Experiment, Figure
-from bench.planar_runs import Array, arc_points
+from bench.planar_runs import arc_points
 from jointfit_daemon.calibration.center.circle import fit_circles
 from jointfit_daemon.calibration.center.oriented import oriented_estimate
 from jointfit_daemon.calibration.center.planar_estimate import Limits
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
 
 Kind = Literal["white", "slow", "OU", "gain"]
 

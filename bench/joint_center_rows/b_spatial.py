@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
-    Array = NDArray[np.float64]
     Paths = Callable[[np.random.Generator], Array]
 
 MM = 1000.0

@@ -27,12 +27,9 @@ from jointfit_daemon.kinematics.live_inverse_kinematics import LiveInverseKinema
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.chain_motion import ChainState
-
-    Array = NDArray[np.float64]
 
 EXPECTED_MM = dict(zip(TRIALS, (2.37, 6.57, 10.61, 8.62, 11.29), strict=True))
 REPEATS = 20

@@ -28,11 +28,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
     from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.chain_motion import ChainState
-
-    Array = NDArray[np.float64]
 
 _MM = 1000.0
 _EVERY = {"walking1": 1, "squats1": 8, "DJ1": 2, "STS1": 8}

@@ -14,7 +14,8 @@ from jointfit_daemon.kinematics.live_inverse_kinematics import LiveInverseKinema
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
 
 
 def rows(quick: bool) -> list[Row]:

@@ -15,7 +15,6 @@ from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.joint_center import (
     CenterOfRotation,
@@ -31,10 +30,10 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.markers import ClusterTrack
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 FLEXES_FORWARD = ("hip", "ankle", "elbow", "shoulder", "wrist")
 """Joints whose flexion is positive about x (the distal part goes forward); others are knees."""

@@ -33,11 +33,10 @@ from jointfit_daemon.kinematics.rotation_scalar import exp_one, multiply_one
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 LARGEST = 0.4
 """No component of a correction exceeds this, rad."""

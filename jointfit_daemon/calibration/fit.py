@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration import mount
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, Anatomy, JointFound, find_anatomy
@@ -51,6 +50,7 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.alignment_phase import Alignment
     from jointfit_daemon.calibration.segment_model import SegmentModel
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
@@ -59,7 +59,6 @@ if TYPE_CHECKING:
 
 __all__ = ["better", "fit_calibration"]
 
-Array = NDArray[np.float64]
 
 MIN_SEEN = 0.5
 PLATE_SD_NS = 500_000.0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 FARTHEST = 30.0
 """Leverage ratios beyond tell nothing more."""

@@ -11,7 +11,6 @@ from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.sphere_directions import Limits
 from jointfit_daemon.calibration.center.sphere_solve import (
@@ -23,10 +22,10 @@ from jointfit_daemon.calibration.center.sphere_verdict import objection
 from jointfit_daemon.calibration.markers import visible
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
     from jointfit_daemon.calibration.markers import ClusterTrack
 
-Array = NDArray[np.float64]
 
 MIN_FRAMES = 50
 MAX_FRAMES = 2000

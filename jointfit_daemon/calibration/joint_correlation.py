@@ -23,13 +23,10 @@ from jointfit_daemon.calibration.segment_model import FEWEST_FRAMES, SegmentTrai
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.model_fit import LimbTraining
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.model import Chain
-
-    Array = NDArray[np.float64]
 
 MOST = 0.9
 """Neither errors that are quite the same nor quite opposite are believed."""

@@ -17,11 +17,8 @@ from jointfit_daemon.kinematics.rotation_scalar import between_one, log_one
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 
 def features(sensors: Sequence[Array], q_other: Array) -> Array:

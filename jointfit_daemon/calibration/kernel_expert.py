@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
     Ways = Sequence[Sequence[NDArray[np.bool_]]]
     Rows = tuple[tuple[float, ...], ...]
 

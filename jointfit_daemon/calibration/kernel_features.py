@@ -24,11 +24,8 @@ from jointfit_daemon.kinematics.rotation_scalar import turn_one
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 WIDTHS = (0.35, 0.5, 0.8)
 """Joint rotations and tilts this far apart have much to do with each other, rad: what a fit may

@@ -39,11 +39,10 @@ from jointfit_daemon.kinematics.rotation_scalar import turned_one
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 HULL = 3.0
 """The correction of a fades where its leverage exceeds this many times its quantile over training:

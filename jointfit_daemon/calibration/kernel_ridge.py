@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
     Masks = Sequence[NDArray[np.bool_]]
 
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)

@@ -23,11 +23,8 @@ from jointfit_daemon.calibration.kernel_expert import LARGEST, Expert
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Vector
-
-    Array = NDArray[np.float64]
 
 _BENDS = 6
 """Smooth terms before u itself."""

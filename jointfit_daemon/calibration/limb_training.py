@@ -10,7 +10,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.markers import visible
 from jointfit_daemon.calibration.model_fit import LimbTraining
@@ -21,13 +20,13 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.anatomy import Anatomy
     from jointfit_daemon.calibration.markers import ClusterTrack
     from jointfit_daemon.calibration.result import SensorCalibration
     from jointfit_daemon.calibration.trial import CalibrationTrial
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 MAX_FRAMES = 2000
 """More frames than this of one movement repeat themselves; the fit takes every n-th."""

@@ -19,7 +19,6 @@ from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.anatomy import (
     SKIN_SD_M,
@@ -40,11 +39,11 @@ from jointfit_daemon.calibration.stance import stand_straight
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
     from jointfit_daemon.calibration.markers import Cluster
     from jointfit_daemon.model import Chain, MocapFrame
 
-Array = NDArray[np.float64]
 
 _ROUNDED_M2 = 1e-12
 _ALONG = 0.7

@@ -17,10 +17,10 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.markers import Cluster
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PATTERNS = 4096

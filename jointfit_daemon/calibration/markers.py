@@ -23,9 +23,9 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.trial import CalibrationSettings, OpticalTrack
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MIN_MARKERS = 3

@@ -20,11 +20,10 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,16 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.model_fit import LimbTraining
 from jointfit_daemon.calibration.weighted_mean import fuse
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 MOST = 800
 """Frames kept: the models have some hundred unknowns, and each frame costs 50 bytes."""

@@ -12,7 +12,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.anatomy import flexion_sign
 from jointfit_daemon.calibration.redundancy import SegmentModel, fit_segment
@@ -24,9 +23,11 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 METHODS: tuple[Method, ...] = get_args(Method)
 MAX_SUBSET_SENSORS = 3

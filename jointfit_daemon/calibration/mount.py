@@ -26,9 +26,9 @@ from jointfit_daemon.calibration.static import robust_mean
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 Kind = Literal["full", "heading", "mount"]
 

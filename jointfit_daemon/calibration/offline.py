@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.anatomy import flexion_sign
 from jointfit_daemon.calibration.joint_correlation import error_correlations
@@ -40,10 +39,10 @@ from jointfit_daemon.kinematics.joint_angles import functional_axis, joint_rotat
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 COMPARED: tuple[Method, ...] = tuple(method for method in METHODS if method != "single")
 """Beside each sensor alone, of which ``single`` would be one again."""

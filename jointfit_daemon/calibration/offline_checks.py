@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.limb_training import twins
 from jointfit_daemon.calibration.mount import fit_alignment
@@ -19,10 +18,10 @@ from jointfit_daemon.kinematics.joint_angles import joint_rotation
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.offline import OfflineTrial
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 MISALIGNED = np.deg2rad(25.0)
 """A heading that differs by more is no matter of skin."""

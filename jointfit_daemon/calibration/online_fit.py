@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.joint_correlation import error_correlations
 from jointfit_daemon.calibration.markers import rigid_fit
@@ -33,11 +32,11 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
 
 FEWEST = 200
 HELD = 0.3

@@ -13,9 +13,9 @@ import numpy as np
 from jointfit_daemon.kinematics.rotation import first_eigenvector
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 EXCITATION = 1e-3
 """Below this g^T P g a sample teaches nothing; with forgetting it would only wind P up."""

@@ -27,12 +27,9 @@ from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frame
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
     from jointfit_daemon.calibration.markers import Cluster, ClusterTrack
-
-    Array = NDArray[np.float64]
 
 FARTHEST_M = 0.03
 """A marker that would move farther is another one, or is no longer on this part."""

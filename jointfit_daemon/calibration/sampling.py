@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.markers import visible
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.trial import SensorTrack
 
-Array = NDArray[np.float64]
 
 MAX_GAP_SAMPLES = 3.5
 """Widest gap bridged, in median sample periods: three missing samples are not bridged."""

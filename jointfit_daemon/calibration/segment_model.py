@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion, Vector
-
-    Array = NDArray[np.float64]
 
 FEWEST_FRAMES = 30
 

@@ -20,7 +20,6 @@ from operator import le, mul
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.kinematics import rotation
 
@@ -29,9 +28,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
-Array = NDArray[np.float64]
 Kind = Literal["pair", "joint"]
 
 RIDGE = 1e-3

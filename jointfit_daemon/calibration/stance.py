@@ -12,12 +12,12 @@ from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 STANDING_SD_RAD = radians(2.0)
 """How far from plumb a segment is when its wearer stands straight, per axis: an operator looks."""

@@ -17,11 +17,8 @@ from jointfit_daemon.kinematics.rotation_scalar import as_quaternion, normalize_
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 _SMALLEST_VARIANCE = 1e-12  # rad^2; a sensor that is its own reference still gets a finite weight
 

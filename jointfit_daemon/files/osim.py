@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.files.osim_joints import NearestJoint
-    from jointfit_daemon.files.osim_tree import Array, OsimDocument, OsimMarker
+    from jointfit_daemon.files.osim_tree import OsimDocument, OsimMarker
     from jointfit_daemon.kinematics.chain_model import Sample
     from jointfit_daemon.model import Quaternion, Vector
 

@@ -23,7 +23,8 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.coupled_joint import CoupledCurve
 
 if TYPE_CHECKING:
-    from jointfit_daemon.files.osim_tree import Array, Coordinate, OsimJoint
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.osim_tree import Coordinate, OsimJoint
     from jointfit_daemon.kinematics.chain_model import JointKind
 
 _ALL = 3

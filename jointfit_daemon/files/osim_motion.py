@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from xml.etree.ElementTree import Element
 
-    from jointfit_daemon.files.osim_tree import Array, OsimJoint
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.osim_tree import OsimJoint
 
     Function = Callable[[Array], Array]
 

@@ -18,9 +18,7 @@ from jointfit_daemon.files.text_table import Malformed, refuse_device
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 LARGEST = 64 << 20
 GROUND = "ground"

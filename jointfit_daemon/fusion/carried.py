@@ -11,7 +11,6 @@ from math import isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.markers import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 from jointfit_daemon.kinematics.rotation_scalar import (
@@ -22,10 +21,9 @@ from jointfit_daemon.kinematics.rotation_scalar import (
 )
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.markers import Cluster
     from jointfit_daemon.model import MocapFrame, MocapLayout, Vector
-
-Array = NDArray[np.float64]
 
 
 class _Pattern(NamedTuple):

@@ -16,14 +16,8 @@ fades within :data:`BIAS_S`, so a drift is what stays, and is believed only as f
 from __future__ import annotations
 
 from math import exp, radians, sqrt
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 BLOCK_S = 1.0
 LEAST_LOOKS = 5

@@ -18,11 +18,10 @@ from jointfit_daemon.kinematics.rotation_scalar import rotate_one
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion, Vector
-
-    Array = NDArray[np.float64]
 
 DISTAL: Vector = (0.0, 0.0, -1.0)
 """Direction from a segment's proximal to its distal joint, in segment axes."""

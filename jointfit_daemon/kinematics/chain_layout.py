@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from jointfit_daemon.kinematics.coupled_joint import CoupledCurve
 
 if TYPE_CHECKING:
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
 
 Index = NDArray[np.intp]
 

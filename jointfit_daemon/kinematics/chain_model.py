@@ -18,18 +18,17 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion, Vector
 
-Array = NDArray[np.float64]
 JointKind = Literal["free", "ball", "hinge", "coupled"]
 DEGREES_OF_FREEDOM: dict[JointKind, int] = {"free": 6, "ball": 3, "hinge": 1, "coupled": 1}
 Sample = tuple[float, float, float, float, float, float, float, float]

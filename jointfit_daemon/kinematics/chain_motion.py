@@ -19,11 +19,13 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chain_layout import LEVI, Layout, layout_of
-from jointfit_daemon.kinematics.chain_model import Array, ChainModel, rest_rotations
+from jointfit_daemon.kinematics.chain_model import ChainModel, rest_rotations
 from jointfit_daemon.kinematics.coupled_joint import COLUMNS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
 
 
 _TINY = 1e-30  # rad^2: keeps sin(x)/x from 0/0, far below rounding

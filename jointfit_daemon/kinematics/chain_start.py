@@ -19,7 +19,8 @@ from jointfit_daemon.kinematics.marker_equations import Slots, slots_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.chain_motion import ChainState
 
 _SQUARINGS = 10

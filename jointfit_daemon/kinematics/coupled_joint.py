@@ -23,9 +23,7 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 _GUESSES = 91
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]

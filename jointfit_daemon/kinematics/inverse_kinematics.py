@@ -23,7 +23,8 @@ from jointfit_daemon.kinematics.pose_search import Band, Problem, limits_of, sea
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.chain_motion import ChainState
 
 _TOGETHER = 4096

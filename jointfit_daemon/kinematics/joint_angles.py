@@ -22,9 +22,8 @@ from jointfit_daemon.model import JointAngles
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
-
-    Array = NDArray[np.float64]
 
 GIMBAL_SINE = 0.9999
 """Sine of the middle angle beyond which the outer two are not told apart."""

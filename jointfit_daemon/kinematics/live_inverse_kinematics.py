@@ -27,7 +27,8 @@ from jointfit_daemon.kinematics.pose_search import Band
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
 
 _TRIES = 6
 _LAST_STEP = 3e-3

@@ -27,7 +27,8 @@ from jointfit_daemon.kinematics.chain_motion import transforms, twists
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.chain_motion import ChainState
 
 

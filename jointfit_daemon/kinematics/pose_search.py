@@ -28,8 +28,9 @@ from jointfit_daemon.kinematics.marker_equations import Fit, fit, normal_equatio
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.kinematics.chain_layout import Layout
-    from jointfit_daemon.kinematics.chain_model import Array, ChainModel
+    from jointfit_daemon.kinematics.chain_model import ChainModel
 
 _DAMPING = 1e-4
 _EASIER, _HARDER, _HOPELESS = 0.2, 8.0, 1e6

@@ -19,14 +19,11 @@ from jointfit_daemon.pipeline.learning_watch import LearningWatch, hidden
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Quaternion
     from jointfit_daemon.pipeline.events import Notice
     from jointfit_daemon.timing.align import AlignedFrame
-
-    Array = NDArray[np.float64]
 
 EVERY_NS = 100_000_000
 """Between frames that are looked at."""

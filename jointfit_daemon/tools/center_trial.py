@@ -12,7 +12,6 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.estimate import METHODS, estimate_center
 from jointfit_daemon.calibration.center.movement import BodyPoses, Movement
@@ -30,10 +29,10 @@ from jointfit_daemon.kinematics import rotation
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
     from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
 
-Array = NDArray[np.float64]
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
 """Squared semi-axes of the 95 % ellipsoid over the variances, by the number of dimensions."""

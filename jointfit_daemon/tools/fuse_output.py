@@ -11,7 +11,6 @@ from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.markers import visible
 from jointfit_daemon.files.npz import OrientationTrial, write_orientations_npz
@@ -28,12 +27,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.files.marker_trial import Axis
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.tools.fuse_tables import Table
 
-Array = NDArray[np.float64]
 
 ANGLES = ("flexion", "adduction", "rotation")
 ENDINGS = (".sto", ".npz", ".csv")

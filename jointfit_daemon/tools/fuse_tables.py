@@ -11,7 +11,6 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.files.npz import quaternions_z_up, read_arrays, read_orientations_npz
 from jointfit_daemon.files.sto import read_orientations_sto
@@ -21,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.files.marker_trial import Axis
 
-Array = NDArray[np.float64]
 
 SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0
 NORM_SLACK = 0.05

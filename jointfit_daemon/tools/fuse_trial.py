@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.markers import (
     MIN_MARKERS,
@@ -40,11 +39,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.markers import Cluster
     from jointfit_daemon.calibration.static import RobustMean
     from jointfit_daemon.files.marker_trial import Axis
 
-Array = NDArray[np.float64]
 
 MARKER_FILES = (".trc", ".c3d")
 SMALLEST_M, LARGEST_M = 0.01, 2.0

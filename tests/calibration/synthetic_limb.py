@@ -6,9 +6,9 @@ Segment frames as in CONVENTIONS.md: x right, y forward, z up, origin at the pro
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from jointfit_daemon.calibration.trial import (
@@ -19,7 +19,8 @@ from jointfit_daemon.calibration.trial import (
 )
 from jointfit_daemon.model import Chain
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
 
 CHAIN = Chain(
     joints=("hip", "knee", "ankle"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +18,6 @@ from jointfit_daemon.calibration.result import (
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chain
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1", "S2"), ("S3",)))
 TWO_AND_TWO = Chain(CHAIN.joints, CHAIN.segments, (("S1", "S2"), ("S3", "S4")))

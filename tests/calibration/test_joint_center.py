@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.calibration.joint_center import fit_center, slide_under
 
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
 CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])
 CENTER = np.array([0.1, -0.2, 0.9])
 SIDE = np.array([1.0, -1.0, 0.75])
-Array = NDArray[np.float64]
 
 
 def ball(rng: np.random.Generator, arc_deg: float, n: int = 200, sigma: float = 1e-3) -> Array:

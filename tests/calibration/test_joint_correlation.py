@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import hypot, sqrt
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,11 +16,6 @@ from jointfit_daemon.fusion.skeleton import read_angles
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.model import Chain
 from tests.calibration.taught_limb import calibration
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 N = 600
 CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1", "S2"), ("S3", "S4")))

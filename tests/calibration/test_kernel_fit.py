@@ -20,7 +20,7 @@ from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 N = 500
 DEG = np.deg2rad(1.0)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.calibration.markers import (
@@ -21,7 +22,9 @@ from jointfit_daemon.calibration.markers import (
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.trial import CalibrationSettings, OpticalTrack
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
 SHIFT = np.array([1.0, 2.0, 1.0])
 TEMPLATE = np.array([[0.1, 0, 0], [-0.05, 0.08, 0.02], [0, -0.07, 0.05], [0.02, 0.03, -0.1]])
 TEMPLATE -= TEMPLATE.mean(axis=0)

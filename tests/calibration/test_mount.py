@@ -11,9 +11,7 @@ from jointfit_daemon.calibration.mount import align, fit_alignment
 from jointfit_daemon.kinematics import rotation as rot
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 DEG = np.deg2rad(1.0)
 N = 600

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -21,11 +21,6 @@ from jointfit_daemon.calibration.redundancy import (
 from jointfit_daemon.calibration.trial import Method
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 METHODS: tuple[Method, ...] = get_args(Method)
 DEG = np.deg2rad(1.0)

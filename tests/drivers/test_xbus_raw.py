@@ -26,11 +26,8 @@ from jointfit_simulators.felt import Felt
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Decoded
-
-    Array = NDArray[np.float64]
 
 vqf = pytest.importorskip("vqf")
 STILL = (0.0, 0.0, 0.0)

@@ -16,9 +16,7 @@ from jointfit_daemon.tools.__main__ import app
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 N = 200
 RATE_HZ = 50.0

@@ -46,10 +46,6 @@ from tests.tools.fuse_files import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
-
 
 def test_every_method_is_judged_on_every_trial_left_out(files: Path) -> None:
     result = run("evaluate", *trials(files), *LIMB, "--static", files / "still.npz", "--json")

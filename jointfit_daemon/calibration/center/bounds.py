@@ -9,12 +9,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 
 def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False) -> Array:

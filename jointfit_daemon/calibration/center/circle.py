@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.moments import (
     ROUNDING,
@@ -22,9 +21,10 @@ from jointfit_daemon.calibration.center.moments import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 Method = Literal["kasa", "pratt", "taubin", "hyper"]
 
 _STEPS = 20

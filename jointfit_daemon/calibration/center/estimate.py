@@ -10,7 +10,6 @@ from math import degrees, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center import in_plane
 from jointfit_daemon.calibration.center.movement import Movement
@@ -26,10 +25,10 @@ from jointfit_daemon.calibration.center.sphere_verdict import refusal
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.movement import BodyPoses
     from jointfit_daemon.calibration.center.result import CenterEstimate
 
-Array = NDArray[np.float64]
 
 _ASK_EVERY = 50
 """Frames after which a stream is asked, so that it knows what leaves its spheres."""

@@ -10,7 +10,6 @@ from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.circle import fit_circles
 from jointfit_daemon.calibration.center.moments import ellipse_scale, seen_places
@@ -24,9 +23,10 @@ from jointfit_daemon.calibration.center.result import CenterEstimate
 from jointfit_daemon.calibration.center.sphere_solve import persistence
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 METHOD = "geometric"
 HUBER = 1.5

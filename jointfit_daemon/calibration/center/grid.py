@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 _AT_ONCE = 400_000
 """Distances held at a time: they stay in the cache."""

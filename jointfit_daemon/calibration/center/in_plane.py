@@ -12,7 +12,6 @@ from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center import sphere_directions as directions
 from jointfit_daemon.calibration.center.geometric import geometric_estimate
@@ -29,11 +28,11 @@ from jointfit_daemon.calibration.center.three_frames import three_frame_estimate
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.circle import Method
     from jointfit_daemon.calibration.center.movement import Movement
     from jointfit_daemon.calibration.center.result import CenterEstimate
 
-Array = NDArray[np.float64]
 
 OFF_AXIS = (
     "the paths do not lie in planes, the joint turned about more than one axis: use sphere or "

@@ -11,12 +11,12 @@ from math import exp, inf, log
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from jointfit_daemon.arrays import Array
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
 Number = TypeVar("Number", float, Array)
 
 GATE = 6.0

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import radians
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.kinematics import rotation
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
 
 PARENT_TURN_RAD = radians(0.8)
 """A frame fitted to markers 10 cm from its middle, 1 mm noisy, turns by half of it, and its turns

@@ -11,7 +11,6 @@ from math import inf, radians, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.circle import Circles, fit_circles
 from jointfit_daemon.calibration.center.moments import GATE, seen_places
@@ -26,9 +25,9 @@ from jointfit_daemon.calibration.center.planar_estimate import (
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
 
-Array = NDArray[np.float64]
 
 METHOD = "oriented"
 MAX_FRAMES = 300

@@ -7,12 +7,14 @@ it. In a plane with two parent markers see `planar_reduction.parent_noise`.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.kinematics import rotation
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
 
 
 def spatial_noise(points: Array, parent: Array, noise: float) -> Array:

@@ -11,7 +11,6 @@ from math import degrees, inf, isfinite, pi, radians, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.circle import (
     Method,
@@ -36,7 +35,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 STILL_M = 0.001
 """RMS distance from their mean below which points are one place seen again and again."""

@@ -11,17 +11,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.sphere_directions import Limits
 from jointfit_daemon.calibration.center.sphere_sums import LAGS, SphereSums, centered, sum_up
 from jointfit_daemon.calibration.center.sphere_verdict import center_and_spheres, center_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
     from jointfit_daemon.calibration.center.sphere_algebra import Spheres
 
-Array = NDArray[np.float64]
 
 OUTLIER = 3.0
 """Residuals above so many standard deviations lose weight. Not Huber's 1.5: a frame is weighted

@@ -9,9 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from jointfit_daemon.calibration.center.score import (
     FEW,
     HINGE_RATIO,
@@ -22,10 +19,9 @@ from jointfit_daemon.calibration.center.score import (
 from jointfit_daemon.calibration.center.sphere_verdict import refusal
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.movement import BodyPoses
     from jointfit_daemon.calibration.center.result import CenterEstimate
-
-Array = NDArray[np.float64]
 
 
 def fit_axis(

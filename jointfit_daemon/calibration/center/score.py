@@ -12,7 +12,6 @@ from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.result import CenterEstimate
 from jointfit_daemon.calibration.center.sphere_directions import Limits, of_posture, within95
@@ -21,9 +20,9 @@ from jointfit_daemon.calibration.center.sphere_verdict import arc_of, objection,
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.movement import BodyPoses
 
-Array = NDArray[np.float64]
 
 HINGE_RATIO = 0.3
 """σ₆/σ₅ below which only an axis was observed (hips in squats 0.07 to 0.35; a ball joint moved in

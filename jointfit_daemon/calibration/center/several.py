@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.result import CenterEstimate
 from jointfit_daemon.calibration.center.sphere_verdict import refusal
@@ -18,7 +17,8 @@ from jointfit_daemon.calibration.center.sphere_verdict import refusal
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 TOLERATED = 2.5
 """Mahalanobis distance per root of the dimension from which an estimate loses weight (Huber)."""

@@ -11,15 +11,14 @@ from math import exp
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.running_sphere import RunningSphere
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
     from jointfit_daemon.calibration.center.sphere_directions import Limits
 
-Array = NDArray[np.float64]
 
 SKIN_SD_M = 0.010
 """Of a center through the skin of a leg: markers leave the bone by 5 to 50 mm."""

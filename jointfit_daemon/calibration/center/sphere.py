@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.parent_noise import relative
 from jointfit_daemon.calibration.center.sphere_algebra import paths_of
@@ -24,9 +23,9 @@ from jointfit_daemon.calibration.center.sphere_sums import centered, sum_up
 from jointfit_daemon.calibration.center.sphere_verdict import MIN_FRAMES, center_of, refusal
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
 
-Array = NDArray[np.float64]
 
 OUTLIER = 3.0
 """Residuals above so many standard deviations lose weight in the verdict: beyond, noise hardly

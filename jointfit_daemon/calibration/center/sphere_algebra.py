@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.sphere_sums import SphereSums
 
-Array = NDArray[np.float64]
 
 _STEPS = 40
 _REWEIGHED = 6

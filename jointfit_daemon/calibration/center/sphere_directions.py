@@ -13,16 +13,15 @@ from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.sphere_algebra import common_center
 from jointfit_daemon.calibration.center.sphere_sums import LAGS
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.sphere_algebra import Paths, Spheres
     from jointfit_daemon.calibration.center.sphere_sums import SphereSums
 
-Array = NDArray[np.float64]
 
 MIN_CONDITIONING = 6.0
 """T: radius over the center's standard deviation, below which a direction is not seen."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import erf, exp, pi, sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,9 @@ from jointfit_daemon.calibration.center.sphere_verdict import (
     refusal,
 )
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
 Mask = NDArray[np.bool_]
 
 HUBER = 1.5

@@ -13,11 +13,14 @@ how long they persist. Forgetting multiplies both. A marker that is not seen add
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
 
 LAGS = (1, 4)
 """Frames apart: neighbours, and far enough for noise that halves itself each frame to be gone."""

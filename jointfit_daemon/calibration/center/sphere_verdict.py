@@ -11,7 +11,6 @@ from math import degrees, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.planar_estimate import arc_of_spread
 from jointfit_daemon.calibration.center.result import CenterEstimate
@@ -25,11 +24,11 @@ from jointfit_daemon.calibration.center.sphere_directions import (
 from jointfit_daemon.calibration.center.sphere_sums import centered
 
 if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.sphere_algebra import Paths, Spheres
     from jointfit_daemon.calibration.center.sphere_directions import Seen
     from jointfit_daemon.calibration.center.sphere_sums import SphereSums
 
-Array = NDArray[np.float64]
 
 MIN_FRAMES = 15
 """Effective frames a marker must be seen in."""

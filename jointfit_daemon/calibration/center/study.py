@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration.center.bounds import uniform_arc_rms
 from jointfit_daemon.calibration.center.circle import fit_circles
@@ -32,7 +31,8 @@ from jointfit_daemon.calibration.center.three_frames import three_frame_center
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
+
 
 CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
 """Both maps of a correlation are cut off there, m; None: as they are."""

@@ -7,7 +7,7 @@ arranged for thousands of short movements, all with the same number of frames an
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,9 @@ from jointfit_daemon.calibration.center.circle import Circles, fit_circles
 from jointfit_daemon.calibration.center.moments import GATE
 from jointfit_daemon.calibration.center.oriented import AngleNoise
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
 Complex = NDArray[np.complex128]
 
 _TOLD = AngleNoise()

@@ -9,15 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf, sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from jointfit_daemon.calibration.center.moments import seen_places
 from jointfit_daemon.calibration.center.planar_reduction import in_segment_plane
 from jointfit_daemon.calibration.center.result import CenterEstimate
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
 
 FLAT = 1e-9
 """Twice the area over the longest side squared, below which three points are a line."""

@@ -24,7 +24,8 @@ from jointfit_daemon.calibration.marker_refinement.anderson import Anderson
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.calibration.marker_refinement.objective import Array, Problem
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement.objective import Problem
 
 _TOLERANCE = 1e-4
 _MOST_ITERATIONS = 30

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.kinematics.chain_model import ChainModel
-
-    Array = NDArray[np.float64]
 
 _LEAST_FRAMES = 10
 _UNIT_FACTOR = 100.0

@@ -19,9 +19,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 _ZERO = 1e-6
 """Eigenvalues of S/T are squared metres per squared metre, 1 for a marker nothing else depends on:

@@ -31,7 +31,8 @@ from jointfit_daemon.kinematics.chain_motion import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.calibration.marker_refinement.objective import Array, Problem
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement.objective import Problem
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e9
 _FLOOR = 1e-11

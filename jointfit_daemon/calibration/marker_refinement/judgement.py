@@ -18,11 +18,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
     from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, IkResult
-
-    Array = NDArray[np.float64]
 
 
 def fit_of(residuals: Array) -> Fit:

@@ -11,10 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from jointfit_daemon.calibration.marker_refinement.search import SearchSettings
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    from jointfit_daemon.arrays import Array
 
 RefinementMethod = Literal["joint", "block", "search"]
 

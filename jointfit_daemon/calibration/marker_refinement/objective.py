@@ -21,17 +21,17 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.kinematics.chain_layout import layout_of
 from jointfit_daemon.kinematics.pose_search import limits_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.kinematics.chain_model import ChainModel
     from jointfit_daemon.kinematics.chain_motion import ChainState
     from jointfit_daemon.kinematics.pose_search import Band
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

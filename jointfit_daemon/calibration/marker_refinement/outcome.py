@@ -14,13 +14,10 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.gauge import Gauge
     from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
     from jointfit_daemon.kinematics.chain_model import ChainModel
-
-    Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

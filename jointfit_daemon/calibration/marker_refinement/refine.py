@@ -34,8 +34,8 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
-    from jointfit_daemon.calibration.marker_refinement.objective import Array
     from jointfit_daemon.kinematics.chain_model import ChainModel
 
     Progress = Callable[[float, float], None]

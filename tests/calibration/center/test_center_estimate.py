@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from bench.moving_joint import ball_turns, carried, covers, fan, hinge_turns, watched
 from jointfit_daemon.calibration.center.estimate import METHODS, estimate_center
 from jointfit_daemon.calibration.center.movement import BodyPoses, Movement
 
-Array = NDArray[np.float64]
 IN_A_PLANE = sorted(name for name, method in METHODS.items() if method.planar)
 IN_SPACE = ["sphere", "running_sphere", "halvorsen", "gamage_lasenby", "score"]
 CENTER = np.array([0.02, -0.3, 0.5])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from bench.moving_joint import CHILD, ball_turns, carried, fan, hinge_turns
 from jointfit_daemon.calibration.center.circle import fit_circles
@@ -16,7 +16,9 @@ from jointfit_daemon.calibration.center.running_sphere import RunningSphere, fit
 from jointfit_daemon.calibration.center.skin import RollingCenter, with_skin
 from jointfit_daemon.calibration.center.sphere_directions import Limits
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
 CENTER = np.array([0.1, -0.2, 0.9])
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from bench.moving_joint import CHILD, PARENT, ball_turns, hinge_turns, watched
@@ -19,7 +19,9 @@ from jointfit_daemon.calibration.center.sphere_directions import Limits, of_post
 from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.kinematics import rotation
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
 AT_REST = np.tile(np.eye(3), (200, 1, 1))
 
 

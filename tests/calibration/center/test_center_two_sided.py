@@ -7,7 +7,6 @@ from math import inf
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from bench.moving_joint import CHILD, PARENT, ball_turns, carried, covers, fan, hinge_turns, watched
 from jointfit_daemon.calibration.center.movement import BodyPoses
@@ -20,7 +19,6 @@ from jointfit_daemon.calibration.center.score import fit_score
 from jointfit_daemon.calibration.center.several import fuse_centers
 from jointfit_daemon.calibration.center.sphere_verdict import refusal
 
-Array = NDArray[np.float64]
 ANYHOW = Limits(gate=0.0, arc=0.0, sd=inf)
 
 
