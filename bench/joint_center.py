@@ -1,6 +1,6 @@
 """Centers of rotation: `bench/joint_center.py [--json FILE] [--markdown] [--plot DIR] [ID ...]`.
 
-Measures every row of ``bench/joint_center_rows``; see ``bench/table.py``. With ``--plot DIR`` it
+Measures its table; see ``bench/framework/table.py``. With ``--plot DIR`` it
 also draws the real trials, one PNG each: the estimated centers beside those of the models.
 """
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, from anywhere
 
-from bench import table
+from bench.framework import table
 
 if TYPE_CHECKING:
     import argparse
@@ -26,7 +26,7 @@ def main() -> int:
     """Measure the rows, then draw if asked; return the exit code."""
     code, options = table.main(__doc__ or "", "joint_center_rows", _options)
     if options.plot is not None:
-        from bench.joint_center_plot import draw  # noqa: PLC0415 - matplotlib is optional
+        from bench.plots.joint_centers import draw  # noqa: PLC0415 - matplotlib is optional
 
         for path in draw(options.plot):
             print(path, file=sys.stderr)

@@ -16,7 +16,15 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the daemon's unit and its fits have it
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, from anywhere
 
-from bench.harness import Bench, Row, as_json, as_markdown, as_text, find_benches, machine
+from bench.framework.measurement import (
+    Bench,
+    Row,
+    as_json,
+    as_markdown,
+    as_text,
+    find_benches,
+    machine,
+)
 
 
 def main() -> int:

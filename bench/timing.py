@@ -1,6 +1,6 @@
 """The timing table: `python bench/timing.py [--json FILE] [--markdown] [ID ...]`.
 
-Measures every row of ``bench/timing_rows``; see ``bench/table.py``. With ``--plot DIR`` it draws
+Measures its table; see ``bench/framework/table.py``. With ``--plot DIR`` it draws
 the clocks of a simulated run instead, or of a recorded one (``--replay EVENTLOG``, as the daemon
 writes it); rows are measured beside the pictures only where they are named.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, from anywhere
 
-from bench import table
+from bench.framework import table
 
 
 def plot_options(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +33,7 @@ def plot(directory: Path, recorded: Path | None) -> int:
     if find_spec("matplotlib") is None:
         print("matplotlib is not installed: pip install 'jointfitd[plot]'", file=sys.stderr)
         return 2
-    draw = import_module("bench.timing_plots.draw")  # the table needs no matplotlib
+    draw = import_module("bench.plots.clocks")  # the table needs no matplotlib
     try:
         written = draw.run(directory, recorded)
     except (OSError, ValueError) as error:  # no such log, or none that can be read

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from bench.experiment import DATA, Experiment
-from bench.joint_center_rows import a_planar, a_planar_oriented
-from bench.planar_runs import runs_on, share_covered
+from bench.experiments.joint_center import planar, planar_oriented
+from bench.framework.experiment import DATA, Experiment
+from bench.subjects.planar_arcs import runs_on, share_covered
 
 pytestmark = pytest.mark.figures
-EXPERIMENTS = (*a_planar.EXPERIMENTS, *a_planar_oriented.EXPERIMENTS)
+EXPERIMENTS = (*planar.EXPERIMENTS, *planar_oriented.EXPERIMENTS)
 
 
 @pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if not e.long], ids=lambda e: e.id)

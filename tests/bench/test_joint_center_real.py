@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.experiment import find_experiments
+from bench.framework.experiment import find_experiments
 
 pytestmark = pytest.mark.figures
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.harness import Bench, Row, as_json, as_text, fixed_loop, percentile
+from bench.framework.measurement import Bench, Row, as_json, as_text, fixed_loop, percentile
 from bench.speed import main
 from tests.broker_fixture import MOSQUITTO_MISSING
 

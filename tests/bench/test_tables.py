@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.experiment import DATA, Experiment, Figure, find_experiments, near
+from bench.framework.experiment import DATA, Experiment, Figure, find_experiments, near
 
 TABLES = ("accuracy", "timing", "markers", "fusion")
 EXPERIMENTS = {name: find_experiments(f"{name}_rows") for name in TABLES}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.timing_rows.c_memory import Held, growth, held, watch
+from bench.experiments.timing.memory import Held, growth, held, watch
 
 KIB = 1024
 FULL_H = 0.06

@@ -12,8 +12,8 @@ import orjson
 import pytest
 
 from bench import timing
-from bench.timing_plots.simulated import Run, simulated
-from bench.timing_plots.trace import Trace, traced, true_errors
+from bench.rigs.core_trace import Trace, traced, true_errors
+from bench.subjects.simulated_clocks import Run, simulated
 from jointfit_daemon.outputs.event_log import FORMAT, encode_event
 
 if TYPE_CHECKING:

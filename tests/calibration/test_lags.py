@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from bench.semireal import load
+from bench.subjects.recorded_knee import load
 from jointfit_daemon.calibration.lags import (
     FLESH_SD_NS,
     MARKERS_SD_NS,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.accuracy_rows.e_simulated_limb import people
+from bench.experiments.fusion.simulated_leg import people
 
 pytestmark = pytest.mark.figures
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.loopback import delays_ns
+from bench.rigs.loopback import delays_ns
 from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_drivers.wall_clock import WallClock
 from jointfit_drivers.xbus_events import XbusEvents

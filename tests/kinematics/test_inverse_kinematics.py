@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from bench.oc4_lower import measured, oc4_lower
+from bench.subjects.adult_lower_limbs import measured, oc4_lower
 from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, Marker, Segment
 from jointfit_daemon.kinematics.chain_motion import (
     apply_step,

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench import end_to_end
-from bench.accuracy_rows.b_redundant_sensors import KneeModels, Squats
+from bench.experiments.fusion.knee_segments import KneeModels, Squats
+from bench.rigs import recorded_trial
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from bench.end_to_end import Played
+    from bench.rigs.recorded_trial import Played
     from jointfit_daemon.calibration.trial import Method
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
@@ -33,7 +33,7 @@ def knee(shared_data: Path) -> Squats:
 
 @pytest.fixture
 def played(shared_data: Path) -> dict[tuple[str, Method], Played]:
-    return end_to_end.run(shared_data, METHODS)
+    return recorded_trial.run(shared_data, METHODS)
 
 
 def test_squats_as_bytes_give_the_offline_figures(

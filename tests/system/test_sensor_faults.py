@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bench.worn import bench_rig, fitted
+from bench.subjects.simulated_wearer import bench_rig, fitted
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import load_rig
 from tests.system.station import Listener, Station, knee_angles, listening, sensors_in

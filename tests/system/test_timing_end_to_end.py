@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.restarts import EVERY, live
-from bench.stamp_truth import OPTICAL
+from bench.rigs.device_restarts import EVERY, live
+from bench.rigs.timestamp_errors import OPTICAL
 
 if TYPE_CHECKING:
     from pathlib import Path

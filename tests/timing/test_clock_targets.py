@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.timing_rows import a_clocks
+from bench.experiments.timing import clocks
 
 if TYPE_CHECKING:
-    from bench.experiment import Figure
+    from bench.framework.experiment import Figure
 
 NOWHERE = Path()
 SLACK = 1.5
@@ -25,17 +25,17 @@ def kept(figure: Figure) -> bool:
 @pytest.mark.parametrize(
     "figures",
     [
-        pytest.param(lambda: a_clocks.echoes(NOWHERE, runs=30), id="T1"),
-        pytest.param(lambda: a_clocks.jitter(NOWHERE, runs=6), id="T2"),
-        pytest.param(lambda: a_clocks.timer(NOWHERE, runs=12), id="T3"),
-        pytest.param(lambda: a_clocks.wraps_and_restarts(NOWHERE), id="T5"),
+        pytest.param(lambda: clocks.echoes(NOWHERE, runs=30), id="T1"),
+        pytest.param(lambda: clocks.jitter(NOWHERE, runs=6), id="T2"),
+        pytest.param(lambda: clocks.timer(NOWHERE, runs=12), id="T3"),
+        pytest.param(lambda: clocks.wraps_and_restarts(NOWHERE), id="T5"),
     ],
 )
-def test_clocks_keep_their_targets(figures: a_clocks.Figures) -> None:
+def test_clocks_keep_their_targets(figures: clocks.Figures) -> None:
     missed = [figure for figure in figures() if not kept(figure)]
     assert missed == []
 
 
 def test_an_update_costs_microseconds() -> None:
-    (figure,) = a_clocks.cost(NOWHERE)
+    (figure,) = clocks.cost(NOWHERE)
     assert figure.value <= 5 * figure.goal  # a busy machine of any kind; the bench says how many

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bench.timing_rows import b_lag
+from bench.experiments.timing import lag
 
 
 def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
-    t_imu, q_imu, t_ref, q_ref = b_lag.made_up(1, 10.0, 5.0)
+    t_imu, q_imu, t_ref, q_ref = lag.made_up(1, 10.0, 5.0)
     for t, q in ((t_imu, q_imu), (t_ref, q_ref)):
         q[t < 5.0e9] = q[t < 5.0e9][-1]
         q[t > 5.25e9] = q[t > 5.25e9][0]
-    found = b_lag.estimate_between(b_lag.Tracks(t_imu, q_imu, t_ref, q_ref), 0.4, 9.6)
+    found = lag.estimate_between(lag.Tracks(t_imu, q_imu, t_ref, q_ref), 0.4, 9.6)
     assert found.refused is not None

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.moving_joint import ball_turns, carried, covers, fan, hinge_turns, watched
+from bench.subjects.simulated_joints import ball_turns, carried, covers, fan, hinge_turns, watched
 from jointfit_daemon.calibration.center.estimate import METHODS, estimate_center
 from jointfit_daemon.calibration.center.movement import BodyPoses, Movement
 

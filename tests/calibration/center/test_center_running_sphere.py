@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.moving_joint import CHILD, ball_turns, carried, fan, hinge_turns
+from bench.subjects.simulated_joints import CHILD, ball_turns, carried, fan, hinge_turns
 from jointfit_daemon.calibration.center.circle import fit_circles
 from jointfit_daemon.calibration.center.running_sphere import RunningSphere, fit_running
 from jointfit_daemon.calibration.center.skin import RollingCenter, with_skin

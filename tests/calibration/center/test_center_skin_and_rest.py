@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import f as fisher
 
-from bench.moving_joint import CHILD, PARENT, ball_turns, hinge_turns, watched
+from bench.subjects.simulated_joints import CHILD, PARENT, ball_turns, hinge_turns, watched
 from jointfit_daemon.calibration.center.estimate import estimate_center
 from jointfit_daemon.calibration.center.movement import Movement
 from jointfit_daemon.calibration.center.parent_noise import turn_noise

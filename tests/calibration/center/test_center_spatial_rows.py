@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from bench.experiment import DATA, Experiment
-from bench.joint_center_rows.b_spatial import AT_20, AT_45, EXPERIMENTS, ball_joint
+from bench.experiments.joint_center.spatial import AT_20, AT_45, EXPERIMENTS, ball_joint
+from bench.framework.experiment import DATA, Experiment
 
 pytestmark = pytest.mark.figures
 

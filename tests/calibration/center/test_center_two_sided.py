@@ -8,7 +8,16 @@ from math import inf
 import numpy as np
 import pytest
 
-from bench.moving_joint import CHILD, PARENT, ball_turns, carried, covers, fan, hinge_turns, watched
+from bench.subjects.simulated_joints import (
+    CHILD,
+    PARENT,
+    ball_turns,
+    carried,
+    covers,
+    fan,
+    hinge_turns,
+    watched,
+)
 from jointfit_daemon.calibration.center.movement import BodyPoses
 from jointfit_daemon.calibration.center.parent_noise import planar_noise, relative, spatial_noise
 from jointfit_daemon.calibration.center.planar_estimate import Limits, circle_estimate

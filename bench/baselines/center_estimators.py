@@ -1,0 +1,128 @@
+"""Hips and knees of real trials by the estimators, beside those of the models.
+
+Law: the estimators see markers of two neighbouring segments and nothing else: no static trial, no
+regression, no model. Distances are taken in the parent's coordinates, where both centers rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path  # noqa: TC003 - the cache's key
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.subjects.model_joint_centers import ModelTrial, gait2354, opencap
+from jointfit_daemon.calibration.center.estimate import estimate_center
+from jointfit_daemon.tools.center_trial import Reduced, reduce
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.calibration.center.result import CenterEstimate
+
+OPENCAP = ("squats1", "STS1", "DJ1", "walking1")
+_PELVIS = ("r.ASIS", "L.ASIS", "r.PSIS", "L.PSIS")
+_THIGHS = {side: tuple(f"{side}_thigh{i}" for i in range(1, 5)) for side in ("r", "L")}
+_SHANKS = {
+    "r": ("r_sh2", "r_sh3", "r_sh4", "r_shank_antsup"),
+    "L": ("L_sh2", "L_sh3", "L_shank_antsup"),
+}
+_GAIT = ("Upper", "Front", "Rear")
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint to find: the model's name for it, and the markers of its two segments."""
+
+    name: str
+    model: str
+    parent: tuple[str, ...]
+    child: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """An estimate beside the model's center."""
+
+    joint: Joint
+    reduced: Reduced
+    model: NDArray[np.float64]
+    """The model's center in the parent's coordinates, mean over its frames, m."""
+    wander: float
+    """RMS distance of the model's center from that mean: it is not at rest under the skin, m."""
+    estimates: dict[str, CenterEstimate]
+    """By method."""
+
+    def off(self, method: str) -> float:
+        """Return the distance from estimate to model, m."""
+        return float(np.linalg.norm(self.estimates[method].center - self.model))
+
+    def off_axis(self, method: str) -> float:
+        """Return the same across the joint's axis, m: along it a hinge shows no center."""
+        gap = self.estimates[method].center - self.model
+        axis = hinge(self.reduced)
+        return float(np.linalg.norm(gap - axis * (gap @ axis)))
+
+    def told_across(self, method: str) -> float:
+        """Return the RMS error across the axis that the estimate tells, m."""
+        axis = hinge(self.reduced)
+        across = np.eye(3) - np.outer(axis, axis)
+        spread = across @ self.estimates[method].covariance @ across
+        return float(np.sqrt(max(np.trace(spread), 0.0)))
+
+
+def hinge(reduced: Reduced) -> NDArray[np.float64]:
+    """Return the direction about which the child turned most, in the parent's coordinates."""
+    points = reduced.movement.points
+    assert points is not None
+    whole = points[np.isfinite(points).all(axis=(1, 2))]
+    steps = whole - whole.mean(axis=0)
+    # every marker of a hinge stays in a plane across the axis: least spread of all movement
+    _, vectors = np.linalg.eigh(np.einsum("tki,tkj->ij", steps, steps))
+    return np.asarray(vectors[:, 0])
+
+
+def opencap_joints() -> tuple[Joint, ...]:
+    sides = (("right", "r", "r"), ("left", "L", "l"))
+    return tuple(
+        joint
+        for word, S, s in sides
+        for joint in (
+            Joint(f"{word} hip", f"hip_{s}", _PELVIS, _THIGHS[S]),
+            Joint(f"{word} knee", f"walker_knee_{s}", _THIGHS[S], _SHANKS[S]),
+        )
+    )
+
+
+def gait_joints() -> tuple[Joint, ...]:
+    pelvis = ("R.ASIS", "L.ASIS", "V.Sacral")
+    found = []
+    for word, side in (("right", "R"), ("left", "L")):
+        thigh = tuple(f"{side}.Thigh.{place}" for place in _GAIT)
+        shank = tuple(f"{side}.Shank.{place}" for place in _GAIT)
+        found.append(Joint(f"{word} hip", f"hip_{side.lower()}", pelvis, thigh))
+        found.append(Joint(f"{word} knee", f"knee_{side.lower()}", thigh, shank))
+    return tuple(found)
+
+
+@cache
+def judged(data: Path, trial: str, methods: tuple[str, ...]) -> tuple[Judged, ...]:
+    """Estimate all joints of a trial; ``gait2354`` or one of `OPENCAP`."""
+    if trial == "gait2354":
+        model, joints = gait2354(data), gait_joints()
+    else:
+        model, joints = opencap(data, trial), opencap_joints()
+    return tuple(_judge(model, joint, methods) for joint in joints)
+
+
+def _judge(model: ModelTrial, joint: Joint, methods: tuple[str, ...]) -> Judged:
+    reduced = reduce(model.markers, joint.parent, joint.child, None)
+    frames = model.frames
+    poses = type(reduced.poses)(reduced.poses.q[frames], reduced.poses.t[frames])
+    local = poses.to_body(model.centers[joint.model][:, None])[:, 0]
+    mean = np.nanmean(local, axis=0)
+    wander = float(np.sqrt(np.nanmean(((local - mean) ** 2).sum(axis=1))))
+    found = {method: estimate_center(reduced.movement, method) for method in methods}
+    return Judged(joint, reduced, mean, wander, found)

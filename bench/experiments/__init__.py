@@ -1,0 +1,1 @@
+"""One package a topic; a module lists its experiments in ``EXPERIMENTS``."""

@@ -1,0 +1,1 @@
+"""Recorded trials sent as bytes through the daemon."""

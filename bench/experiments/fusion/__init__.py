@@ -1,0 +1,1 @@
+"""Fusion of redundant sensors: recorded movements, simulated subjects, online learning."""

@@ -1,0 +1,175 @@
+"""Rows F-7 to F-11: sit-to-stand, movements left out, claims, and standing still, on both legs.
+
+Trials of `skin_knee`: the same subject as rows F-1 to F-5, made anew with poses of our own inverse
+kinematics, the left leg and sit-to-stand besides.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.baselines import fusion_methods
+from bench.experiments.fusion.recorded_movements import (
+    DEFAULT,
+    NAMES,
+    NOTHING,
+    TOLERANCE,
+    flexion_scores,
+)
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.recorded_knee import FOLDER, Judge, training_frames
+from bench.subjects.skin_marker_knees import AS_RECORDED, MOVEMENTS, STATIC, SUBJECT, skin_knee
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bench.subjects.recorded_knee import KneeTrial
+
+    Errors = tuple[float, float, float]
+
+SIDES = {"right": "r", "left": "l"}
+EXCHANGED = (AS_RECORDED, (1, 2, 3, 0), (3, 0, 1, 2), (2, 3, 0, 1), (1, 0, 3, 2))
+"""Whose filter's errors each sensor has."""
+RIVALS = ("mean", "patent12", "linear", DEFAULT)
+DEEP_DEG = 40.0
+
+
+def sit_to_stand(data: Path) -> list[Figure]:
+    """F-7: trained on 60 % of the squats, walking and the jump, judged on sit-to-stand.
+
+    The default must be worse in nothing than the mean of two or patent12.
+    """
+    figures = []
+    for side, trials in _both(data).items():
+        found = _risen(trials)
+        for method, errors in found.items():
+            goals = _best(found) if method == DEFAULT else (NOTHING,) * 3
+            figures += [
+                Figure(f"{side}, {method}: {name}", error, goal)
+                for name, error, goal in zip(NAMES, errors, goals, strict=True)
+            ]
+    return figures
+
+
+def exchanged(data: Path) -> list[Figure]:
+    """F-11: the same with the filters' errors exchanged between the sensors, RMS of five ways.
+
+    The recordings give every sensor one filter's error; which has which is chance.
+    """
+    figures = []
+    for side in SIDES:
+        ways = [_risen(_both(data, errors_of)[side]) for errors_of in EXCHANGED]
+        found: dict[str, Errors] = {}
+        for method in RIVALS:
+            a, b, c = np.sqrt(np.mean(np.square([way[method] for way in ways]), axis=0)).tolist()
+            found[method] = (a, b, c)
+        figures += [
+            Figure(f"{side}: {name}", error, goal)
+            for name, error, goal in zip(NAMES, found[DEFAULT], _best(found), strict=True)
+        ]
+        kept = [np.less_equal(way[DEFAULT], _best(way)) for way in ways]
+        for i, name in enumerate(NAMES):
+            count = float(sum(each[i] for each in kept))
+            figures.append(Figure(f"{side}: {name} kept, ways of 5", count, NOTHING, unit=""))
+    return figures
+
+
+def left_out(data: Path) -> list[Figure]:
+    """F-8: each of four movements judged by what the other three have taught."""
+    figures = []
+    for side, trials in _both(data).items():
+        squats = trials["squats1"]
+        judge = Judge.of(squats.part(slice(0, training_frames(squats))))
+        for movement, trial in trials.items():
+            others = [other for name, other in trials.items() if name != movement]
+            found = _errors(judge, others, trial)
+            figures += [
+                Figure(f"{side}, {movement}: {name}", error, goal)
+                for name, error, goal in zip(NAMES, found[DEFAULT], _best(found), strict=True)
+            ]
+    return figures
+
+
+def coverage(data: Path) -> list[Figure]:
+    """F-9: how often errors of flexion lie within what is claimed, both legs and all movements.
+
+    Movements left out, and the last 40 % of each where the first 60 % of all four have taught.
+    """
+    unseen, later = [], []
+    for trials in _both(data).values():
+        begun = [trial.part(slice(0, training_frames(trial))) for trial in trials.values()]
+        for movement, trial in trials.items():
+            others = [other for name, other in trials.items() if name != movement]
+            unseen.append(flexion_scores(others, trial))
+            later.append(flexion_scores(begun, trial.part(slice(training_frames(trial), None))))
+    return [
+        Figure(
+            f"{label}: flexion within {within:g} sd",
+            float(np.mean(np.abs(np.concatenate(scores)) < within)),
+            round(share + TOLERANCE, 9),
+            least=round(share - TOLERANCE, 9),
+            unit="",
+        )
+        for label, scores in (("movements left out", unseen), ("later parts", later))
+        for share, within in ((0.68, 1.0), (0.95, 1.96))
+    ]
+
+
+def standing(data: Path) -> list[Figure]:
+    """F-10: what is corrected in the static pose of people who stand as they stand.
+
+    Bones lean and knees are not quite straight there; the mounts of the sensors make the mean the
+    reference, so what is corrected is an error. Trained on squats, and on deep bends alone.
+    """
+    figures = []
+    for side, trials in _both(data).items():
+        squats, static = trials["squats1"], skin_knee(data, STATIC, SIDES[side])
+        bend = rotation.angle_between(squats.thigh, squats.shank)
+        deep = squats.part(bend > np.deg2rad(DEEP_DEG))
+        for label, taught in (("squats", squats), (f"beyond {DEEP_DEG:g} deg", deep)):
+            for method in ("mean", DEFAULT):
+                said = fusion_methods.fit(method, [taught])(static)
+                errors = Judge.of(squats).errors(said, static)
+                figures += [
+                    Figure(f"{side}, {label}, {method}: {name}", error, NOTHING)
+                    for name, error in zip(NAMES, errors, strict=True)
+                ]
+        stood = float(np.rad2deg(np.mean(rotation.angle_between(static.thigh, static.shank))))
+        figures.append(Figure(f"{side}, rotation of the knee while standing", stood, NOTHING))
+    return figures
+
+
+def _both(data: Path, errors_of: tuple[int, ...] = AS_RECORDED) -> dict[str, dict[str, KneeTrial]]:
+    return {
+        side: {movement: skin_knee(data, movement, letter, errors_of) for movement in MOVEMENTS}
+        for side, letter in SIDES.items()
+    }
+
+
+def _risen(trials: dict[str, KneeTrial]) -> dict[str, Errors]:
+    """Return errors in sit-to-stand, trained on 60 % of the squats, walking and the jump."""
+    squats = trials["squats1"]
+    begin = squats.part(slice(0, training_frames(squats)))
+    taught = [begin, trials["walking1"], trials["DJ1"]]
+    return _errors(Judge.of(begin), taught, trials["STS1"])
+
+
+def _errors(judge: Judge, taught: list[KneeTrial], trial: KneeTrial) -> dict[str, Errors]:
+    return {m: judge.errors(fusion_methods.fit(m, taught)(trial), trial) for m in RIVALS}
+
+
+def _best(found: dict[str, Errors]) -> tuple[float, ...]:
+    return tuple(round(min(pair), 3) for pair in zip(found["mean"], found["patent12"], strict=True))
+
+
+_DATA = (FOLDER, SUBJECT)
+EXPERIMENTS = (
+    Experiment("F-7", "sit-to-stand, trained on three others", sit_to_stand, _DATA),
+    Experiment("F-8", "each of four movements left out, default", left_out, _DATA),
+    Experiment("F-9", "flexion within its claimed deviation, both legs", coverage, _DATA),
+    Experiment("F-10", "corrected in the static pose", standing, _DATA),
+    Experiment("F-11", "sit-to-stand, filters' errors exchanged", exchanged, _DATA),
+)

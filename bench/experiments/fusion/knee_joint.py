@@ -1,0 +1,102 @@
+"""Rows B-10 and B-14: the rotation of the joint, and errors over what is claimed of them.
+
+Law: the same recordings, training and hold-out as the rows on segments.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.baselines import fusion_methods
+from bench.experiments.fusion.knee_segments import Squats
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.recorded_knee import FOLDER, load
+from jointfit_daemon.calibration.kernel_expert import fit_expert
+from jointfit_daemon.calibration.kernel_model import BLOCKS
+from jointfit_daemon.calibration.segment_model import SegmentTraining
+from jointfit_daemon.calibration.weighted_mean import fuse
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.joint_angles import joint_rotation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bench.subjects.recorded_knee import KneeTrial
+    from jointfit_daemon.arrays import Array
+
+JOINT_GOALS = {"hold-out": 1.2, "walking": 3.0, "drop jump": 4.3}
+NORMALIZED = (0.5, 1.3)
+EQUAL = (0.5, 0.5)
+ROTATIONS = 3
+"""The joint as the means see it, and what the sensors of each segment disagree by."""
+
+
+def joint_itself(data: Path) -> list[Figure]:
+    """B-10: RMS angle of the joint's rotation: by both segments, and by a fit to the joint alone.
+
+    The reference's knee is a hinge, so its adduction and rotation follow from flexion: a fit to the
+    joint learns that, a real knee would not let it.
+    """
+    squats = Squats(data)
+    judged = {
+        "hold-out": squats.held,
+        "walking": load(data, "walking1"),
+        "drop jump": load(data, "DJ1"),
+    }
+    segments = fusion_methods.fit("anchored", [squats.training])
+    u, seen, truth = _joint(squats.training)
+    training = SegmentTraining.of(squats.training.sensors[:2], None, truth)
+    rho = rotation.log(rotation.multiply(rotation.conjugate(seen), truth))
+    alone = fit_expert(u, rho, ROTATIONS, [list(training.folds(BLOCKS))], tilted=False).expert
+    figures = []
+    for name, trial in judged.items():
+        u, seen, truth = _joint(trial)
+        said = rotation.multiply(seen, rotation.exp(alone.correct(u, ROTATIONS)[0]))
+        both = joint_rotation(*segments(trial))
+        figures += [
+            Figure(f"{name}: by both segments", _rms_degrees(both, truth), float("inf")),
+            Figure(f"{name}: by the joint alone", _rms_degrees(said, truth), JOINT_GOALS[name]),
+        ]
+    return figures
+
+
+def normalized_errors(data: Path) -> list[Figure]:
+    """B-14: root of the mean of squared errors over claimed variances, three trained movements."""
+    squats = Squats(data)
+    walk, jump = load(data, "walking1"), load(data, "DJ1")
+    models = fusion_methods.models([squats.training, walk, jump])
+    ratios: list[list[Array]] = [[], []]
+    for trial in (squats.held, walk, jump):
+        truths = (trial.thigh, trial.shank)
+        for i, segment in enumerate(fusion_methods.segments(trial)):
+            said = models[i].predict(segment.sensors, segment.other)
+            claimed = fusion_methods.axis_deviations(models[i], segment)
+            squares = rotation.angle_between(said, truths[i]) ** 2
+            ratios[i].append(squares / np.sum(claimed**2, axis=1))
+    low, high = NORMALIZED
+    return [
+        Figure(name, float(np.sqrt(np.mean(np.concatenate(found)))), high, low, unit="")
+        for name, found in zip(("thigh", "shank"), ratios, strict=True)
+    ]
+
+
+def _joint(trial: KneeTrial) -> tuple[Array, Array, Array]:
+    """Return what a fit looks at, the joint as the means of sensors see it, and as it is."""
+    a, b, c, d = trial.sensors
+    seen = joint_rotation(fuse([a, b], EQUAL), fuse([c, d], EQUAL))
+    pairs = [rotation.log(joint_rotation(*pair)) for pair in ((a, b), (c, d))]
+    u = np.concatenate([rotation.log(seen), *pairs], axis=1)
+    return u, seen, joint_rotation(trial.thigh, trial.shank)
+
+
+def _rms_degrees(said: Array, truth: Array) -> float:
+    return float(np.rad2deg(np.sqrt(np.mean(rotation.angle_between(said, truth) ** 2))))
+
+
+_DATA = (FOLDER,)
+EXPERIMENTS = (
+    Experiment("B-10", "rotation of the joint, trained on squats", joint_itself, _DATA),
+    Experiment("B-14", "errors over claimed deviations", normalized_errors, _DATA),
+)

@@ -1,0 +1,171 @@
+"""Rows B-6 to B-9, B-11 to B-13: two sensors a segment, on the semi-real knee.
+
+One subject, one leg, virtual sensors made of skin markers, a model as reference: figures to measure
+again and again, not a validation of the product.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure, near
+from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, training_frames
+from jointfit_daemon.calibration.redundancy import SegmentModel, fit_segment
+from jointfit_daemon.calibration.weighted_mean import fuse
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.trial import Method
+
+NAMES = ("thigh", "shank", "flexion")
+THIGH, SHANK = (0, 1), (2, 3)
+
+
+class KneeModels:
+    """Both segments' models of one method and one choice of sensors, trained on some trials.
+
+    What a segment sees of its neighbour is the mean of the neighbour's sensors, as in a rig.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        trials: list[KneeTrial],
+        thigh: tuple[int, ...] = THIGH,
+        shank: tuple[int, ...] = SHANK,
+    ) -> None:
+        self._thigh, self._shank = thigh, shank
+        sensors = [np.concatenate([t.sensors[i] for t in trials]) for i in range(4)]
+        labels = np.repeat(np.arange(len(trials)), [len(t) for t in trials])
+        femur = np.concatenate([t.thigh for t in trials])
+        tibia = np.concatenate([t.shank for t in trials])
+        self.thigh: SegmentModel = fit_segment(
+            method, [sensors[i] for i in thigh], _mean_of(sensors, shank), femur, labels
+        )
+        self.shank: SegmentModel = fit_segment(
+            method, [sensors[i] for i in shank], _mean_of(sensors, thigh), tibia, labels
+        )
+
+    def predict(self, trial: KneeTrial) -> tuple[Array, Array]:
+        q = trial.sensors
+        return (
+            self.thigh.predict([q[i] for i in self._thigh], _mean_of(q, self._shank)),
+            self.shank.predict([q[i] for i in self._shank], _mean_of(q, self._thigh)),
+        )
+
+
+def _mean_of(sensors: Sequence[Array], chosen: tuple[int, ...]) -> Array:
+    return fuse([sensors[i] for i in chosen], (1.0 / len(chosen),) * len(chosen))
+
+
+class Squats:
+    """The squats, cut into training and hold-out, and the judge of both."""
+
+    def __init__(self, data: Path) -> None:
+        whole = load(data, "squats1")
+        count = training_frames(whole)
+        self.training, self.held = whole.part(slice(0, count)), whole.part(slice(count, None))
+        self.judge = Judge.of(self.training)
+
+
+def _single(index: int) -> Callable[[KneeTrial], tuple[Array, Array]]:
+    return lambda trial: (trial.sensors[index], trial.sensors[2 + index])
+
+
+def _mean(trial: KneeTrial) -> tuple[Array, Array]:
+    equal = (0.5, 0.5)
+    return fuse(trial.sensors[:2], equal), fuse(trial.sensors[2:], equal)
+
+
+def baselines(data: Path) -> list[Figure]:
+    """B-6: what single sensors, their mean and the patent's regressions give."""
+    squats = Squats(data)
+    said = {
+        "S2/S4 alone": (_single(1), (9.04, 9.00, 6.15)),
+        "mean": (_mean, (9.29, 9.61, 3.21)),
+        "patent12": (KneeModels("patent12", [squats.training]).predict, (3.45, 2.81, 2.11)),
+        "patent6": (KneeModels("patent6", [squats.training]).predict, (5.37, 3.83, 4.21)),
+    }
+    figures = []
+    for label, (predict, expected) in said.items():
+        errors = squats.judge.errors(predict(squats.held), squats.held)
+        figures += [
+            near(f"{label}: {name}", error, value, 0.1)
+            for name, error, value in zip(NAMES, errors, expected, strict=True)
+        ]
+    return figures
+
+
+def _goals(errors: tuple[float, ...], goals: tuple[float, ...], label: str = "") -> list[Figure]:
+    return [
+        Figure(f"{label}{name}", error, goal)
+        for name, error, goal in zip(NAMES, errors, goals, strict=False)
+    ]
+
+
+def held_out(data: Path) -> list[Figure]:
+    """B-7: the anchored correction on the last 40 %."""
+    squats = Squats(data)
+    models = KneeModels("anchored", [squats.training])
+    return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (1.4, 1.6, 1.2))
+
+
+def _untrained(name: str, goals: tuple[float, ...]) -> Callable[[Path], list[Figure]]:
+    def run(data: Path) -> list[Figure]:
+        squats, other = Squats(data), load(data, name)
+        models = KneeModels("anchored", [squats.training])
+        return _goals(squats.judge.errors(models.predict(other), other), goals)
+
+    return run
+
+
+def three_movements(data: Path) -> list[Figure]:
+    """B-11: trained on squats, walking and jump together."""
+    squats = Squats(data)
+    trials = [squats.training, load(data, "walking1"), load(data, "DJ1")]
+    models = KneeModels("anchored", trials)
+    return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (2.0, 1.9, 1.4))
+
+
+def facing_elsewhere(data: Path) -> list[Figure]:
+    """B-12: the largest change of any orientation, seen from a subject who turned around."""
+    squats = Squats(data)
+    models = KneeModels("anchored", [squats.training])
+    straight = models.predict(squats.held)
+    worst = 0.0
+    for degrees in (10, 30, 90, 170, 180):
+        angle = np.deg2rad(degrees)
+        turned = models.predict(squats.held.turned(angle))
+        for before, after in zip(straight, turned, strict=True):
+            back = rotation.multiply(rotation.heading(-angle), after)
+            worst = max(worst, float(np.rad2deg(rotation.angle_between(before, back).max())))
+    return [Figure("largest change", worst, 1e-9)]
+
+
+def one_sensor(data: Path) -> list[Figure]:
+    """B-13: a model for each sensor that may be left alone."""
+    squats = Squats(data)
+    figures = []
+    for index, goals in ((0, (1.5, 1.9)), (1, (2.1, 2.0))):
+        models = KneeModels("anchored", [squats.training], (index,), (2 + index,))
+        errors = squats.judge.errors(models.predict(squats.held), squats.held)
+        figures += _goals(errors, goals, f"{'AB'[index]} only: ")
+    return figures
+
+
+_DATA = (FOLDER,)
+EXPERIMENTS = (
+    Experiment("B-6", "squats hold-out, baselines", baselines, _DATA),
+    Experiment("B-7", "squats hold-out, anchored", held_out, _DATA),
+    Experiment("B-8", "walking, trained on squats", _untrained("walking1", (5.0, 3.6, 3.3)), _DATA),
+    Experiment("B-9", "drop jump, trained on squats", _untrained("DJ1", (5.2, 4.5, 3.4)), _DATA),
+    Experiment("B-11", "squats hold-out, trained on three", three_movements, _DATA),
+    Experiment("B-12", "hold-out, subject turned by 10 to 180 deg", facing_elsewhere, _DATA),
+    Experiment("B-13", "hold-out, one sensor left on each segment", one_sensor, _DATA),
+)

@@ -1,0 +1,337 @@
+"""Rows ONLINE: people calibrated on walking, who then do other things in view of the cameras.
+
+Simulated people at the demo's defaults; truth is the bones, which neither the cameras' markers nor
+any fit has seen. Circles and walking are calibrated, squats and sitting down and up are learned in
+three rounds, and what is judged comes later still: both kinds again, and walking, to see whether
+it was forgotten. Errors are RMS over all people, heading's wandering included in the segments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.faulty_wearer import Worn, play
+from bench.subjects.simulated_wearer import NS, bench_rig
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.online_fit import Fresh, learn
+from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration.sampling import sensor_at
+from jointfit_daemon.calibration.static_pose import fit_static, with_new_static
+from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
+from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.kinematics import rotation
+from jointfit_simulators.cameras import Cameras
+from jointfit_simulators.orientation import to_wxyz
+from jointfit_simulators.programme import Step
+from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.settings import Knobs
+from jointfit_simulators.wearer import SENSORS, Wearer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+
+SEEDS = (1, 2, 5, 6, 7, 8)
+SEGMENTS = ("thigh", "shank")
+RATE_HZ = 60.0
+FRESH_HZ = 10.0
+ROUNDS = 3
+ROUND_S = 80.0
+TURN_DEG = 15.0
+"""How each sensor is turned on the skin when it is put on again."""
+OTHER_SKIN = 0.25
+"""And how much otherwise the skin of its new place moves: standard deviation of a factor."""
+PLAN = (
+    Step("plate", 24.0), Step("stand", 9.0), Step("functional", 15.0), Step("walk", 40.0),
+    *(Step(name, 20.0) for _ in range(ROUNDS) for name in ("squat", "sit_to_stand") * 2),
+    Step("stand", 10.0), Step("squat", 15.0), Step("sit_to_stand", 15.0), Step("walk", 20.0),
+)  # fmt: skip
+LEARN_S = 88.0
+STAND_S = LEARN_S + ROUNDS * ROUND_S
+JUDGE_S = STAND_S + 10.0
+KINDS = {"new movements": (JUDGE_S + 1, JUDGE_S + 30), "old one": (JUDGE_S + 31, JUDGE_S + 50)}
+
+
+@dataclass(frozen=True)
+class Person:
+    """Everything one person did."""
+
+    t_s: Array
+    said: dict[str, Array]
+    optical: OpticalTrack
+    bones: dict[str, Array]
+    flexion: Array
+
+    def trial(self, begin_s: float, end_s: float) -> CalibrationTrial:
+        """Return what a phase of the calibration records."""
+        now = (self.t_s >= begin_s) & (self.t_s < end_s)
+        t_ns = np.round(self.t_s[now] * NS).astype(np.int64)
+        shot = (self.optical.t_ns >= begin_s * NS) & (self.optical.t_ns < end_s * NS)
+        sensors = {name: SensorTrack(t_ns, q[now]) for name, q in self.said.items()}
+        return CalibrationTrial(sensors, _cut(self.optical, shot))
+
+
+def _cut(track: OpticalTrack, rows: NDArray[np.bool_]) -> OpticalTrack:
+    return replace(
+        track,
+        t_ns=track.t_ns[rows],
+        positions=track.positions[rows],
+        body_positions=track.body_positions[rows],
+        body_orientations=track.body_orientations[rows],
+    )
+
+
+@cache
+def person(seed: int) -> Person:
+    """Return one person."""
+    knobs = Knobs(seed=seed, rate_hz=RATE_HZ)
+    wearer = Wearer(knobs, list(PLAN))
+    end_s = sum(step.seconds for step in PLAN)
+    t_s, camera_s = np.arange(0.0, end_s, 1 / RATE_HZ), np.arange(0.0, end_s, 1 / RATE_HZ)
+    seen = wearer.observe([t_s] * len(SENSORS), camera_s, t_s)
+    said = {
+        name: OrientationSensor(knobs, name).report(t_s, q)
+        for name, q in zip(SENSORS, seen.sensors, strict=True)
+    }
+    cameras = Cameras(knobs, wearer, rate_hz=RATE_HZ)
+    frames = cameras.see(seen)
+    optical = OpticalTrack(
+        np.round(camera_s * NS).astype(np.int64),
+        cameras.markers,
+        frames.markers,
+        cameras.bodies,
+        frames.body_positions,
+        frames.body_orientations,
+    )
+    bones = {name: to_wxyz(cameras.world * seen.truth.orientations[name]) for name in SEGMENTS}
+    return Person(t_s, said, optical, bones, seen.truth.knee[:, 0])
+
+
+@cache
+def calibrated(seed: int) -> Calibration | None:
+    """Return the person's calibration; None where the daemon would ask for another pose."""
+    rig, one = bench_rig(), person(seed)
+    settings = replace(rig.calibration, functional_min_s=0.0)
+    try:
+        alignment = fit_alignment(one.trial(2.0, 24.0), settings)
+        return fit_calibration(
+            one.trial(26.0, 33.0), one.trial(33.0, LEARN_S), alignment, settings, rig.chain
+        )
+    except CalibrationRefused:
+        return None
+
+
+def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -> Fresh:
+    """Return what the daemon keeps of a while in view of the cameras."""
+    trial = one.trial(begin_s, end_s)
+    optical = trial.optical
+    if optical is None:
+        raise ValueError("the simulated cameras saw nothing")
+    every = round(RATE_HZ / FRESH_HZ)
+    names = {segment: calibration.clusters[segment].markers for segment in SEGMENTS}
+    markers = {
+        segment: optical.positions[::every][:, [optical.markers.index(m) for m in group]]
+        for segment, group in names.items()
+    }
+    whole = np.all([np.isfinite(x).all(axis=(1, 2)) for x in markers.values()], axis=0)
+    sensors = {}
+    for name, item in calibration.sensor.items():
+        raw = sensor_at(trial.sensors[name], optical.t_ns[::every], item.lag_ns)
+        turned = rotation.multiply(np.array(item.q_optical_world), raw)
+        sensors[name] = rotation.multiply(turned, np.array(item.q_sensor_segment))
+        whole &= np.isfinite(sensors[name]).all(axis=1)
+    return Fresh(
+        {name: q[whole] for name, q in sensors.items()},
+        {name: x[whole] for name, x in markers.items()},
+        {},
+    )
+
+
+def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
+    """Return the calibration after all rounds, and how many of them were taken."""
+    taken = 0
+    for k in range(ROUNDS):
+        begin_s = LEARN_S + k * ROUND_S
+        new = fresh(person(seed), calibration, begin_s, begin_s + ROUND_S)
+        result = learn(calibration, new, bench_rig().chain)
+        if "calibration" in result:
+            calibration, taken = Calibration.from_dict(result["calibration"]), taken + 1
+    return calibration, taken
+
+
+def squares(one: Person, calibration: Calibration, span: tuple[float, float]) -> Array:
+    """Return the mean squared error of flexion, thigh and shank of a span, rad²."""
+    now = (one.t_s >= span[0]) & (one.t_s < span[1])
+    part = Worn(
+        one.t_s[now] - one.t_s[now][0],
+        {name: q[now] for name, q in one.said.items()},
+        {name: q[now] for name, q in one.bones.items()},
+        one.flexion[now],
+    )
+    states, _ = play(LimbFuser(bench_rig().chain, calibration), part)
+    knee = [state.joints[1] for state in states]
+    flexion = np.array([joint.angles.flexion if joint.angles else np.nan for joint in knee])
+    found = [flexion - part.flexion]
+    for i, name in enumerate(SEGMENTS):
+        q = np.array([state.segments[i].q_world_segment for state in states])
+        found.append(rotation.angle_between(q, part.bones[name]))
+    return np.array([float(np.nanmean(x**2)) for x in found])
+
+
+def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+    """Return errors before and after learning on."""
+    taken, people = 0, 0
+    rows: dict[tuple[str, str], list[Array]] = {}
+    worst = -np.inf
+    for seed in seeds:
+        before = calibrated(seed)
+        if before is None:
+            continue
+        after, rounds = taught(seed, before)
+        taken, people = taken + rounds, people + 1
+        for kind, span in KINDS.items():
+            pair = squares(person(seed), before, span), squares(person(seed), after, span)
+            for when, found in zip(("before", "after"), pair, strict=True):
+                rows.setdefault((kind, when), []).append(found)
+            worst = max(worst, float(np.rad2deg(np.sqrt(pair[1][0]) - np.sqrt(pair[0][0]))))
+        person.cache_clear()
+    figures = [
+        Figure("people", people, len(seeds), len(seeds) - 2, unit=""),
+        Figure("rounds taken", taken, float("inf"), unit=""),
+        Figure("flexion, worst change of a person", worst, 1.0),
+    ]
+    for kind in KINDS:
+        was, now = (
+            np.rad2deg(np.sqrt(np.mean(rows[kind, when], axis=0))) for when in ("before", "after")
+        )
+        for name, a, b in zip(("knee flexion", *SEGMENTS), was, now, strict=True):
+            slack = 0.0 if kind == "new movements" else 0.3
+            figures.append(Figure(f"{kind}: {name} before", float(a), float("inf")))
+            figures.append(Figure(f"{kind}: {name} after", float(b), round(float(a) + slack, 3)))
+    return figures
+
+
+# --- cameras that are wrong -------------------------------------------------------------------
+
+
+def _swapped(new: Fresh) -> Fresh:
+    return replace(new, markers={"thigh": new.markers["shank"], "shank": new.markers["thigh"]})
+
+
+def _two_names(new: Fresh) -> Fresh:
+    x = new.markers["thigh"].copy()
+    x[:, [0, 1]] = x[:, [1, 0]]
+    return replace(new, markers={**new.markers, "thigh": x})
+
+
+def _moved(new: Fresh) -> Fresh:
+    """Turn the whole cluster on the thigh by 12°: it fits as well as ever."""
+    x = new.markers["thigh"]
+    middle = x.mean(axis=1, keepdims=True)
+    local = new.sensors["S1"]
+    turn = rotation.multiply(
+        rotation.multiply(local, rotation.exp(np.deg2rad([12.0, 0.0, 0.0]))),
+        rotation.conjugate(local),
+    )
+    return replace(
+        new, markers={**new.markers, "thigh": rotation.rotate(turn[:, None], x - middle) + middle}
+    )
+
+
+def _late(new: Fresh) -> Fresh:
+    return replace(new, markers={name: np.roll(x, 4, axis=0) for name, x in new.markers.items()})
+
+
+SPOILERS: dict[str, Callable[[Fresh], Fresh]] = {
+    "thigh and shank swapped": _swapped,
+    "two markers of a segment swapped": _two_names,
+    "a cluster turned on its segment by 12 deg": _moved,
+    "cameras 0.4 s late": _late,
+}
+
+
+def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+    """Return how often something was taken from cameras that are wrong."""
+    taken = dict.fromkeys(SPOILERS, 0)
+    for seed in seeds:
+        calibration = calibrated(seed)
+        if calibration is None:
+            continue
+        new = fresh(person(seed), calibration, LEARN_S, LEARN_S + ROUND_S)
+        person.cache_clear()
+        for name, spoil in SPOILERS.items():
+            try:
+                taken[name] += "calibration" in learn(calibration, spoil(new), bench_rig().chain)
+            except CalibrationRefused:
+                continue
+    return [Figure(f"taken: {name}", float(n), 0.0, unit="") for name, n in taken.items()]
+
+
+# --- put on anew ------------------------------------------------------------------------------
+
+
+def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+    """Return errors of taught people whose sensors were turned: with a new static pose only."""
+    rows: dict[str, list[Array]] = {"as worn": [], "put on anew": []}
+    for seed in seeds:
+        calibration = calibrated(seed)
+        if calibration is None:
+            continue
+        calibration, _rounds = taught(seed, calibration)
+        one, dice = person(seed), np.random.default_rng(seed)
+        again = _anew(one, calibration, dice)
+        rows["as worn"].append(squares(one, calibration, KINDS["new movements"]))
+        rig = bench_rig()
+        try:
+            pose = fit_static(again.trial(STAND_S + 2.0, JUDGE_S), rig.calibration, rig.chain)
+        except CalibrationRefused:
+            rows["as worn"].pop()
+            continue
+        new = with_new_static(calibration, pose)
+        rows["put on anew"].append(squares(again, new, KINDS["new movements"]))
+        person.cache_clear()
+    was, now = (np.rad2deg(np.sqrt(np.mean(found, axis=0))) for found in rows.values())
+    figures = []
+    for name, a, b in zip(("knee flexion", *SEGMENTS), was, now, strict=True):
+        figures.append(Figure(f"{name} as worn", float(a), float("inf")))
+        figures.append(Figure(f"{name} put on anew", float(b), round(float(a) + 1.0, 3)))
+    return figures
+
+
+def _anew(one: Person, calibration: Calibration, dice: np.random.Generator) -> Person:
+    """Return the person with every sensor turned, on skin that moves otherwise."""
+    said = {}
+    for name, q in one.said.items():
+        item = calibration.sensor[name]
+        world, mount = np.array(item.q_optical_world), np.array(item.q_sensor_segment)
+        bone = one.bones["thigh" if name in ("S1", "S2") else "shank"]
+        aligned = rotation.multiply(rotation.multiply(world, q), mount)
+        skin = rotation.log(rotation.multiply(rotation.conjugate(bone), aligned))
+        other = rotation.exp(skin * (1.0 + OTHER_SKIN * dice.normal(size=3)))
+        axis = dice.normal(size=3)
+        turn = rotation.exp(np.deg2rad(TURN_DEG) * axis / np.linalg.norm(axis))
+        moved = rotation.multiply(rotation.multiply(bone, other), rotation.conjugate(mount))
+        said[name] = rotation.multiply(rotation.multiply(rotation.conjugate(world), moved), turn)
+    return replace(one, said=said)
+
+
+REDONNED = (
+    f"taught; then every sensor turned by {TURN_DEG:g} deg, skin that moves"
+    f" {100 * OTHER_SKIN:g} % otherwise, a new static pose only"
+)
+EXPERIMENTS = (
+    Experiment("ONLINE", "walking calibrated, squats and sitting learned on", online, long=True),
+    Experiment("ONLINE-guard", "nothing is learned from wrong cameras", guarded, long=True),
+    Experiment("ONLINE-redon", REDONNED, redonned, long=True),
+)

@@ -1,0 +1,236 @@
+"""Row SIM: calibration and live on the simulator's wearer, without bytes, for several people.
+
+Each seed is another person with other mounts, headings, skin and sensor errors, all at the demo's
+defaults. Truth is the bones, which the optical reference never sees: it is made of skin markers.
+Calibrated on 60 s (joint circles, walking, squats, sitting down and up), judged on 24 s afterwards.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.simulated_wearer import bench_rig, phases
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.calibration.static_pose import StaticPose, fit_static
+from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
+from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.kinematics import rotation
+from jointfit_simulators.cameras import Cameras
+from jointfit_simulators.orientation import to_wxyz
+from jointfit_simulators.programme import Step
+from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.settings import Knobs
+from jointfit_simulators.wearer import SENSORS, Wearer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.model import LimbState, Quaternion
+
+SEEDS = tuple(range(1, 9))
+"""The first one is the demo's."""
+METHODS: tuple[Method, ...] = ("anchored", "patent12", "patent6", "mean")
+SEGMENTS = ("thigh", "shank")
+BEGIN_S = 100.0
+"""Errors and skin wander with time: the live part is later than all of the calibration."""
+LIVE = (("walk", 8.0), ("squat", 8.0), ("sit_to_stand", 8.0))
+RATE_HZ = 50.0
+KNEE_GOAL_DEG = 3.0
+NS = 1_000_000_000
+_STILL_S = np.arange(3.0, 8.0, 0.1)  # of a person who stands
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """One person in motion: what sensors say, and the bones, in the optical world."""
+
+    t_ns: list[int]
+    said: dict[str, list[Quaternion]]
+    bones: dict[str, Array]
+    """q_optical_segment, shape (n, 4)."""
+    flexion: Array
+    """Of the knee, rad, shape (n,)."""
+    standing_m: dict[str, Array]
+    """Joint centers in the static pose, shape (3,)."""
+
+
+@dataclass(slots=True)
+class Errors:
+    """Squares and shares of one method on one person."""
+
+    knee: float = 0.0
+    thigh: float = 0.0
+    shank: float = 0.0
+    within_1_sd: float = 0.0
+    within_2_sd: float = 0.0
+    centers_mm: dict[str, float] = field(default_factory=dict)
+
+
+def wear_live(seed: int) -> Live:
+    knobs = Knobs(seed=seed)
+    still = Wearer(knobs, [Step("stand", 9.0)]).observe([np.empty(0)] * 4, np.empty(0), _STILL_S)
+    wearer = Wearer(knobs, [Step("stand", BEGIN_S), *(Step(*motion) for motion in LIVE)])
+    end_s = BEGIN_S + sum(seconds for _, seconds in LIVE)
+    t_s = np.arange(BEGIN_S, end_s, 1 / RATE_HZ)
+    seen = wearer.observe([t_s] * len(SENSORS), np.empty(0), t_s)
+    said = {
+        name: [
+            (w, x, y, z) for w, x, y, z in OrientationSensor(knobs, name).report(t_s, q).tolist()
+        ]
+        for name, q in zip(SENSORS, seen.sensors, strict=True)
+    }
+    world = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz).world
+    return Live(
+        np.round(t_s * NS).astype(int).tolist(),
+        said,
+        {name: to_wxyz(world * seen.truth.orientations[name]) for name in SEGMENTS},
+        seen.truth.knee[:, 0],
+        {name: world.apply(center.mean(axis=0)) for name, center in still.truth.joints.items()},
+    )
+
+
+def _states(calibration: Calibration, live: Live) -> list[LimbState]:
+    fuser = LimbFuser(bench_rig().chain, calibration)
+    return [
+        fuser.fuse(t_ns, t_ns, i, {name: q[i] for name, q in live.said.items()})
+        for i, t_ns in enumerate(live.t_ns)
+    ]
+
+
+def errors_of(calibration: Calibration, live: Live) -> Errors:
+    states = _states(calibration, live)
+    knee = [state.joints[1] for state in states]
+    flexion = np.array([joint.angles.flexion if joint.angles else np.nan for joint in knee])
+    sd = np.array([joint.angle_sd or np.nan for joint in knee])
+    off = flexion - live.flexion
+    rms = {
+        name: _rms_deg(
+            rotation.angle_between(
+                np.array([state.segments[i].q_world_segment for state in states]), live.bones[name]
+            )
+        )
+        for i, name in enumerate(SEGMENTS)
+    }
+    centers = {
+        name: 1e3 * float(np.linalg.norm(np.array(joint.center) - live.standing_m[name]))
+        for name, joint in calibration.joint.items()
+        if joint.center is not None
+    }
+    return Errors(
+        _rms_deg(off),
+        rms["thigh"],
+        rms["shank"],
+        float(np.mean(np.abs(off) < sd)),
+        float(np.mean(np.abs(off) < 2 * sd)),
+        centers,
+    )
+
+
+def _rms_deg(angles: Array) -> float:
+    return float(np.rad2deg(np.sqrt(np.mean(np.square(angles)))))
+
+
+@cache
+def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
+    """Return the errors of every method on every person, in the order of `seeds`."""
+    rig = bench_rig()
+    found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
+    for seed in seeds:
+        trials, live = phases(seed), wear_live(seed)
+        alignment = fit_alignment(trials.align, rig.calibration)
+        pose = take_pose(trials.static, rig)
+        if pose is None:
+            continue
+        for method in METHODS:
+            settings = replace(rig.calibration, method=method)
+            calibration = fit_calibration(pose, trials.functional, alignment, settings, rig.chain)
+            found[method].append(errors_of(calibration, live))
+    return found
+
+
+def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
+    """Return the pose that the daemon would take; None where it would ask for another."""
+    until_ns = min(int(track.t_ns[0]) for track in static.sensors.values())
+    until_ns += round(rig.calibration.static_s * NS)
+    optical = static.optical
+    if optical is None:
+        return None
+    shot = optical.t_ns < until_ns
+    asked = CalibrationTrial(
+        {
+            name: SensorTrack(track.t_ns[now], track.q_world_sensor[now])
+            for name, track in static.sensors.items()
+            if (now := track.t_ns < until_ns).any()
+        },
+        replace(
+            optical,
+            t_ns=optical.t_ns[shot],
+            positions=optical.positions[shot],
+            body_positions=optical.body_positions[shot],
+            body_orientations=optical.body_orientations[shot],
+        ),
+    )
+    try:
+        return fit_static(asked, rig.calibration, rig.chain)
+    except CalibrationRefused as refusal:
+        print(f"SIM: {refusal}", file=sys.stderr)
+        return None
+
+
+def _row(method: Method) -> Callable[[Path], list[Figure]]:
+    def run(_: Path) -> list[Figure]:
+        errors = people()[method]
+        goal = KNEE_GOAL_DEG if method == "anchored" else float("inf")
+        figures = [
+            Figure("people not refused", float(len(errors)), len(SEEDS), len(SEEDS) - 1, unit=""),
+            Figure("knee, the demo's person", errors[0].knee, goal),
+        ]
+        for name in ("knee", "thigh", "shank"):
+            figures += _spread(name, [getattr(each, name) for each in errors])
+        for name, ideal in (("within_1_sd", 0.68), ("within_2_sd", 0.95)):
+            share = float(np.mean([getattr(each, name) for each in errors]))
+            label = f"knee {name.replace('_', ' ')} (ideal {ideal})"
+            figures.append(Figure(label, share, 1.0, least=ideal - 0.05, unit=""))
+        return figures
+
+    return run
+
+
+def centers(_: Path) -> list[Figure]:
+    """Return how far joint centers are from the true ones in the static pose."""
+    errors = people()["anchored"]
+    figures: list[Figure] = []
+    for joint in ("hip", "knee", "ankle"):
+        figures += _spread(joint, [each.centers_mm[joint] for each in errors], "mm")
+    return figures
+
+
+def _spread(name: str, values: list[float], unit: str = "deg") -> list[Figure]:
+    nothing = float("inf")
+    return [
+        Figure(f"{name}, median", float(np.median(values)), nothing, unit=unit),
+        Figure(f"{name}, worst", max(values), nothing, unit=unit),
+    ]
+
+
+EXPERIMENTS = (
+    *(
+        Experiment(f"SIM-{method}", f"worn simulated leg, {method}, {len(SEEDS)} people",
+                   _row(method), long=True)
+        for method in METHODS
+    ),
+    Experiment("SIM-centers", f"joint centers of {len(SEEDS)} people", centers, long=True),
+)  # fmt: skip

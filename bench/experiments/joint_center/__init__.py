@@ -1,0 +1,1 @@
+"""Functional joint centers in the plane and in space."""

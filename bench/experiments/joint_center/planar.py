@@ -1,0 +1,283 @@
+"""Rows C-1 to C-9 and beyond: centers in the plane against theory, bound, peers and time."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.planar_arcs import (
+    arc_points,
+    runs_on,
+    share_covered,
+    upper_rms,
+)
+from jointfit_daemon.calibration.center.bounds import circle_rms_bound
+from jointfit_daemon.calibration.center.circle import fit_circle, fit_circles
+from jointfit_daemon.calibration.center.error_prediction import (
+    arbitrary_error,
+    equal_step_error,
+    triangle_error,
+)
+from jointfit_daemon.calibration.center.geometric import combine, geometric_estimate
+from jointfit_daemon.calibration.center.planar_estimate import Limits, circle_estimate
+from jointfit_daemon.calibration.center.running_circle import RunningCircle
+from jointfit_daemon.calibration.center.three_frames import three_frame_center
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+WIDE = Limits(0.0, (0.0, np.inf), 0.0, np.inf)
+
+
+def three_frames(_: Path) -> list[Figure]:
+    """C-1: closed form against Cramer's rule; the misprinted denominator against a meter."""
+    rng = np.random.default_rng(1)
+    p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
+    u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+    longest = np.maximum.reduce([(w**2).sum(axis=1) for w in (u, v, u - v)])
+    p = p[area >= 0.01 * longest][:10_000]
+    normals = 2.0 * (p[:, 1:] - p[:, :1])
+    heights = (p[:, 1:] ** 2).sum(axis=2) - (p[:, :1] ** 2).sum(axis=2)
+    solved = np.linalg.solve(normals, heights[..., None])[..., 0]
+    off = float(np.abs(three_frame_center(p) - solved).max())
+    return [
+        Figure("largest difference", off, 1e-12, unit="m"),
+        Figure("RMS with equation 11 as printed", _as_printed(rng), np.inf, 1.0, "m"),
+    ]
+
+
+def _as_printed(rng: np.random.Generator) -> float:
+    """Return the RMS error that (x1 - x2) in place of (x1 - x3) gives at 60° and 1 mm, m."""
+    p = arc_points(np.deg2rad(60.0) * np.arange(3), 0.2) + rng.normal(0, 0.001, (20_000, 3, 2))
+    x, y, s = p[..., 0], p[..., 1], (p**2).sum(axis=-1)
+    above = (s[:, 1] - s[:, 0]) * (y[:, 2] - y[:, 0]) - (s[:, 2] - s[:, 0]) * (y[:, 1] - y[:, 0])
+    wrong = (x[:, 0] - x[:, 1]) * (y[:, 0] - y[:, 1]) - (x[:, 0] - x[:, 1]) * (y[:, 0] - y[:, 2])
+    return float(np.sqrt(np.mean((above / (2.0 * wrong)) ** 2)))
+
+
+def equal_steps(_: Path) -> list[Figure]:
+    """C-2: equation 15 against 200 000 runs."""
+    figures = []
+    for step in (45, 60, 90, 120, 150):
+        rng = np.random.default_rng(step)
+        alpha = np.deg2rad(step)
+        p = arc_points(alpha * np.arange(3), 0.2) + rng.normal(0.0, 0.001, (200_000, 3, 2))
+        rms = float(np.sqrt((three_frame_center(p) ** 2).sum(axis=1).mean()))
+        ratio = rms / float(equal_step_error(alpha, 0.001))
+        figures.append(Figure(f"{step}°: simulated over predicted", ratio, 1.01, 0.99, ""))
+    return figures
+
+
+def forms(_: Path) -> list[Figure]:
+    """C-3: equation 14 by angles, by sides, and the Cramér-Rao bound."""
+    rng = np.random.default_rng(3)
+    t = np.sort(rng.uniform(0.0, 2.0 * np.pi, (500, 3)), axis=1)
+    t = t[np.diff(t, axis=1).min(axis=1) > 0.2]
+    angles = arbitrary_error(t, 0.001)
+    sides = triangle_error(arc_points(t, 0.3), 0.001)
+    bound = np.array([circle_rms_bound(row, 0.001) for row in t])
+    return [
+        Figure("by sides", float(np.abs(sides / angles - 1.0).max()), 1e-10, unit=""),
+        Figure("Cramér-Rao", float(np.abs(bound / angles - 1.0).max()), 1e-10, unit=""),
+    ]
+
+
+CASES = ((100, 90, 0.002), (100, 45, 0.005), (100, 20, 0.0005), (100, 20, 0.002), (500, 30, 0.002))
+
+
+def plain_hyper(_: Path) -> list[Figure]:
+    """C-4: the textbook's Hyper over the bound, and Kåsa beside it."""
+    figures = []
+    for n, arc, noise in CASES:
+        goal = 1.2 if (n, arc, noise) == (100, 20, 0.002) else 1.05
+        for method, limit in (("hyper", goal), ("kasa", np.inf)):
+            found = runs_on(n, arc, noise, runs=4000, method=method, tempered=False)
+            label = f"{method}, n = {n}, {arc}°, {1000 * noise:g} mm"
+            figures.append(Figure(label, found.rms / found.bound, limit, unit="× bound"))
+    return figures
+
+
+def streaming(_: Path) -> list[Figure]:
+    """C-5: one frame at a time against all at once, forgetting and windowed, and its time."""
+    rng = np.random.default_rng(5)
+    n = 2000
+    swing = 0.6 * np.sin(np.arange(n) * 0.05)
+    p = arc_points(swing, 0.3) + np.array([0.7, -0.7]) + rng.normal(0.0, 0.002, (n, 2))
+    figures = []
+    for name, forgetting, window in (
+        ("all", 1.0, None),
+        ("forgetting", 0.995, None),
+        ("window", 1.0, 300),
+    ):
+        running = RunningCircle(forgetting=forgetting, window=window)
+        for x, y in p.tolist():
+            running.feed(x, y)
+        weights = forgetting ** np.arange(n - 1, -1, -1.0)
+        last = slice(-window if window else None, None)
+        batch, live = circle_estimate(p[last], weights[last]), running.estimate()
+        off = np.abs(batch.center - live.center).max()
+        figures.append(Figure(f"{name}: center", float(off), 1e-9, unit="m"))
+        off_sd = abs(batch.sd - live.sd)
+        figures.append(Figure(f"{name}: predicted error", float(off_sd), 1e-9, unit="m"))
+    running, began = RunningCircle(), time.thread_time()
+    for x, y in p.tolist():
+        running.feed(x, y)
+        running.circle()
+    took = (time.thread_time() - began) / n
+    return [*figures, Figure("a frame, center found", 1e6 * took, 40.0, unit="µs")]
+
+
+def claims(_: Path) -> list[Figure]:
+    """C-6: predicted error over actual, and how many short arcs pass the gate."""
+    figures = []
+    for n, arc, noise in ((100, 22, 0.002), (100, 30, 0.002), *CASES[:3], CASES[4]):
+        found = runs_on(n, arc, noise, runs=8000)
+        label = f"n = {n}, {arc}°, {1000 * noise:g} mm: claimed over actual"
+        figures.append(Figure(label, found.claimed / found.rms, 1.15, 0.85, ""))
+    for arc, goal in ((10, 0.01), (15, 0.05)):
+        share = float(runs_on(100, arc, 0.002, runs=8000).published.mean())
+        figures.append(Figure(f"{arc}°, 2 mm: share published", share, goal, unit=""))
+    return figures
+
+
+def several(_: Path) -> list[Figure]:
+    """C-7a: four markers at different angles round the joint, 20° arc."""
+    rng = np.random.default_rng(7)
+    t = np.linspace(-0.5, 0.5, 100) * np.deg2rad(20.0)
+    offsets, radii = np.array([0.0, 0.25, -0.3, 0.6]), np.array([0.30, 0.35, 0.20, 0.28])
+    turned = t[:, None] + offsets
+    truth = np.stack((radii * np.cos(turned), radii * np.sin(turned)), axis=-1)
+    information = [
+        np.linalg.inv(fit_bound) for fit_bound in (_bound(turned[:, k], 0.002) for k in range(4))
+    ]
+    bound = float(np.sqrt(np.trace(np.linalg.inv(np.sum(information, axis=0)))))
+    weighted, joint = [], []
+    for _run in range(400):
+        p = truth + rng.normal(0.0, 0.002, truth.shape)
+        each = [circle_estimate(p[:, k], limits=WIDE) for k in range(4)]
+        weighted.append(combine(each)[0])
+        joint.append(geometric_estimate(p, robust=False, limits=WIDE).center)
+    return [
+        Figure("information-weighted", _rms(weighted) / bound, 1.2, unit="× bound"),
+        Figure("all at once", _rms(joint) / bound, 1.2, unit="× bound"),
+    ]
+
+
+def _bound(angles: Array, noise: float) -> Array:
+    u = np.column_stack((np.cos(angles), np.sin(angles), np.ones_like(angles)))
+    return np.asarray(noise**2 * np.linalg.inv(u.T @ u)[:2, :2])
+
+
+def _rms(centers: list[Array]) -> float:
+    return float(np.sqrt((np.array(centers) ** 2).sum(axis=1).mean()))
+
+
+def at_the_bound(_: Path) -> list[Figure]:
+    """20 000 runs of what is published, upper 95 % limit of the RMS error over the bound."""
+    figures = []
+    for arc, goal in ((20, 1.15), (30, 1.15), (45, 1.03), (60, 1.03), (90, 1.03), (180, 1.03)):
+        found = runs_on(100, arc, 0.002)
+        figures.append(
+            Figure(f"{arc}°: drawn in", upper_rms(found) / found.bound, goal, unit="× bound")
+        )
+        plain = runs_on(100, arc, 0.002, tempered=False)
+        ratio = upper_rms(plain) / plain.bound
+        figures.append(Figure(f"{arc}°: plain Hyper", ratio, max(goal, 1.16), unit="× bound"))
+    return figures
+
+
+ELLIPSES: tuple[tuple[int, float, float, float], ...] = (
+    *((100, arc, 0.002, 0.3) for arc in (17, 18, 19, 20, 22, 25, 30, 45, 90, 180, 360)),
+    *((500, arc, 0.002, 0.3) for arc in (12, 13.5, 15, 45)),
+    *((30, arc, 0.002, 0.3) for arc in (27, 30, 60)),
+    *((15, arc, 0.002, 0.3) for arc in (33, 45, 90)),
+    *((100, arc, 0.01, 0.3) for arc in (45, 60, 120)),
+    *((100, arc, 0.001, 0.1) for arc in (26, 40, 90)),
+    *((60, arc, 0.02, 0.45) for arc in (60, 90, 200)),
+)
+
+
+def ellipses(_: Path) -> list[Figure]:
+    """Share of published centers whose 95 % ellipse holds the truth; over 10 % are published."""
+    figures = []
+    for n, arc, noise, radius in ELLIPSES:
+        found = runs_on(n, arc, noise, radius=radius, runs=10_000, correlated=True)
+        share = share_covered(found, n)
+        label = f"n = {n}, {arc:g}°, {1000 * noise:g} mm of {100 * radius:g} cm"
+        note = f"{label} ({100 * float(found.published.mean()):.0f} % published)"
+        figures.append(Figure(note, share, 0.97, 0.93, ""))
+    return figures
+
+
+def peers(_: Path) -> list[Figure]:
+    """One run: the PyPI package circle-fit and scipy, time and accuracy, 45° and 5 mm."""
+    from circle_fit import hyperLSQ, hyperSVD, lm, taubinSVD  # noqa: PLC0415 - only this row's
+    from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import
+
+    rng = np.random.default_rng(9)
+    p = arc_points(np.linspace(-0.5, 0.5, 100) * np.deg2rad(45.0), 0.3)
+    sets = p + rng.normal(0.0, 0.005, (300, 100, 2))
+
+    def by_scipy(x: Array) -> Array:
+        start = np.array([*x.mean(axis=0), 0.3])
+
+        def off(z: Array) -> Array:
+            return np.asarray(np.linalg.norm(x - z[:2], axis=1) - z[2])
+
+        found = least_squares(off, start)
+        return np.asarray(found.x)
+
+    others: dict[str, Callable[[Array], object]] = {
+        "circle-fit hyperSVD": hyperSVD,
+        "circle-fit hyperLSQ": hyperLSQ,
+        "circle-fit taubinSVD": taubinSVD,
+        "circle-fit lm": lambda x: lm(x, np.array([*x.mean(axis=0), 0.3])),
+        "scipy least_squares": by_scipy,
+    }
+    mine, error = _timed(fit_circle, sets)
+    judged, drawn_in = _timed(lambda x: circle_estimate(x, limits=WIDE).center, sets)
+    began = time.thread_time()
+    fit_circles(sets)
+    many = (time.thread_time() - began) / len(sets)
+    figures = [
+        Figure("here, the circle alone as theirs", 1e6 * mine, np.inf, unit="µs"),
+        Figure("here, with covariance and verdict", 1e6 * judged, np.inf, unit="µs"),
+        Figure("here, 300 at once", 1e6 * many, np.inf, unit="µs"),
+        Figure("here, drawn in: RMS error over plain", drawn_in / error, 1.0, unit=""),
+    ]
+    for name, fit in others.items():
+        took, off = _timed(fit, sets)
+        figures.append(Figure(f"{name}: our time over theirs", mine / took, 1.0, unit=""))
+        figures.append(Figure(f"{name}: our RMS error over theirs", error / off, 1.005, unit=""))
+    return figures
+
+
+def _timed(fit: Callable[[Array], object], sets: Array) -> tuple[float, float]:
+    fit(sets[0])
+    began = time.thread_time()
+    centers = [np.asarray(fit(x))[:2] for x in sets]
+    took = (time.thread_time() - began) / len(sets)
+    return took, float(np.sqrt((np.array(centers, dtype=np.float64) ** 2).sum(axis=1).mean()))
+
+
+EXPERIMENTS = (
+    Experiment("C-1", "three frames against Cramer's rule", three_frames),
+    Experiment("C-2", "predicted error of equal steps against 200 000 runs", equal_steps),
+    Experiment("C-3", "three forms of the predicted error", forms),
+    Experiment("C-4", "circle fits over the Cramér-Rao bound, 4000 runs", plain_hyper),
+    Experiment("C-5", "one frame at a time against all at once", streaming),
+    Experiment("C-6", "predicted error over actual, 8000 runs; the gate", claims),
+    Experiment("C-7a", "four markers, 20° arc", several),
+    Experiment("C-20", "what is published, at the bound, 20 000 runs", at_the_bound),
+    Experiment("C-21", "95 % ellipses of what is published", ellipses, long=True),
+    Experiment(
+        "C-22", "beside circle-fit and scipy, one run", peers, packages=("circle_fit", "scipy")
+    ),
+)

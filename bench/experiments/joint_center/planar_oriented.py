@@ -1,0 +1,114 @@
+"""Rows C-8 and C-9: measured angles help a center, and wrong ones do little harm."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.planar_arcs import arc_points
+from jointfit_daemon.calibration.center.circle import fit_circles
+from jointfit_daemon.calibration.center.oriented import oriented_estimate
+from jointfit_daemon.calibration.center.planar_estimate import Limits
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+Kind = Literal["white", "slow", "OU", "gain"]
+
+FRAMES, SECONDS, NOISE_M, RADIUS_M = 100, 2.0, 0.002, 0.3
+WIDE = Limits(0.0, (0.0, np.inf), 0.0, np.inf)
+STATED: tuple[tuple[Kind, float], ...] = (
+    ("white", 0.0),
+    ("white", 1.0),
+    ("slow", 1.0),
+    ("OU", 1.5),
+)
+BEYOND: tuple[tuple[Kind, float], ...] = (
+    ("white", 3.0),
+    ("slow", 3.0),
+    ("slow", 4.5),
+    ("OU", 4.5),
+    ("gain", 1.0),
+    ("gain", 3.0),
+)
+ARCS = (20, 30, 45, 60, 75, 90, 180)
+
+
+def angle_error(kind: Kind, size: float, rng: np.random.Generator) -> Array:
+    """Return errors of the angle, RMS `size`, shape (FRAMES,)."""
+    n = FRAMES
+    if kind == "white":
+        return np.asarray(size * rng.normal(size=n))
+    if kind == "slow":
+        phase = 2.0 * np.pi * rng.random() + np.linspace(0.0, 2.0 * np.pi, n) * rng.uniform(
+            0.3, 1.5
+        )
+        return np.asarray(size * np.sqrt(2.0) * np.sin(phase))
+    if kind == "gain":
+        scale = float(size * np.sqrt(12.0) * rng.normal())
+        return np.asarray(scale * np.linspace(-0.5, 0.5, n))
+    t = np.linspace(0.0, SECONDS, n)
+    root = np.linalg.cholesky(np.exp(-np.abs(t[:, None] - t)) + 1e-12 * np.eye(n))
+    return np.asarray(size * (root @ rng.normal(size=n)))
+
+
+@cache
+def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float, float, int]:
+    """Return the RMS errors with and without angles, m, where both answer, and refusals."""
+    rng = np.random.default_rng(1000 + round(arc))
+    theta = np.linspace(-0.5, 0.5, FRAMES) * np.deg2rad(arc)
+    truth = arc_points(theta, RADIUS_M)
+    p = truth + rng.normal(0.0, NOISE_M, (runs, *truth.shape))
+    plain = fit_circles(p, tempered=False)
+    aided = np.full((runs, 2), np.nan)
+    for run in range(runs):
+        measured = theta + angle_error(kind, np.deg2rad(degrees), rng)
+        found = oriented_estimate(p[run], measured, SECONDS / FRAMES, limits=WIDE)
+        if found.refused is None:
+            aided[run] = found.center
+    both = plain.valid & np.isfinite(aided[:, 0])
+    with_angles, without = (
+        float(np.sqrt((c[both] ** 2).sum(axis=1).mean())) for c in (aided, plain.center)
+    )
+    return with_angles, without, int(np.isnan(aided[:, 0]).sum())
+
+
+def table(_: Path) -> list[Figure]:
+    """C-8: RMS with angles over RMS of plain Hyper."""
+    figures = []
+    for arc in ARCS:
+        for kind, degrees in (*STATED, *BEYOND):
+            with_angles, without, refused = rms_errors(arc, kind, degrees, 200)
+            goal = 1.02 if (kind, degrees) in STATED else 1.1
+            if (kind, degrees) == ("white", 1.0) and arc < 90:
+                goal = 0.999
+            label = f"{arc}°, {kind} {degrees:g}°: {1000 * with_angles:.3g} mm"
+            note = f"{label}, {refused} refused" if refused else label
+            figures.append(Figure(note, with_angles / without, goal, unit="× Hyper"))
+    return figures
+
+
+def short_arc(_: Path) -> list[Figure]:
+    """C-9: 20° with slow errors of 1°; and a few of the worst of C-8."""
+    with_angles, without, refused = rms_errors(20, "slow", 1.0, 200)
+    figures = [
+        Figure("20°, slow 1°: with angles", 1000 * with_angles, 28.0, unit="mm"),
+        Figure("20°, slow 1°: plain Hyper", 1000 * without, np.inf, unit="mm"),
+        Figure("20°, slow 1°: refused", refused, 0, unit="of 200"),
+    ]
+    for arc, kind, degrees, goal in ((60, "white", 1.0, 0.999), (60, "slow", 4.5, 1.1)):
+        with_angles, without, _refused = rms_errors(arc, kind, degrees, 200)
+        label = f"{arc}°, {kind} {degrees:g}°"
+        figures.append(Figure(label, with_angles / without, goal, unit="× Hyper"))
+    return figures
+
+
+EXPERIMENTS = (
+    Experiment("C-8", "angles as good as told, and three times worse", table, long=True),
+    Experiment("C-9", "angles on a short arc", short_arc),
+)

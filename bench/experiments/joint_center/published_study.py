@@ -1,0 +1,43 @@
+"""Row C-13: the source's numerical experiment, repeated; table 1 as its printed digits are read."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+from bench.framework.experiment import Experiment, Figure, near
+from jointfit_daemon.calibration.center.study import PRINTED, PairMaps, StudySetup, run_study
+from jointfit_daemon.tools.report_tables import NEAREST, correlations
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+EXPECTED = {"α–σ": (0.98, 0.81), "r–σ": (1.00, 0.99), "r–α": (0.96, 0.91)}
+"""By an independent implementation, at the clip that comes nearest to print."""
+
+
+@cache
+def _study() -> list[PairMaps]:
+    return run_study(StudySetup())
+
+
+def table_1(_: Path) -> list[Figure]:
+    figures: list[Figure] = []
+    for pair in _study():
+        clip, (predicted, grid) = NEAREST[pair.name], EXPECTED[pair.name]
+        first, second = correlations(pair, "grid", clip)
+        shifted = correlations(pair, "shifted grid", clip)[1]
+        at = "raw" if clip is None else f"≤ {100 * clip:g} cm"
+        printed = PRINTED[pair.name]
+        label = f"{pair.name}, {at}"
+        figures += [
+            near(f"{label}: prediction–analytic, printed {printed[0]}", first, predicted, 0.03, ""),
+            near(f"{label}: analytic–grid, printed {printed[1]}", second, grid, 0.06, ""),
+            near(f"{label}: analytic–shifted grid", shifted, grid, 0.06, ""),
+        ]
+    return figures
+
+
+EXPERIMENTS = (
+    Experiment("C-13", "the source's table 1: correlations of error maps", table_1, long=True),
+)

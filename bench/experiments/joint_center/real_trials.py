@@ -1,0 +1,69 @@
+"""Rows R: hips and knees of people, beside the joint centers of their models.
+
+No goal is fitted to these figures. Across the knee's axis there is a floor, far above what was
+measured: it tells when something breaks. Along the axis a hinge shows nothing, and thigh skin
+slides over the femur with every step: both are reported as they come.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.baselines.center_estimators import judged
+from bench.framework.experiment import Experiment, Figure
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+METHODS = ("auto", "sara")
+TRIALS = {
+    "squats1": "squats",
+    "STS1": "sit to stand",
+    "DJ1": "drop jump",
+    "walking1": "walking",
+    "gait2354": "walking, three markers a segment",
+}
+KNEE_FLOOR_MM = 50.0
+
+
+def compare(trial: str, data: Path) -> list[Figure]:
+    """Return distances from the model's centers, and what the estimates said of themselves."""
+    figures: list[Figure] = []
+    for found in judged(data, trial, METHODS):
+        floor = KNEE_FLOOR_MM if "knee" in found.joint.name else inf
+        for method in METHODS:
+            e = found.estimates[method]
+            name = f"{found.joint.name}, {e.method}"
+            if e.refused is not None:
+                name += " (refused)"
+            figures.append(Figure(f"{name}: error it tells", 1000 * e.sd, inf, unit="mm"))
+            if np.isfinite(e.center).all():
+                told = 1000 * found.told_across(method)
+                figures.append(
+                    Figure(f"{name}: error it tells across the axis", told, inf, unit="mm")
+                )
+                off, across = 1000 * found.off(method), 1000 * found.off_axis(method)
+                figures += [
+                    Figure(f"{name}: from the model", off, inf, unit="mm"),
+                    Figure(f"{name}: across the axis", across, floor, unit="mm"),
+                ]
+    return figures
+
+
+def _row(number: int, trial: str, movement: str) -> Experiment:
+    folder = "opensim_gait2354" if trial == "gait2354" else "opencap_subject4"
+    return Experiment(
+        f"R-{number}",
+        f"{movement}, beside the model",
+        partial(compare, trial),
+        recordings=(folder,),
+        packages=("opensim",),
+        long=True,
+    )
+
+
+EXPERIMENTS = tuple(_row(i, *item) for i, item in enumerate(TRIALS.items(), start=1))

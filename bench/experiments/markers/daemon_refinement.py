@@ -1,0 +1,118 @@
+"""Row SIM-markers: what refining marker places in the daemon is worth, against the bones.
+
+The people of ``SIM``, calibrated with `refine_markers` on and off; some of them again with a marker
+of each segment knocked off its place between static pose and movement. Live errors are compared,
+person by person; the optical reference itself is seen only through them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.experiments.fusion.simulated_leg import SEEDS, SEGMENTS, errors_of, take_pose, wear_live
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.simulated_wearer import bench_rig, phases
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.markers import track_cluster
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bench.experiments.fusion.simulated_leg import Live
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.alignment_phase import Alignment
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.calibration.static_pose import StaticPose
+    from jointfit_daemon.calibration.trial import CalibrationTrial
+    from jointfit_daemon.config import Rig
+
+KNOCKED = {"thigh": "T2", "shank": "C2"}
+KNOCKED_M = 0.015
+FEW = 4
+"""People whose markers are knocked off."""
+NOTHING = float("inf")
+COSTS_NOTHING_DEG = 0.1
+
+
+def refined(_: Path) -> list[Figure]:
+    """SIM-markers: change of live errors by refining, deg; negative is better."""
+    rig = bench_rig()
+    worn: list[Array] = []
+    knocked: list[Array] = []
+    off_mm: list[Array] = []
+    for seed in SEEDS:
+        trials, live = phases(seed), wear_live(seed)
+        pose = take_pose(trials.static, rig)
+        if pose is None:
+            continue
+        alignment = fit_alignment(trials.align, rig.calibration)
+
+        change, calibration = _change(rig, pose, trials.functional, alignment, live)
+        worn.append(change)
+        parts = calibration.quality["markers"]["parts"]
+        off_mm.append(
+            1e3 * np.array([[parts[s]["before_m"], parts[s]["after_m"]] for s in SEGMENTS])
+        )
+        if len(knocked) < FEW:
+            functional = _knocked(trials.functional, pose, seed)
+            knocked.append(_change(rig, pose, functional, alignment, live)[0])
+        phases.cache_clear()
+    before, after = np.mean(off_mm, axis=(0, 1))
+    return [
+        Figure("people", float(len(worn)), NOTHING, unit=""),
+        Figure("markers off a rigid part, static places", float(before), NOTHING, unit="mm"),
+        Figure(
+            "markers off a rigid part, refined", float(after), round(float(before), 2), unit="mm"
+        ),
+        *_changes("as worn", worn, COSTS_NOTHING_DEG),
+        *_changes(f"a marker each knocked off, {len(knocked)} people", knocked, 0.0),
+    ]
+
+
+def _change(
+    rig: Rig, pose: StaticPose, functional: CalibrationTrial, alignment: Alignment, live: Live
+) -> tuple[Array, Calibration]:
+    """Return errors of knee, thigh and shank with refining less those without, deg."""
+    found = [
+        fit_calibration(
+            pose, functional, alignment, replace(rig.calibration, refine_markers=on), rig.chain
+        )
+        for on in (False, True)
+    ]
+    errors = [errors_of(calibration, live) for calibration in found]
+    plain, better = (np.array([e.knee, e.thigh, e.shank]) for e in errors)
+    return better - plain, found[1]
+
+
+def _changes(label: str, found: list[Array], goal: float) -> list[Figure]:
+    table = np.array(found)
+    figures = []
+    for i, name in enumerate(("knee", *SEGMENTS)):
+        mean, worst = float(table[:, i].mean()), float(table[:, i].max())
+        figures.append(Figure(f"{label}: {name}, mean change", mean, goal, -NOTHING))
+        figures.append(Figure(f"{label}: {name}, worst change", worst, NOTHING, -NOTHING))
+    return figures
+
+
+def _knocked(functional: CalibrationTrial, pose: StaticPose, seed: int) -> CalibrationTrial:
+    """Return the movement with one marker of each segment shifted on its segment."""
+    optical, rng = functional.optical, np.random.default_rng(seed)
+    if optical is None:
+        return functional
+    positions = optical.positions.copy()
+    for segment, marker in KNOCKED.items():
+        shift = rng.normal(size=3)
+        shift *= KNOCKED_M / np.linalg.norm(shift)
+        q = track_cluster(optical, pose.clusters[segment]).q
+        positions[:, optical.markers.index(marker)] += rotation.rotate(q, shift)
+    return replace(functional, optical=replace(optical, positions=positions))
+
+
+EXPERIMENTS = (
+    Experiment("SIM-markers", f"marker places refined, {len(SEEDS)} people", refined, long=True),
+)

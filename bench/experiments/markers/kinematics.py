@@ -1,0 +1,143 @@
+"""Rows D-1, D-2, D-3, D-12: the chain's Jacobian, its fit to an adult, its speed.
+
+Times are CPU time of one thread, medians, as in the speed bench.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from statistics import median
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure, near
+from bench.framework.measurement import cpu_s
+from bench.subjects.adult_lower_limbs import FOLDER, TRIALS, measured, oc4_lower
+from bench.subjects.two_segments import swing, two_segments
+from jointfit_daemon.kinematics.chain_motion import (
+    apply_step,
+    jacobian,
+    marker_positions,
+    step_between,
+)
+from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
+from jointfit_daemon.kinematics.live_inverse_kinematics import LiveInverseKinematics
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chain_motion import ChainState
+
+EXPECTED_MM = dict(zip(TRIALS, (2.37, 6.57, 10.61, 8.62, 11.29), strict=True))
+REPEATS = 20
+_ROOT_SHIFT = [3, 4, 5]
+
+
+def slope(data: Path) -> list[Figure]:
+    """D-1: central differences at 5 instants of walking."""
+    model = oc4_lower(data)
+    state = solve_frames(model, measured(data, "walking1", model)[::26]).state
+    told, h, off = jacobian(model, state), 1e-6, 0.0
+    for k in range(model.nq):
+        step = np.zeros((len(state), model.nq))
+        step[:, k] = h
+        ahead = marker_positions(model, apply_step(model, state, step))
+        behind = marker_positions(model, apply_step(model, state, -step))
+        off = max(off, float(np.abs(told[..., k] - (ahead - behind) / (2 * h)).max()))
+    return [Figure("largest difference", off, 1e-7, unit="m/rad")]
+
+
+def fit(data: Path) -> list[Figure]:
+    """D-2: tracking error before any refinement, all instants."""
+    model = oc4_lower(data)
+    figures = []
+    for trial, expected in EXPECTED_MM.items():
+        found = solve_frames(model, measured(data, trial, model))
+        error = 1000 * tracking_error(found.residuals)
+        figures.append(near(trial, error, expected, 0.05, "mm"))
+    return figures
+
+
+def exact(data: Path) -> tuple[ChainModel, ChainState, Array]:
+    """Return the model, its walk and the markers of that walk without noise."""
+    model = oc4_lower(data)
+    truth = solve_frames(model, measured(data, "walking1", model)).state
+    return model, truth, marker_positions(model, truth)
+
+
+def turns_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> Array:
+    return np.degrees(np.delete(step_between(model, a, b), _ROOT_SHIFT, axis=1))
+
+
+def occluded(data: Path) -> list[Figure]:
+    """D-3: every segment loses one marker in half of all instants; then a fifth of all markers."""
+    model, truth, clean = exact(data)
+    rng = np.random.default_rng(0)
+    y = clean.copy()
+    for t in range(len(y)):
+        for s in range(len(model.segments)):
+            if rng.random() < 0.5:
+                y[t, rng.choice(np.flatnonzero(model.marker_segments == s))] = np.nan
+    found = solve_frames(model, y)
+    placed = marker_positions(model, found.state) - clean
+    scattered = clean.copy()
+    scattered[rng.random(scattered.shape[:2]) < 0.2] = np.nan
+    loose = turns_off_deg(model, truth, solve_frames(model, scattered).state)
+    return [
+        Figure("largest marker error", 1000 * float(np.abs(placed).max()), 1e-6, unit="mm"),
+        Figure(
+            "largest turn error",
+            float(np.abs(turns_off_deg(model, truth, found.state)).max()),
+            1e-6,
+        ),
+        Figure("a fifth of all markers missing: turns", float(np.sqrt(np.mean(loose**2))), 0.25),
+    ]
+
+
+def batch_us(model: ChainModel, y: Array) -> float:
+    solve_frames(model, y)
+    took = [cpu_s(lambda: solve_frames(model, y)) for _ in range(REPEATS)]
+    return 1e6 * median(took) / len(y)
+
+
+def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
+    """Return the median time an instant, covariance included, and the tracking error, mm."""
+    live = LiveInverseKinematics(model)
+    residuals: list[Array] = []
+
+    def feed(row: Array) -> None:
+        residuals.append(live.feed(row).residuals)
+
+    took = [cpu_s(partial(feed, row)) for row in y]
+    return 1e6 * median(took), 1000 * tracking_error(np.array(residuals))
+
+
+def speed(data: Path) -> list[Figure]:
+    """D-12: seven segments, 29 markers, 20 degrees of freedom; then two segments."""
+    model = oc4_lower(data)
+    y = measured(data, "walking1", model)
+    small = two_segments()
+    _, swung = swing(small)
+    took, error = live_us(model, y)
+    full = 1000 * tracking_error(solve_frames(model, y).residuals)
+    return [
+        Figure("seven segments, from nowhere", batch_us(model, y), 400, unit="µs/instant"),
+        Figure("seven segments, live with covariance", took, 1200, unit="µs/instant"),
+        Figure("live over least tracking error", error / full, 1.001, unit=""),
+        Figure("two segments, from nowhere", batch_us(small, swung), 50, unit="µs/instant"),
+        Figure(
+            "two segments, live with covariance", live_us(small, swung)[0], 300, unit="µs/instant"
+        ),
+    ]
+
+
+_RECORDED = (FOLDER,)
+EXPERIMENTS = (
+    Experiment("D-1", "Jacobian against central differences", slope, _RECORDED),
+    Experiment("D-2", "seven segments before refinement", fit, _RECORDED),
+    Experiment("D-3", "occluded markers, no noise", occluded, _RECORDED),
+    Experiment("D-12", "speed of inverse kinematics", speed, _RECORDED, timed=True),
+)

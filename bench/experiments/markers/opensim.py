@@ -1,0 +1,214 @@
+"""Rows D-14 to D-17: refined markers judged by OpenSim's own inverse kinematics.
+
+The models are as their files have them; only markers are ours. Trials that are called unseen were
+not learned from, and nothing was chosen by them.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from math import inf
+from pathlib import Path  # noqa: TC003 - the cache's key
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure, near
+from bench.subjects.opensim_reference import CONVERGED, OpenSimFollower, judge
+from bench.subjects.opensim_trials import GAIT, OPENCAP, gait2354, opencap
+from jointfit_daemon.calibration.marker_refinement.motion import RefinementSettings
+from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
+from jointfit_daemon.calibration.marker_refinement.search import search
+from jointfit_daemon.files.osim import to_z_up
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    IkOptions,
+    solve_frames,
+    tracking_error,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from bench.subjects.opensim_reference import Verdict
+    from bench.subjects.opensim_trials import Subject
+    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
+
+_MM, _MM2 = 1000.0, 1e6
+_ALL = 10_000
+PLAIN = RefinementSettings(huber_m=None, frames=_ALL)
+THREE = ("walking1", "squats1", "DJ1")
+EVERYTHING = (*THREE, "STS1")
+_EVENNESS = (0.0, 1.0, 2.0, 4.0)
+_DEARER = 1.02
+"""The mean error of movements held back may be this much above the least."""
+
+
+def _less(before: float, after: float) -> float:
+    return 100.0 * (1.0 - after / before)
+
+
+def scaled_only(data: Path) -> list[Figure]:
+    """D-14."""
+    subject = gait2354(data)
+    chain, walk = subject.chain(), [subject.motion("walk1")]
+    before = subject.verdicts(["walk1"])["walk1"].rms
+    found = refine_markers(chain, walk, PLAIN)
+    rms, most = np.degrees(found.angle_change())
+    after = subject.verdicts(["walk1"], found.model)["walk1"]
+    return [
+        near("before", _MM * before, 34.52, 0.05, "mm"),
+        Figure("joint", _MM * after.rms, inf, unit="mm"),
+        Figure("joint, less by", _less(before, after.rms), inf, 66, "%"),
+        Figure("our own inverse kinematics, off by", _off(found, after), 0.2, unit="mm"),
+        Figure("joint angles turned, RMS", float(rms), inf),
+        Figure("joint angles turned, most", float(most), inf),
+    ]
+
+
+def _off(found: Refinement, verdict: Verdict) -> float:
+    return _MM * abs(found.trials[0].after.rms - verdict.rms)
+
+
+def beside_opensim(data: Path) -> list[Figure]:
+    """D-15: the published search through OpenSim, to its end; the joint method, the same frames."""
+    subject = gait2354(data)
+    chain, walk = subject.chain(), [subject.motion("walk1")]
+    refine_markers(chain, walk, PLAIN)
+    began = time.perf_counter()
+    joint = refine_markers(chain, walk, PLAIN)
+    between = time.perf_counter()
+    segments = [m.segment for m in chain.markers]
+    follower = OpenSimFollower(subject.model, subject.trials["walk1"], segments)
+    found = search(follower.tracking_error, chain.positions, ~chain.locked)
+    ended = time.perf_counter()
+    before = subject.verdicts(["walk1"])["walk1"].rms
+    sets = (joint.model, chain.with_markers(found.positions))
+    by_joint, by_search = (subject.verdicts(["walk1"], s)["walk1"].rms for s in sets)
+    return [
+        Figure("search", _MM * by_search, inf, unit="mm"),
+        Figure("search, less by", _less(before, by_search), inf, 66, "%"),
+        Figure("joint", _MM * by_joint, inf, unit="mm"),
+        Figure("runs of OpenSim's inverse kinematics", found.runs, inf, unit=""),
+        Figure("search", ended - between, inf, unit="s"),
+        Figure("joint, checks and report included", between - began, inf, unit="s"),
+        Figure("search over joint", (ended - between) / (between - began), inf, 100, "times"),
+    ]
+
+
+def _compared(
+    before: Mapping[str, Verdict], after: Mapping[str, Verdict], least: Mapping[str, float]
+) -> list[Figure]:
+    figures = []
+    for name in after:
+        was, now = before[name].rms, after[name].rms
+        figures += [
+            Figure(f"{name} before", _MM * was, inf, unit="mm"),
+            Figure(f"{name} after", _MM * now, inf, unit="mm"),
+            Figure(f"{name} less by", _less(was, now), inf, least.get(name, -inf), "%"),
+        ]
+    return figures
+
+
+@cache
+def _untouched(data: Path) -> dict[str, Verdict]:
+    return opencap(data).verdicts(EVERYTHING)
+
+
+def walking_alone(data: Path) -> list[Figure]:
+    """D-16."""
+    subject = opencap(data)
+    found = refine_markers(subject.chain(), [subject.motion("walking1")], PLAIN)
+    after = subject.verdicts(EVERYTHING, found.model)
+    return [
+        Figure("walking1, learned from", _MM * after["walking1"].rms, 4.9, unit="mm"),
+        *_compared(_untouched(data), after, {"squats1": 20, "STS1": 20}),
+        *_to_the_end(subject, found),
+        Figure("joint angles turned, RMS", float(np.degrees(found.angle_change()[0])), inf),
+    ]
+
+
+def _to_the_end(subject: Subject, found: Refinement) -> list[Figure]:
+    """What OpenSim finds of the walk when its default accuracy does not stop it."""
+    walk = subject.judged["walking1"]
+    before = judge(subject.model, walk, accuracy=CONVERGED).rms
+    after = judge(subject.model, walk, found.model, CONVERGED).rms
+    within = IkOptions(limit_m2=PLAIN.limit_m2)
+    ones = np.ones(len(subject.names))
+    ours = solve_frames(found.model, to_z_up(walk.positions), ones, options=within)
+    off = abs(tracking_error(ours.residuals) - after)
+    return [
+        Figure("OpenSim to convergence: walking1 before", _MM * before, inf, unit="mm"),
+        Figure("OpenSim to convergence: walking1 after", _MM * after, inf, unit="mm"),
+        Figure("our own inverse kinematics from there, off by", _MM * off, 0.02, unit="mm"),
+    ]
+
+
+def three_movements(data: Path) -> list[Figure]:
+    """D-17: one set of markers for all; how even trials are weighed, chosen on these three."""
+    subject = opencap(data)
+    evenness = chosen_evenness(subject, THREE)
+    figures = [Figure("evenness chosen by movements held back", evenness, inf, unit="")]
+    before = _untouched(data)
+    for power in sorted({0.0, evenness}):
+        found = refined_evenly(subject, THREE, power)
+        after = subject.verdicts(EVERYTHING, found.model)
+        if power == evenness:
+            figures += _compared(before, after, {"STS1": 32})
+        figures += [
+            Figure(f"{who}: variance across trials, evenness {power:g}", value, goal, unit="mm²")
+            for who, value, goal in (
+                ("OpenSim", _MM2 * _across(after), _MM2 * _across(before)),
+                ("ours, training trials", _MM2 * found.variance_of_trials(trained=True)[1], inf),
+            )
+        ]
+    return [*figures, Figure("OpenSim: variance before", _MM2 * _across(before), inf, unit="mm²")]
+
+
+def _across(verdicts: Mapping[str, Verdict]) -> float:
+    return float(np.var([v.rms for v in verdicts.values()]))
+
+
+def refined_evenly(
+    subject: Subject, trained: Sequence[str], power: float, judged: Sequence[str] = ()
+) -> Refinement:
+    """Return markers learned from some trials, harder ones weighing more."""
+    settings = RefinementSettings(huber_m=None, frames=100, evenness=power)
+    trials, others = ([subject.motion(n) for n in names] for names in (trained, judged))
+    return refine_markers(subject.chain(), trials, settings, others)
+
+
+def chosen_evenness(subject: Subject, trained: Sequence[str]) -> float:
+    """Return the greatest evenness that movements held back do not pay for.
+
+    Each training trial is held back in turn. Of all powers whose mean error of trials held back is
+    within 2 % of the least, the greatest: it spreads what is left most evenly.
+    """
+    means = {}
+    for power in _EVENNESS:
+        left_out = [
+            refined_evenly(subject, [o for o in trained if o != n], power, [n]).trials[-1]
+            for n in trained
+        ]
+        means[power] = float(np.mean([t.after.rms for t in left_out]))
+    return max(p for p, mean in means.items() if mean <= _DEARER * min(means.values()))
+
+
+_OPENSIM = ("opensim",)
+EXPERIMENTS = (
+    Experiment("D-14", "gait2354 judged by OpenSim", scaled_only, (GAIT,), _OPENSIM, long=True),
+    Experiment(
+        "D-15", "beside the search through OpenSim", beside_opensim, (GAIT,), _OPENSIM, long=True
+    ),
+    Experiment(
+        "D-16", "walking alone, judged by OpenSim", walking_alone, (OPENCAP,), _OPENSIM, long=True
+    ),
+    Experiment(
+        "D-17",
+        "three movements, judged by OpenSim",
+        three_movements,
+        (OPENCAP,),
+        _OPENSIM,
+        long=True,
+    ),
+)

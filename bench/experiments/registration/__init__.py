@@ -1,0 +1,1 @@
+"""Stillness, sensor-to-segment and world alignment, orientation on the gateway."""

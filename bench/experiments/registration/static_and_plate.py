@@ -1,0 +1,159 @@
+"""Rows B-1 to B-5: stillness, the static mean, and the alignment of sensor and optical world."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from jointfit_daemon.calibration.mount import align, fit_alignment
+from jointfit_daemon.calibration.static import robust_mean
+from jointfit_daemon.calibration.stillness import still_from_rates
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+TRIALS = ("02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B")
+INFINITY = float("inf")
+
+
+def _degrees(angle: object) -> float:
+    return float(np.rad2deg(np.asarray(angle, dtype=np.float64)))
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def stillness(data: Path) -> list[Figure]:
+    """B-1: rest found, and motion taken for rest, on two whole trials of a board."""
+    h5py = import_module("h5py")  # only this bench needs it
+    figures = []
+    for name in TRIALS:
+        with h5py.File(data / "broad" / f"{name}.hdf5") as trial:
+            moving = trial["movement"][:].astype(bool)
+            rate = float(trial.attrs["sampling_rate"])
+            still = still_from_rates(trial["imu_gyr"][:], trial["imu_acc"][:], rate)
+        figures += [
+            Figure(f"{name[:2]} rest", float(still[~moving].mean()), INFINITY, 0.97, ""),
+            Figure(f"{name[:2]} motion", float(still[moving].mean()), 0.002, unit=""),
+        ]
+    return figures
+
+
+def static_mean(_: Path) -> list[Figure]:
+    """B-2: 1 degree of scatter per axis, a fifth of the frames turned by 30 to 90 degrees."""
+    rng = np.random.default_rng(2)
+    errors = []
+    for _run in range(100):
+        truth = rotation.exp(rng.normal(size=3))
+        q = rotation.multiply(truth, rotation.exp(np.deg2rad(1.0) * rng.normal(size=(500, 3))))
+        wrong = rng.choice(500, 100, replace=False)
+        axes = rng.normal(size=(100, 3))
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        turns = rotation.exp(axes * np.deg2rad(rng.uniform(30, 90, (100, 1))))
+        q[wrong] = rotation.multiply(truth, turns)
+        errors.append(_degrees(rotation.angle_between(robust_mean(q).q, truth)))
+    return [Figure("RMS", _rms(errors), 0.18)]
+
+
+def random_walk(
+    rng: np.random.Generator, outliers: float = 0.0, axis: tuple[float, ...] | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Return sensor and body orientations of a plate turned by hand, and true q_W and q_B."""
+    n, steps = 2000, rng.normal(0.0, 0.05, (1999, 3))
+    if axis is not None:
+        steps = steps[:, :1] * np.array(axis)
+    q_s = np.empty((n, 4))
+    q_s[0] = rotation.IDENTITY
+    for i, step in enumerate(rotation.exp(steps)):
+        q_s[i + 1] = rotation.multiply(q_s[i], step)
+    q_world, q_mount = rotation.exp(rng.normal(size=3)), rotation.exp(rng.normal(size=3))
+    noise = rotation.exp(np.deg2rad(1.0) * rng.normal(size=(n, 3)))
+    q_body = rotation.multiply(rotation.multiply(rotation.multiply(q_world, q_s), q_mount), noise)
+    wrong = rng.random(n) < outliers
+    q_body[wrong] = rotation.normalize(rng.normal(size=(int(wrong.sum()), 4)))
+    return q_s, q_body, q_world, q_mount
+
+
+def plate(_: Path) -> list[Figure]:
+    """B-3: world and mount of a plate, with and without 15 % random orientations, 10 runs each."""
+    figures = []
+    for share, label in ((0.0, "clean"), (0.15, "15 % outliers")):
+        world, mount = [], []
+        for seed in range(10):
+            q_s, q_body, q_world, q_mount = random_walk(np.random.default_rng(seed), share)
+            found = fit_alignment("full", q_s, q_body)
+            world.append(_degrees(rotation.angle_between(found.q_world, q_world)))
+            mount.append(_degrees(rotation.angle_between(found.q_mount, q_mount)))
+        figures += [
+            Figure(f"{label}: world", _rms(world), 0.15),
+            Figure(f"{label}: mount", _rms(mount), 0.15),
+        ]
+    return figures
+
+
+def one_axis(_: Path) -> list[Figure]:
+    """B-4: turning about one axis only must be refused."""
+    q_s, q_body, *_truth = random_walk(np.random.default_rng(4), axis=(1.0, 0.0, 0.0))
+    found = align(q_s, q_body)
+    kappa = fit_alignment("full", q_s, q_body).kappa
+    return [
+        Figure("kappa", kappa, 1.0, 0.999, ""),
+        Figure("full fit accepted", float(found.kind == "full"), 0.0, unit=""),
+    ]
+
+
+def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Figure]:
+    rng = np.random.default_rng(5)
+    q_world, q_mount = rotation.exp(rng.normal(size=3)), rotation.exp(rng.normal(size=3))
+    q_body = rotation.multiply(rotation.multiply(q_world, q_opt), q_mount)
+    found = align(q_s[kept], q_body[kept])
+    return [
+        Figure("world", _degrees(rotation.angle_between(found.q_world, q_world)), 1.5),
+        Figure("mount", _degrees(rotation.angle_between(found.q_mount, q_mount)), 1.0),
+        Figure("full fit refused", float(found.kind != "full"), 0.0, unit=""),
+    ]
+
+
+def real_plate(data: Path) -> list[Figure]:
+    """B-5: a real board, its orientation by a filter; 30 s of motion at 47.6 Hz."""
+    h5py, vqf = import_module("h5py"), import_module("vqf")  # only this bench needs them
+    with h5py.File(data / "broad" / f"{TRIALS[0]}.hdf5") as trial:
+        rate = float(trial.attrs["sampling_rate"])
+        columns = [np.ascontiguousarray(trial[f"imu_{kind}"][:]) for kind in ("gyr", "acc", "mag")]
+        q_opt, moving = trial["opt_quat"][:], trial["movement"][:].astype(bool)
+    q_s = vqf.VQF(1.0 / rate).updateBatch(*columns)["quat9D"]
+    first = int(np.flatnonzero(moving)[0])
+    return _aligned(q_s, q_opt, slice(first, first + int(30 * rate), 6))
+
+
+def integrated_plate(data: Path) -> list[Figure]:
+    """The same board, its orientation by adding up the gyro alone; 30 s, 5 s into the motion."""
+    with np.load(data / "broad_excerpts" / f"{TRIALS[0]}_60s.npz", allow_pickle=False) as trial:
+        rate = float(trial["sampling_rate"])
+        gyr = trial["imu_gyr"].astype(np.float64)
+        q_opt = rotation.normalize(trial["opt_quat"])
+        first = int(np.flatnonzero(trial["movement"])[0])
+    rates = gyr - gyr[:first].mean(axis=0)
+    steps = rotation.exp(0.5 * (rates[1:] + rates[:-1]) / rate)
+    q_s = q_opt.copy()  # starts with the optics' world, so that the truth is known
+    for i in range(first, len(steps)):
+        q_s[i + 1] = rotation.multiply(q_s[i], steps[i])
+    begin = first + int(5 * rate)
+    return _aligned(rotation.normalize(q_s), q_opt, slice(begin, begin + int(30 * rate), 6))
+
+
+EXPERIMENTS = (
+    Experiment("B-1", "stillness, share of samples", stillness, ("broad",), ("h5py",)),
+    Experiment("B-2", "static mean, a fifth of the frames wrong", static_mean),
+    Experiment("B-3", "plate turned by hand, synthetic", plate),
+    Experiment("B-4", "plate turned about one axis only", one_axis),
+    Experiment("B-5", "real board, filtered", real_plate, ("broad",), ("h5py", "vqf")),
+    Experiment("B-5g", "real board, gyro added up", integrated_plate, ("broad_excerpts",)),
+)

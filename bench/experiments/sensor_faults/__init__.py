@@ -1,0 +1,1 @@
+"""Lost, stuck and slipping sensors, heading drift, magnetic disturbance."""

@@ -1,0 +1,171 @@
+"""Rows FAULT-magnet: iron nearby pulls headings away for half a minute, and lets them go.
+
+A filter with a magnetometer follows the field within seconds: 20 to 40 degrees, to either side, of
+one sensor or of both on a segment, in all kinds of movement. What fusion says is compared with the
+bones, and with what it says of the same person without iron.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bench.experiments.sensor_faults.loss_slip_drift import (
+    JUMP_GOAL,
+    RATE_HZ,
+    SEEDS,
+    calibrated_people,
+    fuser_of,
+)
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects import faulty_wearer
+from bench.subjects.faulty_wearer import PULL_S, SEGMENTS, STAY_S
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from bench.subjects.faulty_wearer import Worn
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.model import LimbState
+
+PEOPLE = (*SEEDS, 11, 12, 13, 14)
+"""Four more than those the limits were found with."""
+MAGNET_S, FIRST_S, APART_S = 80.0, 12.3, 2.9
+LEAST_DEG, MOST_DEG = 20.0, 40.0
+PASSED_DEG = 10.0
+"""What is told is told within so and so long of this."""
+OVER_S = 8.0
+"""Errors are those of after the disturbance from so long after its end on."""
+ALONE = (("S1",), ("S2",), ("S3",), ("S4",))
+BOTH = (("S1", "S2"), ("S3", "S4"))
+FLEXION_GOAL = 1.96
+"""Standard deviations that hold 95 % of normal errors in one dimension."""
+
+
+class Pulled(NamedTuple):
+    """One person, one disturbance."""
+
+    delay_s: float
+    """From passing 10 degrees to what was told first; infinite: nothing was."""
+    ended_s: float
+    """From the end of the disturbance to the word that all is well."""
+    others: int
+    """Things told of other segments, or when nothing was the matter."""
+    segment: Array
+    """Error over claimed RMS error of both segments while it lasts, shape (2 n,)."""
+    flexion: Array
+    """Error of the knee's flexion over its claimed deviation, while it lasts."""
+    healthy: Array
+    """As `segment`, without iron."""
+    knee: tuple[float, float, float]
+    """RMS error of the knee's rotation: while it lasts, after, and in both times without, rad."""
+
+
+def _cases(
+    seeds: tuple[int, ...], groups: Sequence[tuple[str, ...]]
+) -> Iterator[tuple[Calibration, Worn, tuple[str, ...], float, float]]:
+    for seed, calibration in calibrated_people(seeds):
+        person = faulty_wearer.live(seed, MAGNET_S, RATE_HZ)
+        for k, names in enumerate(groups):
+            dice = np.random.default_rng(10 * seed + k)
+            angle = np.deg2rad(dice.uniform(LEAST_DEG, MOST_DEG)) * dice.choice([-1.0, 1.0])
+            yield calibration, person, names, FIRST_S + APART_S * k + 0.37 * seed, float(angle)
+
+
+def _pulled(
+    calibration: Calibration, person: Worn, names: tuple[str, ...], at_s: float, angle: float
+) -> Pulled:
+    healthy, _ = faulty_wearer.play(fuser_of(calibration), person)
+    states, told = faulty_wearer.play(
+        fuser_of(calibration), faulty_wearer.pulled(person, names, at_s, angle)
+    )
+    end_s = at_s + 2 * PULL_S + STAY_S
+    lasts = (person.t_s >= at_s) & (person.t_s < end_s)
+    after = person.t_s >= end_s + OVER_S
+    here = "thigh" if names[0] in ("S1", "S2") else "shank"
+    known = {here, *names, *(SEGMENTS if len(names) > 1 else ())}
+    right = [t for t, news in told if news.level == "warning" and news.id in known]
+    over = [t for t, news in told if news.level == "info" and news.id in known]
+    passed_s = at_s + PULL_S * _share_passed(abs(angle))
+    without = faulty_wearer.joint_errors(healthy, person)[lasts | after]
+    errors = faulty_wearer.joint_errors(states, person)
+    return Pulled(
+        delay_s=right[0] - passed_s if right else np.inf,
+        ended_s=over[-1] - end_s if over else np.inf,
+        others=sum(news.id not in known for _, news in told),
+        segment=np.concatenate([_over_claimed(states, person, i)[lasts] for i in (0, 1)]),
+        healthy=np.concatenate([_over_claimed(healthy, person, i)[lasts] for i in (0, 1)]),
+        flexion=_flexion_over_claimed(states, person)[lasts],
+        knee=(_rms(errors[lasts]), _rms(errors[after]), _rms(without)),
+    )
+
+
+def _share_passed(angle: float) -> float:
+    """Return when, as a share of the time it takes to come, the disturbance passes 10 degrees."""
+    grid = np.linspace(0.0, 1.0, 501)
+    way = grid * grid * (3.0 - 2.0 * grid) * angle
+    return float(np.interp(np.deg2rad(PASSED_DEG), way, grid))
+
+
+def _over_claimed(states: Sequence[LimbState], person: Worn, i: int) -> Array:
+    claimed = np.sqrt(3.0) * np.array([s.segments[i].sd for s in states], dtype=np.float64)
+    true = person.bones[SEGMENTS[i]]
+    return np.asarray(rotation.angle_between(faulty_wearer.oriented(states, i), true) / claimed)
+
+
+def _flexion_over_claimed(states: Sequence[LimbState], person: Worn) -> Array:
+    knees = [state.joints[1] for state in states]
+    said = np.array([np.nan if k.angles is None else k.angles.flexion for k in knees])
+    sd = np.array([np.nan if k.angle_sd is None else k.angle_sd for k in knees])
+    return np.asarray(np.abs(said - person.flexion) / sd)
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def magnet(
+    _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = PEOPLE
+) -> list[Figure]:
+    """Return what is told of a disturbance, and how far the output is from the bones."""
+    found = [_pulled(*case) for case in _cases(seeds, groups)]
+    delays = np.array([case.delay_s for case in found])
+    segment, healthy, flexion = (
+        np.concatenate([getattr(case, name) for case in found])
+        for name in ("segment", "healthy", "flexion")
+    )
+    lasting, after, without = np.rad2deg(
+        [_rms(np.array(x)) for x in zip(*(case.knee for case in found), strict=True)]
+    )
+    return [
+        Figure("told", 100.0 * float(np.mean(np.isfinite(delays))), 100.0, 100.0, unit="%"),
+        Figure("told after passing 10 deg, median", float(np.median(delays)), 2.0, unit="s"),
+        Figure("told after passing 10 deg, worst", float(delays.max()), 2.0, unit="s"),
+        Figure("over, told after, worst", max(case.ended_s for case in found), 10.0, unit="s"),
+        Figure("others blamed", float(sum(case.others for case in found)), 0.0, unit=""),
+        _share("segments within what is claimed", segment < JUMP_GOAL),
+        _share("flexion within what is claimed", flexion < FLEXION_GOAL),
+        _share("segments, without", healthy < JUMP_GOAL, 0.0),
+        Figure("knee rotation, while it lasts", float(lasting), float("inf")),
+        Figure("knee rotation, after", float(after), round(float(without) + 0.5, 3)),
+        Figure("knee rotation, without", float(without), float("inf")),
+    ]
+
+
+def _share(name: str, held: NDArray[np.bool_], least: float = 95.0) -> Figure:
+    return Figure(name, 100.0 * float(np.mean(held)), 100.0, least, unit="%")
+
+
+EXPERIMENTS = (
+    Experiment("FAULT-magnet-1", "the heading of one sensor is pulled away by 20 to 40 deg",
+               partial(magnet, groups=ALONE), long=True),
+    Experiment("FAULT-magnet-2", "the headings of both sensors of a segment are",
+               partial(magnet, groups=BOTH), long=True),
+)  # fmt: skip

@@ -1,0 +1,1 @@
+"""CPU time, latency and memory."""

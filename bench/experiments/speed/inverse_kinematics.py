@@ -1,0 +1,51 @@
+"""Poses from markers: all instants at once, and one after the other with covariance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bench.framework.experiment import DATA
+from bench.framework.measurement import Bench, Row, per_item
+from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
+from bench.subjects.two_segments import swing, two_segments
+from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+from jointfit_daemon.kinematics.live_inverse_kinematics import LiveInverseKinematics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chain_model import ChainModel
+
+
+def rows(quick: bool) -> list[Row]:
+    small = two_segments()
+    found = _of("two segments", small, swing(small, 150)[1], (50, 300), quick=quick)
+    if (DATA / FOLDER).is_dir():
+        leg = oc4_lower(DATA)
+        y = measured(DATA, "walking1", leg)
+        found += _of("seven segments, 29 markers", leg, y, (400, 1200), quick=quick)
+    return found
+
+
+def _of(
+    name: str, model: ChainModel, y: Array, goals_us: tuple[int, int], *, quick: bool
+) -> list[Row]:
+    batch_us, live_us = goals_us
+
+    def batch() -> Callable[[], object]:
+        return lambda: solve_frames(model, y)
+
+    def live() -> Callable[[], object]:
+        following = LiveInverseKinematics(model)
+        following.feed(y[0])  # it begins from nowhere
+        return lambda: [following.feed(row) for row in y[1:]]
+
+    count = len(y)
+    return [
+        per_item(f"ik: {name}, batch", batch, items=count, goal_us=batch_us, quick=quick),
+        per_item(f"ik: {name}, live", live, items=count - 1, goal_us=live_us, quick=quick),
+    ]
+
+
+BENCHES = (Bench("ik", "inverse kinematics, an instant", rows),)

@@ -1,0 +1,76 @@
+"""Joint centers while the wearer moves: what a camera frame and a look at the progress cost."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bench.framework.measurement import Bench, Row, per_item
+from bench.subjects.simulated_wearer import bench_rig, phases
+from jointfit_daemon.calibration.movement_guide import MovementGuide
+from jointfit_daemon.model import MocapFrame, MocapLayout
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+FRAMES, LOOKS = 1200, 30
+EVERY = 24
+"""Frames between two looks: five a second at 120 Hz."""
+
+
+def _frames() -> list[MocapFrame]:
+    track = phases().functional.optical
+    assert track is not None
+    layout = MocapLayout(track.markers, track.bodies)
+    seen = zip(track.positions, track.body_positions, track.body_orientations, strict=True)
+    return [MocapFrame(0, i, None, layout, *arrays) for i, arrays in enumerate(seen)][:FRAMES]
+
+
+def _guide() -> MovementGuide:
+    rig = bench_rig()
+    return MovementGuide(rig.chain, rig.calibration, phases().static)
+
+
+def _feed(frames: list[MocapFrame]) -> Callable[[], object]:
+    one = _guide()
+    for i, frame in enumerate(frames[: 4 * EVERY]):  # the estimators know where to look
+        one.add_mocap(frame)
+        if i % EVERY == 0:
+            one.look({}, 1.0)
+
+    def run() -> None:
+        for frame in frames:
+            one.add_mocap(frame)
+
+    return run
+
+
+def _look(frames: list[MocapFrame]) -> Callable[[], object]:
+    one = _guide()
+    for frame in frames:
+        one.add_mocap(frame)
+    return lambda: [one.look({}, 10.0) for _ in range(LOOKS)]
+
+
+def rows(quick: bool) -> list[Row]:
+    frames = _frames()
+    return [
+        per_item(
+            "live centers: one camera frame, 4 parts, 3 joints",
+            lambda: _feed(frames),
+            items=len(frames),
+            goal_us=150,
+            quick=quick,
+            note="16 markers",
+        ),
+        per_item(
+            "live centers: one look, five a second",
+            lambda: _look(frames),
+            items=LOOKS,
+            goal_us=5000,
+            quick=quick,
+            note="one joint anew",
+        ),
+    ]
+
+
+BENCHES = (Bench("live-centers", "joint centers during the functional phase", rows),)

@@ -1,0 +1,60 @@
+"""The streaming sphere: what a frame of one joint costs, and what an answer costs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.measurement import Bench, Row, per_item
+from bench.subjects.simulated_joints import ball_turns, carried
+from jointfit_daemon.calibration.center.running_sphere import RunningSphere
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+FRAMES = 1000
+
+
+def frames() -> list[NDArray[np.float64]]:
+    rng = np.random.default_rng(5)
+    paths = carried(ball_turns(rng, 45.0, FRAMES))
+    return list(paths + rng.normal(0, 1e-3, paths.shape))
+
+
+def fill(stream: RunningSphere, points: list[NDArray[np.float64]]) -> None:
+    for frame in points:
+        stream.feed(frame)
+
+
+def feeding(watched: bool) -> Callable[[], Callable[[], object]]:
+    points = frames()
+
+    def work() -> Callable[[], object]:
+        stream = RunningSphere(4, forgetting=0.999)
+        fill(stream, points[:50])
+        if watched:  # after an answer it looks for markers that leave their spheres
+            stream.estimate()
+        return lambda: fill(stream, points)
+
+    return work
+
+
+def answering() -> Callable[[], object]:
+    stream = RunningSphere(4)
+    fill(stream, frames())
+    return lambda: [stream.estimate() for _ in range(10)]
+
+
+def sphere_rows(quick: bool) -> list[Row]:
+    n = FRAMES
+    return [
+        per_item("sphere: a frame of 4 markers", feeding(False), items=n, goal_us=20, quick=quick),
+        per_item("sphere: the same, watched", feeding(True), items=n, goal_us=20, quick=quick),
+        per_item("sphere: an answer", answering, items=10, goal_us=3000, quick=quick),
+    ]
+
+
+BENCHES = (Bench("centers-spatial", "center of rotation in space, streaming", sphere_rows),)

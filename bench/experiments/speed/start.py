@@ -1,0 +1,82 @@
+"""What a start costs before any device is asked, and a calibration fit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from bench.framework.measurement import Bench, Row
+from bench.subjects.simulated_wearer import bench_rig, phases
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.jobs import run_job
+
+DAEMON = (
+    "import jointfit_daemon.__main__, jointfit_daemon.config, jointfit_daemon.supervisor.daemon"
+)
+CHECKING = "import jointfit_daemon.__main__, jointfit_daemon.config"
+
+
+def _imported(code: str, count: int) -> float:
+    """Return the median wall time of a Python process that runs `code`, less an empty one, s."""
+    took = {code: [], "pass": []}  # type: dict[str, list[float]]
+    for _ in range(count):
+        for each, times in took.items():
+            began = time.perf_counter()
+            subprocess.run([sys.executable, "-c", each], check=True)  # noqa: S603 - ours
+            times.append(time.perf_counter() - began)
+    return statistics.median(took[code]) - statistics.median(took["pass"])
+
+
+def import_rows(quick: bool) -> list[Row]:
+    count = 3 if quick else 9
+    return [
+        Row("start: imports of --check", round(_imported(CHECKING, count), 3), "s", 0.3, 1.5),
+        Row("start: imports of jointfitd", round(_imported(DAEMON, count), 3), "s", 0.6, 3.0),
+    ]
+
+
+def fit_rows(quick: bool) -> list[Row]:
+    """The jobs of the worker, on trials as long as the demo's."""
+    del quick  # one fit is quick enough
+    trials, rig = phases(), bench_rig()
+    payload = {"chain": rig.chain, "settings": rig.calibration, "previous": None}
+    payload["alignment"] = fit_alignment(trials.align, rig.calibration).to_dict()
+    began = time.thread_time(), time.perf_counter()
+    found = run_job(
+        "functional", payload | {"static": trials.static, "functional": trials.functional}
+    )
+    cpu, wall = time.thread_time() - began[0], time.perf_counter() - began[1]
+    assert "calibration" in found, found
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    note = f"{wall:.2f} s of wall time, OPENBLAS_NUM_THREADS {threads}"
+    return [Row("fit: 60 s at 100 Hz and 120 Hz", round(cpu, 2), "s", 3.0, 12.0, note=note)]
+
+
+def exposure_rows(quick: bool) -> list[Row]:
+    """How open the shipped unit is, as systemd counts: 0 is locked, 10 is open."""
+    del quick
+    tool = shutil.which("systemd-analyze")
+    if tool is None:
+        print(
+            "not run: systemd-analyze is not installed: sudo apt install systemd", file=sys.stderr
+        )
+        return []
+    rows = []
+    for unit in sorted((Path(__file__).parents[3] / "systemd").glob("jointfitd*.service")):
+        words = [tool, "security", "--offline=yes", "--no-pager", str(unit)]
+        said = subprocess.run(words, check=True, capture_output=True, text=True).stdout  # noqa: S603 - systemd's
+        figure = float(said.partition("level for")[2].partition(":")[2].split()[0])
+        rows.append(Row(f"exposure of {unit.name}", figure, "of 10", 1.4, 1.4))
+    return rows
+
+
+BENCHES = (
+    Bench("unit", "what the shipped units allow", exposure_rows),
+    Bench("import", "starting the program", import_rows),
+    Bench("fit", "a calibration fit", fit_rows),
+)

@@ -1,0 +1,1 @@
+"""Clocks, lag, alignment and memory."""

@@ -1,0 +1,214 @@
+"""Rows T1, T2, T3, T5, T10: device clocks to host time, simulated on the paths they are met on."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from jointfit_daemon.model import ClockEcho, TickClock
+from jointfit_daemon.timing.clock import DeviceClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Delays = Callable[[np.random.Generator, int], NDArray[np.float64]]
+    Figures = Callable[[], list[Figure]]
+
+MS, S = 1_000_000, 1_000_000_000
+PERIOD = 10 * MS
+START = 7_000 * S
+SKEW = 40e-6
+MICROSECONDS = TickClock(1000, 1 << 32)
+SERVER_HZ = 10_000_000
+SERVER = TickClock(1, None, SERVER_HZ)
+SERVER_SKEW = 42e-6
+
+
+def exponential(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """0.3 ms of jitter."""
+    return rng.exponential(3e5, n)
+
+
+def spiky(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """The same, and 2 % spikes of 5 to 20 ms."""
+    return rng.exponential(3e5, n) + (rng.random(n) < 0.02) * rng.uniform(5e6, 20e6, n)
+
+
+def usb_polling(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """A bus asked every millisecond."""
+    return rng.uniform(0, 1e6, n) + rng.exponential(5e4, n)
+
+
+def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """A USB bridge with its timer at 16 ms."""
+    return rng.uniform(0, 16e6, n)
+
+
+def passive_run(
+    seed: int, delays: Delays, seconds: float
+) -> tuple[NDArray[np.float64], DeviceClock, NDArray[np.float64]]:
+    """Return the error of every stamp, ms, the clock at the end, and every sigma, ms."""
+    rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
+    n = int(seconds * S) // PERIOD
+    true = START + PERIOD * np.arange(n)
+    arrivals = np.maximum.accumulate(true + delays(rng, n).astype(np.int64))
+    ticks = 1000 + ((true - START) / (1 + SKEW) / 1000).astype(np.int64)
+    stamps = [
+        clock.feed_sample(tick, None, arrival, MICROSECONDS)
+        for tick, arrival in zip(ticks.tolist(), arrivals.tolist(), strict=True)
+    ]
+    errors = np.array([stamp.t_ns for stamp in stamps]) - true
+    return errors / MS, clock, np.array([stamp.sigma_ns for stamp in stamps]) / MS
+
+
+def server_ticks(t: float) -> int:
+    """Return what the simulated server's clock shows at host time `t`."""
+    return int((t - START + 400 * S) * (1 + SERVER_SKEW) * (SERVER_HZ / S))
+
+
+def echo_run(seed: int) -> tuple[float, float, float]:
+    """Return the error after 10 and after 60 s of echoes, us, and that of the skew, ppm."""
+    rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
+    now, first, error = START, 0.0, 0.0
+    for number in range(70):
+        there, back = 430_000 + rng.exponential(1e5, 2) + (rng.random(2) < 0.01) * 20e6
+        clock.feed_echo(ClockEcho(now, int(now + there + back), server_ticks(now + there)), SERVER)
+        stamp = clock.feed_sample(server_ticks(now), None, now + 6 * MS, SERVER)
+        error = (stamp.t_ns - now) / 1e3
+        first = error if number == 9 else first
+        now += 50 * MS if number < 10 else S + int(rng.uniform(-0.2, 0.2) * S)
+    return first, error, (clock.skew_ppm or 0.0) + 1e6 * SERVER_SKEW
+
+
+def spread(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return root mean square and 99th percentile of the size."""
+    return float(np.sqrt(np.mean(values**2))), float(np.quantile(np.abs(values), 0.99))
+
+
+def echoes(_: Path, runs: int = 200) -> list[Figure]:
+    """T1: round trips of 0.86 ms and 0.1 ms exponential each way, 1 % spikes of 20 ms."""
+    first, last, skew = np.array([echo_run(seed) for seed in range(runs)]).T
+    (sd10, p10), (sd60, p60) = spread(first), spread(last)
+    return [
+        Figure("after 10 echoes, rms", sd10, 22.0, unit="us"),
+        Figure("after 10 echoes, 99 %", p10, 73.0, unit="us"),
+        Figure("after 60 s, rms", sd60, 7.5, unit="us"),
+        Figure("after 60 s, 99 %", p60, 19.0, unit="us"),
+        Figure("skew after 60 s, rms", spread(skew)[0], 0.22, unit="ppm"),
+    ]
+
+
+def passive(
+    delays: Delays, seconds: float, goals: tuple[float, float], runs: int
+) -> tuple[list[Figure], NDArray[np.float64], NDArray[np.float64]]:
+    """Return rms and 99 % of the error at the end, the skews' errors, and errors in sigmas."""
+    ends, skews, scaled = [], [], []
+    for seed in range(runs):
+        errors, clock, sigmas = passive_run(seed, delays, seconds)
+        ends.append(errors[-1])
+        skews.append((clock.skew_ppm or 0.0) - 1e6 * SKEW)
+        scaled.append(errors[-1] / sigmas[-1])
+    rms, most = spread(np.array(ends))
+    label = f"{delays.__name__.replace('_', ' ')}, {seconds:g} s"
+    figures = [
+        Figure(f"{label}, rms", rms, goals[0], unit="ms"),
+        Figure(f"{label}, 99 %", most, goals[1], unit="ms"),
+    ]
+    return figures, np.array(skews), np.array(scaled)
+
+
+def jitter(_: Path, runs: int = 60) -> list[Figure]:
+    """T2: passive clocks under ordinary jitter."""
+    figures: list[Figure] = []
+    skews = np.zeros(0)
+    for delays, seconds, goals in (
+        (exponential, 10.0, (0.0015, 0.004)),
+        (spiky, 10.0, (0.0015, 0.005)),
+        (usb_polling, 10.0, (0.018, 0.045)),
+        (spiky, 60.0, (0.001, 0.02)),
+    ):
+        found, skews, _scaled = passive(delays, seconds, goals, runs if seconds < 60 else runs // 3)
+        figures += found
+    return [*figures, Figure("skew after 60 s, worst", float(np.abs(skews).max()), 2.0, unit="ppm")]
+
+
+def timer(_: Path, runs: int = 90) -> list[Figure]:
+    """T3: passive clocks under a badly set latency timer."""
+    ten, _skews, scaled = passive(latency_timer, 10.0, (0.11, 0.25), runs)
+    sixty, _skews, _scaled = passive(latency_timer, 60.0, (0.015, 0.05), runs // 3)
+    honest = Figure("error in sigmas, rms", spread(scaled)[0], 1.5, 0.3, unit="")
+    return [*ten, *sixty, honest]
+
+
+def wraps_and_restarts(_: Path) -> list[Figure]:
+    """T5: a wrap of every clock met, then a reboot."""
+    worst, settle, early = 0.0, 0.0, 0
+    for tick_ns, modulus in ((1000, 1 << 32), (100_000, 1 << 32), (100_000, 864_000_000)):
+        for seed in range(3):
+            off, took, before = _wrapped(seed, TickClock(tick_ns, modulus))
+            worst, settle, early = max(worst, off), max(settle, took), early + before
+    return [
+        Figure("across a wrap, worst", worst, 1.0, unit="ms"),
+        Figure("settled after a restart", settle, 5.0, unit="s"),
+        Figure("synced and off by 1 ms after it", early, 0, unit=""),
+    ]
+
+
+def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
+    """Return the worst error across the wrap, the time to settle, synced stamps that were off."""
+    rng, device = np.random.default_rng(seed), DeviceClock(PERIOD)
+    modulus = clock.modulus or 1
+    worst, settled_at, wrong = 0.0, None, 0
+    boot = START + 22 * S
+    for k in range(3000):
+        t = START + k * PERIOD
+        again = t >= boot
+        since = t - boot if again else t - START
+        base = 10 if again else modulus - 15 * S // clock.tick_ns
+        ticks = (base + int(since * (1 + SKEW)) // clock.tick_ns) % modulus
+        arrival = t + int(rng.exponential(3e5))
+        stamp = device.feed_sample(ticks, None, arrival, clock)
+        off = abs(stamp.t_ns - t) / MS
+        if not again and stamp.synced:
+            worst = max(worst, off)
+        elif again and stamp.synced:
+            wrong += off > 1.0
+            settled_at = (t - boot) / S if settled_at is None else settled_at
+    return worst, 99.0 if settled_at is None else settled_at, wrong
+
+
+def cost(_: Path) -> list[Figure]:
+    """T10: time of one sample, refits included, best of five minutes of samples."""
+    rng = np.random.default_rng(0)
+    n = 6000
+    best = float("inf")
+    for _number in range(5):
+        device = DeviceClock(PERIOD)
+        true = START + PERIOD * np.arange(n)
+        rows = list(
+            zip(
+                ((true - START) // 1000).tolist(),
+                (true + rng.exponential(3e5, n)).astype(np.int64).tolist(),
+                strict=True,
+            )
+        )
+        began = time.process_time()
+        for ticks, arrival in rows:
+            device.feed_sample(ticks, None, arrival, MICROSECONDS)
+        best = min(best, time.process_time() - began)
+    return [Figure("clock update, amortized", 1e6 * best / n, 5.0, unit="us")]
+
+
+EXPERIMENTS = (
+    Experiment("T1", "server clock by echoes", echoes),
+    Experiment("T2", "device clock by arrivals, ordinary jitter", jitter, long=True),
+    Experiment("T3", "device clock by arrivals, 16 ms latency timer", timer, long=True),
+    Experiment("T5", "wraps and restarts", wraps_and_restarts),
+    Experiment("T10-clock", "cost of a clock update", cost, timed=True),
+)

@@ -1,0 +1,50 @@
+"""Row LAG-plate: the lag that the align phase finds, on simulated plates turned by hand.
+
+Eight plates with four sensors each, errors of filters and cameras at the demo's defaults, 22 s. All
+streams are on one clock, so that the true lag is 0.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.framework.experiment import Experiment, Figure
+from bench.subjects.simulated_wearer import bench_rig, phases
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SEEDS = tuple(range(1, 9))
+MS = 1e6
+FREE = float("inf")
+
+
+def on_the_plate(_: Path) -> list[Figure]:
+    """LAG-plate: how far the lags of all sensors are off, ms, and in their own sigmas."""
+    settings = bench_rig().calibration
+    lags, sigmas, refused = [], [], 0
+    for seed in SEEDS:
+        for found in fit_alignment(phases(seed).align, settings).sensors.values():
+            if found.lag_ns is None or not found.lag_sigma_ns:
+                refused += 1
+                continue
+            lags.append(found.lag_ns / MS)
+            sigmas.append(found.lag_sigma_ns / MS)
+        phases.cache_clear()
+    off, sigma = np.abs(lags), np.array(sigmas)
+    return [
+        Figure("sensors", float(len(off)), FREE, unit=""),
+        Figure("without a lag", float(refused), 0.0, unit=""),
+        Figure("off by, RMS", float(np.sqrt(np.mean(off**2))), 0.5, unit="ms"),
+        Figure("off by, worst", float(off.max()), 1.0, unit="ms"),
+        Figure("median sigma", float(np.median(sigma)), FREE, unit="ms"),
+        Figure("worst, in its own sigma", float((off / sigma).max()), 4.0, unit="sigma"),
+    ]
+
+
+EXPERIMENTS = (
+    Experiment("LAG-plate", "lag on the plate, eight simulated plates", on_the_plate, long=True),
+)

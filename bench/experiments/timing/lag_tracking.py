@@ -1,0 +1,144 @@
+"""Row T8-live: device clocks far off, mapped as they run, and the live watch of the lag on them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bench.experiments.timing.lag import made_up
+from bench.framework.experiment import Experiment, Figure
+from jointfit_daemon.calibration.result import Calibration, SensorCalibration, StoredCluster
+from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
+from jointfit_daemon.model import Chain, ClockEcho, MocapFrame, MocapLayout, TickClock
+from jointfit_daemon.pipeline.lag_watch import LagWatch
+from jointfit_daemon.timing.clock import DeviceClock
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.model import Quaternion
+
+MS, S = 1_000_000, 1_000_000_000
+START = 7_000 * S
+MICROSECONDS = TickClock(1000, None)
+SERVER = TickClock(100, None)
+LEAST_MS = 2.0
+"""Delay of the sensor's transport that nobody told: this is the lag."""
+CHAIN = Chain(("hip", "knee"), ("thigh",), (("S1",),))
+LAYOUT = MocapLayout((), ("thigh",))
+CALIBRATION = Calibration(
+    method="anchored",
+    joints=CHAIN.joints,
+    segments=CHAIN.segments,
+    chain_sensors=CHAIN.sensors,
+    sensor={"S1": SensorCalibration(IDENTITY_ONE, IDENTITY_ONE, 0, 0.0)},
+    segment={},
+    joint={},
+    clusters={"thigh": StoredCluster((), "thigh", (), (0.0, 0.0, 0.0), IDENTITY_ONE)},
+)
+
+
+class Case(NamedTuple):
+    """Skews of both clocks, and a drift behind the sensor's clock that no clock model can see."""
+
+    sensor_ppm: float
+    cameras_ppm: float
+    unseen_ppm: float = 0.0
+
+
+class Found(NamedTuple):
+    """What the watch said at the end."""
+
+    lag_ms: float
+    sigma_ms: float
+    drift_ppm: float
+    drift_sigma_ppm: float
+    told: list[str]
+
+
+class _Stamps:
+    """Both clocks, fed as the daemon feeds them."""
+
+    def __init__(self, case: Case, seed: int) -> None:
+        self._case, self._rng = case, np.random.default_rng(seed)
+        self._sensor, self._cameras = DeviceClock(10 * MS), DeviceClock(S // 120)
+        self._echo_at, self._echoes = 0.0, 0
+
+    def sensor_ns(self, t_ns: float) -> int:
+        case = self._case
+        ticks = int(t_ns * (1.0 + 1e-6 * (case.sensor_ppm - case.unseen_ppm)) / 1000)
+        arrival = START + int(t_ns + LEAST_MS * MS + self._rng.exponential(3e5))
+        stamp = self._sensor.feed_sample(ticks, None, arrival, MICROSECONDS)
+        return stamp.t_ns + int(1e-6 * case.unseen_ppm * t_ns) if stamp.synced else -1
+
+    def cameras_ns(self, t_ns: float) -> int:
+        if t_ns >= self._echo_at:
+            there, back = 430_000 + self._rng.exponential(1e5, 2)
+            echo = ClockEcho(
+                START + int(t_ns), START + int(t_ns + there + back), self._server(t_ns + there)
+            )
+            self._cameras.feed_echo(echo, SERVER)
+            self._echoes += 1
+            self._echo_at = t_ns + (50 * MS if self._echoes < 10 else S)
+        arrival = START + int(t_ns) + 6 * MS
+        stamp = self._cameras.feed_sample(self._server(t_ns), None, arrival, SERVER)
+        return stamp.t_ns if stamp.synced else -1
+
+    def _server(self, t_ns: float) -> int:
+        return int((t_ns + 400 * S) * (1.0 + 1e-6 * self._case.cameras_ppm) / 100)
+
+
+def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
+    """Play a moving wearer through both clocks into the watch; return what it found."""
+    tracks, stamps = made_up(seed, seconds, 0.0), _Stamps(case, seed)
+    watch, told = LagWatch(CHAIN, CALIBRATION), []
+    events: list[tuple[int, int, Quaternion]] = []
+    for kind, times, turned in ((0, tracks.t_imu, tracks.q_imu), (1, tracks.t_ref, tracks.q_ref)):
+        events += [
+            (t, kind, as_quaternion(row))
+            for t, row in zip(times.tolist(), turned.tolist(), strict=True)
+        ]
+    for number, (t_ns, kind, q) in enumerate(sorted(events)):
+        if kind == 0:
+            stamp = stamps.sensor_ns(t_ns)
+            if stamp >= 0:
+                watch.add_sample("S1", stamp, q)
+            told += [notice.text for notice in watch.step(START + t_ns)]
+            continue
+        stamp = stamps.cameras_ns(t_ns)
+        frame = MocapFrame(
+            t_ns, number, None, LAYOUT, np.zeros((0, 3)), np.zeros((1, 3)), np.array([q])
+        )
+        if stamp >= 0:
+            watch.add_mocap(stamp, frame)
+    tracked = watch.memory["S1"].tracked
+    if tracked is None:
+        return Found(np.nan, np.nan, np.nan, np.nan, told)
+    figures = (tracked.lag_ns / MS, tracked.sigma_ns / MS)
+    return Found(*figures, 1e6 * tracked.drift, 1e6 * tracked.drift_sigma, told)
+
+
+def drifting(_: Path) -> list[Figure]:
+    """Clocks 100 ppm apart leave no drift; one that no clock model sees is found and told."""
+    figures = []
+    for case in (Case(50.0, -50.0), Case(-50.0, 50.0, 5.0)):
+        found = run(case)
+        # the window's center is what the tracker's lag is true for: up to 8 s before the end
+        truth = LEAST_MS + 1e-3 * case.unseen_ppm * 114.0
+        slack = 1e-3 * abs(case.unseen_ppm) * 2.0
+        off = max(0.0, abs(found.lag_ms - truth) - slack)
+        label = f"{case.sensor_ppm:+g} and {case.cameras_ppm:+g} ppm, {case.unseen_ppm:g} unseen"
+        drift = f"drift {found.drift_ppm:.2f} ± {found.drift_sigma_ppm:.2f} ppm, off by"
+        apart = abs(found.drift_ppm - case.unseen_ppm) / found.drift_sigma_ppm
+        wanted = 1.0 if case.unseen_ppm else 0.0
+        figures += [
+            Figure(f"{label}: lag, off by", off, 0.1, unit="ms"),
+            Figure(f"{label}: {drift}", apart, 2.0, unit="sigma"),
+            Figure(f"{label}: told", float(len(found.told)), wanted, wanted, unit=""),
+        ]
+    return figures
+
+
+EXPERIMENTS = (Experiment("T8-live", "lag watched live on clocks ±50 ppm", drifting),)
+"""The lag is the delay that no clock model can see, 2 ms, whatever the skews."""

@@ -1,0 +1,1 @@
+"""Experiments, their results, and the pages that are generated from them."""

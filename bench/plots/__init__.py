@@ -1,0 +1,1 @@
+"""Plots of clocks, lags and joint centers."""

@@ -1,0 +1,1 @@
+"""The daemon, simulators and a broker as processes, and the core fed with recorded events."""

@@ -1,0 +1,293 @@
+"""The real daemon between virtual hardware and a broker, timed as a subscriber sees it.
+
+Law: four processes that know nothing of each other but bytes: ``jointfit-sim`` (two IMUs on ptys,
+two on an SLCAN adapter on a pty, a NatNet server), jointfitd, a broker, and this one, which only
+subscribes. The daemon is calibrated: a stored calibration of the simulator's wearer is in force.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import os
+import sys
+import time
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.framework.measurement import loop_s
+from bench.rigs.request_flood import SECONDS
+from bench.subjects.simulated_wearer import bench_rig, fitted
+from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.config import MqttSettings, load_rig
+from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.tools.demo_processes import daemon, simulator
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.tools.demo_processes import Simulator
+
+SETTLE_S = 4.0
+"""Clocks settle meanwhile; not measured."""
+CONNECT_S, END_S = 40.0, 20.0
+FLOOD_START_S = 0.5
+"""The flooding process imports and connects meanwhile; not measured."""
+ROOT = Path(__file__).resolve().parents[2]
+VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
+TOPICS = ("pose", "bridge/health", "bridge/state", "device/+/availability")
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What the hardware sends."""
+
+    rate_hz: float
+    mocap_hz: float = 100.0
+
+    @property
+    def options(self) -> list[str]:
+        """Words for ``jointfit-sim``."""
+        knobs = ("--set", f"mocap_hz={self.mocap_hz:g}")
+        return ["--rate", f"{self.rate_hz:g}", "--programme", "walk", *knobs]
+
+
+@dataclass(slots=True)
+class Heard:
+    """What the subscriber heard."""
+
+    latencies_ms: list[float] = field(default_factory=list)
+    online: set[str] = field(default_factory=set)
+    health: dict[str, Any] = field(default_factory=dict)
+    pose: dict[str, Any] = field(default_factory=dict)
+    first_pose_s: float | None = None
+    running_s: float | None = None
+    """When the daemon said on ``bridge/state`` that it is there, and its first pose: monotonic."""
+
+    async def listen(self, client: MqttClient) -> None:
+        async for topic, payload in client.messages():
+            if topic == "pose":
+                now_us = time.time_ns() / 1e3
+                self.latencies_ms.append((now_us - payload["completed_us"]) / 1e3)
+                self.pose = payload
+                self.first_pose_s = self.first_pose_s or time.monotonic()
+            elif topic == "bridge/health":
+                self.health = payload
+            elif topic == "bridge/state":
+                self.running_s = self.running_s or time.monotonic()
+            else:
+                there = payload == {"v": 1, "state": "online"}
+                (self.online.add if there else self.online.discard)(topic.split("/")[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What one run showed."""
+
+    latencies_ms: list[float]
+    """Receipt minus arrival of the sample that completed the frame, of every frame."""
+    seconds: float
+    cpu_s: float
+    """CPU time of the daemon in these seconds."""
+    loop_s: float
+    """CPU time of the fixed loop, measured meanwhile."""
+    waited_s: float
+    """How long the daemon was ready to run meanwhile and had no core: the machine's doing."""
+    rss_mb: float
+    unaccounted: int
+    """Samples sent and not received, or without a verdict, or dropped."""
+    received: int
+    running_s: float
+    first_pose_s: float
+    """From exec to ``online`` at the broker, and to the first pose."""
+
+
+@cache
+def calibration() -> Calibration:
+    """Return the calibration of the simulator's wearer (seed 1)."""
+    return fitted(bench_rig())
+
+
+@dataclass(frozen=True, slots=True)
+class FloodFigures:
+    """Latencies of every frame of one run, before and during a flood of requests."""
+
+    quiet_ms: list[float]
+    flooded_ms: list[float]
+    quiet_cpu_s: float
+    flooded_cpu_s: float
+    """CPU time of the daemon in each part."""
+    seconds: float
+    """Length of each part."""
+    requests: int
+    """Requests sent in that time."""
+    ignored: int
+    """Requests that the daemon counted as ignored."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Gateway:
+    """Running hardware and daemon, and their subscriber."""
+
+    hardware: Simulator
+    pid: int
+    heard: Heard
+    began_s: float
+    """When the daemon was started, monotonic."""
+
+
+async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
+    """Start everything, settle, measure for `seconds`, stop the hardware, account for samples."""
+    async with _gateway(folder, port, load) as gateway:
+        heard = gateway.heard
+        measured = await _measure(gateway.pid, heard, seconds)
+        sent = (await gateway.hardware.quit())["sent"]
+        devices = await _last_health(heard)
+        return Figures(
+            *measured,
+            _unaccounted(sent, devices),
+            sum(device["received"] for device in devices.values()),
+            (heard.running_s or 0.0) - gateway.began_s,
+            (heard.first_pose_s or 0.0) - gateway.began_s,
+        )
+
+
+async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
+    """Start everything, settle, measure without requests and then under a flood of them."""
+    async with _gateway(folder, port, load) as gateway:
+        heard, pid = gateway.heard, gateway.pid
+        quiet_ms, _, quiet_cpu, *_ = await _measure(pid, heard, SECONDS)
+
+        async with flooder(port, f"jointfit/{folder.name}", SECONDS) as flood:
+            await asyncio.sleep(FLOOD_START_S)
+            flooded_ms, seconds, flooded_cpu, *_ = await _measure(pid, heard, SECONDS)
+            sent = await flood
+        heard.health.clear()
+        async with asyncio.timeout(END_S):
+            while not heard.health:  # noqa: ASYNC110 - as in _last_health
+                await asyncio.sleep(0.05)
+        ignored = heard.health["link"]["ignored_requests"]
+        return FloodFigures(quiet_ms, flooded_ms, quiet_cpu, flooded_cpu, seconds, sent, ignored)
+
+
+@asynccontextmanager
+async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio.Task[int]]:
+    """Run a process that floods the daemon; yield a task that returns how many requests it sent."""
+    words = ("-m", "bench.rigs.request_flood", str(port), base, "--seconds", str(seconds))
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, *words, cwd=ROOT, stdout=asyncio.subprocess.PIPE
+    )
+
+    async def ended() -> int:
+        said, _ = await process.communicate()
+        report = json.loads(said)
+        assert report["seconds"] < seconds + 2.0, f"the flood was too slow: {report}"
+        sent: int = report["sent"]
+        return sent
+
+    task = asyncio.create_task(ended(), name="flooder")
+    try:
+        yield task
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await asyncio.wait([task])
+
+
+@asynccontextmanager
+async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gateway]:
+    """Start hardware, subscriber and daemon; ready when all sources are online and settled."""
+    base = f"jointfit/{folder.name}"
+    CalibrationStore(folder / "state" / "calibrations", "demo").save(calibration())
+    async with simulator(folder, port, base, load.options) as hardware:
+        rig_file = Path((await hardware.ready())["rig"])
+        rig = load_rig(rig_file)
+        assert calibration().fits(rig.chain)
+        wanted = {source.id for source in rig.sources}
+        async with subscriber(rig.mqtt) as heard:
+            began = time.monotonic()
+            async with daemon(folder, rig_file) as process:
+                assert process.process is not None
+                async with asyncio.timeout(CONNECT_S):
+                    while not heard.online >= wanted:
+                        process.check()
+                        await asyncio.sleep(0.05)
+                await asyncio.sleep(SETTLE_S)
+                yield _Gateway(hardware, process.process.pid, heard, began)
+
+
+@asynccontextmanager
+async def subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
+    """Yield what a subscriber receives from the daemon, until the block ends."""
+    heard = Heard()
+    async with MqttClient(settings) as client:
+        await client.subscribe(*TOPICS)
+        listening = asyncio.create_task(heard.listen(client), name="subscriber")
+        try:
+            yield heard
+        finally:
+            listening.cancel()
+            await asyncio.wait([listening])
+
+
+async def _measure(
+    pid: int, heard: Heard, seconds: float
+) -> tuple[list[float], float, float, float, float, float]:
+    gc.collect()
+    gc.freeze()  # pauses of this process would look like the daemon's
+    heard.latencies_ms.clear()
+    began_s, began_cpu, began_wait = time.monotonic(), cpu_s(pid), waited_s(pid)
+    await asyncio.sleep(seconds)
+    latencies, took_s = heard.latencies_ms[:], time.monotonic() - began_s
+    spent, waited = cpu_s(pid) - began_cpu, waited_s(pid) - began_wait
+    assert heard.pose["mode"] == "imu+mocap", heard.pose
+    assert heard.pose["sync"] == "locked", heard.pose
+    return latencies, took_s, spent, loop_s(), waited, rss_mb(pid)
+
+
+async def _last_health(heard: Heard) -> dict[str, Any]:
+    """Wait for the health that knows every source to be gone: no sample is on its way then."""
+    async with asyncio.timeout(END_S):
+        while any(  # noqa: ASYNC110 - it hangs on what a message says, not on its coming
+            device["online"] for device in heard.health["devices"].values()
+        ):
+            await asyncio.sleep(0.05)
+    devices: dict[str, Any] = heard.health["devices"]
+    return devices
+
+
+def _unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> int:
+    lost = 0
+    for name, device in devices.items():
+        received = device["received"]
+        lost += abs(sent[name] - received) + abs(received - sum(device[v] for v in VERDICTS))
+    return lost
+
+
+def cpu_s(pid: int) -> float:
+    """Return the CPU time, user and system, that a process has used, s."""
+    text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+    fields = text.rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+
+
+def waited_s(pid: int) -> float:
+    """Return how long the main thread of a process was ready and had no core so far, s."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="utf-8").split()[1]) / 1e9
+    except OSError:  # a kernel without it
+        return float("nan")
+
+
+def rss_mb(pid: int) -> float:
+    """Return the memory of a process that is in RAM, MB."""
+    for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    return float("nan")

@@ -1,0 +1,289 @@
+"""A recorded trial as bytes through the real daemon, judged by what arrives over MQTT.
+
+Law: three processes that know nothing of each other but bytes: `jointfit-sim play --trial`, the
+daemon with a rig.toml, mosquitto. What is judged are the `pose` messages; the reference is the
+simulator's truth at the very instants of the poses. The calibration is the daemon's own: a static
+pose, then the first 60 % of the squats; judged live on the last 40 %.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tempfile
+import time
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, training_frames
+from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.config import MqttSettings
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.tools.demo_processes import daemon, simulator
+from tests.broker_fixture import chosen_broker
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.tools.demo_processes import Simulator
+
+SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
+SETTLE_S, STATIC_S = 3.0, 3.5
+BLEND_S = 1.0
+"""From standing to the first frame of the trial, made up; cameras see no bones meanwhile."""
+POLL_S = 0.05
+SPARE_S = 1.0
+"""How much longer than its motion a phase is: cameras see nothing more, and late bytes arrive."""
+SQUATS_HZ, WALKING_HZ = 50.0, 100.0
+SEGMENTS = ("thigh", "shank")
+TRUTH_NS, MATCH_NS = 10_000_000, 1_000_000
+"""Truth and poses are true for whole hundredths of a second of one clock; the rest is rounding."""
+CONNECT_S = PATIENCE_S = 40.0
+ENDS = {"static": "posed", "functional": "calibrated"}
+"""Phases, and the state that ends each well."""
+
+
+@dataclass(slots=True)
+class Gateway:
+    """One scene and one daemon at work, and what the daemon says."""
+
+    folder: Path
+    sim: Simulator
+    client: MqttClient
+    poses: list[dict[str, Any]] = field(default_factory=list)
+    online: set[str] = field(default_factory=set)
+    health: dict[str, Any] = field(default_factory=dict)
+    _phases: asyncio.Queue[dict[str, Any]] = field(default_factory=asyncio.Queue)
+
+    async def listen(self) -> None:
+        async for topic, payload in self.client.messages():
+            if topic == "pose":
+                self.poses.append(payload)
+            elif topic == "calibration":
+                self._phases.put_nowait(payload)
+            elif topic == "bridge/health":
+                self.health = payload
+            elif topic.endswith("/availability"):
+                online = payload == {"v": 1, "state": "online"}
+                (self.online.add if online else self.online.discard)(topic.split("/")[1])
+
+    async def connected(self, settle_s: float = SETTLE_S) -> None:
+        async with asyncio.timeout(CONNECT_S):
+            while not self.online >= SOURCES:  # noqa: ASYNC110 - five facts
+                await asyncio.sleep(0.05)
+        await asyncio.sleep(settle_s)
+
+    async def phase(self, name: str, seconds: float) -> None:
+        """Run one phase of a calibration to its end."""
+        while not self._phases.empty():  # what was said before is no answer
+            self._phases.get_nowait()
+        answer = await self.client.request("calibrate", {"phase": name, "seconds": seconds})
+        if answer["status"] != "accepted":
+            raise RuntimeError(f"{name}: {answer}")
+        async with asyncio.timeout(seconds + PATIENCE_S):
+            while (status := await self._phases.get())["phase"] != ENDS[name]:
+                if status["phase"] == "aborted":
+                    raise RuntimeError(f"{name}: {status['text']}")
+
+    async def play(self, motion: str) -> None:
+        """Begin a motion; return when its blend is on, in which cameras see no bones."""
+        await self.sim.say(f"play {motion}")
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                await self.sim.say("status")
+                if (await self.sim.answer()).get("motion") == motion:
+                    return
+                await asyncio.sleep(POLL_S)
+
+    async def live(self, motion: str, seconds: float) -> None:
+        """Play a motion of so many seconds and keep what is said meanwhile."""
+        self.poses.clear()
+        await self.play(motion)
+        await asyncio.sleep(BLEND_S + seconds + SPARE_S)
+
+    def calibration(self) -> Calibration:
+        """Return what the daemon stored."""
+        stored = CalibrationStore(self.folder / "state" / "calibrations", "demo").latest()
+        if stored is None:
+            raise RuntimeError("no calibration was stored")
+        return stored.calibration
+
+
+@asynccontextmanager
+async def gateway(folder: Path, port: int, options: Sequence[str]) -> AsyncIterator[Gateway]:
+    """Start virtual hardware and the daemon; stop both at the end."""
+    base = f"jointfit/{folder.name}"
+    settings = MqttSettings(host="127.0.0.1", port=port, base=base)
+    async with (
+        simulator(folder, port, base, options) as sim,
+        MqttClient(settings) as client,
+    ):
+        ready = await sim.ready()
+        await client.subscribe("pose", "calibration", "bridge/health", "device/+/availability")
+        found = Gateway(folder, sim, client)
+        listening = asyncio.create_task(found.listen(), name="listener")
+        try:
+            async with daemon(folder, Path(ready["rig"])):
+                yield found
+                await sim.quit()
+        finally:
+            listening.cancel()
+            await asyncio.wait([listening])
+
+
+# --- what is played ---------------------------------------------------------------------------
+
+
+def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]:
+    """Return the words for a scene without imperfections but those of the recording itself."""
+    knobs = {
+        "mocap_hz": rate_hz,
+        "transition_s": BLEND_S,
+        "clock_offset_s": 0,
+        "latency_uart_ms": 0,
+        "latency_can_ms": 0,
+        "latency_mocap_ms": 0,
+    }
+    return [
+        *("--trial", *map(str, files), "--perfect", "--rate", f"{rate_hz:g}"),
+        *(word for name, value in knobs.items() for word in ("--set", f"{name}={value:g}")),
+        *("--output-rate-hz", f"{rate_hz:g}", "--method", method, "--axes", "static"),
+        *("--static-s", f"{STATIC_S:g}"),
+    ]
+
+
+async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
+    """Calibrate on the first 60 % of the squats, go live on the rest."""
+    files = [data / FOLDER / name for name in ("squats1.npz", "static_bias.json")]
+    whole = load(data, "squats1")
+    cut, last = training_frames(whole), len(whole) - 1
+    async with gateway(folder, port, _options(files, SQUATS_HZ, method)) as running:
+        await running.connected()
+        await running.phase("static", STATIC_S)
+        await running.play(f"trial@0-{(cut - 1) / SQUATS_HZ:g}")
+        await running.phase("functional", BLEND_S + (cut - 1) / SQUATS_HZ + SPARE_S)
+        await running.live(f"trial@{cut / SQUATS_HZ:g}-", (last - cut) / SQUATS_HZ)
+    return _judged(running, data)
+
+
+async def walking(data: Path, folder: Path, port: int, method: Method) -> Played:
+    """Start anew with the calibration that the squats left in `folder`; walk live."""
+    files = [data / FOLDER / name for name in ("walking1.npz", "static_bias.json")]
+    async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
+        await running.connected(2 * SETTLE_S)  # a millisecond is half a degree at this speed
+        await running.live("trial", 1.3)
+    return _judged(running, data)
+
+
+# --- judgement --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One live part, as the daemon told it."""
+
+    frames: int
+    """Poses judged."""
+    truth: tuple[Array, Array]
+    """Recorded thigh and shank at their instants, q_world_bone, shape (frames, 4)."""
+    errors: tuple[float, float, float]
+    """RMS degrees of thigh, shank and knee flexion."""
+    calibration: Calibration
+    health: dict[str, Any]
+    """The daemon's last account of its devices."""
+
+    def of(self, recorded: KneeTrial) -> KneeTrial:
+        """Return the frames of the recording that were judged: those nearest in posture."""
+        femur, tibia = (q[:, None] for q in self.truth)
+        apart = rotation.angle_between(femur, recorded.thigh)
+        apart = apart + rotation.angle_between(tibia, recorded.shank)
+        nearest = np.argmin(apart, axis=1)
+        thigh_a, thigh_b, shank_a, shank_b = (q[nearest] for q in recorded.sensors)
+        return KneeTrial(
+            (thigh_a, thigh_b, shank_a, shank_b),
+            recorded.thigh[nearest],
+            recorded.shank[nearest],
+        )
+
+
+def _judged(running: Gateway, data: Path) -> Played:
+    """Judge the poses for whose instant the truth is a recorded one, in the bones' own frames."""
+    truth = _recorded_truth(running.folder / "truth.jsonl")
+    unix_ns = time.time_ns() - time.monotonic_ns()
+    rows = []
+    for pose in running.poses:
+        t_ns = pose["t_us"] * 1000 - unix_ns
+        at = round(t_ns / TRUTH_NS) * TRUTH_NS
+        said = [pose["segments"][name]["q"] for name in SEGMENTS]
+        everyone = all(len(pose["segments"][name]["used"]) == 2 for name in SEGMENTS)
+        everyone &= "extrapolating" not in pose["flags"]  # this host was late, not the method wrong
+        if at in truth and abs(at - t_ns) < MATCH_NS and everyone:
+            rows.append([*said, *truth[at]])
+    calibration = running.calibration()
+    columns = np.array(rows).swapaxes(0, 1)
+    femur, tibia = columns[2:]
+    # what turned the bones' frames into the calibration's is constant, and is undone here
+    frames = [np.array(calibration.segment[name].q_static) for name in SEGMENTS]
+    thigh, shank = (
+        rotation.multiply(q, rotation.conjugate(frame))
+        for q, frame in zip(columns[:2], frames, strict=True)
+    )
+    whole = load(data, "squats1")
+    judge = Judge.of(whole.part(slice(0, training_frames(whole))))
+    errors = judge.errors((thigh, shank), KneeTrial((femur,) * 4, femur, tibia))
+    return Played(len(rows), (femur, tibia), errors, calibration, running.health)
+
+
+def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
+    """Return thigh and shank by instant, ns; what was made up has no positions and is left out."""
+    found = {}
+    for line in path.read_text(encoding="utf-8").splitlines()[1:]:
+        row = json.loads(line)
+        if row["motion"] != "stand" and row["joint_m"]["knee"][0] is not None:
+            found[row["t_ns"]] = [row["q_world_segment"][name] for name in SEGMENTS]
+    return found
+
+
+# --- all of it --------------------------------------------------------------------------------
+
+
+async def _everything(
+    data: Path, folder: Path, methods: Sequence[Method], walkers: Sequence[Method]
+) -> dict[tuple[str, Method], Played]:
+    broker = chosen_broker()(folder)
+    broker.start()
+    found: dict[tuple[str, Method], Played] = {}
+
+    async def one(method: Method) -> None:
+        home = folder / method
+        home.mkdir()
+        found["squats", method] = await squats(data, home, broker.port, method)
+        if method in walkers:
+            found["walking", method] = await walking(data, home, broker.port, method)
+
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            for method in methods:
+                tasks.create_task(one(method), name=method)
+    finally:
+        broker.stop()
+    return found
+
+
+def run(
+    data: Path, methods: Sequence[Method], walkers: Sequence[Method] = ()
+) -> dict[tuple[str, Method], Played]:
+    """Play the squats by every method at once, each on hardware and a daemon of its own.
+
+    `walkers` then walk. Takes about 35 s, and 10 s more for walking: trials run in real time.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return asyncio.run(_everything(data, Path(folder), methods, walkers))

@@ -1,0 +1,1 @@
+"""Recorded and simulated subjects, joints, devices and clocks that experiments share."""

@@ -1,0 +1,169 @@
+"""A worn leg whose sensors fail: what they say with faults put in, and what fusion says then.
+
+Law: simulated people with known bones; the calibration is the daemon's own, made before the fault.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.subjects.simulated_wearer import NS, bench_rig, phases
+from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.kinematics import rotation
+from jointfit_simulators.cameras import Cameras
+from jointfit_simulators.orientation import Rotation, from_wxyz, to_wxyz
+from jointfit_simulators.programme import Step
+from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.settings import Knobs
+from jointfit_simulators.wearer import SENSORS, Wearer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.fusion import LimbFuser
+    from jointfit_daemon.fusion.sensor_watch import SensorNews
+    from jointfit_daemon.model import LimbState
+
+BEGIN_S = 100.0
+"""Errors and skin wander with time: the live part is later than all of the calibration."""
+MOVES = ("walk", "squat", "sit_to_stand", "stand")
+MOVE_S = 15.0
+SEGMENTS = ("thigh", "shank")
+PULL_S, STAY_S = 5.0, 30.0
+"""A magnetic disturbance: how long it takes to come and to go, and how long it lasts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Worn:
+    """One person in motion."""
+
+    t_s: Array
+    """From 0, shape (n,)."""
+    said: Mapping[str, Array]
+    """q_world_sensor by sensor, shape (n, 4); NaN: nothing said."""
+    bones: Mapping[str, Array]
+    """q_optical_segment, shape (n, 4)."""
+    flexion: Array
+    """Of the knee, rad."""
+
+    def spoilt(self, name: str, q: Array) -> Worn:
+        """Return the same with what one sensor says replaced."""
+        return Worn(self.t_s, {**self.said, name: q}, self.bones, self.flexion)
+
+
+@cache
+def calibrated(seed: int) -> Calibration | None:
+    """Return the calibration of one person; None where the daemon would ask for another pose."""
+    rig, trials = bench_rig(), phases(seed)
+    alignment = fit_alignment(trials.align, rig.calibration)
+    try:
+        return fit_calibration(
+            trials.static, trials.functional, alignment, rig.calibration, rig.chain
+        )
+    except CalibrationRefused:
+        return None
+
+
+@cache
+def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) -> Worn:
+    """Return a person who walks, squats, sits down and up and stands, in turn."""
+    knobs = Knobs(seed=seed)
+    count = -(-int(seconds) // int(MOVE_S))
+    steps = [Step(MOVES[k % len(MOVES)], MOVE_S) for k in range(count)]
+    wearer = Wearer(knobs, [Step("stand", begin_s), *steps])
+    t_s = np.arange(begin_s, begin_s + seconds, 1 / rate_hz)
+    seen = wearer.observe([t_s] * len(SENSORS), np.empty(0), t_s)
+    world = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz).world
+    said = {
+        name: OrientationSensor(knobs, name).report(t_s, q)
+        for name, q in zip(SENSORS, seen.sensors, strict=True)
+    }
+    bones = {name: to_wxyz(world * seen.truth.orientations[name]) for name in SEGMENTS}
+    return Worn(t_s - begin_s, said, bones, seen.truth.knee[:, 0])
+
+
+def stuck(person: Worn, name: str, at_s: float) -> Worn:
+    """Return the person with a sensor that repeats its last orientation for ever."""
+    q = person.said[name]
+    first = int(np.searchsorted(person.t_s, at_s))
+    return person.spoilt(name, np.where(np.arange(len(q))[:, None] < first, q, q[first]))
+
+
+def silent(person: Worn, name: str, at_s: float) -> Worn:
+    """Return the person with a sensor that says nothing more."""
+    q = np.where(person.t_s[:, None] < at_s, person.said[name], np.nan)
+    return person.spoilt(name, q)
+
+
+def slipped(person: Worn, name: str, at_s: float, angle_rad: float, seed: int) -> Worn:
+    """Return the person with a sensor that slides on the skin within 0.3 s, any way."""
+    axis = np.random.default_rng(seed).normal(size=3)
+    axis /= np.linalg.norm(axis)
+    share = np.clip((person.t_s - at_s) / 0.3, 0.0, 1.0)
+    slide = Rotation.from_rotvec(angle_rad * share[:, None] * axis)
+    return person.spoilt(name, to_wxyz(from_wxyz(person.said[name]) * slide))
+
+
+def drifting(person: Worn, names: Sequence[str], rate_rad_s: float) -> Worn:
+    """Return the person with sensors whose worlds turn about the vertical."""
+    for name in names:
+        turn = rotation.heading(rate_rad_s * person.t_s)
+        person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
+    return person
+
+
+def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) -> Worn:
+    """Return the person near iron: some headings are pulled away, stay for 30 s, and come back.
+
+    It takes :data:`PULL_S` either way, as a filter of a few seconds lets in a magnetic field.
+    """
+    begin, end = (person.t_s - at_s) / PULL_S, (person.t_s - at_s - PULL_S - STAY_S) / PULL_S
+    turn = rotation.heading(angle_rad * (_smooth(begin) - _smooth(end)))
+    for name in names:
+        person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
+    return person
+
+
+def _smooth(share: Array) -> Array:
+    """Return a step from 0 to 1 while `share` goes there, without a kink."""
+    x = np.clip(share, 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
+
+
+def play(fuser: LimbFuser, person: Worn) -> tuple[list[LimbState], list[tuple[float, SensorNews]]]:
+    """Return what fusion says of every frame, and what it told when (s)."""
+    rows = {name: [(w, x, y, z) for w, x, y, z in q.tolist()] for name, q in person.said.items()}
+    states, told = [], []
+    for k, t_s in enumerate(person.t_s.tolist()):
+        t_ns = round((BEGIN_S + t_s) * NS)
+        heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is silence
+        states.append(fuser.fuse(t_ns, t_ns, k, heard))
+        told += [(t_s, news) for news in fuser.news(t_ns)]
+    return states, told
+
+
+def oriented(states: Sequence[LimbState], segment: int) -> Array:
+    """Return q_world_segment, shape (n, 4)."""
+    return np.array([state.segments[segment].q_world_segment for state in states])
+
+
+def jumps(before: Sequence[LimbState], after: Sequence[LimbState], segment: int) -> Array:
+    """Return how far a fault moved the output, in units of the RMS error claimed, shape (n,)."""
+    claimed = np.array([state.segments[segment].sd for state in after], dtype=np.float64)
+    moved = rotation.angle_between(oriented(before, segment), oriented(after, segment))
+    return np.asarray(moved / (np.sqrt(3.0) * claimed))
+
+
+def joint_errors(states: Sequence[LimbState], person: Worn) -> Array:
+    """Return the angle between knee rotation and truth, rad, shape (n,)."""
+    above, below = (rotation.conjugate(oriented(states, 0)), oriented(states, 1))
+    true = rotation.multiply(rotation.conjugate(person.bones["thigh"]), person.bones["shank"])
+    return rotation.angle_between(rotation.multiply(above, below), true)

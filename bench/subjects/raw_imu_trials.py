@@ -1,0 +1,102 @@
+"""Raw readings as bytes of an Xbus device, and two trials of a board with its optical truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.subjects import device_bytes
+from jointfit_daemon.driver import find_driver
+from jointfit_daemon.model import Chunk, ImuSample
+from jointfit_protocols import mtdata2, xbus
+from jointfit_protocols.mtdata2 import Item
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.driver import Decoder
+
+TRIALS = ("02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B")
+RATE_HZ = 286
+"""Nominal; the trials have 2000/7 Hz, and the device's ticks say so."""
+PERIOD_NS = 3_500_000
+_KINDS = (Item.RATE_OF_TURN, Item.ACCELERATION, Item.MAGNETIC_FIELD)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardTrial:
+    """One IMU on a board that is turned by hand."""
+
+    felt: tuple[Array, Array, Array]
+    """Rate, rad/s; specific force, m/s^2; magnetic field. Shape (n, 3), as a float of 32 bit."""
+    optical: Array
+    """q_world_sensor, shape (n, 4); NaN where unseen."""
+    moving: NDArray[np.bool_]
+
+
+def load(data: Path, name: str) -> BoardTrial:
+    """Return a trial of the folder ``broad``, rounded to what the wire carries."""
+    h5py = import_module("h5py")  # only this bench needs it
+    with h5py.File(data / "broad" / f"{name}.hdf5") as trial:
+        rate, force, field = (
+            trial[f"imu_{kind}"][:].astype(np.float32).astype(np.float64)
+            for kind in ("gyr", "acc", "mag")
+        )
+        return BoardTrial(
+            (rate, force, field), trial["opt_quat"][:], trial["movement"][:].astype(bool)
+        )
+
+
+def messages(felt: Sequence[Array]) -> list[bytes]:
+    """Counter, time, status and as many kinds of readings as given."""
+    kinds = _KINDS[: len(felt)]
+    return [
+        xbus.encode(
+            xbus.MessageId.MT_DATA2,
+            mtdata2.encode_items(
+                [
+                    (Item.PACKET_COUNTER, k & 0xFFFF),
+                    (Item.SAMPLE_TIME_FINE, k * PERIOD_NS // device_bytes.TICK_NS),
+                    (Item.STATUS_WORD, 2),
+                    *zip(kinds, map(tuple, rows), strict=True),
+                ]
+            ),
+        )
+        for k, rows in enumerate(zip(*felt, strict=True))
+    ]
+
+
+def decoder(*, magnetometer: bool, settle_s: float = 0.0) -> Decoder:
+    """Return a fresh decoder of the driver as rig.toml would set it, from the start by default."""
+    driver = find_driver("xbus")
+    settings = driver.Settings(
+        id="S1",
+        segment="thigh",
+        driver="xbus",
+        port="p",
+        baud=921_600,
+        rate_hz=RATE_HZ,
+        orientation="gateway",
+        magnetometer=magnetometer,
+        settle_s=settle_s,
+    )
+    return driver(settings).decoder()
+
+
+def through_driver(felt: Sequence[Array], *, magnetometer: bool, settle_s: float = 0.0) -> Array:
+    """Return q_world_sensor as the driver gives it, shape (n, 4)."""
+    path = decoder(magnetometer=magnetometer, settle_s=settle_s)
+    said = [
+        item.q_world_sensor
+        for k, data in enumerate(messages(felt))
+        for item in path.feed(Chunk(k * PERIOD_NS, data))
+        if isinstance(item, ImuSample)
+    ]
+    return np.array(said)

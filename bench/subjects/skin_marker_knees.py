@@ -1,0 +1,143 @@
+"""Knees made of skin markers of the recorded subject: both legs, sit-to-stand among the movements.
+
+The semi-real recordings hold the right leg without sit-to-stand. These trials are made from the
+subject's marker files by the same recipe: a sensor is the Kabsch rotation of three neighbouring
+skin markers against their mean in the static trial, with the error of a real filter upon it, as
+the semi-real recordings of the same movement have it (of squats for sit-to-stand); the reference is
+the subject's model by our inverse kinematics without any marker of thigh and shank clusters.
+
+Law: nothing of a sensor's own markers enters its reference. All mounts come from the static trial.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bench.subjects.recorded_knee import FOLDER, KneeTrial
+from jointfit_daemon.calibration.markers import rigid_fit
+from jointfit_daemon.files.osim import read_osim, to_z_up
+from jointfit_daemon.files.trc import read_trc
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+SUBJECT = "opencap_subject4"
+MODEL = "optimized_scale_and_markers.osim"
+MOVEMENTS = {"squats1": 2, "walking1": 1, "DJ1": 1, "STS1": 2}
+"""Every so many frames of 100 Hz, as the semi-real recordings."""
+STATIC, STATIC_EVERY = "static1", 20
+RATE_HZ = 100.0
+CLUSTERS = ("thigh", "sh1", "sh2", "sh3", "sh4", "shank")
+"""Parts of names of the markers on thighs and shanks."""
+SENSORS = {
+    "r": (
+        ("r_thigh1", "r_thigh2", "r_thigh4"),
+        ("r_thigh3", "r_thigh4", "r_thigh2"),
+        ("r_shank_antsup", "r_sh3", "r_sh4"),
+        ("r_sh2", "r_sh4", "r_sh3"),
+    ),
+    "l": (
+        ("L_thigh1", "L_thigh2", "L_thigh4"),
+        ("L_thigh3", "L_thigh4", "L_thigh2"),
+        ("L_shank_antsup", "L_sh2", "L_sh3"),
+        ("L_shank_antsup", "L_sh2", "L_sh3"),
+    ),
+}
+"""Three markers of each; the left shank has but three, so both of its sensors ride the same."""
+MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
+"""Worn while standing alone; a model whose poses change with them would have other bones then."""
+
+
+AS_RECORDED = (0, 1, 2, 3)
+"""Each sensor has the errors that the semi-real recordings give it."""
+
+
+class _Leg(NamedTuple):
+    """What a trial says of one leg before mounts and filters, shape (n, 4) each."""
+
+    skin: tuple[Array, ...]
+    """Rotation of each sensor's markers since the static trial."""
+    thigh: Array
+    shank: Array
+    t_s: Array
+
+
+@cache
+def skin_knee(
+    data: Path, movement: str, side: str, errors_of: tuple[int, ...] = AS_RECORDED
+) -> KneeTrial:
+    """Return one movement, or the static trial without a filter's errors, of leg ``r`` or ``l``.
+
+    `errors_of` says whose filter's errors each sensor has.
+    """
+    leg, static = (_legs(data, name)[side] for name in (movement, STATIC))
+    mounts = [
+        rotation.average(rotation.multiply(rotation.conjugate(q), bone))
+        for q, bone in zip(static.skin, (static.thigh,) * 2 + (static.shank,) * 2, strict=True)
+    ]
+    errors = _filter_errors(data, movement, leg.t_s)
+    columns = [
+        rotation.multiply(rotation.multiply(errors[k], q), mount)
+        for k, q, mount in zip(errors_of, leg.skin, mounts, strict=True)
+    ]
+    seen = np.all([np.isfinite(q).all(axis=1) for q in columns], axis=0)
+    a, b, c, d = (q[seen] for q in columns)
+    return KneeTrial((a, b, c, d), leg.thigh[seen], leg.shank[seen])
+
+
+@cache
+def _legs(data: Path, name: str) -> dict[str, _Leg]:
+    """Return both legs of a trial; one search for the poses of all bones."""
+    trial, static = (read_trc(data / SUBJECT / "trc" / f"{n}.trc") for n in (name, STATIC))
+    every = MOVEMENTS.get(name, STATIC_EVERY)
+    seen = to_z_up(trial.positions[::every])
+    stood = np.nanmean(to_z_up(static.positions), axis=0)
+    path = data / SUBJECT / "models" / MODEL
+    tracked = {n for n in trial.names if n not in MEDIAL and not any(c in n for c in CLUSTERS)}
+    chain = read_osim(path, markers=tracked & {m.name for m in read_osim(path).model.markers}).model
+    found = solve_frames(chain, seen[:, [trial.names.index(n) for n in chain.marker_names]])
+    bones = dict(zip(chain.segment_names, np.moveaxis(found.rotations, 1, 0), strict=True))
+    return {
+        side: _Leg(
+            tuple(
+                rigid_fit(
+                    stood[[static.names.index(m) for m in markers]],
+                    seen[:, [trial.names.index(m) for m in markers]],
+                )[0]
+                for markers in sensors
+            ),
+            rotation.from_matrix(bones[f"femur_{side}"]),
+            rotation.from_matrix(bones[f"tibia_{side}"]),
+            np.arange(len(seen)) * every / RATE_HZ,
+        )
+        for side, sensors in SENSORS.items()
+    }
+
+
+def _filter_errors(data: Path, movement: str, t_s: Array) -> list[Array]:
+    """Return the error of each sensor's filter, q_world_world, shape (n, 4); none while static."""
+    if movement == STATIC:
+        return [np.tile(rotation.IDENTITY, (len(t_s), 1))] * len(SENSORS["r"])
+    known = movement if movement != "STS1" else "squats1"
+    with np.load(data / FOLDER / f"{known}.npz", allow_pickle=False) as arrays:
+        at, pairs = (
+            arrays["t"],
+            [(arrays[f"S{i}_quat"], arrays[f"S{i}_quat_noimuerr"]) for i in (1, 2, 3, 4)],
+        )
+    errors = []
+    for said, true in pairs:
+        q = rotation.multiply(
+            rotation.normalize(said), rotation.conjugate(rotation.normalize(true))
+        )
+        turns = to_z_up(rotation.log(q))
+        whole = np.isfinite(turns).all(axis=1)
+        vectors = [np.interp(t_s, at[whole], turn) for turn in turns[whole].T]
+        errors.append(rotation.exp(np.stack(vectors, axis=1)))
+    return errors
