@@ -12,9 +12,9 @@ import numpy as np
 from typing_extensions import override
 
 from jointfit_daemon.model import MocapFrame
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived
-from jointfit_daemon.pipeline.source import Stamped
+from jointfit_daemon.pipeline.sources import Stamped
 from jointfit_daemon.timing.lag import estimate_lag
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Corrupt, DeviceEvent, LimbState
     from jointfit_daemon.pipeline.events import Event, Output
-    from jointfit_daemon.pipeline.source import SourceState
+    from jointfit_daemon.pipeline.sources import SourceState
     from jointfit_daemon.timing.align import AlignedFrame
     from jointfit_daemon.timing.clock import DeviceClock
     from jointfit_daemon.timing.lag import LagEstimate

@@ -22,8 +22,8 @@ import orjson
 from typing_extensions import override
 
 from jointfit_daemon.model import ImuSample, LimbState
-from jointfit_daemon.pipeline.core import Core
-from jointfit_daemon.pipeline.source import Stamped
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.sources import Stamped
 from jointfit_daemon.timing.stamps import SLEW
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Corrupt, DeviceEvent
     from jointfit_daemon.pipeline.events import Event, Output
-    from jointfit_daemon.pipeline.source import SourceState
+    from jointfit_daemon.pipeline.sources import SourceState
     from jointfit_daemon.timing.align import AlignedFrame
     from jointfit_daemon.timing.stamps import Stamp
 

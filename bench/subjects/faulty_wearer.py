@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.fusion import LimbFuser
-    from jointfit_daemon.fusion.sensor_watch import SensorNews
+    from jointfit_daemon.fusion import LimbFuser, SensorNews
     from jointfit_daemon.model import LimbState
 
 BEGIN_S = 100.0

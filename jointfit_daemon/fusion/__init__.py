@@ -1,7 +1,8 @@
-"""One aligned frame in, one LimbState out, whatever sensors are alive."""
+"""Sensor fusion: limb states from aligned orientations, with detection of sensor faults."""
 
-from jointfit_daemon.fusion.limb import LimbFuser
-from jointfit_daemon.fusion.origin import OpticalOrigin
-from jointfit_daemon.fusion.sensor_watch import SensorWatch
+from jointfit_daemon.fusion._limb_fuser import LimbFuser
+from jointfit_daemon.fusion._optical_origin import OpticalOrigin
+from jointfit_daemon.fusion._segment_fuser import HEADING_SD
+from jointfit_daemon.fusion.faults import SensorNews, SensorWatch
 
-__all__ = ["LimbFuser", "OpticalOrigin", "SensorWatch"]
+__all__ = ["HEADING_SD", "LimbFuser", "OpticalOrigin", "SensorNews", "SensorWatch"]

@@ -1,1 +1,6 @@
-"""The pure core, wired: events in, limb states and notices out."""
+"""The core of the daemon: input events to limb states, notices and calibration jobs."""
+
+from jointfit_daemon.pipeline._core import Core
+from jointfit_daemon.pipeline._replay import replay, replay_states
+
+__all__ = ["Core", "replay", "replay_states"]

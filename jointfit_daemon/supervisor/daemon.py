@@ -35,7 +35,7 @@ from jointfit_daemon.outputs.mqtt import LoopNoise
 from jointfit_daemon.outputs.outbox import Outbox
 from jointfit_daemon.outputs.publisher import MqttPublisher
 from jointfit_daemon.outputs.reporter import Reporter
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
     CalibrationStatus,

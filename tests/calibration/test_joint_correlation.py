@@ -11,8 +11,8 @@ from jointfit_daemon.calibration.joint_correlation import error_correlation, err
 from jointfit_daemon.calibration.model_fit import LimbTraining, all_alive
 from jointfit_daemon.calibration.result import Calibration, UnknownSchema
 from jointfit_daemon.calibration.segment_model import SegmentTraining
-from jointfit_daemon.fusion.segment import Fused
-from jointfit_daemon.fusion.skeleton import read_angles
+from jointfit_daemon.fusion._forward_kinematics import read_angles
+from jointfit_daemon.fusion._segment_fuser import Fused
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.model import Chain
 from tests.calibration.taught_limb import calibration

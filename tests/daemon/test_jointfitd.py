@@ -22,7 +22,7 @@ from jointfit_daemon.calibration.store import checksum
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.pipeline.replay import replay_states
+from jointfit_daemon.pipeline import replay_states
 from tests.calibration.plain_calibration import plain_calibration
 from tests.daemon import fake_drivers
 

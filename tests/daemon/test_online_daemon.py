@@ -14,7 +14,7 @@ import pytest
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.outputs.event_log import decode_event, encode_event
-from jointfit_daemon.pipeline import online_learning
+from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
     CalibrationStored,
@@ -23,7 +23,7 @@ from jointfit_daemon.pipeline.events import (
     JobFinished,
     SourceOpened,
 )
-from jointfit_daemon.pipeline.replay import replay_states
+from jointfit_daemon.pipeline.online_learning import _frame_collector
 from jointfit_daemon.supervisor.fits import FitRunner
 from jointfit_protocols.natnet_frame import Body, FrameOfData
 from jointfit_protocols.natnet_messages import encode as encode_natnet
@@ -77,10 +77,10 @@ def moved(first: int, last: int, *, cameras: bool = True) -> list[Event]:
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(core_feed, "orientation", orientation)
     monkeypatch.setattr(core_feed, "camera_bytes", camera_bytes)
-    monkeypatch.setattr(online_learning, "ENOUGH", 340)
-    monkeypatch.setattr(online_learning, "EVERY_NS", 30_000_000)
-    monkeypatch.setattr(online_learning, "STILL_DOT", 2.0)
-    monkeypatch.setattr(online_learning, "REST_NS", 100_000_000)
+    monkeypatch.setattr(_frame_collector, "ENOUGH", 340)
+    monkeypatch.setattr(_frame_collector, "EVERY_NS", 30_000_000)
+    monkeypatch.setattr(_frame_collector, "STILL_DOT", 2.0)
+    monkeypatch.setattr(_frame_collector, "REST_NS", 100_000_000)
 
 
 async def answered(bench: Bench, job: FitJob) -> None:

@@ -18,7 +18,7 @@ from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.driver import DeviceLost
 from jointfit_daemon.outputs.mqtt import MqttConnection, Outgoing
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from jointfit_daemon.fusion.angle_rates import AngleRates
+from jointfit_daemon.fusion._angle_rates import AngleRates
 from jointfit_daemon.model import JointAngles
 
 MS = 1_000_000

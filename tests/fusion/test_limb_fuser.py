@@ -26,7 +26,7 @@ from tests.calibration.synthetic_limb import (
     motion,
     record,
 )
-from tests.fusion.worn_limb import calibrated
+from tests.fusion.calibrated_limb import calibrated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -26,7 +26,7 @@ from jointfit_daemon.outputs.mqtt import Incoming
 from jointfit_daemon.outputs.mqtt_signature import signed
 from jointfit_daemon.outputs.outbox import Outbox
 from jointfit_daemon.outputs.reporter import Reporter
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,

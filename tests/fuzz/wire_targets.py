@@ -12,9 +12,9 @@ from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_daemon.outputs.outbox import Outbox
 from jointfit_daemon.outputs.payloads import encode as encode_payload
 from jointfit_daemon.outputs.reporter import Reporter
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
-from jointfit_daemon.pipeline.source import SourceState
+from jointfit_daemon.pipeline.sources import SourceState
 from jointfit_drivers.natnet_answers import OpenQuestions
 from jointfit_protocols.can_frame import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.corrupt import Corrupt

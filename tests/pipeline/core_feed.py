@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, LimbState
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened, Tick
 from jointfit_protocols.can_frame import CanFrame, pack_frames
 from jointfit_protocols.mtdata2 import Item, encode_items

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.event_log import decode_event, encode_event, encode_state
+from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened, Tick
-from jointfit_daemon.pipeline.replay import replay_states
 from jointfit_protocols.can_frame import RECORD_BYTES
 from tests.pipeline.core_feed import (
     MS,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from typing_extensions import override
 
 from jointfit_daemon.model import Chunk
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Notice, SourceClosed, SourceOpened
 from jointfit_protocols.can_frame import CanFrame, pack_frames
 from jointfit_protocols.mtdata2 import Item, encode_items

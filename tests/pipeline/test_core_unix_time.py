@@ -13,7 +13,7 @@ from typing_extensions import override
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, MocapFrame
 from jointfit_daemon.outputs.event_log import decode_event, encode_event, encode_state
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core, replay_states
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,
@@ -21,7 +21,6 @@ from jointfit_daemon.pipeline.events import (
     SourceOpened,
     UnixOffset,
 )
-from jointfit_daemon.pipeline.replay import replay_states
 from jointfit_protocols.natnet_frame import FrameOfData
 from jointfit_protocols.natnet_messages import ServerInfo
 from jointfit_protocols.natnet_messages import encode as encode_natnet
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from jointfit_daemon.pipeline.events import Event
-    from jointfit_daemon.pipeline.source import SourceState, Stamped
+    from jointfit_daemon.pipeline.sources import SourceState, Stamped
 
 S = 1_000_000_000
 BITSTREAM = (4, 1)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
+from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import Configured, JobFinished, SourceClosed, SourceOpened
-from jointfit_daemon.pipeline.replay import replay_states
 from tests.system.station import SENSORS, Listener, Station, hang_up, running, stopped
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from jointfit_daemon.calibration.alignment_phase import fit_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.markers import track_clusters
 from jointfit_daemon.calibration.sampling import sensor_at
-from jointfit_daemon.fusion.segment import HEADING_SD
+from jointfit_daemon.fusion import HEADING_SD
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.fusion.sensor_watch import SensorNews
+    from jointfit_daemon.fusion import SensorNews
 
 SEEDS = (1, 2, 5, 6, 7, 8)
 RATE_HZ = 50.0

@@ -16,7 +16,7 @@ from bench.subjects.simulated_wearer import bench_rig, fitted, walking
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.model import LimbState, TickClock
 from jointfit_daemon.outputs.payloads import encode_pose
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
 from jointfit_daemon.timing.align import FrameAligner, StreamSpec
 from jointfit_daemon.timing.clock import DeviceClock

@@ -12,7 +12,7 @@ from bench.framework.measurement import Bench, Row, cpu_s, loop_s, repeats
 from bench.subjects.simulated_wearer import bench_rig, fitted, phases
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.model import MocapFrame, MocapLayout
-from jointfit_daemon.pipeline.lag_watch import LagWatch
+from jointfit_daemon.pipeline.sources import LagWatch
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion

@@ -11,7 +11,7 @@ from bench.framework.experiment import Experiment, Figure
 from jointfit_daemon.calibration.result import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
 from jointfit_daemon.model import Chain, ClockEcho, MocapFrame, MocapLayout, TickClock
-from jointfit_daemon.pipeline.lag_watch import LagWatch
+from jointfit_daemon.pipeline.sources import LagWatch
 from jointfit_daemon.timing.clock import DeviceClock
 
 if TYPE_CHECKING:

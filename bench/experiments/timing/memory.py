@@ -23,7 +23,7 @@ from bench.subjects.simulated_clocks import ON_UART, SERVER_HZ, VERSION, xbus_ch
 from bench.subjects.simulated_wearer import bench_rig
 from jointfit_daemon.config.load import parse_rig
 from jointfit_daemon.model import Chunk, LimbState
-from jointfit_daemon.pipeline.core import Core
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
 from jointfit_protocols.natnet_frame import FrameOfData
 from jointfit_protocols.natnet_messages import EchoRequest, EchoResponse, ServerInfo, encode

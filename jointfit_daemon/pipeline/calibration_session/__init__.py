@@ -1,0 +1,5 @@
+"""Calibration session: state machine, recording of the phases, stillness of a static pose."""
+
+from jointfit_daemon.pipeline.calibration_session._session import CalibrationSession
+
+__all__ = ["CalibrationSession"]

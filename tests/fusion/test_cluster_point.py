@@ -1,0 +1,75 @@
+"""One frame's fit against the fit of whole trials, which is written another way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.calibration.markers import MAX_FIT_RMS_M, Cluster, rigid_fit
+from jointfit_daemon.fusion._cluster_point import CarriedPoint
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.model import MocapFrame, MocapLayout
+
+NAMES = ("a", "b", "c", "d", "e")
+LAYOUT = MocapLayout(("x", *reversed(NAMES)), ("other", "Pelvis"))
+POINT = np.array([0.3, -0.1, 0.9])
+
+
+def cluster(template: np.ndarray, body: str | None = None) -> Cluster:
+    origin = np.array([0.2, 0.1, 1.0])
+    q = rotation.exp(np.array([0.3, 0.2, -0.4]))
+    return Cluster("pelvis", () if body else NAMES, body, template, origin, q)
+
+
+def seen(positions: np.ndarray) -> MocapFrame:
+    markers = np.concatenate([np.full((1, 3), 9.0), positions[::-1]])
+    bodies = np.full((2, 3), np.nan), np.full((2, 4), np.nan)
+    return MocapFrame(0, 1, None, LAYOUT, markers, *bodies)
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(st.booleans(), min_size=5, max_size=5),
+    st.sampled_from([1.0, 0.001, 0.0]),
+    st.sampled_from([0.0, 0.002, 0.02, 0.2]),
+)
+def test_it_finds_what_the_fit_of_trials_finds(
+    seed: int, hidden: list[bool], thickness: float, scatter: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    template = rng.normal(0, 0.08, (5, 3)) * [1.0, thickness, 1.0]
+    turn = Rotation.random(random_state=rng)
+    positions = turn.apply(template) + rng.normal(size=3) + rng.normal(0, scatter, (5, 3))
+    positions[hidden] = np.nan
+    part = cluster(template)
+    found = CarriedPoint(part, POINT, LAYOUT).locate(seen(positions))
+    q, t, rms = (each[0] for each in rigid_fit(template, positions[None]))
+    if not rms <= MAX_FIT_RMS_M:
+        assert found is None
+    else:
+        assert found is not None
+        np.testing.assert_allclose(found, rotation.rotate(q, POINT - part.origin) + t, atol=1e-6)
+
+
+def test_a_rigid_body_carries_the_point_from_where_it_stood() -> None:
+    part = cluster(np.eye(3), body="Pelvis")
+    frame = seen(np.zeros((5, 3)))
+    point = CarriedPoint(part, POINT, LAYOUT)
+    assert point.locate(frame) is None
+    frame.body_positions[1], frame.body_orientations[1] = part.origin, part.q_body
+    assert point.locate(frame) == pytest.approx(tuple(POINT))
+    turned = Rotation.from_euler("z", 90, degrees=True)
+    body = turned * Rotation.from_quat(part.q_body, scalar_first=True)
+    frame.body_orientations[1] = body.as_quat(scalar_first=True)
+    expected = turned.apply(POINT - part.origin) + part.origin
+    assert point.locate(frame) == pytest.approx(tuple(expected))
+
+
+def test_a_stream_without_the_markers_or_the_body_locates_nothing() -> None:
+    frame = seen(np.zeros((5, 3)))
+    bare = MocapLayout(NAMES[:-1], ("other",))
+    for part in (cluster(np.eye(5, 3)), cluster(np.eye(3), body="Pelvis")):
+        assert CarriedPoint(part, POINT, bare).locate(frame) is None

@@ -1,0 +1,105 @@
+"""Positions, angles and deviations of one frame against Monte-Carlo; blending step by step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.calibration.redundancy import MeanModel
+from jointfit_daemon.calibration.result import SegmentCalibration, alive_key
+from jointfit_daemon.fusion._forward_kinematics import Reach, joint_positions, read_angles
+from jointfit_daemon.fusion._segment_fuser import Fused, SegmentFuser, mean_one
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Quaternion
+
+REST: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+def about_x(degrees: float) -> Quaternion:
+    half = np.radians(degrees) / 2
+    return (float(np.cos(half)), float(np.sin(half)), 0.0, 0.0)
+
+
+def fused(r: Rotation, sd: float) -> Fused:
+    w, x, y, z = r.as_quat(scalar_first=True).tolist()
+    return Fused((w, x, y, z), sd, (), ())
+
+
+def test_position_deviations_are_those_of_random_errors() -> None:
+    rng = np.random.default_rng(0)
+    bones = [Rotation.from_rotvec([0.4, 0.1, -0.2]), Rotation.from_rotvec([-0.9, 0.2, 0.3])]
+    sds, reaches = (0.03, 0.05), [Reach(0.42, 0.006), Reach(0.4, 0.01)]
+    places = joint_positions(
+        (0.1, 0.2, 0.9), [fused(r, sd) for r, sd in zip(bones, sds, strict=True)], reaches
+    )
+    n, at = 40_000, np.array([0.1, 0.2, 0.9])
+    for i, (bone, sd, reach) in enumerate(zip(bones, sds, reaches, strict=True)):
+        errors = Rotation.from_rotvec(rng.normal(0, sd, (n, 3)))
+        assert reach.length is not None
+        length = rng.normal(reach.length, reach.sd, n)
+        at = at + (bone * errors).apply(np.outer(length, [0, 0, -1.0]))
+        place, variance = places[i + 1]
+        assert place is not None
+        assert np.allclose(place, at.mean(axis=0), atol=2e-3)
+        assert variance == pytest.approx(at.var(axis=0).mean(), rel=0.03)
+
+
+def test_flexion_deviation_is_that_of_random_errors() -> None:
+    rng = np.random.default_rng(1)
+    above, joint = Rotation.random(random_state=rng), Rotation.from_euler("XYZ", [-0.9, 0.5, 0.2])
+    below, n = above * joint, 40_000
+    state = read_angles(fused(above, 0.02), fused(below, 0.03), sign=-1.0, left=False)
+    assert state is not None
+    assert state.angles == pytest.approx((0.9, 0.5, 0.2))
+    noisy = [
+        r * Rotation.from_rotvec(rng.normal(0, sd, (n, 3)))
+        for r, sd in ((above, 0.02), (below, 0.03))
+    ]
+    flexion = -(noisy[0].inv() * noisy[1]).as_euler("XYZ")[:, 0]
+    assert state.flexion_sd == pytest.approx(flexion.std(), rel=0.03)
+
+
+def test_a_left_limb_reads_like_a_right_one_and_locked_axes_are_said() -> None:
+    right = Rotation.from_euler("XYZ", [0.3, 0.2, 0.1])
+    left = Rotation.from_euler("XYZ", [0.3, -0.2, -0.1])
+    rest = fused(Rotation.identity(), 0.01)
+    a = read_angles(rest, fused(right, 0.01), sign=1.0, left=False)
+    b = read_angles(rest, fused(left, 0.01), sign=1.0, left=True)
+    assert a is not None
+    assert b is not None
+    assert a.angles == pytest.approx(b.angles)
+    locked = read_angles(
+        rest, fused(Rotation.from_euler("XYZ", [0.3, np.pi / 2, 0.1]), 0.01), sign=1.0, left=False
+    )
+    assert locked is not None
+    assert (locked.gimbal, locked.flexion_sd) == (True, None)
+    assert read_angles(rest, Fused(None, None, (), ()), sign=1.0, left=False) is None
+
+
+def test_a_swap_between_strangers_fades_over_a_quarter_second() -> None:
+    models = {alive_key((s,), None): MeanModel((1.0,), 0.05) for s in ("A", "B")}
+    fuser = SegmentFuser("thigh", ("A", "B"), SegmentCalibration(REST, None, None, models))
+    assert fuser.fuse(0, {"A": REST}, ()).q == REST
+    for after_ms, degrees in ((10, 0.0), (135, 5.0), (210, 8.0), (260, 10.0), (900, 10.0)):
+        said = fuser.fuse(after_ms * 1_000_000, {"B": about_x(10.0)}, ())
+        assert said.used == ("B",)
+        assert said.q == pytest.approx(about_x(degrees), abs=1e-9)
+
+
+@given(st.integers(0, 10_000), st.integers(2, 4))
+def test_the_quick_mean_is_the_eigenvector_mean_and_blind_to_signs(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    center = Rotation.random(random_state=rng)
+    q = (center * Rotation.from_rotvec(rng.normal(0, 0.1, (count, 3)))).as_quat(scalar_first=True)
+    signs = rng.choice([-1.0, 1.0], (count, 1))
+    rows = [(float(w), float(x), float(y), float(z)) for w, x, y, z in q * signs]
+    best = np.linalg.eigh(q.T @ q)[1][:, -1]
+    said = np.array(mean_one(rows))
+    off = 2 * np.arccos(min(1.0, abs(float(said @ best))))
+    assert off < (1e-6 if count == 2 else 1e-2)

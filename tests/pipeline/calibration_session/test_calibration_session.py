@@ -1,0 +1,357 @@
+"""The calibration session: phases begin, end, refuse and abort as the wearer is told they do."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
+from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
+from jointfit_daemon.pipeline.calibration_session import CalibrationSession
+from jointfit_daemon.pipeline.events import (
+    CalibrationProgress,
+    CalibrationReady,
+    CalibrationStatus,
+    CalibrationStored,
+    CancelJob,
+    FitJob,
+    JobFinished,
+    Notice,
+    Reply,
+    Request,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.pipeline.events import Output
+
+SENSORS = ("S1", "S2", "S3", "S4")
+CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (SENSORS[:2], SENSORS[2:]))
+MARKERS = {segment: tuple(f"{segment}{k}" for k in range(3)) for segment in CHAIN.segments}
+SETTINGS = CalibrationSettings(
+    static_s=3.0, align_s=4.0, functional_s=4.0, markers=MARKERS, plate="Plate"
+)
+SECOND = 1_000_000_000
+LAYOUT = MocapLayout((), ())
+PLAIN = Calibration(
+    "mean", CHAIN.joints, CHAIN.segments, CHAIN.sensors, {}, {}, {}, quality={"still_s": 5.0}
+)
+
+
+def session(*, mocap: bool = True) -> CalibrationSession:
+    return CalibrationSession(CHAIN, SETTINGS, mocap=mocap, calibration=None)
+
+
+def seen(t_ns: int) -> MocapFrame:
+    nothing = np.zeros((0, 3))
+    return MocapFrame(t_ns, 0, None, LAYOUT, nothing, nothing, np.zeros((0, 4)))
+
+
+def ask(one: CalibrationSession, t_ns: int, phase: str, **more: object) -> list[Output]:
+    return one.request(Request(t_ns, "calibrate", "t", {"phase": phase, **more}))
+
+
+def turned(angle: float) -> tuple[float, float, float, float]:
+    return (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
+
+
+def wear(
+    one: CalibrationSession,
+    start_s: float,
+    end_s: float,
+    speed: float = 0.0,
+    *,
+    sensors: tuple[str, ...] = SENSORS,
+    cameras: bool = True,
+) -> list[Output]:
+    """Feed sensors at 50 Hz, turning at `speed` rad/s, and the cameras; let time go on."""
+    out: list[Output] = []
+    for k in range(round(start_s * 50), round(end_s * 50)):
+        t_ns = k * SECOND // 50
+        for sensor in sensors:
+            out += one.add_sample(sensor, t_ns, turned(speed * k / 50))
+        if cameras:
+            one.add_mocap(t_ns, seen(t_ns))
+        out += one.advance(t_ns)
+    return out
+
+
+def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
+    return [output for output in outputs if isinstance(output, kind)]
+
+
+def done(one: CalibrationSession, job: FitJob, **result: object) -> list[Output]:
+    return one.job_finished(JobFinished(99 * SECOND, job.job, result, None))
+
+
+def posed() -> CalibrationSession:
+    one = session()
+    ask(one, 0, "static")
+    (job,) = only(wear(one, 0, 10), FitJob)
+    done(one, job, quality={})
+    return one
+
+
+def test_every_request_is_answered_exactly_once() -> None:
+    one = session()
+    for phase in ("nonsense", "functional", "align", "static", "abort"):
+        assert len(only(ask(one, 0, phase), Reply)) == 1
+
+
+def test_a_functional_phase_without_a_static_pose_says_what_comes_first() -> None:
+    (reply,) = only(ask(session(), 0, "functional"), Reply)
+    assert reply.status == "error"
+    assert "static" in str(reply.error)
+
+
+@pytest.mark.parametrize("phase", ["align", "functional"])
+def test_without_cameras_the_phases_that_need_them_are_refused(phase: str) -> None:
+    (reply,) = only(ask(session(mocap=False), 0, phase), Reply)
+    assert "[mocap]" in str(reply.error)
+
+
+def test_standing_still_ends_the_static_phase_and_hands_over_only_the_still_part() -> None:
+    one = session()
+    ask(one, 0, "static")
+    moving = wear(one, 0, 4, speed=0.5)
+    assert not only(moving, FitJob)
+    (job,) = only(wear(one, 4, 12), FitJob)
+    trial = job.payload["static"]
+    assert isinstance(trial, CalibrationTrial)
+    span_s = (trial.sensors["S1"].t_ns[-1] - trial.sensors["S1"].t_ns[0]) / SECOND
+    assert span_s == pytest.approx(SETTINGS.static_s, abs=0.5)
+    assert trial.sensors["S1"].t_ns[0] > 4 * SECOND
+
+
+def test_movement_restarts_the_static_clock_and_names_the_sensor() -> None:
+    one = session()
+    ask(one, 0, "static")
+    wear(one, 0, 2.5)
+    told = wear(one, 2.5, 3.5, speed=1.0)
+    assert any(notice.id in SENSORS for notice in only(told, Notice))
+    assert not only(wear(one, 3.5, 5.0), FitJob)
+
+
+def test_a_wearer_who_never_stands_still_gets_the_reason() -> None:
+    one = session()
+    ask(one, 0, "static")
+    statuses = only(wear(one, 0, 125, speed=0.5), CalibrationStatus)
+    assert statuses[-1].phase == "aborted"
+    assert "moving" in statuses[-1].text
+
+
+def test_progress_is_told_at_most_five_times_a_second() -> None:
+    one = posed()
+    ask(one, 10 * SECOND, "functional")
+    told = only(wear(one, 10, 13, speed=0.3), CalibrationProgress)
+    assert 10 <= len(told) <= 15
+    assert [p.progress for p in told] == sorted(p.progress for p in told)
+
+
+def test_a_second_request_while_a_phase_runs_is_refused() -> None:
+    one = session()
+    ask(one, 0, "align")
+    (reply,) = only(ask(one, 1, "static"), Reply)
+    assert reply.status == "error"
+    assert "abort" in str(reply.error)
+
+
+def test_abort_cancels_the_worker_and_its_late_result_is_ignored() -> None:
+    one = session()
+    ask(one, 0, "align")
+    (job,) = only(wear(one, 0, 6), FitJob)
+    assert only(ask(one, 7 * SECOND, "abort"), CancelJob) == [CancelJob(job.job)]
+    assert done(one, job, alignment={}, quality={}) == []
+
+
+def test_a_refusal_of_the_fit_aborts_with_its_reason() -> None:
+    one = session()
+    ask(one, 0, "align")
+    (job,) = only(wear(one, 0, 6), FitJob)
+    statuses = only(
+        done(one, job, refused="the plate turned about one axis only"), CalibrationStatus
+    )
+    assert statuses[-1].phase == "aborted"
+    assert "one axis" in statuses[-1].text
+
+
+def test_a_worse_calibration_is_not_taken_and_the_reason_is_told() -> None:
+    one = posed()
+    ask(one, 10 * SECOND, "functional")
+    (job,) = only(wear(one, 10, 16, speed=0.3), FitJob)
+    outputs = done(
+        one, job, calibration={"schema": 1}, worse="knee 3.0 against 1.0 deg", quality={}
+    )
+    assert not only(outputs, CalibrationReady)
+    assert one.calibration is None
+    (status,) = only(outputs, CalibrationStatus)
+    assert "knee 3.0" in status.text
+    assert (status.level, status.kept) == ("warning", "knee 3.0 against 1.0 deg")
+    assert not only(outputs, Notice)  # the status is an event, too
+
+
+def test_the_payload_carries_the_alignment_of_this_session() -> None:
+    one = session()
+    ask(one, 0, "align")
+    (job,) = only(wear(one, 0, 6), FitJob)
+    done(one, job, alignment={"sensors": {}, "notes": []}, quality={})
+    ask(one, 6 * SECOND, "static")
+    (job,) = only(wear(one, 6, 16), FitJob)
+    assert job.payload["alignment"] == {"sensors": {}, "notes": []}
+
+
+# --- what is missing, said in time ----------------------------------------------------------------
+
+
+def test_a_silent_sensor_is_no_still_one_and_is_named() -> None:
+    one = session()
+    ask(one, 0, "static")
+    out = wear(one, 0, 10, sensors=("S1", "S3", "S4"))
+    assert not only(out, FitJob)
+    assert "no data from S2" in only(out, CalibrationProgress)[-1].text
+    assert only(wear(one, 10, 16), FitJob), "it goes on once the sensor speaks"
+
+
+def test_stillness_ends_with_the_data_of_all_sensors() -> None:
+    one = session()
+    ask(one, 0, "static")
+    wear(one, 0, 3)
+    out = wear(one, 3, 10, sensors=())
+    assert not only(out, FitJob)
+    assert only(out, CalibrationProgress)[-1].progress == 0.0
+
+
+def test_what_is_silent_while_moving_is_named() -> None:
+    one = posed()
+    ask(one, 10 * SECOND, "functional")
+    out = wear(one, 10, 12, 0.3, sensors=("S1", "S2", "S3"), cameras=False)
+    assert "no data from S4, the cameras" in only(out, CalibrationProgress)[-1].text
+
+
+def test_a_pose_that_no_camera_saw_is_no_ground_for_a_movement() -> None:
+    one = session()
+    ask(one, 0, "static")
+    (job,) = only(wear(one, 0, 10, cameras=False), FitJob)
+    done(one, job, quality={})
+    (reply,) = only(ask(one, 11 * SECOND, "functional"), Reply)
+    assert "cameras" in str(reply.error)
+
+
+# --- requests that the edge ought to have refused -------------------------------------------------
+
+
+@pytest.mark.parametrize("seconds", ["soon", "5", True, 0, -1.0, math.nan, math.inf, 601, [5]])
+def test_odd_seconds_are_refused(seconds: object) -> None:
+    (reply,) = only(ask(session(), 0, "static", seconds=seconds), Reply)
+    assert reply.status == "error"
+    assert reply.error is not None
+    assert reply.error["key"] == "seconds"
+
+
+@pytest.mark.parametrize("phase", [None, 7, ["static"], {"phase": 1}])
+def test_odd_phases_are_refused(phase: Any) -> None:
+    (reply,) = only(ask(session(), 0, phase), Reply)
+    assert reply.status == "error"
+
+
+def test_the_pose_is_judged_by_the_length_that_was_asked_for() -> None:
+    one = session()
+    ask(one, 0, "static", seconds=1.5)
+    (job,) = only(wear(one, 0, 5), FitJob)
+    settings: Any = job.payload["settings"]
+    assert settings.static_s == 1.5
+
+
+def test_the_movement_after_a_short_pose_judges_it_by_that_length_too() -> None:
+    """A pose that was accepted must not be refused a minute later."""
+    one = session()
+    ask(one, 0, "static", seconds=1.5)
+    (job,) = only(wear(one, 0, 5), FitJob)
+    done(one, job, quality={})
+    reloaded = session()
+    reloaded.take_over(one, same_rig=True)
+    for after in (one, reloaded):
+        ask(after, 5 * SECOND, "functional")
+        (job,) = only(wear(after, 5, 12), FitJob)
+        settings: Any = job.payload["settings"]
+        assert settings.static_s == 1.5
+
+
+# --- what is left over ----------------------------------------------------------------------------
+
+
+def test_a_pose_whose_fit_was_aborted_is_no_pose() -> None:
+    one = session()
+    ask(one, 0, "static")
+    wear(one, 0, 10)
+    ask(one, 11 * SECOND, "abort")
+    (reply,) = only(ask(one, 12 * SECOND, "functional"), Reply)
+    assert reply.status == "error"
+
+
+def test_a_sensor_that_restarts_takes_the_pose_along_and_says_so() -> None:
+    one = posed()
+    (notice,) = one.restarted(11 * SECOND, "S2")
+    assert isinstance(notice, Notice)
+    assert notice.level == "warning"
+    assert "S2" in notice.text
+    (reply,) = only(ask(one, 12 * SECOND, "functional"), Reply)
+    assert "static" in str(reply.error)
+
+
+def test_a_sensor_that_restarts_while_it_is_moved_ends_the_phase() -> None:
+    one = session()
+    ask(one, 0, "align")
+    wear(one, 0, 2)
+    (status,) = only(one.restarted(2 * SECOND, "S1"), CalibrationStatus)
+    assert status.phase == "aborted"
+    assert "S1 restarted" in status.text
+
+
+def test_a_sensor_that_restarts_before_anything_was_calibrated_is_no_news() -> None:
+    assert session().restarted(0, "S1") == []
+
+
+@pytest.mark.parametrize("same_rig", [True, False])
+def test_a_reload_keeps_worlds_and_pose_of_the_same_rig_only(same_rig: bool) -> None:
+    one, after = posed(), session()
+    ask(one, 11 * SECOND, "align")
+    (job,) = only(wear(one, 11, 17), FitJob)
+    done(one, job, alignment={"sensors": {}, "notes": []}, quality={})
+    after.take_over(one, same_rig=same_rig)
+    (reply, *_) = only(ask(after, 18 * SECOND, "functional"), Reply)
+    assert reply.status == ("accepted" if same_rig else "error")
+    if same_rig:
+        (job,) = only(wear(after, 18, 24, 0.3), FitJob)
+        assert job.payload["alignment"] is not None
+
+
+def test_job_numbers_are_never_used_twice() -> None:
+    one, after = posed(), session()
+    after.take_over(one, same_rig=False)
+    ask(after, 0, "static")
+    (job,) = only(wear(after, 0, 10), FitJob)
+    assert job.job == 2
+
+
+def test_a_calibration_has_no_version_until_it_is_stored() -> None:
+    one = CalibrationSession(CHAIN, SETTINGS, mocap=False, calibration=PLAIN, version=3)
+    ask(one, 0, "static")
+    (job,) = only(wear(one, 0, 10), FitJob)
+    outputs = done(one, job, calibration=PLAIN.to_dict(), quality={})
+    assert only(outputs, CalibrationStatus)[-1].version is None
+    (status,) = only(one.stored(CalibrationStored(100 * SECOND, 4)), CalibrationStatus)
+    assert status.version == 4
+    assert status.quality == PLAIN.quality
+
+
+def test_what_the_plate_did_not_show_is_told() -> None:
+    one = session()
+    ask(one, 0, "align")
+    (job,) = only(wear(one, 0, 6), FitJob)
+    notes = ["S1: heading only; turn the plate about more axes"]
+    outputs = done(one, job, alignment={"sensors": {}, "notes": notes}, quality={})
+    assert [notice.text for notice in only(outputs, Notice)] == notes

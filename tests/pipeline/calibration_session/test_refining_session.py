@@ -1,0 +1,71 @@
+"""A functional phase whose worker refines the markers: what the session tells at its end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from jointfit_daemon.calibration.jobs import run_job
+from jointfit_daemon.calibration.static_pose import fit_static
+from jointfit_daemon.pipeline.calibration_session import CalibrationSession
+from jointfit_daemon.pipeline.events import (
+    CalibrationReady,
+    CalibrationStatus,
+    FitJob,
+    JobFinished,
+    Notice,
+    Output,
+    Request,
+)
+from tests.calibration.synthetic_limb import (
+    CHAIN,
+    SETTINGS,
+    Imperfections,
+    Subject,
+    static_and_functional,
+)
+
+S = 1_000_000_000
+WORN = Subject(5, flaws=Imperfections(skin_m=0.002))
+REFINING = replace(SETTINGS, method="mean", static_s=3.0, functional_min_s=0.0)
+
+
+def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
+    return [output for output in outputs if isinstance(output, kind)]
+
+
+def asked(one: CalibrationSession, t_ns: int, phase: str) -> FitJob:
+    """Ask for a phase and let its time pass; what it recorded is put in place by the caller."""
+    one.request(Request(t_ns, "calibrate", "t", {"phase": phase, "seconds": 4.0}))
+    out: list[Output] = []
+    for k in range(600):
+        now_ns = t_ns + k * S // 50
+        for sensor in ("S1", "S2", "S3", "S4"):
+            out += one.add_sample(sensor, now_ns, (1.0, 0.0, 0.0, 0.0))
+        out += one.advance(now_ns)
+    (job,) = only(out, FitJob)
+    assert isinstance(job, FitJob)
+    return job
+
+
+@pytest.mark.timeout(90)
+def test_the_phase_ends_with_the_figures_of_the_markers() -> None:
+    static, functional, _ = static_and_functional(WORN, 20.0)
+    one = CalibrationSession(CHAIN, REFINING, mocap=True, calibration=None)
+    job = asked(one, 0, "static")
+    pose = fit_static(static, REFINING, CHAIN)
+    one.job_finished(JobFinished(30 * S, job.job, {"quality": pose.quality}, None))
+    one._static = static  # the cameras of this test saw it elsewhere
+    job = asked(one, 40 * S, "functional")
+    result = run_job("functional", {**job.payload, "static": static, "functional": functional})
+    out = one.job_finished(JobFinished(90 * S, job.job, result, None))
+    (status,) = only(out, CalibrationStatus)
+    assert status.phase == "calibrated"
+    parts = status.quality["markers"]["parts"]
+    assert set(parts) == {"pelvis", "thigh", "shank", "foot"}
+    assert all(part["before_m"] > 0.0 for part in parts.values())
+    (ready,) = only(out, CalibrationReady)
+    assert ready.calibration.quality["markers"]["parts"] == parts
+    assert not [n for n in only(out, Notice) if "not refined" in n.text]
