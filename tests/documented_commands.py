@@ -46,7 +46,7 @@ NOT_RUN = {
     r"^make ": "minutes of processor time: CI runs the targets",
     r"python bench/": "minutes of processor time: the options are checked against its --help",
     r"pytest": "the test suite itself",
-    r"^jointfit report --cor-study": "12 s of processor time: tests/tools/test_report.py",
+    r"^jointfit report --cor-study": "12 s of processor time",
     r"/dev/|^candump |^ip link|^udevadm ": "needs hardware",
 }
 """Patterns of commands that a test cannot run, each with the reason."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.subjects.model_joint_centers import ModelTrial, gait2354, opencap
 from jointfit_daemon.calibration.center.estimate import estimate_center
-from jointfit_daemon.tools.center_trial import Reduced, reduce
+from jointfit_daemon.tools.center.trial import Reduced, reduce
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

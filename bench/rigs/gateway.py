@@ -25,13 +25,13 @@ from bench.subjects.simulated_wearer import bench_rig, fitted
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.tools.demo_processes import daemon, simulator
+from jointfit_daemon.tools.child_processes import daemon, simulator
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.tools.demo_processes import Simulator
+    from jointfit_daemon.tools.child_processes import Simulator
 
 SETTLE_S = 4.0
 """Clocks settle meanwhile; not measured."""

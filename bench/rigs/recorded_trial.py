@@ -24,7 +24,7 @@ from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.tools.demo_processes import daemon, simulator
+from jointfit_daemon.tools.child_processes import daemon, simulator
 from tests.broker_fixture import chosen_broker
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.trial import Method
-    from jointfit_daemon.tools.demo_processes import Simulator
+    from jointfit_daemon.tools.child_processes import Simulator
 
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
 SETTLE_S, STATIC_S = 3.0, 3.5

@@ -1,1 +1,1 @@
-"""The `jointfit` commands, one module each."""
+"""Commands of the `jointfit` command line, one module or package each."""

@@ -1,4 +1,8 @@
-"""The `jointfit` commands. Law: one module a command; heavy imports wait for the command."""
+"""Entry point of the `jointfit` command line: registers one command a module or package.
+
+Invariant: numpy is not imported before a command runs, because OpenBLAS reads its number of threads
+on import.
+"""
 
 from __future__ import annotations
 
@@ -7,62 +11,64 @@ import os
 import typer
 
 from jointfit_daemon import __version__
-from jointfit_daemon.tools import (
-    calibrate,
-    center,
-    check,
-    decode,
-    demo,
-    fuse,
-    markers,
-    report,
-    sample,
-    schema,
-)
+from jointfit_daemon.tools import fuse
+from jointfit_daemon.tools.calibrate import calibrate
+from jointfit_daemon.tools.center import center
+from jointfit_daemon.tools.check import check
 from jointfit_daemon.tools.command_group import EXIT_CODES, CommandGroup
+from jointfit_daemon.tools.decode import decode
+from jointfit_daemon.tools.demo import demo
+from jointfit_daemon.tools.markers import markers
+from jointfit_daemon.tools.report import report
+from jointfit_daemon.tools.sample import sample
+from jointfit_daemon.tools.schema import schema
 
 app = typer.Typer(
     name="jointfit",
     cls=CommandGroup,
-    help="Tools around jointfitd: check a rig, calibrate it, decode captures, see a demo.",
+    help="Check a rig, calibrate it, decode captures, process recordings, run a demo.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command(name="check")(check.check)
-app.command(name="demo")(demo.demo)
-app.command(name="calibrate")(calibrate.calibrate)
-app.command(name="center")(center.center)
-app.command(name="decode")(decode.decode)
+app.command(name="check")(check)
+app.command(name="demo")(demo)
+app.command(name="calibrate")(calibrate)
+app.command(name="center")(center)
+app.command(name="decode")(decode)
 app.add_typer(fuse.app)
-app.command(name="markers")(markers.markers)
-app.command(name="report")(report.report)
-app.command(name="sample")(sample.sample)
-app.command(name="schema")(schema.schema)
+app.command(name="markers")(markers)
+app.command(name="report")(report)
+app.command(name="sample")(sample)
+app.command(name="schema")(schema)
 
 
-def _version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(__version__)
         raise typer.Exit
 
 
 @app.callback()
-def _options(
+def _shared_options(
     *,
     version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
+        False,
+        "--version",
+        callback=_print_version,
+        is_eager=True,
+        help="Print the version and exit.",
     ),
 ) -> None:
-    """Take the options that every command shares."""
+    """Define the options of `jointfit` itself."""
 
 
 def main() -> None:
-    """Run the command line, with one thread of linear algebra unless the environment asks for more.
+    """Run the command line with one OpenBLAS thread unless the environment sets a number.
 
-    OpenBLAS reads the number when numpy is imported, which commands do. Their matrices are small:
-    `jointfit fuse fit` takes ten times the CPU time where threads wait for each other.
+    The matrices of all commands are small: with more threads, waiting costs `jointfit fuse fit` ten
+    times the CPU time.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()

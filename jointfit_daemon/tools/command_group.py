@@ -90,10 +90,10 @@ def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
         (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriver"),
         (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "BrokerLost"),
         (EXIT_FAILED, "jointfit_daemon.outputs.mqtt_client", "NoAnswer"),
-        (EXIT_FAILED, "jointfit_daemon.tools.calibration_guide", "PhaseAborted"),
-        (EXIT_FAILED, "jointfit_daemon.tools.calibration_guide", "RequestRefused"),
-        (EXIT_FAILED, "jointfit_daemon.tools.demo_processes", "ProcessEnded"),
-        (EXIT_FAILED, "jointfit_daemon.tools.demo_processes", "DemoTimeoutError"),
+        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "PhaseAborted"),
+        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "RequestRefused"),
+        (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessEnded"),
+        (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "DemoTimeoutError"),
         (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
     ):
         loaded = sys.modules.get(module)

@@ -18,7 +18,7 @@ from jointfit_daemon.calibration.refined_clusters import RefinedClusters, refine
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.calibration.static_pose import StaticPose, fit_static, stored_cluster
 from jointfit_daemon.outputs.figures import shown
-from jointfit_daemon.tools.calibration_report import report
+from jointfit_daemon.tools.calibrate import report
 from tests.calibration.synthetic_limb import (
     CHAIN,
     MARKERS,

@@ -18,10 +18,10 @@ from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
 from jointfit_daemon.config import MqttSettings, load_rig
 from jointfit_daemon.outputs.mqtt import BrokerLost
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.tools.calibration_guide import CalibrationWatch
-from jointfit_daemon.tools.demo_processes import Child, Simulator
-from jointfit_daemon.tools.demo_processes import daemon as daemon_child
-from jointfit_daemon.tools.demo_processes import simulator as simulator_child
+from jointfit_daemon.tools.calibrate import CalibrationWatch
+from jointfit_daemon.tools.child_processes import Child, Simulator
+from jointfit_daemon.tools.child_processes import daemon as daemon_child
+from jointfit_daemon.tools.child_processes import simulator as simulator_child
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

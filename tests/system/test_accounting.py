@@ -12,7 +12,7 @@ from tests.system.station import SENSORS, Station, listening, running, unbalance
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.tools.demo_processes import Simulator
+    from jointfit_daemon.tools.child_processes import Simulator
     from tests.broker_fixture import Broker
     from tests.system.station import Listener
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.tools.demo_processes import daemon
+from jointfit_daemon.tools.child_processes import daemon
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.can_wire import SlcanAdapter
 from jointfit_simulators.natnet_options import NatNetServerOptions

@@ -26,7 +26,7 @@ from tests.system.station import BASE, SENSORS, Listener, Station, listening, ru
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from jointfit_daemon.tools.demo_processes import Child
+    from jointfit_daemon.tools.child_processes import Child
     from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.alone]

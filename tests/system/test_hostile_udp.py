@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from jointfit_daemon.tools.demo_processes import daemon
+from jointfit_daemon.tools.child_processes import daemon
 from jointfit_protocols.natnet_messages import (
     EchoResponse,
     MessageId,

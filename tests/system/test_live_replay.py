@@ -15,7 +15,7 @@ from tests.system.station import SENSORS, Listener, Station, hang_up, running, s
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.tools.demo_processes import Child, Simulator
+    from jointfit_daemon.tools.child_processes import Child, Simulator
     from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.tools.demo_truth import TruthReader
+from jointfit_daemon.tools.demo._truth import TruthReader
 from jointfit_simulators.programme import parse_programme
 from jointfit_simulators.rig_file import RigOptions
 from jointfit_simulators.scene import Scene, SceneOptions

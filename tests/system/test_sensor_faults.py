@@ -18,7 +18,7 @@ from tests.system.station import Listener, Station, knee_angles, listening, sens
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.tools.demo_processes import Simulator
+    from jointfit_daemon.tools.child_processes import Simulator
     from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.alone]

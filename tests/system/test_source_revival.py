@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.tools.demo_processes import Child, daemon
+from jointfit_daemon.tools.child_processes import Child, daemon
 from jointfit_simulators.contract_scene import orientation
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xbus_device import XbusDevice

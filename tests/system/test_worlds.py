@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import orjson
 import pytest
 
-from jointfit_daemon.tools.demo_score import Score
-from jointfit_daemon.tools.demo_truth import TruthReader
+from jointfit_daemon.tools.demo._score import Score
+from jointfit_daemon.tools.demo._truth import TruthReader
 from jointfit_simulators.programme import parse_programme
 from jointfit_simulators.rig_file import RigOptions
 from jointfit_simulators.scene import Scene, SceneOptions

@@ -205,10 +205,10 @@ def test_output_files_are_checked_before_the_work(
         raise AssertionError("the work began")
 
     # Where they are used: a module imported meanwhile would keep the substitute for ever.
-    for reader in ("jointfit_daemon.tools.markers_trials.read_marker_trial",
-                   "jointfit_daemon.tools.fuse_trial.read_table",
+    for reader in ("jointfit_daemon.tools.markers._trials.read_marker_trial",
+                   "jointfit_daemon.tools.fuse._trial.read_table",
                    "jointfit_daemon.files.marker_trial.read_marker_trial",
-                   "jointfit_daemon.tools.demo._run"):  # fmt: skip
+                   "jointfit_daemon.tools.demo._command._run"):  # fmt: skip
         monkeypatch.setattr(reader, work)
     ending = ENDINGS.get(command, ".png")
     (tmp_path / f"folder{ending}").mkdir()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from bench.framework.experiment import Experiment, Figure, near
 from jointfit_daemon.calibration.center.study import PRINTED, PairMaps, StudySetup, run_study
-from jointfit_daemon.tools.report_tables import NEAREST, correlations
+from jointfit_daemon.tools.report.tables import NEAREST, correlations
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.tools.demo import BOUNDS, missed_bounds
-from jointfit_daemon.tools.demo_score import MeanSquare, Score, Truth, TruthTrack, percentile
+from jointfit_daemon.tools.demo._command import BOUNDS, missed_bounds
+from jointfit_daemon.tools.demo._score import MeanSquare, Score, Truth, TruthTrack, percentile
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.files.marker_trial import Axis
     from jointfit_daemon.model import LimbState
-    from jointfit_daemon.tools.fuse_tables import Table
+    from jointfit_daemon.tools.fuse._tables import Table
 
 
 ANGLES = ("flexion", "adduction", "rotation")

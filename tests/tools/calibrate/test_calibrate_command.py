@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from jointfit_daemon.tools.calibration_report import ProgressLines
+from jointfit_daemon.tools.calibrate._report import ProgressLines
 from jointfit_daemon.tools.embedded_broker import embedded_broker
 from tests.system.station import Station, listening, restore_signals
 

@@ -123,10 +123,10 @@ async def _run(
 ) -> tuple[dict[str, Any], StopRequest | None]:
     """Return the figures, and the signal that ended the run early, if one did."""
     from jointfit_daemon.config import load_rig
-    from jointfit_daemon.tools.demo_display import Display
-    from jointfit_daemon.tools.demo_processes import daemon, simulator
-    from jointfit_daemon.tools.demo_run import Demo
-    from jointfit_daemon.tools.demo_truth import TruthReader
+    from jointfit_daemon.tools.child_processes import daemon, simulator
+    from jointfit_daemon.tools.demo._display import Display
+    from jointfit_daemon.tools.demo._run import Demo
+    from jointfit_daemon.tools.demo._truth import TruthReader
     from jointfit_daemon.tools.embedded_broker import embedded_broker
     from jointfit_daemon.tools.stop_signals import cancel_on_signal
 

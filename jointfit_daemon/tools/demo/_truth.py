@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import orjson
 
-from jointfit_daemon.tools.demo_score import Truth, TruthTrack
+from jointfit_daemon.tools.demo._score import Truth, TruthTrack
 
 if TYPE_CHECKING:
     from pathlib import Path

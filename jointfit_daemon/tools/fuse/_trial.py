@@ -24,7 +24,7 @@ from jointfit_daemon.files.marker_trial import read_marker_trial
 from jointfit_daemon.files.npz import quaternions_z_up
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chain
-from jointfit_daemon.tools.fuse_tables import (
+from jointfit_daemon.tools.fuse._tables import (
     FEWEST,
     Table,
     Unusable,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.offline import OfflineTrial
-    from jointfit_daemon.tools.fuse_trial import Limb
+    from jointfit_daemon.tools.fuse._trial import Limb
 
 UNTAUGHT = ("mean", "single")
 """Methods that need no movement."""
@@ -80,7 +80,7 @@ def evaluate(
 ) -> None:
     """Judge every method where it was not fitted: leave one trial out."""
     from jointfit_daemon.calibration import offline
-    from jointfit_daemon.tools import fuse_report
+    from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_plot
 
     check_plot(plot)
@@ -89,11 +89,11 @@ def evaluate(
     found = offline.evaluate(limb.chain, read, mounts, holdout=holdout)
     _warn(doubts)
     if json:
-        _echo_json(fuse_report.judgement_json(found) | {"notes": doubts})
+        _echo_json(_report.judgement_json(found) | {"notes": doubts})
     else:
-        typer.echo(fuse_report.judgement(found))
+        typer.echo(_report.judgement(found))
     if plot is not None:
-        from jointfit_daemon.tools.fuse_plot import draw_judgement
+        from jointfit_daemon.tools.fuse._plot import draw_judgement
 
         draw_judgement(plot, found)
         typer.echo(f"wrote {plot}", err=True)
@@ -119,7 +119,7 @@ def fit(
 
     from jointfit_daemon import __version__
     from jointfit_daemon.calibration import offline
-    from jointfit_daemon.tools import fuse_report
+    from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_output
 
     check_output("--out", out, (".json",))
@@ -143,7 +143,7 @@ def fit(
     if json:
         _echo_json({"model": str(out), "frames": frames, "notes": doubts})
     else:
-        typer.echo(fuse_report.fitted(calibration, frames))
+        typer.echo(_report.fitted(calibration, frames))
         typer.echo(f"wrote {out}", err=True)
 
 
@@ -164,22 +164,22 @@ def apply(
     json: Json = False,
 ) -> None:
     """Fuse the sensors of a trial as the daemon would live, with its uncertainty."""
-    from jointfit_daemon.tools import fuse_output, fuse_report
-    from jointfit_daemon.tools.fuse_trial import read_worn
+    from jointfit_daemon.tools.fuse import _output, _report
+    from jointfit_daemon.tools.fuse._trial import read_worn
     from jointfit_daemon.tools.output_files import check_output
 
-    check_output("--out", out, fuse_output.ENDINGS)
+    check_output("--out", out, _output.ENDINGS)
     axis = _axis(up)
     calibration = _read_model(model)
-    chain = fuse_output.chain_of(calibration, left=left)
+    chain = _output.chain_of(calibration, left=left)
     table = read_worn(sensors, chain, axis, without or ())
-    found = fuse_output.fuse_trial(calibration, table, left=left)
-    files = fuse_output.write_fused(out, found, table, axis)
+    found = _output.fuse_trial(calibration, table, left=left)
+    files = _output.write_fused(out, found, table, axis)
     if json:
         said = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
         _echo_json(said | {"files": [str(file) for file in files]})
     else:
-        typer.echo(fuse_report.applied(found))
+        typer.echo(_report.applied(found))
         typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
 
 
@@ -194,14 +194,14 @@ def _inputs(
 ) -> tuple[Limb, list[OfflineTrial], dict[str, Any] | None, list[str]]:
     """Return limb, trials, mounts (None: to be learned) and what to doubt."""
     from jointfit_daemon.calibration.offline_checks import doubts
-    from jointfit_daemon.tools import fuse_trial
+    from jointfit_daemon.tools.fuse import _trial
 
-    limb = fuse_trial.read_limb(segments, joints, markers or (), _axis(up))
+    limb = _trial.read_limb(segments, joints, markers or (), _axis(up))
     mounts, still = None, None
     if static is not None:
-        mounts, still = fuse_trial.read_static(*_pair(static), limb)
-    read = [fuse_trial.read_trial(*_pair(text), limb, still) for text in trials]
-    read = fuse_trial.told_apart(read, [_pair(text)[0] for text in trials])
+        mounts, still = _trial.read_static(*_pair(static), limb)
+    read = [_trial.read_trial(*_pair(text), limb, still) for text in trials]
+    read = _trial.told_apart(read, [_pair(text)[0] for text in trials])
     told = doubts(limb.chain, read, mounts)
     if mounts is None:
         told.append(

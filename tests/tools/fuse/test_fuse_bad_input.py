@@ -16,7 +16,7 @@ from jointfit_daemon.files.npz import (
     write_orientations_npz,
 )
 from jointfit_daemon.kinematics import rotation
-from tests.tools.fuse_files import (
+from tests.tools.fuse.fuse_files import (
     LIMB,
     MARKER_OPTIONS,
     N,

@@ -8,9 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from jointfit_daemon.tools import calibrate, calibration_guide
-from jointfit_daemon.tools.calibration_guide import CalibrationWatch, PhaseAborted
-from jointfit_daemon.tools.calibration_report import movement_lines, report
+from jointfit_daemon.tools.calibrate import (
+    CalibrationWatch,
+    PhaseAborted,
+    _command,
+    _phase_tracker,
+    movement_lines,
+    report,
+)
 
 
 def watch(*phases: str) -> CalibrationWatch:
@@ -53,7 +58,7 @@ async def test_who_waits_is_told_that_the_daemon_is_gone() -> None:
 async def test_the_version_of_the_store_is_waited_for_but_not_for_long(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(calibration_guide, "STORING_S", 0.05)
+    monkeypatch.setattr(_phase_tracker, "STORING_S", 0.05)
     one = watch("functional", "fitting", "calibrated")
     ended = await one.ended("functional")
     assert await one.stored(ended) is ended
@@ -117,7 +122,7 @@ def test_a_result_that_is_not_stored_is_printed_once(
     one, text = watch(), "in force but not stored: no space left"
     event = {"kind": "calibration", "level": "error", "id": "bench", "text": text}
     printed = [
-        calibrate._heard(one, "calibration", {"phase": "calibrated", "text": text}),
-        calibrate._heard(one, "bridge/event", event),
+        _command._heard(one, "calibration", {"phase": "calibrated", "text": text}),
+        _command._heard(one, "bridge/event", event),
     ]
     assert sum(line is not None for line in printed) == 1

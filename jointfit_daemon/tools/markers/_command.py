@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     )
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
     from jointfit_daemon.kinematics.chain_model import ChainModel
-    from jointfit_daemon.tools.markers_trials import Asked
+    from jointfit_daemon.tools.markers._trials import Asked
 
 Trials = Annotated[list[Path], typer.Argument(help="Trials to learn from, .trc or .c3d.")]
 Model = Annotated[Path, typer.Option("--model", help="The chain: .toml, .json or OpenSim's .osim.")]
@@ -95,7 +95,7 @@ def markers(
         RefinementSettings,
         Unrefinable,
     )
-    from jointfit_daemon.tools.markers_trials import Asked
+    from jointfit_daemon.tools.markers._trials import Asked
 
     _check(method=method, up=up, out=out or [], plot=plot)
     names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
@@ -121,7 +121,7 @@ def _check(*, method: str, up: str | None, out: Sequence[Path], plot: Path | Non
     from typing import get_args
 
     from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
-    from jointfit_daemon.tools.markers_write import ENDINGS
+    from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.output_files import check_output, check_plot
 
     methods = get_args(RefinementMethod)
@@ -141,7 +141,7 @@ def _refined(
     from rich.progress import Progress, TextColumn
 
     from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
-    from jointfit_daemon.tools.markers_trials import load
+    from jointfit_daemon.tools.markers._trials import load
 
     chain, remarks, learned, judged = load(asked, *trials)
     with Progress(
@@ -161,24 +161,24 @@ def _refined(
 def _print(
     chain: ChainModel, remarks: tuple[str, ...], found: Refinement, *, as_json: bool
 ) -> None:
-    from jointfit_daemon.tools import markers_report
+    from jointfit_daemon.tools.markers import _report
 
     if as_json:
         import orjson
 
-        typer.echo(orjson.dumps(markers_report.as_json(chain, remarks, found)))
+        typer.echo(orjson.dumps(_report.as_json(chain, remarks, found)))
         return
-    typer.echo(markers_report.as_text(chain, remarks, found))
+    typer.echo(_report.as_text(chain, remarks, found))
 
 
 def _write(chain: ChainModel, found: Refinement, out: Sequence[Path], plot: Path | None) -> None:
-    from jointfit_daemon.tools.markers_write import write_markers
+    from jointfit_daemon.tools.markers._output import write_markers
 
     for path in out:
         write_markers(path, chain, found.model)
         typer.echo(f"wrote {path}", err=True)
     if plot is not None:
-        from jointfit_daemon.tools.markers_plot import draw_refinement
+        from jointfit_daemon.tools.markers._plot import draw_refinement
 
         draw_refinement(plot, found)
         typer.echo(f"wrote {plot}", err=True)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from rich.console import Console
 
-from jointfit_daemon.tools.demo_display import STEPS, Display
-from jointfit_daemon.tools.demo_score import Truth
+from jointfit_daemon.tools.demo._display import STEPS, Display
+from jointfit_daemon.tools.demo._score import Truth
 
 if TYPE_CHECKING:
     from pathlib import Path

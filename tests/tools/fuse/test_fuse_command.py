@@ -28,7 +28,7 @@ from jointfit_daemon.files.sto import (
     write_orientations_sto,
 )
 from jointfit_daemon.kinematics import rotation
-from tests.tools.fuse_files import (
+from tests.tools.fuse.fuse_files import (
     LIMB,
     MARKER_OPTIONS,
     RATE_HZ,

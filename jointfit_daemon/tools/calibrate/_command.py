@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt_client import MqttClient
-    from jointfit_daemon.tools.calibration_guide import CalibrationWatch
+    from jointfit_daemon.tools.calibrate._phase_tracker import CalibrationWatch
     from jointfit_daemon.tools.stop_signals import StopRequest
 
 NOT_TAKEN = 3
@@ -116,7 +116,7 @@ def _tell(status: Mapping[str, Any], *, json: bool) -> None:
     """Print the last status; end with `NOT_TAKEN` if its result was not."""
     import orjson
 
-    from jointfit_daemon.tools.calibration_report import report
+    from jointfit_daemon.tools.calibrate._report import report
 
     if json:
         typer.echo(orjson.dumps(status))
@@ -168,7 +168,7 @@ async def _lead(
 async def _phase(
     client: MqttClient, watch: CalibrationWatch, arguments: dict[str, object], config: Path
 ) -> dict[str, Any]:
-    from jointfit_daemon.tools.calibration_guide import RequestRefused
+    from jointfit_daemon.tools.calibrate._phase_tracker import RequestRefused
 
     name = str(arguments["phase"])
     watch.begin()
@@ -227,8 +227,8 @@ async def _watching(client: MqttClient, console: Console) -> AsyncIterator[Calib
     from rich.progress import Progress
     from rich.text import Text
 
-    from jointfit_daemon.tools.calibration_guide import CalibrationWatch
-    from jointfit_daemon.tools.calibration_report import ProgressLines, movement_lines
+    from jointfit_daemon.tools.calibrate._phase_tracker import CalibrationWatch
+    from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines
 
     bar, joints, lines = Progress(console=console), Text(), ProgressLines()
     task = bar.add_task("", total=1.0)
@@ -272,7 +272,7 @@ async def _listen(client: MqttClient, watch: CalibrationWatch, console: Console)
 
 def _heard(watch: CalibrationWatch, topic: str, payload: dict[str, Any]) -> str | None:
     """Tell `watch` what came; return what a person must read at once."""
-    from jointfit_daemon.tools.calibration_guide import PhaseAborted
+    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseAborted
 
     text = str(payload.get("text", ""))
     if topic == "calibration":

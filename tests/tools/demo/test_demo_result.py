@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.demo import NOTHING_MEASURED, result_line
+from jointfit_daemon.tools.demo._command import NOTHING_MEASURED, result_line
 from tests.system.station import restore_signals
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def test_a_complete_run_ends_with_its_result_line(
     async def ran(*_: object, **__: object) -> tuple[dict[str, Any], None]:
         return dict(FIGURES), None
 
-    monkeypatch.setattr("jointfit_daemon.tools.demo._run", ran)
+    monkeypatch.setattr("jointfit_daemon.tools.demo._command._run", ran)
     result = CliRunner().invoke(app, ["demo", *(["--headless"] if headless else [])])
     assert result.exit_code == 0
     assert (result.stderr if headless else result.stdout).splitlines()[-1].startswith("result:")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
-    from jointfit_daemon.tools.center_trial import Answer, Reduced
+    from jointfit_daemon.tools.center.trial import Answer, Reduced
 
 
 def center(
@@ -87,7 +87,7 @@ def _found(
     from typing import cast
 
     from jointfit_daemon.files.marker_trial import read_marker_trial
-    from jointfit_daemon.tools.center_trial import answers, reduce
+    from jointfit_daemon.tools.center.trial import answers, reduce
 
     trial = read_marker_trial(path, cast("Axis | None", up))
     trial.points([*asked[0], *asked[1]])  # all unknown names at once, whoever's they are
@@ -104,25 +104,25 @@ def _print(
     as_table: bool,
     as_json: bool,
 ) -> None:
-    from jointfit_daemon.tools import center_report
+    from jointfit_daemon.tools.center import _report
 
     if as_json:
         import orjson
 
-        typer.echo(orjson.dumps(center_report.as_json(trial, *asked, reduced, found)))
+        typer.echo(orjson.dumps(_report.as_json(trial, *asked, reduced, found)))
         return
-    typer.echo(center_report.head(trial, *asked, reduced))
+    typer.echo(_report.head(trial, *asked, reduced))
     if as_table:
         typer.echo(f"method    {found[0].estimate.method}\n")
-        typer.echo(center_report.windows(found))
+        typer.echo(_report.windows(found))
     else:
-        typer.echo(center_report.details(found[0]))
+        typer.echo(_report.details(found[0]))
 
 
 def _draw(
     plot: Path, trial: Path, reduced: Reduced, markers: Sequence[str], found: Sequence[Answer]
 ) -> None:
-    from jointfit_daemon.tools.center_plot import draw_center
+    from jointfit_daemon.tools.center._plot import draw_center
 
     draw_center(plot, reduced, markers, found, f"{trial.name}: {found[0].estimate.method}")
     typer.echo(f"wrote {plot}", err=True)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.offline import Judged, Judgement
     from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.tools.fuse_output import FusedTrial
+    from jointfit_daemon.tools.fuse._output import FusedTrial
 
 BASELINE = "mean"
 _DIGITS = 2

@@ -47,7 +47,7 @@ def report(
 
 def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:
     from jointfit_daemon.calibration.center.study import StudySetup
-    from jointfit_daemon.tools.report_tables import as_json, tables
+    from jointfit_daemon.tools.report.tables import as_json, tables
 
     plain = StudySetup()
     setup = StudySetup(
@@ -83,7 +83,7 @@ def _computed(setup: StudySetup) -> list[PairMaps]:
 
 def _draw(study: Sequence[PairMaps], out: Path) -> None:
     from jointfit_daemon.tools.plotting import PlotMissing
-    from jointfit_daemon.tools.report_plot import draw_study
+    from jointfit_daemon.tools.report._plot import draw_study
 
     try:
         for path in draw_study(study, out):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.tools.center_trial import CHI2_95
+from jointfit_daemon.tools.center.trial import CHI2_95
 from jointfit_daemon.tools.plotting import new_figure
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.tools.center_trial import Answer, Reduced
+    from jointfit_daemon.tools.center.trial import Answer, Reduced
 
 _MM = 1000.0
 _MOST_POINTS = 600

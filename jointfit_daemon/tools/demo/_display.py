@@ -20,7 +20,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from jointfit_daemon.tools.calibration_report import movement_lines
+from jointfit_daemon.tools.calibrate import movement_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from rich.console import ConsoleOptions, RenderResult
 
-    from jointfit_daemon.tools.demo_score import Truth
+    from jointfit_daemon.tools.demo._score import Truth
 
 LONGEST_CURVE = 200
 """Columns of the curves that are kept; a terminal shows as many of the newest as fit."""

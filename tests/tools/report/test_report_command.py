@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.report_tables import CAVEATS
+from jointfit_daemon.tools.report.tables import CAVEATS
 
 if TYPE_CHECKING:
     from pathlib import Path

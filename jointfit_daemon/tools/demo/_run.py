@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.outputs.mqtt_client import MqttClient
-from jointfit_daemon.tools.calibration_guide import CalibrationWatch, RequestRefused
-from jointfit_daemon.tools.demo_processes import finished_within
-from jointfit_daemon.tools.demo_score import MeanSquare, Score, percentile
+from jointfit_daemon.tools.calibrate import CalibrationWatch, RequestRefused
+from jointfit_daemon.tools.child_processes import finished_within
+from jointfit_daemon.tools.demo._score import MeanSquare, Score, percentile
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.tools.demo_display import Display
-    from jointfit_daemon.tools.demo_processes import Child, Simulator
-    from jointfit_daemon.tools.demo_truth import TruthReader
+    from jointfit_daemon.tools.child_processes import Child, Simulator
+    from jointfit_daemon.tools.demo._display import Display
+    from jointfit_daemon.tools.demo._truth import TruthReader
 
 TOPICS = ("pose", "calibration", "calibration/progress", "bridge/health", "device/+/availability")
 CONNECT_S, FINISH_S = 30.0, 15.0

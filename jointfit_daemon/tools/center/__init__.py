@@ -1,0 +1,5 @@
+"""`jointfit center`: centre of rotation of a joint from a marker trial."""
+
+from jointfit_daemon.tools.center._command import center
+
+__all__ = ["center"]
