@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _start_logging(level: str, rig: str) -> None:
-    from jointfit_daemon.outputs.printable_text import PrintableRecord
+    from jointfit_daemon.outputs.log import PrintableRecord
 
     logging.setLogRecordFactory(PrintableRecord)
     faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
@@ -101,8 +101,12 @@ def _start_logging(level: str, rig: str) -> None:
 
 def _log_handler(rig: str, *, all_of_it: bool) -> logging.Handler:
     """Return what writes the log: with fields, with levels, or with the time, by who reads it."""
-    from jointfit_daemon.outputs.journal import JournalHandler, LevelFormatter, is_journal
-    from jointfit_daemon.outputs.log_limit import LimitedHandler
+    from jointfit_daemon.outputs.log import (
+        JournalHandler,
+        LevelFormatter,
+        LimitedHandler,
+        is_journal,
+    )
 
     if is_journal(sys.stderr):
         return JournalHandler(rig, limited=not all_of_it)
@@ -133,7 +137,7 @@ def describe(rig: Rig) -> str:
 
 def _run(config: Path, rig: Rig) -> int:
     from jointfit_daemon.supervisor.daemon import run_daemon
-    from jointfit_daemon.supervisor.last_resort import leave_within
+    from jointfit_daemon.supervisor.process_exit import leave_within
 
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon takes it: no reload yet
     code = 0

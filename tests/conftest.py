@@ -15,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from tests.broker_fixture import EmbeddedBroker, MosquittoBroker, chosen_broker
+from tests.fake_rig import fakes, table  # noqa: F401 - fixtures
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bench.rigs.core_trace import traced, true_errors
 from bench.subjects.simulated_clocks import Run, simulated
-from jointfit_daemon.outputs.event_log import read_events
+from jointfit_daemon.outputs.recording import read_events
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

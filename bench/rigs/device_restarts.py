@@ -12,7 +12,7 @@ import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
 from bench.rigs.timestamp_errors import OPTICAL, WatchedCore, judge, unexcused
-from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
+from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from tests.system.station import SENSORS, Listener, Station, running, stopped
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from bench.rigs.request_flood import SECONDS
 from bench.subjects.simulated_wearer import bench_rig, fitted
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig
-from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon, simulator
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, trainin
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon, simulator
 from tests.broker_fixture import chosen_broker
 

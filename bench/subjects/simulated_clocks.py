@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.subjects.simulated_wearer import bench_rig
-from jointfit_daemon.config.load import parse_rig
+from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
 from jointfit_protocols import mtdata2, xbus, xcdi

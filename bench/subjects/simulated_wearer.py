@@ -16,7 +16,7 @@ import numpy as np
 from jointfit_daemon.calibration.alignment_phase import fit_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
-from jointfit_daemon.config.load import parse_rig
+from jointfit_daemon.config import parse_rig
 from jointfit_simulators.cameras import CameraFrames, Cameras
 from jointfit_simulators.placement import CLUSTERS
 from jointfit_simulators.programme import Step

@@ -1,13 +1,14 @@
 """rig.toml in, a frozen `Rig` in SI out, or every fault of it at once.
 
-Law: the only room with degrees, millimetres or file names of the rig; nothing opens here.
+Invariant: degrees and millimetres exist in this package only; no device is opened here.
 """
 
-from jointfit_daemon.config.faults import ConfigError, Fault
-from jointfit_daemon.config.load import load_rig, parse_rig
-from jointfit_daemon.config.rig import Rig, Source
-from jointfit_daemon.config.schema import rig_schema
-from jointfit_daemon.config.tables import MqttSettings, RecordingSettings, TlsSettings
+from jointfit_daemon.config._checks import drifting, headings
+from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of, nearest
+from jointfit_daemon.config._load import load_rig, parse_rig
+from jointfit_daemon.config._rig import Rig, Source
+from jointfit_daemon.config._schema import rig_schema
+from jointfit_daemon.config._tables import MqttSettings, RecordingSettings, TlsSettings
 
 __all__ = [
     "ConfigError",
@@ -17,7 +18,11 @@ __all__ = [
     "Rig",
     "Source",
     "TlsSettings",
+    "drifting",
+    "faults_of",
+    "headings",
     "load_rig",
+    "nearest",
     "parse_rig",
     "rig_schema",
 ]

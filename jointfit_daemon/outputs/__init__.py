@@ -1,1 +1,1 @@
-"""Where results go: MQTT and the event log."""
+"""Outputs of the daemon: MQTT topics, the log, and the recording of input events."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from jointfit_daemon.config.checks import drifting, headings
+from jointfit_daemon.config import drifting, headings
 from jointfit_daemon.fusion import LimbFuser, SensorWatch
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline._frame_grid import FrameGrid

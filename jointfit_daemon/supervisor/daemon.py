@@ -28,13 +28,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import ConfigError, load_rig
-from jointfit_daemon.outputs.event_log import EventLog
-from jointfit_daemon.outputs.journal import about
-from jointfit_daemon.outputs.log_topic import LogTopic
-from jointfit_daemon.outputs.mqtt import LoopNoise
-from jointfit_daemon.outputs.outbox import Outbox
-from jointfit_daemon.outputs.publisher import MqttPublisher
-from jointfit_daemon.outputs.reporter import Reporter
+from jointfit_daemon.outputs.log import LogTopic, about
+from jointfit_daemon.outputs.mqtt import LoopNoise, MqttPublisher, Outbox
+from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.recording import EventLog
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -46,19 +43,23 @@ from jointfit_daemon.pipeline.events import (
     Notice,
     Reply,
 )
-from jointfit_daemon.supervisor import calibrations
-from jointfit_daemon.supervisor.fits import FitRunner
-from jointfit_daemon.supervisor.heart import Heart
-from jointfit_daemon.supervisor.last_resort import leave_within
-from jointfit_daemon.supervisor.process import ProcessWatch
-from jointfit_daemon.supervisor.request_guard import RequestGuard
-from jointfit_daemon.supervisor.requests import reply_correlation, reply_topic, request_of
-from jointfit_daemon.supervisor.sources import SourceTasks, stop
+from jointfit_daemon.supervisor import _stored_calibrations
+from jointfit_daemon.supervisor._calibration_writer import StoreRunner
+from jointfit_daemon.supervisor._core_runner import Heart
+from jointfit_daemon.supervisor._fit_runner import FitRunner
+from jointfit_daemon.supervisor._process_statistics import ProcessWatch
+from jointfit_daemon.supervisor._progress_monitor import Progress
+from jointfit_daemon.supervisor._source_tasks import SourceTasks, stop
+from jointfit_daemon.supervisor._status_line import Pace, Seen, phase_of, status_line
+from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
+from jointfit_daemon.supervisor.process_exit import leave_within
+from jointfit_daemon.supervisor.requests import (
+    RequestGuard,
+    reply_correlation,
+    reply_topic,
+    request_of,
+)
 from jointfit_daemon.supervisor.state_directory import state_directory, writing_fault
-from jointfit_daemon.supervisor.status import Pace, Seen, phase_of, status_line
-from jointfit_daemon.supervisor.storing import StoreRunner
-from jointfit_daemon.supervisor.systemd import SystemdNotifier
-from jointfit_daemon.supervisor.watchdog import Progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -67,7 +68,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.pipeline.events import Output
-    from jointfit_daemon.supervisor.heart import CoreLike
+    from jointfit_daemon.supervisor._core_runner import CoreLike
 
 log = logging.getLogger(__name__)
 
@@ -256,7 +257,7 @@ class Daemon:
         """Log a change of the calibration, with its file where it was stored or loaded."""
         text, extra = status.text, about("calibration", status.phase)
         if status.version is not None and status.version != self._version:
-            path = calibrations.store_of(self._rig).path(status.version)
+            path = _stored_calibrations.store_of(self._rig).path(status.version)
             text = f"{text} (version {status.version} in {path})"
         self._version = status.version
         log.log(_LEVELS[status.level], "calibration %s: %s", status.phase, text, extra=extra)
@@ -341,7 +342,7 @@ class Daemon:
         for complaint in found.complaints:
             self._tell("calibration", complaint, "warning")
         now_ns = time.monotonic_ns()
-        age_s = 0.0 if found.calibration is None else calibrations.age_of(found.calibration)
+        age_s = 0.0 if found.calibration is None else _stored_calibrations.age_of(found.calibration)
         self._heart.feed(Configured(now_ns, rig, found.calibration, found.version, age_s))
 
     async def _reload_when_asked(self) -> None:

@@ -42,7 +42,7 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from jointfit_daemon.config.checks import headings
+    from jointfit_daemon.config import headings
     from jointfit_daemon.driver import driver_names
 
     table = Table(title=f"{config}: rig {rig.name!r} is right", title_justify="left")

@@ -89,7 +89,7 @@ def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
         (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlotMissing"),
         (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriver"),
         (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "BrokerLost"),
-        (EXIT_FAILED, "jointfit_daemon.outputs.mqtt_client", "NoAnswer"),
+        (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "NoAnswer"),
         (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "PhaseAborted"),
         (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "RequestRefused"),
         (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessEnded"),

@@ -148,7 +148,7 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
 
     from pydantic import ValidationError
 
-    from jointfit_daemon.config.faults import faults_of
+    from jointfit_daemon.config import faults_of
 
     given: dict[str, Any] = {"driver": name}
     for pair in pairs:

@@ -14,7 +14,7 @@ import pytest
 from bench import timing
 from bench.rigs.core_trace import Trace, traced, true_errors
 from bench.subjects.simulated_clocks import Run, simulated
-from jointfit_daemon.outputs.event_log import FORMAT, encode_event
+from jointfit_daemon.outputs.recording._event_log import FORMAT, encode_event
 
 if TYPE_CHECKING:
     from pathlib import Path

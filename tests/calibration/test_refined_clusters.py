@@ -17,7 +17,7 @@ from jointfit_daemon.calibration.markers import track_clusters
 from jointfit_daemon.calibration.refined_clusters import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.calibration.static_pose import StaticPose, fit_static, stored_cluster
-from jointfit_daemon.outputs.figures import shown
+from jointfit_daemon.outputs.payloads._quality_units import shown
 from jointfit_daemon.tools.calibrate import report
 from tests.calibration.synthetic_limb import (
     CHAIN,

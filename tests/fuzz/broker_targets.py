@@ -19,13 +19,13 @@ from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
 from jointfit_daemon.calibration.store import CalibrationStore, CalibrationUnreadable
 from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
 from jointfit_daemon.config import MqttSettings, load_rig, parse_rig
-from jointfit_daemon.config.faults import ConfigError
+from jointfit_daemon.config._fault_messages import ConfigError
 from jointfit_daemon.model import Chunk
-from jointfit_daemon.outputs.event_log import encode_event, read_events
-from jointfit_daemon.outputs.mqtt import Incoming
-from jointfit_daemon.outputs.mqtt_signature import signed
-from jointfit_daemon.outputs.outbox import Outbox
-from jointfit_daemon.outputs.reporter import Reporter
+from jointfit_daemon.outputs.mqtt import Incoming, Outbox
+from jointfit_daemon.outputs.mqtt._signature import signed
+from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.recording import read_events
+from jointfit_daemon.outputs.recording._event_log import encode_event
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
@@ -34,8 +34,12 @@ from jointfit_daemon.pipeline.events import (
     SourceOpened,
     Tick,
 )
-from jointfit_daemon.supervisor.request_guard import RequestGuard
-from jointfit_daemon.supervisor.requests import reply_correlation, reply_topic, request_of
+from jointfit_daemon.supervisor.requests import (
+    RequestGuard,
+    reply_correlation,
+    reply_topic,
+    request_of,
+)
 from tests.fuzz.target import Target
 from tests.fuzz.wire_targets import rig
 from tests.pipeline.core_feed import (

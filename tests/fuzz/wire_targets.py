@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, DeviceEvent
-from jointfit_daemon.outputs.outbox import Outbox
-from jointfit_daemon.outputs.payloads import encode as encode_payload
-from jointfit_daemon.outputs.reporter import Reporter
+from jointfit_daemon.outputs.mqtt import Outbox
+from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
 from jointfit_daemon.pipeline.sources import SourceState

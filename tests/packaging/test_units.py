@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from jointfit_daemon.__main__ import EXIT_IN_USE, EXIT_USAGE
-from jointfit_daemon.outputs.mqtt_secrets import CREDENTIAL
+from jointfit_daemon.outputs.mqtt._secret_files import CREDENTIAL
 from jointfit_daemon.supervisor.daemon import STOP_S
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk
-from jointfit_daemon.outputs.event_log import decode_event, encode_event, encode_state
+from jointfit_daemon.outputs.recording import encode_state
+from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened, Tick
 from jointfit_protocols.can_frame import RECORD_BYTES

@@ -12,7 +12,8 @@ from typing_extensions import override
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, MocapFrame
-from jointfit_daemon.outputs.event_log import decode_event, encode_event, encode_state
+from jointfit_daemon.outputs.recording import encode_state
+from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline import Core, replay_states
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,

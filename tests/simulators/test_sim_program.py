@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.config.load import load_rig
+from jointfit_daemon.config._load import load_rig
 from jointfit_daemon.model import Corrupt, ImuSample, MocapFrame
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from jointfit_daemon.config.rig import Source
+    from jointfit_daemon.config._rig import Source
     from jointfit_daemon.model import Chunk, Decoded
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]

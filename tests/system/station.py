@@ -16,8 +16,7 @@ from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
 from jointfit_daemon.config import MqttSettings, load_rig
-from jointfit_daemon.outputs.mqtt import BrokerLost
-from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.outputs.mqtt import BrokerLost, MqttClient
 from jointfit_daemon.tools.calibrate import CalibrationWatch
 from jointfit_daemon.tools.child_processes import Child, Simulator
 from jointfit_daemon.tools.child_processes import daemon as daemon_child

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.outputs.mqtt import MqttClient
 from tests.system.station import (
     SENSORS,
     Station,

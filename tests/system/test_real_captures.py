@@ -16,7 +16,7 @@ import pytest
 
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.files.packet_capture import read_udp
-from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon
 from jointfit_simulators.natnet_replay import NatNetReplay
 from jointfit_simulators.xbus_replay import XbusReplay

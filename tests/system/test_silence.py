@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.outputs.event_log import encode_state, read_events, read_states
+from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from jointfit_daemon.pipeline import replay_states
 from tests.system.station import (
     SENSORS,

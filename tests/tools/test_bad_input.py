@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
-from jointfit_daemon.outputs.broker_faults import broker_fault
+from jointfit_daemon.outputs.mqtt._error_messages import broker_fault
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.embedded_broker import free_port
 from jointfit_simulators.sample_data import write_sample

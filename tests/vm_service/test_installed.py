@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 KEY = Path("/etc/credstore/jointfitd.request-key")
 SIGN = (
-    "import json, sys; from jointfit_daemon.outputs.mqtt_signature import signed; "
+    "import json, sys; from jointfit_daemon.outputs.mqtt import signed; "
     "key = open(sys.argv[1], 'rb').read().strip(); "
     "print(json.dumps(signed(key, sys.argv[2], json.loads(sys.argv[3]))))"
 )

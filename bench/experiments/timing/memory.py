@@ -21,7 +21,7 @@ import numpy as np
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_clocks import ON_UART, SERVER_HZ, VERSION, xbus_chunk, xcdi_chunk
 from bench.subjects.simulated_wearer import bench_rig
-from jointfit_daemon.config.load import parse_rig
+from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, LimbState
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.outputs.mqtt_client import MqttClient
+    from jointfit_daemon.outputs.mqtt import MqttClient
     from jointfit_daemon.tools.calibrate._phase_tracker import CalibrationWatch
     from jointfit_daemon.tools.stop_signals import StopRequest
 
@@ -139,7 +139,7 @@ async def _lead(
 ) -> dict[str, Any]:
     from rich.console import Console
 
-    from jointfit_daemon.outputs.mqtt_client import MqttClient
+    from jointfit_daemon.outputs.mqtt import MqttClient
     from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
     console = Console(stderr=True)

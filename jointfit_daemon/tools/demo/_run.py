@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration.store import CalibrationStore
-from jointfit_daemon.outputs.mqtt_client import MqttClient
+from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.calibrate import CalibrationWatch, RequestRefused
 from jointfit_daemon.tools.child_processes import finished_within
 from jointfit_daemon.tools.demo._score import MeanSquare, Score, percentile

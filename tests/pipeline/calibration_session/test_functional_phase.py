@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.model import MocapFrame, MocapLayout
-from jointfit_daemon.outputs.payloads import encode
+from jointfit_daemon.outputs.payloads._encoding import encode
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
     CalibrationProgress,

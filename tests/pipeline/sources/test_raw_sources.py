@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from jointfit_daemon.config import parse_rig
-from jointfit_daemon.config.checks import headings
+from jointfit_daemon.config import headings, parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, Notice, SourceOpened

@@ -1,0 +1,248 @@
+"""What no single table can know: names that must match across tables.
+
+Law: each check returns its faults; none stops at the first.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from jointfit_daemon.config._fault_messages import Fault, nearest
+from jointfit_daemon.config._rig import MOCAP
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+
+    from jointfit_daemon.config._rig import Source
+    from jointfit_daemon.config._tables import ChainTable
+    from jointfit_daemon.driver import CanBusSettings, MocapSettings
+
+_FORBIDDEN = "+#/"
+_FOLDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_LONGEST_M = 3.0  # no limb is longer; a length in millimetres is
+_LEAST_MARKERS = 3  # fewer do not define an orientation
+
+
+def control_characters(value: object, key: str = "") -> Iterator[Fault]:
+    """Check that no text holds a NUL: no file, port or topic may be named so."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from control_characters(name, f"key {name!r}")
+            yield from control_characters(inner, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for at, inner in enumerate(value):
+            yield from control_characters(inner, f"{key}[{at}]")
+    elif isinstance(value, str) and "\0" in value:
+        yield Fault(key, "must not hold a NUL character", value)
+
+
+def topic_name(key: str, name: str) -> list[Fault]:
+    """Check a name that becomes one level of an MQTT topic."""
+    if not name.strip():
+        return [Fault(key, "must not be empty: it becomes an MQTT topic", name)]
+    if bad := [letter for letter in _FORBIDDEN if letter in name]:
+        return [Fault(key, f"must not hold {' '.join(bad)}: it becomes an MQTT topic", name)]
+    if name.startswith("$") or not name.isprintable() or name != name.strip():
+        what = "must not begin with $, nor hold control characters or outer blanks"
+        return [Fault(key, f"{what}: it becomes an MQTT topic", name)]
+    return []
+
+
+def topic_base(key: str, base: str) -> list[Fault]:
+    """Check the levels before every topic; they may hold slashes, but no empty level."""
+    return [
+        Fault(key, fault.expected, base)
+        for level in base.split("/")
+        for fault in topic_name(key, level)
+    ][:1]
+
+
+def folder_name(key: str, name: str) -> list[Fault]:
+    """Check a name that becomes one folder of the calibration store."""
+    if _FOLDER.fullmatch(name):
+        return []
+    allowed = "letters, digits, . _ and -, beginning with a letter or digit"
+    return [Fault(key, f"must be the plain name of one folder: {allowed}", name)]
+
+
+def chain(table: ChainTable) -> Iterator[Fault]:
+    """Check the limb: its names, and that joints and segments alternate.
+
+    Keys of `table` that had faults are None.
+    """
+    for key in ("joints", "segments"):
+        names = getattr(table, key) or ()
+        for name in names:
+            yield from topic_name(f"chain.{key}", name)
+        yield from _repeated(f"chain.{key}", names)
+    found = [len(names) for names in (table.joints, table.segments) if names]
+    if len(found) == 2 and found[0] != found[1] + 1:  # noqa: PLR2004 - both could be read
+        yield Fault(
+            "chain.joints",
+            f"expected {len(table.segments) + 1} joints, one more than segments",
+            list(table.joints),
+        )
+    yield from _neighbours(table)
+    for name, length in (table.lengths_m or {}).items():
+        if table.segments:
+            yield from known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
+        if not 0 < length < _LONGEST_M:
+            yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
+
+
+def _neighbours(table: ChainTable) -> Iterator[Fault]:
+    for key in ("proximal", "distal"):
+        name = getattr(table, key)
+        if name is None:
+            continue
+        yield from topic_name(f"chain.{key}", name)
+        if name in (table.segments or ()):
+            yield Fault(f"chain.{key}", "is already a segment", name)
+
+
+def known_name(
+    key: str, name: str, known: Sequence[str], what: str, taken: Collection[str] = ()
+) -> list[Fault]:
+    """Check that `name` is one of `known`; propose none of `taken`."""
+    if name in known:
+        return []
+    choices = ", ".join(known) or "none"
+    near = nearest(name, [other for other in known if other not in taken])
+    return [Fault(key, f"no such {what}; known: {choices}", name, near)]
+
+
+def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
+    for name, times in Counter(names).items():
+        if times > 1:
+            yield Fault(key, f"named {times} times, expected once", name)
+
+
+def sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iterator[Fault]:
+    """Check ids and segments of all ``[[imu]]`` tables, as far as they can be read."""
+    ids = [imu["id"] for imu in imus if isinstance(imu.get("id"), str)]
+    yield from _repeated("imu.id", ids)
+    for name in dict.fromkeys(ids):
+        yield from topic_name(f"imu[{name}].id", name)
+        if name == MOCAP:
+            yield Fault(f"imu[{name}].id", "is the name of the optical source", name)
+    if table is None or not table.segments:
+        return
+    worn = [imu["segment"] for imu in imus if isinstance(imu.get("segment"), str)]
+    for at, imu in enumerate(imus, 1):
+        if isinstance(imu.get("segment"), str):
+            key = f"imu[{imu.get('id', f'#{at}')}].segment"
+            yield from known_name(key, imu["segment"], table.segments, "segment")
+    for segment in table.segments:
+        if segment not in worn:
+            yield Fault("imu", f"no sensor is on segment {segment!r}, expected at least one")
+
+
+def markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
+    """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
+    for kind in ("markers", "rigid_body"):
+        for part in getattr(settings, kind) or ():
+            if table is not None and table.segments:
+                parts = [*table.segments, *filter(None, (table.proximal, table.distal))]
+                taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
+                yield from known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
+    for part, names in (settings.markers or {}).items():
+        key = f"mocap.markers.{part}"
+        yield from _repeated(key, names)
+        if len(set(names)) < _LEAST_MARKERS:
+            yield Fault(key, "expected at least three different markers", list(names))
+        if part in (settings.rigid_body or {}):
+            yield Fault(f"mocap.rigid_body.{part}", "has markers already; give one of the two")
+    yield from _shared_markers(settings)
+
+
+def _shared_markers(settings: MocapSettings) -> Iterator[Fault]:
+    owners: dict[str, str] = {}
+    for part, names in (settings.markers or {}).items():
+        for name in dict.fromkeys(names):
+            if (owner := owners.setdefault(name, part)) != part:
+                yield Fault(f"mocap.markers.{part}", f"is a marker of {owner!r} already", name)
+
+
+def ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:
+    """Check that nobody shares a serial port."""
+    users = [
+        (f"imu[{source.id}].port", getattr(source.settings, "port", None)) for source in sources
+    ]
+    users += [
+        (f"can.{name}.channel", bus.channel)
+        for name, bus in buses.items()
+        if bus.interface == "slcan"
+    ]
+    taken: dict[str, str] = {}
+    for key, port in users:
+        if isinstance(port, str):  # a link and its target are one port
+            owner = taken.setdefault(os.path.realpath(port), key)
+            if owner != key:
+                yield Fault(key, f"is the port of {owner.rpartition('.')[0]} already", port)
+
+
+def can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
+    """Check that on one bus every message id belongs to one sensor."""
+    owners: dict[tuple[str, int], str] = {}
+    for source in sources:
+        bus = getattr(source.settings, "can", None)
+        if bus is None:
+            continue
+        for message, number in _numbers(getattr(source.settings, "ids", None)):
+            owner = owners.setdefault((repr(bus), number), f"{source.id} ({message})")
+            if owner != f"{source.id} ({message})":
+                text = f"id {number:#x} on this bus is taken by {owner}; expected one of its own"
+                yield Fault(f"imu[{source.id}].ids.{message}", text)
+
+
+def drifting(sources: Sequence[Source]) -> frozenset[str]:
+    """Return the IMUs whose heading is worked out on the gateway without a magnetometer."""
+    return frozenset(_on_gateway(sources)[True])
+
+
+def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
+    """Return the IMUs whose heading is worked out here, by whether it drifts."""
+    drifts: dict[bool, list[str]] = {True: [], False: []}
+    for source in sources:
+        if getattr(source.settings, "orientation", None) == "gateway":
+            drifts[not getattr(source.settings, "magnetometer", False)].append(source.id)
+    return drifts
+
+
+def headings(sources: Sequence[Source]) -> str | None:
+    """Say what is wrong with IMUs of which some find north on the gateway and others drift.
+
+    A fault it is not: who wants it may have it. Of a device that computes its own orientation it
+    is not known which it is.
+    """
+    drifts = _on_gateway(sources)
+    if not drifts[True] or not drifts[False]:
+        return None
+    return (
+        f"heading by magnetometer on {', '.join(drifts[False])}, but not on "
+        f"{', '.join(drifts[True])}: it drifts there, and joint rotation with it; "
+        "set `magnetometer` alike on all"
+    )
+
+
+def _numbers(ids: object) -> Iterator[tuple[str, int]]:
+    """Yield message names and identifiers of an ``ids`` table, be it a model or a dict.
+
+    A model whose identifiers follow from each other gives them all by ``resolved``.
+    """
+    resolved = getattr(ids, "resolved", None)
+    if callable(resolved):
+        ids = resolved()
+    if isinstance(ids, BaseModel):
+        ids = dict(ids)
+    elif isinstance(ids, tuple) and hasattr(ids, "_asdict"):
+        ids = ids._asdict()
+    if isinstance(ids, dict):
+        for name, number in ids.items():
+            if isinstance(number, int) and not isinstance(number, bool):
+                yield name, number

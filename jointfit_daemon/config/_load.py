@@ -1,0 +1,332 @@
+"""From the text of a rig.toml to a `Rig`. Law: all faults at once, before anything opens."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from jointfit_daemon.calibration.trial import CalibrationSettings
+from jointfit_daemon.config import _bandwidth, _checks
+from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of, nearest
+from jointfit_daemon.config._rig import MOCAP, Rig, Source
+from jointfit_daemon.config._syntax import read_table
+from jointfit_daemon.config._tables import (
+    CalibrationTable,
+    ChainTable,
+    MqttSettings,
+    RecordingSettings,
+    RigTable,
+)
+from jointfit_daemon.driver import (
+    CanBusSettings,
+    ImuSettings,
+    MocapSettings,
+    UnknownDriver,
+    driver_names,
+    find_driver,
+)
+from jointfit_daemon.files.structured_text import plain_fault
+from jointfit_daemon.model import Chain
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Driver
+
+Model = TypeVar("Model", bound=BaseModel)
+
+SECTIONS = ("rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recording")
+
+
+def load_rig(path: Path) -> Rig:
+    """Read and check the rig.toml at `path`.
+
+    Relative names of files in ``[mqtt]`` start at the folder of `path`.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, is not TOML, or describes no usable rig; lists all faults.
+    """
+    table, syntax = read_table(path)
+    _anchor_files(table, path.absolute().parent)
+    return _rig_of(table, str(path), syntax)
+
+
+def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
+    """Check `table`, a parsed rig.toml, and return what it means.
+
+    Parameters
+    ----------
+    table
+        As tomllib gives it; not kept, not changed.
+    source
+        Name of the file, for messages.
+
+    Raises
+    ------
+    ConfigError
+        Lists every fault of the table.
+    """
+    if (fault := plain_fault(table)) is not None:
+        raise ConfigError(source, [Fault("TOML", fault)])
+    return _rig_of(deepcopy(dict(table)), source, [])
+
+
+def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
+    reader = _Reader(table)
+    unusable = list(_checks.control_characters(table))
+    reader.faults += unusable
+    rig = None if unusable else reader.rig()
+    faults = [*syntax, *reader.faults]
+    if syntax:  # what seems to be missing may be on a line that could not be parsed
+        faults = [*syntax, *(fault for fault in reader.faults if fault.has_value)]
+    if rig is None or faults:
+        raise ConfigError(source, list({fault.text(): fault for fault in faults}.values()))
+    return rig
+
+
+def _partial(table: Mapping[str, Any], model: type[Model], error: ValidationError) -> Model:
+    """Return a model that is None at the keys that have faults."""
+    wrong = {detail["loc"][0] for detail in error.errors() if detail["loc"]}
+    values = {
+        name: None
+        if field.is_required() or name in wrong
+        else field.get_default(call_default_factory=True)
+        for name, field in model.model_fields.items()
+    }
+    for name in values.keys() & table.keys() - wrong:
+        text = json.dumps(table[name], default=str)
+        annotation: Any = model.model_fields[name].annotation
+        with contextlib.suppress(ValidationError):
+            values[name] = TypeAdapter(annotation).validate_json(text, strict=True)
+    return model.model_construct(**values)
+
+
+def _anchor_files(table: dict[str, Any], folder: Path) -> None:
+    mqtt = table.get("mqtt")
+    if isinstance(mqtt, dict):
+        _anchor(mqtt, ("password_file", "request_key_file"), folder)
+        _anchor(mqtt.get("tls"), ("ca", "cert", "key"), folder)
+
+
+def _anchor(part: object, keys: Sequence[str], folder: Path) -> None:
+    if isinstance(part, dict):
+        for key in keys:
+            if isinstance(part.get(key), str):
+                part[key] = str(folder / part[key])
+
+
+class _Reader:
+    """Reads one table and collects what is wrong with it."""
+
+    def __init__(self, table: dict[str, Any]) -> None:
+        self.table = table
+        self.faults: list[Fault] = []
+        self.partial: dict[str, Any] = {}
+        """Tables with faults, by key: models of what is right in them, for the cross-checks."""
+        self.seen: list[Source] = []
+        """The IMUs, also those with faults, as far as they could be read."""
+        for key in table:
+            if key not in SECTIONS:
+                known = f"no such table; known: {', '.join(SECTIONS)}"
+                self.faults.append(Fault(key, known, near=nearest(key, SECTIONS)))
+
+    def rig(self) -> Rig | None:
+        """Return the rig if every table could be read; cross-checks add their faults."""
+        head = self._section("rig", RigTable, needed=True)
+        chain = self._section("chain", ChainTable, needed=True)
+        calibration = self._section("calibration", CalibrationTable)
+        mqtt = self._section("mqtt", MqttSettings)
+        recording = (
+            self._section("recording", RecordingSettings) if "recording" in self.table else None
+        )
+        buses = self._buses()
+        limb = chain or self.partial.get("chain")
+        sources = self._imus(limb, buses)
+        mocap = self._mocap(limb, head)
+        self.faults += _checks.ports(self.seen, buses)
+        self.faults += _checks.can_ids(self.seen)
+        self.faults += _bandwidth.serial_lines(sources)
+        self.faults += _bandwidth.can_buses(sources, buses)
+        self.faults += self._names()
+        if limb is not None:
+            self.faults += _checks.chain(limb)
+        if head is None or chain is None or calibration is None or mqtt is None or self.faults:
+            return None
+        base = mqtt.base or f"jointfit/{head.name}"
+        return Rig(
+            name=head.name,
+            output_rate_hz=head.output_rate_hz,
+            align_mode=head.align_mode,
+            chain=_chain(chain, sources),
+            sources=(*sources, mocap) if mocap is not None else tuple(sources),
+            calibration=_calibration(calibration, mocap),
+            calibration_store=calibration.store,
+            mqtt=mqtt.model_copy(update={"base": base}),
+            recording=recording,
+            table=self.table,
+        )
+
+    def _names(self) -> list[Fault]:
+        """Check the names of topics and folders even where another key of their table is wrong."""
+        faults: list[Fault] = []
+        for section, key, check in (
+            ("rig", "name", _checks.topic_name),
+            ("calibration", "store", _checks.folder_name),
+            ("mqtt", "base", _checks.topic_base),
+        ):
+            table = self.table.get(section)
+            name = table.get(key) if isinstance(table, dict) else None
+            if isinstance(name, str) and (name or key != "base"):
+                faults += check(f"{section}.{key}", name)
+        return faults
+
+    def _section(self, key: str, model: type[Model], *, needed: bool = False) -> Model | None:
+        if key not in self.table and needed:
+            self.faults.append(Fault(f"[{key}]", "this table is missing"))
+            return None
+        return self._validate(key, self.table.get(key, {}), model)
+
+    def _validate(self, key: str, table: object, model: type[Model]) -> Model | None:
+        if not isinstance(table, dict):
+            self.faults.append(Fault(key, "expected a table", table))
+            return None
+        try:  # strict JSON: a string is no number, yet an array is a tuple
+            return model.model_validate_json(json.dumps(table, default=str), strict=True)
+        except ValidationError as error:
+            self.faults += faults_of(error, model, key)
+            self.partial[key] = _partial(table, model, error)
+            return None
+
+    def _buses(self) -> dict[str, CanBusSettings]:
+        tables = self.table.get("can", {})
+        if not isinstance(tables, dict):
+            self.faults.append(Fault("can", "expected tables [can.NAME]", tables))
+            return {}
+        read = {
+            name: self._validate(f"can.{name}", tables[name], CanBusSettings) for name in tables
+        }
+        return {name: bus for name, bus in read.items() if bus is not None}
+
+    def _imus(self, chain: ChainTable | None, buses: Mapping[str, CanBusSettings]) -> list[Source]:
+        tables = self.table.get("imu", [])
+        if not isinstance(tables, list) or not all(isinstance(imu, dict) for imu in tables):
+            self.faults.append(Fault("imu", "expected [[imu]] tables", tables))
+            return []
+        self.faults += _checks.sensors(tables, chain)
+        found = []
+        for at, imu in enumerate(tables, 1):
+            key = f"imu[{imu.get('id', f'#{at}')}]"
+            driver = self._driver(key, imu, ImuSettings)
+            table = self._with_bus(key, imu, buses)
+            settings = self._settings(key, table, driver, ImuSettings)
+            if driver is not None and settings is not None:
+                found.append(_imu_source(imu["driver"], settings, driver))
+            known = settings or self.partial.get(key)
+            if driver is not None and known is not None and known.id is not None:
+                self.seen.append(_imu_source(imu["driver"], known, driver))
+        return found
+
+    def _with_bus(
+        self, key: str, imu: dict[str, Any], buses: Mapping[str, CanBusSettings]
+    ) -> dict[str, Any]:
+        """Put the ``[can.NAME]`` table in the place of its name."""
+        name = imu.get("can")
+        if not isinstance(name, str):
+            return imu
+        if name in buses:
+            return imu | {"can": buses[name].model_dump()}
+        named = self.table.get("can", {})
+        if isinstance(named, dict) and name not in named:
+            text = f"no table [can.{name}]; known: {', '.join(buses) or 'none'}"
+            self.faults.append(Fault(f"{key}.can", text, name, nearest(name, buses)))
+        return imu | {"can": CanBusSettings(channel="unknown").model_dump()}  # told already
+
+    def _driver(
+        self, key: str, table: dict[str, Any], base: type[BaseModel]
+    ) -> type[Driver] | None:
+        name = table.get("driver")
+        if not isinstance(name, str):
+            return None  # missing or no text: the settings model says so
+        try:
+            driver = find_driver(name)
+        except UnknownDriver:
+            self.faults += _checks.known_name(f"{key}.driver", name, driver_names(), "driver")
+            return None
+        except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig, not ours
+            self.faults.append(Fault(f"{key}.driver", f"cannot be loaded: {error!r}", name))
+            return None
+        if not issubclass(driver.Settings, base):
+            what = "motion capture" if base is ImuSettings else "an IMU"
+            self.faults.append(Fault(f"{key}.driver", f"is a driver of {what}", name))
+            return None
+        return driver
+
+    def _settings(
+        self, key: str, table: object, driver: type[Driver] | None, base: type[BaseModel]
+    ) -> Any:
+        """Check with the driver's model; without a driver only the keys that all drivers have."""
+        if driver is not None:
+            return self._validate(key, table, driver.Settings)
+        if isinstance(table, dict):
+            table = {name: value for name, value in table.items() if name in base.model_fields}
+        return self._validate(key, table, base)
+
+    def _mocap(self, chain: ChainTable | None, head: RigTable | None) -> Source | None:
+        table = self.table.get("mocap")
+        if table is None:
+            return None
+        driver = self._driver(MOCAP, table, MocapSettings) if isinstance(table, dict) else None
+        settings = self._settings(MOCAP, table, driver, MocapSettings)
+        known = settings or self.partial.get(MOCAP)
+        if known is not None:
+            self.faults += _checks.markers(known, chain)
+        if settings is None or driver is None or head is None:
+            return None
+        rate = getattr(settings, "rate_hz", None) or head.output_rate_hz
+        return Source(MOCAP, "mocap", table["driver"], rate, None, settings, driver)
+
+
+def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:
+    return Source(settings.id, "imu", name, settings.rate_hz, settings.segment, settings, driver)
+
+
+def _chain(table: ChainTable, sources: Sequence[Source]) -> Chain:
+    return Chain(
+        joints=table.joints,
+        segments=table.segments,
+        sensors=tuple(
+            tuple(source.id for source in sources if source.segment == segment)
+            for segment in table.segments
+        ),
+        left_side=table.side == "left",
+        origin=table.origin_m,
+        lengths=tuple(table.lengths_m.get(segment) for segment in table.segments),
+        proximal=table.proximal,
+        distal=table.distal,
+        static_axes=table.axes == "static",
+    )
+
+
+def _calibration(table: CalibrationTable, mocap: Source | None) -> CalibrationSettings:
+    optical = mocap.settings if mocap is not None else None
+    return CalibrationSettings(
+        method=table.method,
+        static_s=table.static_s,
+        align_s=table.align_s,
+        functional_s=table.functional_s,
+        functional_min_s=table.functional_min_s,
+        center_target_m=table.center_target_mm / 1e3,
+        holdout_share=table.holdout_share,
+        refine_markers=table.refine_markers,
+        learn_online=table.learn_online,
+        markers=dict(optical.markers) if optical is not None else {},
+        rigid_bodies=dict(optical.rigid_body) if optical is not None else {},
+        plate=optical.plate if optical is not None else None,
+    )

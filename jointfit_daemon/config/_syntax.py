@@ -1,0 +1,80 @@
+"""The text of a rig.toml to a table, with every syntax error that can be told apart.
+
+After an error the line is left out and the rest parsed again, so that one slip hides no other.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.config._fault_messages import ConfigError, Fault
+from jointfit_daemon.files.structured_text import DEEPEST, parse_toml, plain_fault, read_text
+from jointfit_daemon.files.text_table import Malformed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_MOST_BYTES = 256 * 1024  # a rig of four sensors has 3 kB, and parsing takes 0.5 s per MB
+_MOST_ERRORS = 20
+_OF_SEVERAL_LINES = ("[", "]", "{", "}", '"""', "'''")
+_AT_LINE = re.compile(r"(.*) \(at line (\d+), column \d+\)", re.DOTALL)
+_DECIMAL_COMMA = re.compile(r"[=\[,]\s*[+-]?\d+,\d+\s*(#.*)?$")
+
+
+def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
+    """Return what could be parsed of a rig.toml, and the syntax errors in the rest.
+
+    Raises
+    ------
+    ConfigError
+        Nothing of the file can be used.
+    """
+    try:
+        text = read_text(path, _MOST_BYTES)
+    except Malformed as error:
+        raise ConfigError(
+            str(path), [Fault("file", str(error).removeprefix(f"{path}: "))]
+        ) from error
+    try:
+        table, faults = _parse(text.split("\n"))
+    except RecursionError as error:
+        fault = Fault("TOML", f"nested more than {DEEPEST} levels deep")
+        raise ConfigError(str(path), [fault]) from error
+    if table is None:
+        raise ConfigError(str(path), faults)
+    if (text_of_fault := plain_fault(table)) is not None:
+        raise ConfigError(str(path), [*faults, Fault("TOML", text_of_fault)])
+    return table, faults
+
+
+def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
+    """Return the table, None if what is left out would make up further faults."""
+    faults: list[Fault] = []
+    last, opened = -1, False
+    while len(faults) < _MOST_ERRORS:
+        try:
+            return parse_toml("\n".join(lines)), faults
+        except ValueError as error:  # an integer of 5000 digits is a plain ValueError
+            found = _AT_LINE.fullmatch(str(error))
+            number = int(found[2]) if found else 0
+            if faults and (found is None or (number == last + 1 and opened)):
+                break  # the line left out was part of a value of several lines
+            if found is None:
+                faults.append(Fault("TOML", str(error)))
+                break
+            line = lines[number - 1].strip()
+            faults.append(Fault(f"line {number}", f"{_lowered(found[1])}{_remedy(line)}", line))
+            if not line or line.startswith("["):
+                break  # its keys would land in another table
+            lines[number - 1], last = "", number
+            opened = any(mark in line for mark in _OF_SEVERAL_LINES)
+    return None, faults
+
+
+def _lowered(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+def _remedy(line: str) -> str:
+    return "; decimals take a point, not a comma" if _DECIMAL_COMMA.search(line) else ""

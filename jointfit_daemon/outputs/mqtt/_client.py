@@ -1,0 +1,173 @@
+"""A small client for tools: watch a daemon over MQTT and send it requests.
+
+Law: no reconnecting; a tool that loses its broker says so and ends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import uuid
+from collections import deque
+from typing import TYPE_CHECKING, Any, Self
+
+import orjson
+
+from jointfit_daemon.outputs.mqtt._connection import BrokerLost, Incoming, MqttConnection, Outgoing
+from jointfit_daemon.outputs.mqtt._secret_files import NoKey, request_key_of
+from jointfit_daemon.outputs.mqtt._signature import signed
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+    from types import TracebackType
+
+    from jointfit_daemon.config import MqttSettings
+
+_UNREAD = 2000  # messages kept for a slow reader
+_LONGEST_BYTES = 1024 * 1024
+"""Limit of incoming packets: the qualities of a calibration fill a tenth of it."""
+_EXPIRY_S = 30  # a request nobody took for so long must not run
+
+
+class NoAnswer(Exception):  # noqa: N818 - named for what happened
+    """No daemon answered the request in time."""
+
+
+class MqttClient:
+    """A connection to the broker of a rig, for as long as the ``async with`` block lasts.
+
+    Parameters
+    ----------
+    settings
+        ``[mqtt]`` of the rig: ``settings.base`` is the daemon to talk to.
+
+    Raises
+    ------
+    BrokerLost
+        On entering, from any method, and from iterating: the broker is not there or went away.
+    """
+
+    def __init__(self, settings: MqttSettings) -> None:
+        self.base = settings.base
+        self.dropped = 0
+        """Messages that came faster than they were read."""
+        self._settings = settings
+        self._connection = MqttConnection(settings, longest_bytes=_LONGEST_BYTES)
+        self._own = uuid.uuid4().hex
+        """Last level of the topics on which this client wants its answers (MQTT 5)."""
+        self._unread: deque[Incoming] = deque()
+        self._arrived = asyncio.Event()
+        self._lost: BrokerLost | None = None
+        self._waiting: dict[str, asyncio.Future[dict[str, Any]]] = {}
+
+    async def __aenter__(self) -> Self:
+        await self._connection.__aenter__()
+        self._reader = asyncio.create_task(self._read(), name="mqtt client")
+        answers = f"{self.base}/bridge/response/+"
+        await self._connection.subscribe([answers, f"{answers}/{self._own}"])
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._reader.cancel()
+        await asyncio.wait([self._reader])
+        await self._connection.__aexit__(None, None, None)
+
+    async def subscribe(self, *topics: str) -> None:
+        """Subscribe to `topics` below the base, as ``pose`` or ``device/+/availability``."""
+        await self._connection.subscribe([f"{self.base}/{topic}" for topic in topics])
+
+    async def messages(self) -> AsyncIterator[tuple[str, Any]]:
+        """Yield topic below the base, and decoded payload, of every message but responses."""
+        while True:
+            while self._unread:
+                message = self._unread.popleft()
+                yield message.topic.removeprefix(f"{self.base}/"), _decoded(message.payload)
+            if self._lost is not None:
+                raise self._lost
+            self._arrived.clear()
+            await self._arrived.wait()
+
+    async def request(
+        self, command: str, arguments: Mapping[str, object], *, timeout_s: float = 5.0
+    ) -> dict[str, Any]:
+        """Send a request and return its answer: ``status``, ``data`` and, on refusal, ``error``.
+
+        It is signed if the rig names a key.
+
+        Raises
+        ------
+        NoAnswer
+            Nobody answered within `timeout_s`, or the key to sign with cannot be read.
+        """
+        transaction = uuid.uuid4().hex
+        answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._waiting[transaction] = answer
+        topic = f"{self.base}/bridge/request/{command}"
+        try:
+            payload = self._payload(topic, {**arguments, "transaction": transaction})
+            if self._lost is not None:
+                raise self._lost
+            await self._connection.publish(
+                Outgoing(
+                    topic,
+                    payload,
+                    1,
+                    expiry_s=_EXPIRY_S,
+                    response_topic=f"{self.base}/bridge/response/{command}/{self._own}",
+                )
+            )
+            async with asyncio.timeout(timeout_s):
+                return await answer
+        except TimeoutError as error:
+            text = (
+                f"no daemon answers on {topic}: is jointfitd running, with this base? It ignores "
+                "requests beyond ten a second: is somebody else sending many?"
+            )
+            raise NoAnswer(text) from error
+        finally:
+            del self._waiting[transaction]
+            answer.cancel()
+
+    def _payload(self, topic: str, request: dict[str, object]) -> bytes:
+        try:
+            key = request_key_of(self._settings)
+        except NoKey as missing:
+            raise NoAnswer(f"cannot sign the request: {missing}") from missing
+        return orjson.dumps(request if key is None else signed(key, topic, request))
+
+    async def _read(self) -> None:
+        try:
+            async for message in self._connection.messages():
+                self._take(message)
+        except BrokerLost as error:
+            self._lost = error
+            for answer in self._waiting.values():
+                if not answer.done():
+                    answer.set_exception(error)
+            self._arrived.set()
+
+    def _take(self, message: Incoming) -> None:
+        if message.topic.startswith(f"{self.base}/bridge/response/"):
+            reply = _decoded(message.payload)
+            key = reply.get("transaction") if isinstance(reply, dict) else None
+            answer = self._waiting.get(key) if isinstance(key, str) else None
+            if answer is not None and not answer.done():
+                answer.set_result(reply)
+            return
+        if len(self._unread) >= _UNREAD:
+            self._unread.popleft()
+            self.dropped += 1
+        self._unread.append(message)
+        self._arrived.set()
+
+
+def _decoded(payload: bytes) -> Any:
+    """Return the JSON value of `payload`; None where it is none."""
+    try:
+        return orjson.loads(payload)
+    except orjson.JSONDecodeError:
+        return None

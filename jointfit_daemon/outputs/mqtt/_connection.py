@@ -1,0 +1,481 @@
+"""One connection to an MQTT broker. Law: the only module of the daemon that knows aiomqtt and paho.
+
+Nothing of theirs leaves it: whatever goes wrong with a broker is ``BrokerLost``. A connection is
+used once; whoever wants another makes another.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import aiomqtt
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from jointfit_daemon.outputs.mqtt._error_messages import broker_fault, session_fault
+from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
+from jointfit_daemon.outputs.mqtt._secret_files import password_of
+from jointfit_daemon.outputs.mqtt._tls import TlsFault, tls_context, tls_remedy
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Sequence
+    from types import TracebackType
+
+    from jointfit_daemon.config import MqttSettings
+
+PAYLOAD_VERSION = 1
+"""Raised when a key is removed or renamed or changes its unit or meaning."""
+
+KEEPALIVE_S = 5  # a frozen broker is noticed in half as much again
+ANSWER_S = 3.0  # a broker that takes longer over one packet is no use
+SUBSCRIBED_S = 30.0
+"""Limit of a subscription: a broker may send thousands of stored messages before it confirms."""
+GOODBYE_S = 1.0  # leaving is worth that much
+_Properties: Any = (
+    Properties  # its constructor is not annotated, its attributes are made at run time
+)
+
+_INCOMING = 64  # requests are rare; a flood of them must not grow
+_REFUSED = 0x80  # MQTT reason codes from here on are refusals
+_TAKEN_OVER = 0x8E  # reason code "session taken over"
+_CLOSED_EARLY = "the broker closed the connection during the handshake"
+_NOT_STORED = 2
+"""MQTT 5 retain handling: the broker sends no stored message at a subscription."""
+LONGEST_PACKET_BYTES = 32 * 1024
+"""Limit of incoming packets where none is given: a request, or a pose of seventy segments."""
+
+_SOCKET_OPTIONS = (
+    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # else stalls of 40 ms
+    (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * KEEPALIVE_S),
+    (socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024),  # what hides in the kernel is lost unseen
+)
+
+
+class BrokerLost(Exception):  # noqa: N818 - named for what happened
+    """The broker is absent, refuses, fell silent or went away: worth another try."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """One message to publish. The properties travel with MQTT 5 only."""
+
+    topic: str
+    payload: bytes
+    qos: int = 0
+    retain: bool = False
+    expiry_s: int | None = None
+    """The broker drops it, undelivered, after this long."""
+    response_topic: str | None = None
+    correlation: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """One message received."""
+
+    topic: str
+    payload: bytes
+    retained: bool
+    response_topic: str | None = None
+    correlation: bytes | None = None
+
+
+def stop_if_cancelled() -> None:
+    """Raise the cancellation that Python 3.11's ``wait_for``, inside aiomqtt, may have lost.
+
+    It prefers a result that comes in the same instant. To be called in leaf tasks only: a task
+    that held a failed TaskGroup may look cancelled for ever.
+    """
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+class MqttConnection:
+    """A connection for as long as the ``async with`` block lasts.
+
+    Leaving by cancellation publishes `farewell` and disconnects in order; leaving by any other
+    error closes the socket at once, so that the broker publishes `will`.
+
+    Parameters
+    ----------
+    settings
+        Where, as whom, with which version.
+    identifier
+        Client id; a fixed one lets a new connection take over from its own dead predecessor.
+    will, farewell
+        Published by the broker when we vanish, and by us when we leave.
+    longest_bytes
+        Limit of incoming packets: announced to the broker with MQTT 5, and enforced here.
+    admit
+        Called with topic and retain flag of each incoming message before it is decoded, which
+        costs 100 µs; False drops it. Only for subscriptions with `live`.
+
+    Raises
+    ------
+    BrokerLost
+        From any method: the message says what was tried.
+    """
+
+    def __init__(
+        self,
+        settings: MqttSettings,
+        identifier: str | None = None,
+        *,
+        will: Outgoing | None = None,
+        farewell: Outgoing | None = None,
+        longest_bytes: int = LONGEST_PACKET_BYTES,
+        admit: Callable[[str, bool], bool] | None = None,
+    ) -> None:
+        self._settings, self._identifier = settings, identifier
+        self._will, self._farewell = will, farewell
+        self._longest_bytes, self._admit = longest_bytes, admit
+        self._modern = settings.version == "5"
+        self._cached: dict[int | None, Any] = {}
+        self._troubles = _Troubles()
+
+    async def __aenter__(self) -> Self:
+        self._client = await self._new_client()
+        task = asyncio.current_task()
+        asked_before = task.cancelling() if task else 0  # by others, of tasks that go on
+        try:
+            await self._client.__aenter__()
+            if task and task.cancelling() > asked_before:
+                stop_if_cancelled()
+        except aiomqtt.MqttError as error:
+            self._client.abandon()
+            why = f"{broker_fault(error)}{self._hint(error)}"
+            raise BrokerLost(f"{self._place()}: {why}") from error
+        except BaseException:
+            self._client.abandon()
+            raise
+        return self
+
+    @property
+    def taken_over(self) -> bool:
+        """Whether the broker ended it because another client connected with the same id."""
+        return self._client.taken_over
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None or issubclass(kind, asyncio.CancelledError):
+                await self._leave()
+        finally:
+            self._client.abandon()
+
+    async def _leave(self) -> None:
+        """Say farewell and disconnect, each bounded; a clean disconnect takes the will back."""
+        self._client.timeout = GOODBYE_S
+        with contextlib.suppress(aiomqtt.MqttError, OSError):
+            if self._farewell is not None:
+                await self._publish(self._farewell)
+            await self._client.__aexit__(None, None, None)
+
+    @property
+    def oversized(self) -> int:
+        """Incoming packets that were dropped because they were over the limit."""
+        return self._client.oversized
+
+    async def publish(self, message: Outgoing) -> str | None:
+        """Publish; at QoS 1 returns when the broker has it, at QoS 0 when the kernel has it.
+
+        Returns
+        -------
+        str or None
+            The broker's reason for refusing the message, as far as it gives one: with MQTT 5 and
+            at QoS 1.
+        """
+        self._client.refusal = None
+        try:
+            await self._publish(message)
+        except (aiomqtt.MqttError, ValueError) as error:
+            why = session_fault(error)
+            raise BrokerLost(f"{self._place()}: {message.topic}: {why}") from error
+        stop_if_cancelled()
+        return self._client.refusal
+
+    async def _publish(self, message: Outgoing) -> None:
+        await self._client.publish(
+            message.topic,
+            message.payload,
+            message.qos,
+            message.retain,
+            self._properties(message) if self._modern else None,
+        )
+
+    async def subscribe(self, topics: Sequence[str], *, live: bool = False) -> list[str]:
+        """Subscribe and return the topics that the broker refused.
+
+        With MQTT 5 a message that its sender wants retained arrives marked so, even fresh.
+
+        Parameters
+        ----------
+        topics
+            Topics or patterns.
+        live
+            At QoS 0 and, with MQTT 5, without the messages that the broker has stored; else at
+            QoS 1 and with them.
+        """
+        qos = 0 if live else 1
+        handling = _NOT_STORED if live else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+        options = SubscribeOptions(qos=qos, retainAsPublished=True, retainHandling=handling)
+        asked: list[Any] = [(topic, options if self._modern else qos) for topic in topics]
+        try:
+            codes = await self._client.subscribe(asked, timeout=SUBSCRIBED_S)
+        except aiomqtt.MqttError as error:
+            why = session_fault(error)
+            raise BrokerLost(f"{self._place()}: cannot subscribe: {why}") from error
+        stop_if_cancelled()
+        values = [code if isinstance(code, int) else int(code.value) for code in codes]
+        return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
+
+    async def unsubscribe(self, topic: str) -> None:
+        """Unsubscribe from one topic."""
+        try:
+            await self._client.unsubscribe(topic)
+        except aiomqtt.MqttError as error:
+            why = session_fault(error)
+            raise BrokerLost(f"{self._place()}: cannot unsubscribe: {why}") from error
+        stop_if_cancelled()
+
+    async def messages(self) -> AsyncIterator[Incoming]:
+        """Yield what arrives; beyond 64 unread messages the newest are discarded."""
+        arriving = self._client.messages
+        while True:
+            try:
+                message = await anext(arriving)
+            except aiomqtt.MqttError as error:
+                why = broker_fault(error.__cause__ or error)
+                raise BrokerLost(f"{self._place()}: {why}") from error
+            except OSError as error:  # what the reader met
+                raise BrokerLost(f"{self._place()}: {broker_fault(error)}") from error
+            stop_if_cancelled()
+            yield Incoming(
+                message.topic.value,
+                bytes(message.payload),
+                retained=bool(message.retain),
+                response_topic=getattr(message.properties, "ResponseTopic", None),
+                correlation=getattr(message.properties, "CorrelationData", None),
+            )
+
+    # --- making one --------------------------------------------------------------------------
+
+    async def _new_client(self) -> _Client:
+        settings, will = self._settings, self._will
+        context = None
+        if settings.tls is not None:
+            try:  # in a thread: reading the system's certificates takes tens of milliseconds
+                context = await asyncio.to_thread(tls_context, settings.tls)
+            except TlsFault as fault:
+                raise BrokerLost(f"{self._place()}: [mqtt.tls]: {fault}") from fault
+
+        limit: Any = None
+        if self._modern:
+            limit = _Properties(PacketTypes.CONNECT)
+            limit.MaximumPacketSize = self._longest_bytes
+        version = aiomqtt.ProtocolVersion.V5 if self._modern else aiomqtt.ProtocolVersion.V311
+        return _Client(
+            settings.host,
+            settings.tcp_port,
+            username=settings.username,
+            password=password_of(settings),
+            identifier=self._identifier,
+            protocol=version,
+            will=None
+            if will is None
+            else aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
+            clean_session=None if self._modern else True,
+            timeout=ANSWER_S,
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=_INCOMING,
+            tls_context=context,
+            logger=self._troubles,
+            properties=limit,
+            longest_bytes=self._longest_bytes,
+            admit=self._admit,
+        )
+
+    def _place(self) -> str:
+        return f"broker {self._settings.host}:{self._settings.tcp_port}"
+
+    def _hint(self, error: Exception) -> str:
+        met = self._troubles.last or error.__cause__ or error.__context__
+        if remedy := tls_remedy(met, self._settings, established=self._client.opened):
+            return remedy
+        if self._modern and ("timed out" in str(error) or _CLOSED_EARLY in str(error)):
+            return (
+                " (no answer to MQTT 5; if this broker is older or keeps MQTT 5 on another port, "
+                'set version = "3.1.1" in [mqtt], or that port)'
+            )
+        return ""
+
+    def _properties(self, message: Outgoing) -> Any:
+        plain = message.response_topic is None and message.correlation is None
+        if plain and (cached := self._cached.get(message.expiry_s)) is not None:
+            return cached  # building one costs 40 us
+        made: Any = _Properties(PacketTypes.PUBLISH)
+        made.ContentType = "application/json"
+        made.UserProperty = ("v", str(PAYLOAD_VERSION))
+        if message.expiry_s is not None:
+            made.MessageExpiryInterval = message.expiry_s
+        if message.response_topic is not None:
+            made.ResponseTopic = message.response_topic
+        if message.correlation is not None:
+            made.CorrelationData = message.correlation
+        if plain:
+            self._cached[message.expiry_s] = made
+        return made
+
+
+class _Troubles(logging.Logger):
+    """Takes what paho would log, and keeps the last exception of a socket.
+
+    A broker that does not accept our certificate says so after the handshake (TLS 1.3), where paho
+    logs the alert and aiomqtt only sees that time passes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("mqtt", logging.ERROR)
+        self.last: OSError | None = None
+
+    def handle(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
+        """Keep the exception of `record`, if it has one."""
+        for value in record.args if isinstance(record.args, tuple) else ():
+            if isinstance(value, OSError):
+                self.last = value
+        if record.exc_info:  # a callback of ours failed: a bug
+            logging.getLogger(__name__).handle(record)
+
+
+class _Client(aiomqtt.Client):
+    """aiomqtt's client with a limit on incoming packets and faster notice of failures.
+
+    It can be dropped in the middle of connecting, fails at once if the connection breaks during
+    the handshake, and keeps the reason for which the broker refused a message.
+    """
+
+    _abandoned = False
+    taken_over = False
+
+    def __init__(
+        self,
+        *arguments: Any,
+        longest_bytes: int,
+        admit: Callable[[str, bool], bool] | None,
+        **options: Any,
+    ) -> None:
+        super().__init__(*arguments, **options)
+        self.refusal: str | None = None
+        """Why the broker refused the last message; one is under way at a time."""
+        self._longest_bytes, self._admit = longest_bytes, admit
+        self._limited: PacketLimitSocket | None = None
+        self._disconnected.add_done_callback(self._fail_handshake)
+
+    @property
+    def opened(self) -> bool:
+        """Whether a socket was opened, and its TLS handshake, if any, completed."""
+        return self._limited is not None
+
+    @property
+    def oversized(self) -> int:
+        """Incoming packets that were over the limit."""
+        return 0 if self._limited is None else self._limited.oversized
+
+    async def __aenter__(self) -> Self:  # type: ignore[explicit-override]  # Python 3.12's
+        """Connect; a connection that ended with its acceptance is no connection.
+
+        aiomqtt forgets such an end, and would wait for messages for ever.
+        """
+        ended = self._disconnected
+        await super().__aenter__()
+        if ended.done():
+            raise aiomqtt.MqttError(_CLOSED_EARLY)
+        return self
+
+    def abandon(self) -> None:
+        """Close whatever is open, without a word; else a failed connect keeps it for seconds."""
+        self._abandoned = True
+        if self._misc_task is not None:
+            self._misc_task.cancel()
+        opened: Any = self._client.socket()
+        if opened is not None and opened.fileno() >= 0:
+            self._loop.remove_reader(opened.fileno())
+            self._loop.remove_writer(opened.fileno())
+            opened.close()
+
+    def _on_socket_open(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, sock: Any
+    ) -> None:
+        """Run in the thread that connects, perhaps after the connection was given up."""
+        if self._abandoned:
+            sock.close()
+            return
+        if isinstance(sock, socket.socket):
+            for option in _SOCKET_OPTIONS:  # aiomqtt sets them on plain sockets only
+                sock.setsockopt(*option)
+        self._limited = PacketLimitSocket(sock, self._longest_bytes, self._admit)
+        client._sock = self._limited  # noqa: SLF001 - paho has no other way in
+        super()._on_socket_open(client, userdata, sock)
+
+    def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
+    ) -> None:
+        """Remember the reason: of several tasks that fail, the first may know none.
+
+        A connection that ends before its acceptance fails now; aiomqtt would wait for a timeout.
+        """
+        self.taken_over |= getattr(reason_code, "value", None) == _TAKEN_OVER
+        self._fail_handshake()
+        super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
+    def _fail_handshake(self, ended: asyncio.Future[None] | None = None) -> None:
+        if ended is not None and not ended.cancelled():
+            ended.exception()  # seen: aiomqtt reads it only where messages are awaited
+        if not self._connected.done():
+            self._connected.set_exception(aiomqtt.MqttError(_CLOSED_EARLY))
+
+    def _on_publish(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, mid: int, reason_code: Any, properties: Any
+    ) -> None:
+        if reason_code.is_failure:
+            self.refusal = str(reason_code)
+        super()._on_publish(client, userdata, mid, reason_code, properties)
+
+
+class LoopNoise:
+    """Loop exception handler that drops the two complaints aiomqtt causes at a disconnect.
+
+    They are an ``MqttError`` in a future that nobody awaits any more, and a bad file descriptor in
+    a callback on a socket just closed. They are counted; everything else is told as always.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Judge one complaint of the loop."""
+        error, message = context.get("exception"), str(context.get("message", ""))
+        late = isinstance(error, aiomqtt.MqttError) and "never retrieved" in message
+        closed = isinstance(error, OSError) and error.errno == 9 and _is_mqtt(context)  # noqa: PLR2004 - EBADF
+        if late or closed:
+            self.dropped += 1
+        else:
+            loop.default_exception_handler(context)
+
+
+def _is_mqtt(context: dict[str, Any]) -> bool:
+    """Return whether a function of aiomqtt is called, or passed on, by the handle of `context`."""
+    handle = context.get("handle")
+    functions = (getattr(handle, "_callback", None), *(getattr(handle, "_args", None) or ()))
+    return any(str(getattr(f, "__module__", "")).startswith("aiomqtt") for f in functions)

@@ -1,0 +1,96 @@
+"""What devices and servers send cannot forge lines of the log or escapes on a terminal."""
+
+from __future__ import annotations
+
+import io
+import logging
+from typing import TYPE_CHECKING, Any
+
+import orjson
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.outputs.log import (
+    LevelFormatter,
+    PrintableRecord,
+    about,
+    printable,
+    printable_data,
+)
+from jointfit_daemon.outputs.log._printable_text import LONGEST
+from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.pipeline.events import DeviceInfo, Notice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+FORGED = "MTi-3\n2026-11-22 ERROR jointfitd: the leg fell off\r\x1b[2J\u202e\u2028x"
+
+
+@given(st.text())
+def test_any_text_becomes_one_printable_line(text: str) -> None:
+    found = printable(text)
+    assert found.isprintable()
+    assert len(found.splitlines()) <= 1
+    assert printable(found) == found
+
+
+def test_long_text_is_cut_and_nested_data_bounded() -> None:
+    assert len(printable("x" * 10_000)) == LONGEST
+    nested: Any = "end"
+    for _ in range(500):
+        nested = [nested]
+    assert len(orjson.dumps(printable_data({"a": nested, "b": 1.5}))) < 2 * LONGEST
+
+
+@pytest.fixture
+def printable_records() -> Iterator[None]:
+    before = logging.getLogRecordFactory()
+    logging.setLogRecordFactory(PrintableRecord)
+    yield
+    logging.setLogRecordFactory(before)
+
+
+@pytest.mark.usefixtures("printable_records")
+@pytest.mark.parametrize(
+    "formatter", [logging.Formatter("%(levelname)s %(message)s"), LevelFormatter()]
+)
+def test_a_name_of_a_device_makes_no_line_of_the_log(formatter: logging.Formatter) -> None:
+    stream = io.StringIO()
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(formatter)
+    log = logging.Logger("device")  # noqa: LOG001 - one of its own
+    log.addHandler(handler)
+    log.warning("S1: %s", FORGED, extra=about("device", FORGED))
+    lines = stream.getvalue().splitlines()
+    assert all(
+        line.lstrip("<4>").startswith(("WARNING S1", "device: S1", "  | ")) for line in lines
+    )
+    assert "\x1b" not in stream.getvalue()
+
+
+class _Outbox:
+    """Keeps what is published."""
+
+    def __init__(self) -> None:
+        self.payloads: list[bytes] = []
+
+    def retain(self, _: str, payload: bytes) -> None:
+        self.payloads.append(payload)
+
+    event = retain
+
+
+def test_events_and_device_info_hold_no_control_characters(table: dict[str, Any]) -> None:
+    outbox: Any = _Outbox()
+    reporter = Reporter(parse_rig(table), outbox)
+    outbox.payloads.clear()
+    reporter.handle(Notice(1, "device", "S1", FORGED, "warning", {"name": [FORGED]}))
+    reporter.handle(DeviceInfo("S1", {"model": FORGED}))
+    event, info = map(orjson.loads, outbox.payloads)
+    assert all(
+        text.isprintable() for text in (event["text"], *event["data"]["name"], info["model"])
+    )
+    assert "the leg fell off" in event["text"]

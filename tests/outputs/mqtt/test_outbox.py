@@ -1,0 +1,124 @@
+"""What waits for the broker is bounded, coalesced and counted."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.outputs.mqtt import Outbox
+
+LIFE = "base/bridge/state"
+
+actions = st.lists(
+    st.tuples(
+        st.sampled_from(["retain", "event", "stream", "send", "reconnect"]),
+        st.sampled_from(["a", "b", LIFE]),
+        st.binary(max_size=2),
+    ),
+    max_size=60,
+)
+
+
+async def drain(outbox: Outbox) -> list[tuple[str, bytes, bool]]:
+    sent = []
+    while outbox.queued:
+        message, done = await outbox.next()
+        done()
+        sent.append((message.topic, message.payload, message.retain))
+    return sent
+
+
+async def test_state_is_sent_once_with_its_last_value() -> None:
+    outbox = Outbox(LIFE)
+    outbox.retain("a", b"1")
+    outbox.retain("a", b"2")
+    assert await drain(outbox) == [("a", b"2", True)]
+    outbox.retain("a", b"2")
+    assert outbox.queued == 0
+
+
+async def test_a_value_that_changes_while_it_is_sent_is_sent_again() -> None:
+    outbox = Outbox(LIFE)
+    outbox.retain("a", b"1")
+    _, done = await outbox.next()
+    outbox.retain("a", b"2")
+    done()
+    assert await drain(outbox) == [("a", b"2", True)]
+
+
+async def test_after_a_reconnect_all_state_goes_again_and_life_goes_last() -> None:
+    outbox = Outbox(LIFE)
+    for topic in ("z", LIFE, "a"):
+        outbox.retain(topic, b"1")
+    await drain(outbox)
+    outbox.reconnected()
+    assert [topic for topic, _, _ in await drain(outbox)] == ["z", "a", LIFE]
+
+
+async def test_streams_drop_the_oldest_and_count() -> None:
+    outbox = Outbox(LIFE)
+    for number in range(1000):
+        outbox.stream("pose", str(number).encode())
+    sent = await drain(outbox)
+    assert len(sent) + outbox.dropped == 1000
+    assert sent[-1][1] == b"999"
+    assert [int(payload) for _, payload, _ in sent] == list(range(1000 - len(sent), 1000))
+
+
+async def test_a_flood_of_poses_pushes_no_event_out() -> None:
+    outbox = Outbox(LIFE)
+    outbox.event("bridge/response/calibrate", b"answer")
+    for _ in range(1000):
+        outbox.stream("pose", b"")
+    assert (await drain(outbox))[0][1] == b"answer"
+
+
+async def test_what_was_late_before_a_reconnect_is_dropped_and_counted() -> None:
+    outbox = Outbox(LIFE)
+    outbox.stream("pose", b"old")
+    outbox.event("event", b"kept")
+    outbox.reconnected()
+    assert [payload for _, payload, _ in await drain(outbox)] == [b"kept"]
+    assert outbox.dropped == 1
+
+
+async def test_a_cleared_topic_is_sent_empty_once_and_forgotten() -> None:
+    outbox = Outbox(LIFE)
+    outbox.retain("device/S1/info", b"x")
+    await drain(outbox)
+    outbox.retain("device/S1/info", b"")
+    assert await drain(outbox) == [("device/S1/info", b"", True)]
+    outbox.reconnected()
+    assert await drain(outbox) == []
+
+
+@given(actions)
+async def test_every_message_is_sent_or_waits_or_is_counted(
+    script: list[tuple[str, str, bytes]],
+) -> None:
+    outbox, given_out, sent, wanted = Outbox(LIFE), 0, 0, {}
+    for action, topic, payload in script:
+        if action == "retain":
+            wanted[topic] = payload
+            outbox.retain(topic, payload)
+        elif action == "reconnect":
+            outbox.reconnected()
+        elif action != "send":
+            given_out += 1
+            getattr(outbox, action)(topic, payload)
+        elif outbox.queued:
+            message, done = await outbox.next()
+            done()
+            sent += not message.retain
+    at_broker = {}
+    outbox.reconnected()
+    while outbox.queued:
+        message, done = await outbox.next()
+        done()
+        sent += not message.retain
+        if message.retain:
+            at_broker[message.topic] = message.payload
+    assert sent + outbox.dropped == given_out
+    assert {topic: value for topic, value in wanted.items() if value} == {
+        topic: value for topic, value in at_broker.items() if value
+    }

@@ -1,0 +1,275 @@
+"""The payloads of docs/mqtt.md, to the letter, and what may never be in one."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import orjson
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import JointAngles, JointState, LimbState, SegmentState
+from jointfit_daemon.outputs.mqtt import Outbox
+from jointfit_daemon.outputs.payloads import Reporter, encode_pose
+from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
+from jointfit_daemon.pipeline.events import (
+    CalibrationProgress,
+    CalibrationStatus,
+    DeviceInfo,
+    DeviceStatus,
+    Notice,
+    Reply,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+UNITS = {"deg", "m", "s", "ms", "us", "hz", "ppm", "pct", "bytes"}
+
+KNEE = JointState(
+    "knee",
+    (0.0210, 0.1040, 0.4810),
+    0.00512,
+    JointAngles(math.radians(28.314), math.radians(-1.92), math.radians(3.4)),
+    math.radians(151.7),
+    math.radians(1.4),
+    JointAngles(math.radians(120.004), math.radians(-3.0), 0.0),
+)
+STATE = LimbState(
+    seq=184211,
+    t_ns=5_000_123_000,
+    completed_ns=5_004_000_000,
+    mode="imu",
+    sync="locked",
+    flags=(),
+    segments=(
+        SegmentState("thigh", (0.9914, 0.1276, 0.0094, -0.0251), math.radians(0.9), ("S1", "S2")),
+        SegmentState("shank", None, None, ()),
+    ),
+    joints=(JointState("hip", (0.0, 0.0, 0.912), 0.006), KNEE, JointState("ankle", None, None)),
+)
+
+
+def bent(alpha_deg: float, beta_deg: float, gamma_deg: float) -> LimbState:
+    """Return the state with a shank turned against the thigh by Rz(gamma) Ry(beta) Rx(alpha)."""
+    turn = Rotation.from_euler("ZYX", [gamma_deg, beta_deg, alpha_deg], degrees=True)
+    thigh = Rotation.from_quat([0.0094, -0.0251, 0.1276, 0.9914])
+    q = [tuple(r.as_quat(scalar_first=True).tolist()) for r in (thigh, thigh * turn)]
+    segments = tuple(
+        one._replace(q_world_segment=turned) for one, turned in zip(STATE.segments, q, strict=True)
+    )
+    return STATE._replace(segments=segments)
+
+
+def test_a_pose_is_this_text() -> None:
+    pose = encode_pose(STATE, 1_795_250_055_351_700_000, 5_007_523_000)
+    assert json.loads(pose) == {
+        "v": 1,
+        "seq": 184211,
+        "t_us": 1795250060351823,
+        "completed_us": 1795250060355700,
+        "mono_us": 5000123,
+        "age_ms": 7.4,
+        "mode": "imu",
+        "sync": "locked",
+        "flags": [],
+        "segments": {
+            "thigh": {"q": [0.9914, 0.1276, 0.0094, -0.0251], "sd_deg": 0.9, "used": ["S1", "S2"]},
+            "shank": {"q": None, "sd_deg": None, "used": []},
+        },
+        "joints": {
+            "hip": {"p_m": [0.0, 0.0, 0.912], "sd_m": 0.006},
+            "knee": {
+                "p_m": [0.021, 0.104, 0.481],
+                "sd_m": 0.0051,
+                "flexion_deg": 28.31,
+                "adduction_deg": -1.92,
+                "rotation_deg": 3.4,
+                "inner_deg": 151.7,
+                "sd_deg": 1.4,
+                "flexion_deg_s": 120.0,
+                "adduction_deg_s": -3.0,
+                "rotation_deg_s": 0.0,
+                "patent": None,  # the shank is unknown
+            },
+            "ankle": {"p_m": None, "sd_m": None},
+        },
+    }
+
+
+def test_a_joint_is_scalars_only() -> None:
+    assert json.loads(encode_joint(bent(-30.0, 0.0, 0.0), 1, 7)) == {
+        "v": 1, "t_us": 7, "x_m": 0.021, "y_m": 0.104, "z_m": 0.481, "sd_m": 0.0051,
+        "flexion_deg": 28.31, "adduction_deg": -1.92, "rotation_deg": 3.4, "inner_deg": 151.7,
+        "sd_deg": 1.4, "flexion_deg_s": 120.0, "adduction_deg_s": -3.0, "rotation_deg_s": 0.0,
+        "patent_alpha_deg": -30.0, "patent_beta_deg": 0.0, "patent_gamma_deg": 0.0,
+        "patent_joint_deg": 150.0, "patent_gimbal": False,
+    }  # fmt: skip
+
+
+def test_a_joint_keeps_its_keys_while_its_angles_are_unknown() -> None:
+    known = json.loads(encode_joint(bent(-30.0, 0.0, 0.0), 1, 7))
+    unknown = json.loads(encode_joint(STATE, 1, 7))
+    assert list(known) == list(unknown)
+    assert [key for key, value in unknown.items() if value is None] == [
+        "patent_alpha_deg", "patent_beta_deg", "patent_gamma_deg", "patent_joint_deg",
+        "patent_gimbal",
+    ]  # fmt: skip
+
+
+def test_the_patents_angles_stand_beside_ours() -> None:
+    joints = json.loads(encode_pose(bent(-50.0, 12.0, 7.0), 0, 0))["joints"]
+    assert joints["knee"]["patent"] == {
+        "alpha_deg": -50.0, "beta_deg": 12.0, "gamma_deg": 7.0, "joint_deg": 130.0, "gimbal": False,
+    }  # fmt: skip
+    assert "patent" not in joints["hip"]
+    assert "patent" not in joints["ankle"]
+
+
+def test_where_the_patents_outer_angles_lock_alpha_takes_all_and_the_block_says_so() -> None:
+    found = json.loads(encode_pose(bent(-20.0, 90.0, 15.0), 0, 0))["joints"]["knee"]["patent"]
+    assert found == {
+        "alpha_deg": -35.0, "beta_deg": 90.0, "gamma_deg": 0.0, "joint_deg": 145.0, "gimbal": True,
+    }  # fmt: skip
+
+
+def test_an_unknown_joint_is_null_not_zero() -> None:
+    assert json.loads(encode_joint(STATE, 2, 7)) == {
+        "v": 1, "t_us": 7, "x_m": None, "y_m": None, "z_m": None, "sd_m": None,
+    }  # fmt: skip
+
+
+@example(1.797693134862316e304)  # finite, and not in hundredths of a degree
+@given(st.floats(allow_nan=True, allow_infinity=True))
+def test_no_number_json_does_not_know_gets_out(value: float) -> None:
+    joint = JointState("knee", (value, value, value), value, JointAngles(value, value, value))
+    pose = encode_pose(STATE.__class__(1, 0, 0, "imu", "locked", (), (), (joint,)), 0, 0)
+    json.loads(pose, parse_constant=lambda word: pytest.fail(f"{word} in a pose"))
+
+
+def test_integers_a_browser_would_round_and_surrogates_end_nothing() -> None:
+    payload = {"t_ns": 2**53 + 1, "data": {"name": "a\udcff", "ticks": (-(2**60), 5, True)}}
+    assert orjson.loads(encode(payload)) == {
+        "t_ns": None,
+        "data": {"name": "a?", "ticks": [None, 5, True]},
+    }
+
+
+def test_numpy_and_named_tuples_are_written_as_they_are() -> None:
+    payload = encode({"a": np.float64(0.5), "b": np.arange(2), "c": JointAngles(1, 2, 3)})
+    assert payload == b'{"a":0.5,"b":[0,1],"c":[1,2,3]}'
+
+
+# --- the reporter -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def outbox() -> Outbox:
+    return Outbox("b/bridge/state")
+
+
+async def sent(outbox: Outbox) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    while outbox.queued:
+        message, done = await outbox.next()
+        done()
+        text = orjson.loads(message.payload) if message.payload else None
+        found.setdefault(message.topic.removeprefix("b/"), []).append(text)
+    return found
+
+
+def rig_table(table: dict[str, Any], **mqtt: Any) -> dict[str, Any]:
+    return table | {"mqtt": {"base": "b", **mqtt}}
+
+
+def numbers(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from numbers(inner, name)
+    elif isinstance(value, float):
+        yield key, value
+
+
+async def test_ten_seconds_of_poses_are_decimated_as_promised(
+    table: dict[str, Any], outbox: Outbox
+) -> None:
+    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    await sent(outbox)
+    counts: dict[str, int] = {}
+    for number in range(1000):
+        t_ns = 3_000_000_000 + number * 10_000_000
+        reporter.handle(
+            LimbState(number, t_ns, t_ns, "imu", "locked", (), STATE.segments, STATE.joints)
+        )
+        for topic, payloads in (await sent(outbox)).items():
+            counts[topic] = counts.get(topic, 0) + len(payloads)
+    assert counts == {
+        "pose": 1000, "pose/ui": 100, "joint/hip": 10, "joint/knee": 10, "joint/ankle": 10,
+    }  # fmt: skip
+
+
+async def test_devices_are_absent_until_heard_and_cleared_when_gone(
+    table: dict[str, Any], outbox: Outbox
+) -> None:
+    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    reporter.handle(DeviceStatus("S1", online=True))
+    reporter.handle(DeviceInfo("S2", {"model": "fake"}))
+    found = await sent(outbox)
+    assert found["device/S1/availability"] == [{"v": 1, "state": "online"}]
+    assert found["device/S2/availability"] == [{"v": 1, "state": "offline"}]
+    assert found["device/S2/info"] == [{"v": 1, "model": "fake"}]
+    del table["imu"][1]
+    reporter.configure(parse_rig(rig_table(table)))
+    found = await sent(outbox)
+    assert found["device/S2/availability"] == [None]
+    assert found["device/S2/info"] == [None]
+    assert "device/S1/availability" not in found
+
+
+async def test_changes_of_state_go_where_the_contract_says(
+    table: dict[str, Any], outbox: Outbox
+) -> None:
+    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    reporter.handle(Notice(0, "device", "S1", "streaming"))
+    reporter.handle(CalibrationStatus(0, "calibrated", "done", 3, {"rms_m": 0.004}))
+    reporter.handle(CalibrationProgress(0, "functional", 0.5, "keep moving", {"arc_deg": 40.0}))
+    reporter.health({"devices": {}, "process": {"cpu_pct": 3.0}})
+    reporter.log_line("warning", "x", "hot", 2)
+    found = await sent(outbox)
+    device, calibration = found["bridge/event"]
+    assert (device["kind"], device["id"], device["text"]) == ("device", "S1", "streaming")
+    assert (calibration["kind"], calibration["id"]) == ("calibration", "calibrated")
+    assert found["calibration"][0]["version"] == 3
+    assert found["calibration"][0]["quality"] == {"rms_m": 0.004}
+    assert found["calibration/progress"][0]["progress"] == 0.5
+    assert found["bridge/health"][0]["process"] == {"cpu_pct": 3.0}
+    assert found["bridge/log"][0]["suppressed"] == 2
+    assert found["bridge/info"][0]["joints"] == ["hip", "knee", "ankle"]
+    for payloads in found.values():
+        for payload in payloads:
+            for key, _ in numbers(payload):
+                assert key.rpartition("_")[2] in UNITS | {"progress"}, key
+
+
+async def test_an_answer_goes_where_the_caller_wants_it(
+    table: dict[str, Any], outbox: Outbox
+) -> None:
+    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    await sent(outbox)
+    reply = Reply("calibrate", "7", "accepted", {"phase": "static"})
+    reporter.reply(reply, None, None)
+    reporter.reply(reply, "my/answers", b"9")
+    usual, _ = await outbox.next()
+    own, _ = await outbox.next()
+    assert usual.topic == "b/bridge/response/calibrate"
+    assert orjson.loads(usual.payload) == {
+        "v": 1, "transaction": "7", "status": "accepted", "data": {"phase": "static"},
+        "error": None,
+    }  # fmt: skip
+    assert (own.topic, own.correlation, own.expiry_s) == ("my/answers", b"9", 30)

@@ -1,0 +1,146 @@
+"""UNIX time set while the daemon runs: followed, told to the core, and frames keep their order."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from typing import TYPE_CHECKING, Any
+
+import orjson
+import pytest
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import LimbState
+from jointfit_daemon.outputs.mqtt import Outbox
+from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.unix_clock import UnixClock
+from jointfit_daemon.pipeline.events import UnixOffset
+from jointfit_daemon.supervisor._core_runner import Heart
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.pipeline.events import Event, Output
+
+S, MS = 1_000_000_000, 1_000_000
+BEGIN_UNIX_NS = 1_795_250_000 * S
+
+
+class Host:
+    """Both clocks of a host: monotonic time goes on by itself, UNIX time can be set."""
+
+    def __init__(self) -> None:
+        self.now_ns, self.offset_ns = 5_000 * S, BEGIN_UNIX_NS - 5_000 * S
+        self.wait_ns: Callable[[], int] = lambda: 100
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += self.wait_ns()
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        return self.monotonic_ns() + self.offset_ns
+
+
+@pytest.fixture
+def host(monkeypatch: pytest.MonkeyPatch) -> Host:
+    host = Host()
+    monkeypatch.setattr(time, "monotonic_ns", host.monotonic_ns)
+    monkeypatch.setattr(time, "time_ns", host.time_ns)
+    return host
+
+
+def test_the_unix_clock_keeps_the_spacing_of_stamps(host: Host) -> None:
+    clock = UnixClock()
+    before = clock.offset_ns()
+    host.offset_ns += 3_600 * S
+    assert clock.offset_ns() == before
+    assert before == pytest.approx(BEGIN_UNIX_NS - 5_000 * S, abs=1_000)
+
+
+@pytest.mark.parametrize("step_s", [3_600.0, -3_600.0, 0.01, -0.01, 0.0002])
+def test_a_step_is_followed_within_a_second_and_told_once(host: Host, step_s: float) -> None:
+    clock = UnixClock()
+    before = clock.offset_ns()
+    host.offset_ns += round(step_s * S)
+    host.now_ns += S
+    assert clock.offset_ns() - before == pytest.approx(step_s * S, abs=1_000)
+    assert clock.news_ns() == pytest.approx(before + step_s * S, abs=1_000)
+    assert clock.news_ns() is None
+
+
+def test_a_busy_machine_is_no_step(host: Host) -> None:
+    waits = iter([100, 20 * MS, 100, 100, 30 * MS] * 100)
+    host.wait_ns = lambda: next(waits)
+    clock = UnixClock()
+    told = []
+    for _ in range(5):
+        told.append(clock.news_ns())
+        host.now_ns += S
+    assert told[1:] == [None] * 4
+
+
+async def sent(outbox: Outbox) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    while outbox.queued:
+        message, done = await outbox.next()
+        done()
+        found.setdefault(message.topic.removeprefix("b/"), []).append(
+            orjson.loads(message.payload) if message.payload else None
+        )
+    return found
+
+
+async def test_poses_across_a_step_back_keep_their_order(table: dict[str, Any], host: Host) -> None:
+    outbox = Outbox("b/bridge/state")
+    reporter = Reporter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox)
+    poses: list[dict[str, Any]] = []
+    for number in range(400):
+        if number == 200:
+            host.offset_ns -= 3_600 * S
+        host.now_ns += 10 * MS
+        t_ns = host.now_ns - 5 * MS
+        reporter.handle(LimbState(number, t_ns, t_ns, "imu", "locked", (), (), ()))
+        poses += (await sent(outbox)).get("pose", [])
+    steps = [b["t_us"] - a["t_us"] for a, b in itertools.pairwise(poses)]
+    assert sum(step < 0 for step in steps) == 1
+    assert sum(step for step in steps if step < 0) == pytest.approx(-3_600e6, abs=20_000)
+    mono = [b["mono_us"] - a["mono_us"] for a, b in itertools.pairwise(poses)]
+    assert min(mono) > 9_900
+    assert max(mono) < 10_100
+    assert all(pose["age_ms"] < 6 for pose in poses)
+
+
+class Listening:
+    """A core that only hears."""
+
+    def __init__(self) -> None:
+        self.heard: list[Event] = []
+        self.next_deadline_ns = None
+
+    def feed(self, event: Event) -> list[Output]:
+        self.heard.append(event)
+        return []
+
+    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the shape of a core
+        return {}
+
+
+async def test_the_core_hears_of_unix_time_before_anything_else_and_again_when_it_was_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Through the real heart; the host's clock is set a second after the start."""
+    set_ns = 0
+    true_unix_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: true_unix_ns() + set_ns)
+    core = Listening()
+    beating = asyncio.create_task(Heart(core, lambda _: None).run(), name="heart")
+    await asyncio.sleep(0.3)
+    set_ns = -3_600 * S
+    await asyncio.sleep(1.5)
+    beating.cancel()
+    await asyncio.wait([beating])
+    assert isinstance(core.heard[0], UnixOffset)
+    told = [event.offset_ns for event in core.heard if isinstance(event, UnixOffset)]
+    assert len(told) == 2
+    assert told[1] - told[0] == pytest.approx(-3_600 * S, abs=MS)

@@ -1,0 +1,219 @@
+"""Writing calibrations: in turn, off the loop, and never at odds with what a reload finds."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.outputs.mqtt import Incoming
+from jointfit_daemon.pipeline.events import (
+    CalibrationReady,
+    CalibrationStatus,
+    CalibrationStored,
+    Configured,
+    Request,
+)
+from jointfit_daemon.supervisor import _stored_calibrations
+from jointfit_daemon.supervisor._calibration_writer import StoreRunner
+from jointfit_daemon.supervisor.daemon import Daemon
+from tests.calibration.plain_calibration import plain_calibration
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Event, Output
+
+
+@pytest.fixture
+def rig(table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    return parse_rig(table)
+
+
+def calibration_of(rig: Rig, note: str = "") -> Calibration:
+    return plain_calibration(rig.chain, notes=(note,))
+
+
+class SlowDisk:
+    """Writes when it is told to go on; counts who writes at the same time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go = threading.Event()
+        self.writing = self.most = 0
+        self._save = _stored_calibrations.save
+        monkeypatch.setattr("jointfit_daemon.supervisor._stored_calibrations.save", self.save)
+
+    def save(self, rig: Rig, calibration: Calibration) -> int:
+        self.writing += 1
+        self.most = max(self.most, self.writing)
+        self.go.wait(5)
+        version = self._save(rig, calibration)
+        self.writing -= 1
+        return version
+
+
+async def test_two_calibrations_are_written_one_after_the_other(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = SlowDisk(monkeypatch)
+    events: list[Event] = []
+    complaints: list[str] = []
+    async with asyncio.TaskGroup() as tasks:
+        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner.start(rig, calibration_of(rig, "first"))
+        runner.start(rig, calibration_of(rig, "second"))
+        await asyncio.sleep(0.05)
+        disk.go.set()
+        await runner.settle()
+    assert disk.most == 1
+    assert complaints == []
+    assert [event.version for event in events if isinstance(event, CalibrationStored)] == [1, 2]
+    found = runner.found(rig).calibration
+    assert found is not None
+    assert found.notes == ("second",)
+
+
+async def test_what_could_not_be_written_stays_in_force_over_a_reload(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> int:
+        raise OSError("no space left")
+
+    _stored_calibrations.save(rig, calibration_of(rig, "old"))
+    monkeypatch.setattr("jointfit_daemon.supervisor._stored_calibrations.save", full)
+    complaints: list[str] = []
+    events: list[Event] = []
+    async with asyncio.TaskGroup() as tasks:
+        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner.start(rig, calibration_of(rig, "new"))
+    assert "no space left" in complaints[0]
+    assert events == []
+    found = runner.found(rig)
+    assert found.calibration == calibration_of(rig, "new")
+    assert found.version is None
+    assert "not stored" in found.complaints[0]
+
+
+class ReadyCore:
+    """Hands out a calibration when asked, and keeps what it is configured with."""
+
+    next_deadline_ns = None
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.events: list[Event] = []
+
+    def feed(self, event: Event) -> list[Output]:
+        self.events.append(event)
+        if isinstance(event, Request) and not event.arguments:
+            status = CalibrationStatus(event.t_ns, "calibrated", "calibrated")
+            return [CalibrationReady(self.calibration), status]
+        return []
+
+    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
+        return {"devices": {}, "frames": {}}
+
+
+async def test_a_reload_while_a_calibration_is_written_finds_it(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    disk, core = SlowDisk(monkeypatch), ReadyCore(calibration_of(rig, "new"))
+    daemon = Daemon(tmp_path / "rig.toml", rig, core)
+    running = asyncio.create_task(daemon.run())
+    async with asyncio.timeout(8):
+        while not core.events:
+            await asyncio.sleep(0.01)
+        daemon._heart.feed(Request(1, "calibrate", "t", {}))
+        reload = asyncio.create_task(daemon._change_to(rig))
+        await asyncio.sleep(0.2)
+        disk.go.set()
+        await reload
+    running.cancel()
+    await asyncio.wait([running])
+    configured = [event for event in core.events if isinstance(event, Configured)]
+    assert configured[-1].calibration is not None
+    assert configured[-1].calibration_version == 1
+
+
+async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_stored_later(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    blocked = tmp_path / "blocked"
+    blocked.write_text("")
+    monkeypatch.setenv("STATE_DIRECTORY", str(blocked / "state"))
+    core = ReadyCore(calibration_of(rig, "new"))
+    daemon = Daemon(tmp_path / "rig.toml", rig, core)
+    running = asyncio.create_task(daemon.run())
+    async with asyncio.timeout(20):
+        while "state directory cannot be written" not in caplog.text:
+            await asyncio.sleep(0.01)
+        assert f"{blocked}/state/calibrations: Not a directory" in caplog.text
+
+        daemon._heart.feed(Request(1, "calibrate", "t", {}))
+        while daemon._stores.fault is None:
+            await asyncio.sleep(0.01)
+        published = daemon._outbox.retained
+        assert b"in force but not stored" in published["jointfit/bench-1/calibration"]
+        daemon._tell_health()
+        assert b'"not_stored":"' in daemon._outbox.retained["jointfit/bench-1/bridge/health"]
+
+        blocked.unlink()
+        daemon._asked(Incoming("x/calibrate", b'{"phase":"abort"}', retained=False))
+        while not any(isinstance(event, CalibrationStored) for event in core.events):
+            await asyncio.sleep(0.01)
+    assert "can be written again" in caplog.text
+    running.cancel()
+    await asyncio.wait([running])
+    found = _stored_calibrations.stored(rig).calibration
+    assert found is not None
+    assert found.notes == ("new",)
+
+
+async def test_what_could_not_be_written_is_tried_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jointfit_daemon.supervisor._calibration_writer.RETRY_S", 0.05)
+    save, failures = _stored_calibrations.save, ["disk full", "disk full", "gone"]
+
+    def failing(*given: Any) -> int:
+        if failures:
+            raise OSError(failures.pop(0))
+        return save(*given)
+
+    monkeypatch.setattr("jointfit_daemon.supervisor._stored_calibrations.save", failing)
+    events: list[Event] = []
+    complaints: list[str] = []
+    async with asyncio.TaskGroup() as tasks, asyncio.timeout(5):
+        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner.start(rig, calibration_of(rig, "new"))
+        while not events:
+            await asyncio.sleep(0.01)
+    assert [complaint.split(": ")[1] for complaint in complaints] == [
+        "disk full; tried again every 0.05 s", "gone; tried again every 0.05 s",
+    ]  # fmt: skip
+    found = runner.found(rig)
+    assert (found.version, found.complaints) == (1, ())
+
+
+@pytest.mark.parametrize(
+    ("created", "age_s"),
+    [
+        ("2026-03-01T10:00:00+00:00", 3600.0),
+        ("2026-03-01T12:00:00+01:00", 0.0),
+        ("2026-03-02T10:00:00+00:00", 0.0),
+        ("2026-03-01T10:00:00", 0.0),
+        ("", 0.0),
+    ],
+)
+def test_the_age_of_a_calibration_is_known_or_nothing(created: str, age_s: float) -> None:
+    """A host without a clock of its own may think it is yesterday."""
+    now = datetime.datetime(2026, 3, 1, 11, tzinfo=datetime.UTC)
+    calibration = Calibration("mean", (), (), (), {}, {}, {}, created_utc=created)
+    assert _stored_calibrations.age_of(calibration, now) == age_s

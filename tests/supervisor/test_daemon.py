@@ -1,0 +1,495 @@
+"""The shell, in this process: sources, reloads, stops, requests; the core is real or a fake."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import signal
+import socket
+import time
+from typing import TYPE_CHECKING, Any, cast
+
+import orjson
+import pytest
+
+from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.driver import DeviceLost
+from jointfit_daemon.outputs.mqtt import MqttClient
+from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.events import (
+    ChunkArrived,
+    Configured,
+    FitJob,
+    JobFinished,
+    Reply,
+    Request,
+    SourceClosed,
+    SourceOpened,
+    Tick,
+)
+from jointfit_daemon.supervisor._core_runner import HEARTBEAT_NS, Heart
+from jointfit_daemon.supervisor._fit_runner import FitRunner
+from jointfit_daemon.supervisor._progress_monitor import Progress
+from jointfit_daemon.supervisor._source_tasks import keep_running
+from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
+from jointfit_daemon.supervisor.daemon import Daemon
+from tests.broker_fixture import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Event, Output
+    from tests.broker_fixture import Broker
+    from tests.fake_drivers import FakeImu
+
+
+class RecordingCore:
+    """Keeps what it is fed and answers from a script."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self.next_deadline_ns: int | None = None
+        self.answers: dict[type[Any], list[Output]] = {}
+        self.failure: Exception | None = None
+
+    def feed(self, event: Event) -> list[Output]:
+        self.events.append(event)
+        if self.failure is not None:
+            raise self.failure
+        if isinstance(event, Request):
+            return [Reply(event.command, event.transaction, "accepted", dict(event.arguments))]
+        return self.answers.pop(type(event), [])
+
+    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
+        return {"devices": {}, "frames": {}}
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [event for event in self.events if isinstance(event, kind)]
+
+
+def small(table: dict[str, Any], port: int, **moods: str) -> dict[str, Any]:
+    """Return a rig of the two plain fakes, one a segment."""
+    imus = [imu | {"mood": moods.get(imu["id"], "well")} for imu in table["imu"][:2]]
+    imus[1]["segment"] = "shank"
+    return {
+        "rig": table["rig"],
+        "chain": table["chain"],
+        "imu": imus,
+        "mqtt": {"host": "127.0.0.1", "port": port},
+    }
+
+
+def toml(table: dict[str, Any]) -> str:
+    """Write `table`, of tables of plain values and one list of tables, as TOML."""
+    lines = []
+    for name, part in table.items():
+        for section in part if isinstance(part, list) else [part]:
+            lines.append(f"[[{name}]]" if isinstance(part, list) else f"[{name}]")
+            lines += [f"{key} = {orjson.dumps(value).decode()}" for key, value in section.items()]
+    return "\n".join(lines)
+
+
+@contextlib.asynccontextmanager
+async def daemon(
+    table: dict[str, Any], folder: Path, core: Any = None
+) -> AsyncIterator[asyncio.Task[None]]:
+    path = folder / "rig.toml"
+    path.write_text(toml(table), encoding="utf-8")
+    task = asyncio.create_task(Daemon(path, parse_rig(table), core or Core()).run(), name="daemon")
+    try:
+        yield task
+    finally:
+        began = time.monotonic()
+        task.cancel()
+        await asyncio.wait([task], timeout=10)
+        assert time.monotonic() - began < 5, "stopping took too long"
+        asyncio.get_running_loop().set_exception_handler(None)
+
+
+@pytest.fixture(autouse=True)
+def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+
+
+async def until(condition: Callable[[], bool], within_s: float = 8.0) -> None:
+    async with asyncio.timeout(within_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+# --- one source ---------------------------------------------------------------------------------
+
+
+class Script:
+    """A driver whose every run does the next thing on its list."""
+
+    steps: list[Any]
+
+    def __init__(self, settings: Any) -> None:
+        pass
+
+    async def run(self, emit: Any) -> None:
+        step = type(self).steps.pop(0) if type(self).steps else "wait"
+        if step == "wait":
+            await asyncio.Event().wait()
+        if step == "send then go":
+            from jointfit_daemon.model import Chunk  # noqa: PLC0415 - here only
+
+            emit(Chunk(1, b"x"))
+            raise DeviceLost("unplugged")
+        raise cast("Exception", step)
+
+
+async def run_script(rig: Rig, steps: list[Any]) -> tuple[list[Event], asyncio.Task[None]]:
+    driver = type("Scripted", (Script,), {"steps": steps})
+    source = rig.sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
+    events: list[Event] = []
+    task = asyncio.create_task(keep_running(source, events.append), name="source")
+    await asyncio.wait([task], timeout=1.2)
+    task.cancel()
+    await asyncio.wait([task])
+    return events, task
+
+
+async def test_a_lost_device_is_tried_again_and_told_once_a_reason(table: dict[str, Any]) -> None:
+    gone = DeviceLost("is not there")
+    events, _ = await run_script(
+        parse_rig(table), ["send then go", gone, DeviceLost("is not there"), "send then go"]
+    )
+    told = [(type(event).__name__, getattr(event, "text", "")) for event in events]
+    assert told == [
+        ("SourceOpened", ""),
+        ("ChunkArrived", ""),
+        ("SourceClosed", "unplugged"),
+        ("SourceClosed", "is not there"),
+        ("SourceOpened", ""),
+        ("ChunkArrived", ""),
+        ("SourceClosed", "unplugged"),
+    ]
+
+
+async def test_a_bug_in_a_driver_is_not_swallowed(table: dict[str, Any]) -> None:
+    _, task = await run_script(parse_rig(table), [ZeroDivisionError("bug")])
+    assert isinstance(task.exception(), ZeroDivisionError)
+
+
+# --- the whole shell ----------------------------------------------------------------------------
+
+
+async def test_a_wrong_device_is_retired_and_the_others_run(
+    table: dict[str, Any], tmp_path: Path, fakes: type[FakeImu]
+) -> None:
+    core = RecordingCore()
+    async with daemon(small(table, free_port(), S1="wrong"), tmp_path, core):
+        await until(lambda: bool(core.of(SourceClosed)) and len(core.of(ChunkArrived)) > 3)
+        (closed,) = core.of(SourceClosed)
+        assert (closed.source, closed.reason) == ("S1", "misconfigured")
+        assert fakes.running == ["S2"]
+    assert fakes.running == []
+
+
+async def test_a_bug_ends_the_daemon_with_its_exception(
+    table: dict[str, Any], tmp_path: Path
+) -> None:
+    async with daemon(small(table, free_port(), S1="bug"), tmp_path) as task:
+        await asyncio.wait([task], timeout=5)
+    assert isinstance(task.exception(), ExceptionGroup)
+    with pytest.raises(ExceptionGroup) as caught:
+        task.result()
+    assert caught.value.subgroup(ZeroDivisionError) is not None
+
+
+async def test_what_the_core_raises_on_a_tick_ends_the_daemon_too(
+    table: dict[str, Any], tmp_path: Path
+) -> None:
+    core = RecordingCore()
+    async with daemon(small(table, free_port(), S1="lost", S2="lost"), tmp_path, core) as task:
+        await until(lambda: bool(core.of(Tick)))
+        core.failure = ZeroDivisionError("in the core")
+        await asyncio.wait([task], timeout=5)
+    assert isinstance(task.exception(), ExceptionGroup)
+
+
+async def test_configuration_comes_first_and_time_never_stops(
+    table: dict[str, Any], tmp_path: Path
+) -> None:
+    core = RecordingCore()
+    async with daemon(small(table, free_port(), S1="lost", S2="lost"), tmp_path, core):
+        await until(lambda: len(core.of(Tick)) > 3)
+    assert isinstance(core.events[0], Configured)
+    ticks = [event.t_ns for event in core.of(Tick)]
+    assert all(later > earlier for earlier, later in itertools.pairwise(ticks))
+
+
+async def test_it_stops_under_load_thirty_times_of_thirty(
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
+) -> None:
+    fast = small(table, broker.port)
+    for imu in fast["imu"]:
+        imu["rate_hz"] = 400
+    for number in range(30):
+        async with daemon(fast, tmp_path) as task:
+            await until(lambda: len(fakes.running) == 2)
+            await asyncio.sleep(0.003 * number)
+        assert task.cancelled(), f"stop {number}"
+
+
+async def test_without_a_broker_it_runs_and_stops(
+    table: dict[str, Any], tmp_path: Path, fakes: type[FakeImu]
+) -> None:
+    async with daemon(small(table, free_port()), tmp_path):
+        await until(lambda: len(fakes.running) == 2)
+        await asyncio.sleep(0.5)
+
+
+async def test_a_reload_restarts_only_what_changed(
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
+) -> None:
+    rig = small(table, broker.port)
+    core = RecordingCore()
+    async with daemon(rig, tmp_path, core):
+        await until(lambda: len(fakes.running) == 2)
+        rig["imu"][1]["rate_hz"] = 50
+        (tmp_path / "rig.toml").write_text(toml(rig))
+        os.kill(os.getpid(), signal.SIGHUP)
+        await until(lambda: fakes.started == ["S1", "S2", "S2"])
+        await until(lambda: len(core.of(SourceOpened)) == 3)
+    kinds = [
+        type(event).__name__
+        for event in core.events
+        if isinstance(event, Configured | SourceClosed | SourceOpened)
+    ]
+    assert kinds[:6] == [
+        "Configured", "SourceOpened", "SourceOpened",
+        "SourceClosed", "Configured", "SourceOpened",
+    ]  # fmt: skip
+
+
+async def test_a_bad_file_changes_nothing_and_says_why(
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
+) -> None:
+    rig = parse_rig(small(table, broker.port))
+    core = RecordingCore()
+    async with (
+        daemon(small(table, broker.port), tmp_path, core),
+        MqttClient(rig.mqtt) as client,
+    ):
+        await client.subscribe("bridge/event")
+        await until(lambda: len(fakes.running) == 2)
+        (tmp_path / "rig.toml").write_text("[rig]\nnmae = 'x'\n")
+        os.kill(os.getpid(), signal.SIGHUP)
+        async with asyncio.timeout(5):
+            async for topic, event in client.messages():
+                if topic == "bridge/event" and event["kind"] == "reload":
+                    break
+        assert "did you mean 'name'?" in event["text"]
+        assert event["level"] == "error"
+        assert fakes.started == ["S1", "S2"]
+        assert len(core.of(Configured)) == 1
+
+
+async def test_a_reload_to_another_base_takes_the_retained_state_along(
+    table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
+) -> None:
+    rig = small(table, broker.port)
+    async with daemon(rig, tmp_path):
+        await until(lambda: len(fakes.running) == 2)
+        rig["mqtt"]["base"] = "moved/rig"
+        (tmp_path / "rig.toml").write_text(toml(rig))
+        os.kill(os.getpid(), signal.SIGHUP)
+        async with asyncio.timeout(8), MqttClient(parse_rig(rig).mqtt) as client:
+            await client.subscribe("bridge/state", "device/+/availability", "calibration")
+            found = {}
+            async for topic, payload in client.messages():
+                found[topic] = payload
+                if len(found) == 4 and found["bridge/state"] == {"v": 1, "state": "online"}:
+                    break
+    assert found["calibration"]["phase"] == "uncalibrated"
+
+
+async def test_requests_are_answered_once_and_all_their_faults_told(
+    table: dict[str, Any], tmp_path: Path, broker: Broker
+) -> None:
+    rig = parse_rig(small(table, broker.port))
+    core = RecordingCore()
+    async with (
+        daemon(small(table, broker.port), tmp_path, core),
+        MqttClient(rig.mqtt) as client,
+    ):
+        await client.subscribe("bridge/state")
+        async with asyncio.timeout(5):
+            async for _, state in client.messages():
+                if state == {"v": 1, "state": "online"}:
+                    break
+        await asyncio.sleep(0.3)
+        good = await client.request("calibrate", {"phase": "static", "seconds": 3.0})
+        bad = await client.request("calibrate", {"phse": "x", "seconds": "3"})
+        unknown = await client.request("calibrat", {})
+    assert (good["status"], good["data"]) == (
+        "accepted",
+        {"phase": "static", "seconds": 3.0, "force": False},
+    )
+    assert bad["status"] == "error"
+    assert {fault["key"] for fault in bad["error"]["faults"]} == {
+        "calibrate.phase", "calibrate.phse", "calibrate.seconds",
+    }  # fmt: skip
+    assert "did you mean 'calibrate'?" in unknown["error"]["message"]
+    assert len(core.of(Request)) == 1
+
+
+async def test_a_run_of_the_real_core_gives_poses_and_health(
+    table: dict[str, Any], tmp_path: Path, broker: Broker
+) -> None:
+    rig = small(table, broker.port)
+    seqs: list[int] = []
+    async with daemon(rig, tmp_path), MqttClient(parse_rig(rig).mqtt) as client:
+        await client.subscribe("pose", "bridge/health", "device/+/availability")
+        health: dict[str, Any] = {}
+        async with asyncio.timeout(10):
+            async for topic, payload in client.messages():
+                if topic == "pose":
+                    seqs.append(payload["seq"])
+                elif topic == "bridge/health" and payload["devices"]["S1"]["received"]:
+                    health = payload
+                if len(seqs) > 50 and health:
+                    break
+    assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
+    assert health["process"]["rss_bytes"] > 1e6
+    assert health["link"]["connected"] is True
+
+
+# --- parts --------------------------------------------------------------------------------------
+
+
+async def test_a_deadline_that_stays_past_does_not_spin() -> None:
+    core = RecordingCore()
+    core.next_deadline_ns = 0
+    heart = Heart(core, lambda _: None)
+    running = asyncio.create_task(heart.run(), name="heart")
+    await asyncio.sleep(0.1)
+    running.cancel()
+    await asyncio.wait([running])
+    assert 1 < len(core.events) <= 110
+
+
+async def test_the_core_hears_its_deadline_in_time() -> None:
+    core = RecordingCore()
+    heart = Heart(core, lambda _: None)
+    core.next_deadline_ns = time.monotonic_ns() + HEARTBEAT_NS // 2
+    running = asyncio.create_task(heart.run(), name="heart")
+    await until(lambda: any(isinstance(event, Tick) for event in core.events))
+    tick = next(event for event in core.events if isinstance(event, Tick))
+    late_ns = tick.t_ns - core.next_deadline_ns
+    running.cancel()
+    await asyncio.wait([running])
+    assert 0 <= late_ns < 40_000_000
+
+
+@pytest.fixture
+def notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        listener.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield listener
+
+
+def heard(listener: socket.socket) -> list[str]:
+    found = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            found.append(listener.recv(4096).decode())
+    return found
+
+
+async def test_systemd_hears_ready_watchdog_status_and_stopping(
+    notified: socket.socket,
+    monkeypatch: pytest.MonkeyPatch,
+    table: dict[str, Any],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", "600000")
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    async with daemon(small(table, free_port(), S1="lost"), tmp_path, RecordingCore()):
+        words = []
+        for number in range(20):  # the queue of a datagram socket holds ten
+            await asyncio.sleep(0.1)
+            words += heard(notified)
+            if number == 12:
+                os.kill(os.getpid(), signal.SIGHUP)
+    words += heard(notified)
+    assert words[0].startswith("STATUS=")  # what is known is told with it
+    assert words[1] == "READY=1"
+    assert words.count("WATCHDOG=1") >= 3
+    assert any(word.startswith("STATUS=0 of 2 IMUs, missing S1, S2") for word in words)
+    assert any(word.startswith("RELOADING=1\nMONOTONIC_USEC=") for word in words)
+    assert words.count("READY=1") == 2
+    after = words[words.index("STOPPING=1") + 1 :]
+    assert set(after) <= {"WATCHDOG=1"}  # a stop that takes its time is still alive
+
+
+async def test_a_systemd_that_does_not_listen_does_not_stop_the_loop(
+    notified: socket.socket,
+) -> None:
+    systemd = SystemdNotifier()
+    began = time.monotonic()
+    for _ in range(15):
+        systemd.alive()
+    assert time.monotonic() - began < 5
+    assert heard(notified)
+
+
+def test_without_systemd_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    SystemdNotifier().ready()
+    monkeypatch.setenv("NOTIFY_SOCKET", "@nobody-listens-here")
+    SystemdNotifier().ready()
+
+
+def counters(received: int, late: int = 0) -> dict[str, object]:
+    return {"devices": {"S1": {"received": received, "late": late}, "mocap": {"received": 99}}}
+
+
+def test_the_watchdog_starves_only_when_samples_bring_no_state() -> None:
+    progress, imus = Progress(), frozenset({"S1"})
+    assert progress.made(counters(0), 0, imus)  # nothing arrives
+    assert progress.made(counters(10), 5, imus)  # states come
+    assert progress.made(counters(20, late=10), 5, imus)  # arrives, too late for any state
+    assert not progress.made(counters(40, late=10), 5, imus)  # arrives, and nothing comes of it
+    assert progress.made(counters(60, late=10), 6, imus)
+    assert progress.made({}, 6, imus)
+
+
+# --- fits ---------------------------------------------------------------------------------------
+
+
+async def fit(kind: str, *, cancel_after_s: float | None = None) -> list[JobFinished]:
+    ended: list[Any] = []
+    async with asyncio.TaskGroup() as tasks:
+        runner = FitRunner(tasks, ended.append)
+        runner.start(FitJob(1, kind, {}))
+        if cancel_after_s is not None:
+            await asyncio.sleep(cancel_after_s)
+            runner.cancel()
+    return ended
+
+
+async def test_a_fit_that_fails_says_why() -> None:
+    (ended,) = await fit("no such kind")
+    assert ended.result is None
+    assert "KeyError" in str(ended.error)
+
+
+async def test_a_cancelled_fit_is_killed_and_not_heard_of() -> None:
+    assert await fit("static", cancel_after_s=0.05) == []
+
+
+async def test_a_request_to_nobody_is_harmless(broker: Broker) -> None:
+    from jointfit_daemon.config import MqttSettings  # noqa: PLC0415 - here only
+
+    async with MqttConnection(MqttSettings(host="127.0.0.1", port=broker.port)) as connection:
+        await connection.publish(Outgoing("x/bridge/request/calibrate", b"{}", 1))

@@ -1,0 +1,74 @@
+"""Which sources run after a reload."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.driver import DeviceMisconfigured
+from jointfit_daemon.pipeline.events import SourceClosed
+from jointfit_daemon.supervisor import _source_tasks as sources_module
+from jointfit_daemon.supervisor._source_tasks import SourceTasks
+
+if TYPE_CHECKING:
+    import pytest
+
+    from jointfit_daemon.pipeline.events import Event
+
+
+class Refused:
+    """A driver that may not open its port until somebody mends the permissions."""
+
+    mended = False
+    opened = 0
+
+    def __init__(self, settings: Any) -> None:
+        pass
+
+    async def run(self, emit: Any) -> None:  # noqa: ARG002 - a driver's interface
+        if not type(self).mended:
+            raise DeviceMisconfigured("no permission: add the user to group dialout")
+        type(self).opened += 1
+        await asyncio.Event().wait()
+
+
+async def test_a_source_that_paused_is_tried_again_after_a_while_and_reported_once(
+    table: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sources_module, "PAUSE_S", 0.05)
+    driver: Any = type("Port", (Refused,), {})
+    source = parse_rig(table).sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
+    events: list[Event] = []
+    async with asyncio.TaskGroup() as tasks:
+        sources = SourceTasks(tasks, events.append)
+        await sources.apply([source])
+        await asyncio.sleep(0.5)
+        driver.mended = True
+        async with asyncio.timeout(2):
+            while not driver.opened:
+                await asyncio.sleep(0.01)
+        (closed,) = events
+        assert isinstance(closed, SourceClosed)
+        assert "add the user to group dialout (tried again" in closed.text
+        assert caplog.text == ""  # the core reports it, on the log too
+        await sources.stop()
+
+
+async def test_a_source_that_stopped_is_tried_again_at_a_reload(table: dict[str, Any]) -> None:
+    driver: Any = type("Port", (Refused,), {})
+    source = parse_rig(table).sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
+    events: list[Event] = []
+    async with asyncio.TaskGroup() as tasks:
+        sources = SourceTasks(tasks, events.append)
+        await sources.apply([source])
+        await asyncio.sleep(0.05)
+        assert [type(event) for event in events] == [SourceClosed]
+        driver.mended = True
+        await sources.apply([source])
+        await asyncio.sleep(0.05)
+        assert driver.opened == 1
+        await sources.apply([source])  # it runs: it keeps its port
+        await asyncio.sleep(0.05)
+        assert driver.opened == 1
+        await sources.stop()

@@ -1,0 +1,113 @@
+"""What systemd is told at the start, and the line that an operator reads first."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.supervisor._source_tasks import SourceTasks
+from jointfit_daemon.supervisor._status_line import Pace, Seen, phase_of, status_line
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk
+
+
+def source(name: str, kind: str = "imu", driver: Any = None) -> Any:
+    return SimpleNamespace(id=name, kind=kind, driver_class=driver, settings=name)
+
+
+RIG = [source("S1"), source("S2"), source("mocap", "mocap")]
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("seen", "line"),
+    [
+        (
+            Seen({"S1", "S2", "mocap"}, "calibrated", 49.98, True),
+            "2 of 2 IMUs, cameras, calibrated, 50 poses/s",
+        ),
+        (
+            Seen({"S1"}, "uncalibrated", NAN, False),
+            "1 of 2 IMUs, missing S2, no cameras, uncalibrated, no broker",
+        ),
+        (
+            Seen({"S2", "mocap"}, "functional", 0.0, True),
+            "1 of 2 IMUs, missing S1, cameras, calibration: functional, 0 poses/s",
+        ),
+    ],
+)
+def test_the_status_counts_what_is_well_and_names_what_is_not(seen: Seen, line: str) -> None:
+    assert status_line(RIG, seen) == line
+
+
+def test_a_rig_without_cameras_is_not_told_that_it_lacks_them() -> None:
+    assert "cameras" not in status_line(RIG[:2], Seen({"S1", "S2"}, "calibrated", NAN, True))
+
+
+def test_the_pace_is_that_since_the_last_look() -> None:
+    pace = Pace()
+    assert pace.since(7, 100.0) != pace.since(7, 100.0)  # NaN: nothing to compare with, no time
+    assert pace.since(507, 110.0) == 50.0
+    assert pace.since(507, 120.0) == 0.0
+
+
+@pytest.mark.parametrize("health", [{}, {"calibration": {}}, {"calibration": None}])
+def test_what_is_not_told_is_not_calibrated(health: dict[str, object]) -> None:
+    assert phase_of(health) == "uncalibrated"
+    assert phase_of({"calibration": {"phase": "aligned"}}) == "aligned"
+
+
+class Driver:
+    """Sends one byte, or ends as it is told to, when it is let go."""
+
+    def __init__(self, settings: str) -> None:
+        self._id = settings
+
+    async def run(self, emit: Any) -> None:
+        await GO[self._id].wait()
+        if self._id == "lost":
+            raise DeviceLost("away")
+        if self._id == "wrong":
+            raise DeviceMisconfigured("a toaster")
+        emit(CHUNK)
+        await asyncio.Event().wait()
+
+
+CHUNK: Chunk = SimpleNamespace(t_ns=1)  # type: ignore[assignment]  # only passed on
+GO: dict[str, asyncio.Event] = {}
+
+
+@pytest.fixture
+async def sources() -> Any:
+    names = ("well", "lost", "wrong")
+    GO.update((name, asyncio.Event()) for name in names)
+    async with asyncio.TaskGroup() as tasks:
+        made = SourceTasks(tasks, lambda _: None)
+        await made.apply([source(name, driver=Driver) for name in names])
+        yield made
+        await made.stop()
+
+
+async def test_inputs_are_known_when_each_was_heard_lost_or_found_wrong(
+    sources: SourceTasks,
+) -> None:
+    waiting = asyncio.create_task(sources.known(10.0))
+    for go in GO.values():
+        await asyncio.sleep(0.02)
+        assert not waiting.done()
+        go.set()
+    async with asyncio.timeout(1):
+        await waiting
+
+
+async def test_a_source_that_stays_silent_is_taken_for_absent(sources: SourceTasks) -> None:
+    GO["well"].set()
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    await sources.known(0.1)
+    assert 0.09 < loop.time() - began < 2.0

@@ -1,0 +1,100 @@
+"""Stores and workers as the shell uses them: a bad file costs a calibration, not the run."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pickle
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.supervisor import _stored_calibrations
+from jointfit_daemon.supervisor.worker import HEADER
+from tests.calibration.plain_calibration import plain_calibration
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def rig(table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path / 'state'}:/elsewhere")
+    return parse_rig(table | {"calibration": {"store": "subject-07"}})
+
+
+def test_an_empty_store_is_no_trouble(rig: Rig) -> None:
+    assert _stored_calibrations.stored(rig) == (None, None, ())
+
+
+def test_what_was_saved_is_found_with_its_version_and_date(rig: Rig) -> None:
+    assert _stored_calibrations.save(rig, plain_calibration(rig.chain)) == 1
+    assert _stored_calibrations.save(rig, plain_calibration(rig.chain)) == 2
+    found = _stored_calibrations.stored(rig)
+    assert found.version == 2
+    assert found.calibration is not None
+    assert found.calibration.created_utc.endswith("+00:00")
+    assert found.complaints == ()
+
+
+def test_a_calibration_of_another_limb_is_not_used(rig: Rig) -> None:
+    _stored_calibrations.save(
+        rig, plain_calibration(rig.chain, joints=("shoulder", "elbow", "wrist"))
+    )
+    found = _stored_calibrations.stored(rig)
+    assert found.calibration is None
+    assert "of another limb" in found.complaints[0]
+
+
+def test_a_damaged_store_is_told_and_survived(rig: Rig, tmp_path: Path) -> None:
+    _stored_calibrations.save(rig, plain_calibration(rig.chain))
+    _stored_calibrations.store_of(rig).path(1).write_text("{")
+    found = _stored_calibrations.stored(rig)
+    assert found.calibration is None
+    assert "cannot be used" in found.complaints[0]
+    assert "set aside as 0001.json.bad" in found.complaints[0]
+
+
+async def test_a_worker_dies_with_its_parent(tmp_path: Path) -> None:
+    """The parent below starts a worker on an endless job and is then killed outright."""
+    parent = (
+        "import subprocess, sys, time\n"
+        "worker = subprocess.Popen([sys.executable, '-c', sys.argv[1]], stdin=subprocess.PIPE)\n"
+        "worker.stdin.write(sys.stdin.buffer.read()); worker.stdin.flush()\n"
+        "print(worker.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    worker = (
+        "import time, jointfit_daemon.calibration.jobs as jobs\n"
+        "jobs.run_job = lambda kind, payload: time.sleep(60)\n"
+        "from jointfit_daemon.supervisor.worker import main\n"
+        "main()\n"
+    )
+    job = pickle.dumps(("static", {}))
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", parent, worker,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write(HEADER.pack(len(job)) + job)
+    process.stdin.close()
+    pid = int(await process.stdout.readline())
+    await asyncio.sleep(1.0)
+    os.kill(pid, 0)  # it works
+    process.kill()
+    await process.wait()
+    async with asyncio.timeout(10):
+        while _alive(pid):
+            await asyncio.sleep(0.05)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat", encoding="ascii") as stat:  # noqa: PTH123 - /proc
+            return stat.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
