@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast, get_args
 
 import numpy as np
 
-from jointfit_daemon.calibration.anchored import fit_anchored
+from bench.baselines.linear_correction import fit_linear_correction
 from jointfit_daemon.calibration.joint_correlation import error_correlation
 from jointfit_daemon.calibration.redundancy import fit_segment
 from jointfit_daemon.calibration.segment_model import SegmentTraining
@@ -89,7 +89,7 @@ def axis_deviations(model: SegmentModel, segment: Segment) -> Array:
 
 def _model(method: str, training: SegmentTraining) -> SegmentModel:
     if method == "linear":
-        return fit_anchored(training)
+        return fit_linear_correction(training)
     if method not in get_args(Method):
         raise ValueError(f"method {method!r}; known: {', '.join(METHODS)}")
     return fit_segment(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.subjects.simulated_wearer import NS, bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.kinematics import rotation
@@ -62,7 +62,7 @@ class Worn:
 def calibrated(seed: int) -> Calibration | None:
     """Return the calibration of one person; None where the daemon would ask for another pose."""
     rig, trials = bench_rig(), phases(seed)
-    alignment = fit_alignment(trials.align, rig.calibration)
+    alignment = fit_plate_alignment(trials.align, rig.calibration)
     try:
         return fit_calibration(
             trials.static, trials.functional, alignment, rig.calibration, rig.chain

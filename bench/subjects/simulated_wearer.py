@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
 from jointfit_daemon.config import parse_rig
@@ -101,7 +101,7 @@ def fitted(rig: Rig, seed: int = 1) -> Calibration:
     """Return the calibration that `rig` would make of this wearer."""
     trials = phases(seed)
     settings = rig.calibration
-    alignment = fit_alignment(trials.align, settings)
+    alignment = fit_plate_alignment(trials.align, settings)
     return fit_calibration(trials.static, trials.functional, alignment, settings, rig.chain)
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from typing_extensions import override  # typing has it from Python 3.12
 
-from jointfit_daemon.calibration.mount import fit_alignment
+from jointfit_daemon.calibration.mount import fit_sensor_alignment
 from jointfit_daemon.calibration.segment_model import (
     Prediction,
     SegmentModel,
@@ -101,7 +101,7 @@ class AlignedModel(SegmentModel):
 def fit_aligned(training: SegmentTraining) -> AlignedModel:
     """Return the mean of aligned sensors, each weighted by what it errs then.
 
-    Robot-world and hand-eye calibration with true verticals, see `mount.fit_alignment`, sensor by
+    Robot-world and hand-eye calibration with true verticals, see `fit_sensor_alignment`, sensor by
     sensor, then the eigenvector mean of Markley et al. 2007.
     """
 
@@ -113,7 +113,7 @@ def fit_aligned(training: SegmentTraining) -> AlignedModel:
 
 
 def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:
-    found = [fit_alignment("heading", q, training.q_reference) for q in training.sensors]
+    found = [fit_sensor_alignment("heading", q, training.q_reference) for q in training.sensors]
     turned = [
         rotation.multiply(rotation.multiply(one.q_world, q), one.q_mount)
         for one, q in zip(found, training.sensors, strict=True)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration import mount
 from jointfit_daemon.calibration.lags import sensor_lags, usable_ns
 from jointfit_daemon.calibration.markers import columns, moving_template, rigid_fit, visible
+from jointfit_daemon.calibration.mount import fit_observable_alignment
 from jointfit_daemon.calibration.refused import CalibrationRefused, unknown_name
 from jointfit_daemon.calibration.result import quaternion
 from jointfit_daemon.calibration.sampling import sensor_at
@@ -60,7 +60,7 @@ class AlignedSensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
+class PlateAlignment:
     """Every sensor's world in the optical one."""
 
     sensors: Mapping[str, AlignedSensor]
@@ -106,9 +106,9 @@ class Alignment:
         }
 
     @staticmethod
-    def from_dict(data: Mapping[str, Any]) -> Alignment:
+    def from_dict(data: Mapping[str, Any]) -> PlateAlignment:
         """Return the alignment of a JSON form."""
-        return Alignment(
+        return PlateAlignment(
             {
                 name: AlignedSensor(
                     quaternion(item["q_optical_world"]),
@@ -125,12 +125,12 @@ class Alignment:
         )
 
 
-def fit_alignment(
+def fit_plate_alignment(
     trial: CalibrationTrial,
     settings: CalibrationSettings,
     *,
     lag_ns: Mapping[str, int] | None = None,
-) -> Alignment:
+) -> PlateAlignment:
     """Align every sensor of the trial with the optical world.
 
     Parameters
@@ -172,7 +172,7 @@ def fit_alignment(
         for name, item in found.items()
         if item.kind == "heading"
     ]
-    return Alignment(found, tuple(notes))
+    return PlateAlignment(found, tuple(notes))
 
 
 def plate_track(
@@ -220,7 +220,7 @@ def _align_one(
             " check that the sensor streams and the plate is in view"
         )
     every = both[:: -(-both.size // MAX_FRAMES)]
-    fit = mount.align(q_sensor[every], q_plate[every])
+    fit = fit_observable_alignment(q_sensor[every], q_plate[every])
     if fit.kind == "mount":
         raise CalibrationRefused(f"{name}: {'; '.join(fit.refused)}")
     if fit.residual_scale > MAX_RMS:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration import mount
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, Anatomy, JointFound, find_anatomy
 from jointfit_daemon.calibration.digest import trials_digest
 from jointfit_daemon.calibration.joint_correlation import error_correlations
@@ -28,6 +27,7 @@ from jointfit_daemon.calibration.limb_training import MIN_FRAMES, limb_training
 from jointfit_daemon.calibration.markers import ClusterTrack, track_clusters, visible
 from jointfit_daemon.calibration.memory import evenly, pack
 from jointfit_daemon.calibration.model_fit import LimbTraining, fit_models, judge
+from jointfit_daemon.calibration.mount import fit_sensor_alignment
 from jointfit_daemon.calibration.refined_clusters import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.result import (
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.alignment_phase import Alignment
+    from jointfit_daemon.calibration.alignment_phase import PlateAlignment
     from jointfit_daemon.calibration.segment_model import SegmentModel
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, Quaternion
@@ -76,7 +76,7 @@ MEANING = (
 def fit_calibration(
     static: StaticPose | CalibrationTrial,
     functional: CalibrationTrial,
-    alignment: Alignment | None,
+    alignment: PlateAlignment | None,
     settings: CalibrationSettings,
     chain: Chain,
     *,
@@ -94,7 +94,7 @@ def fit_calibration(
         The static pose, or the trial to take it from.
     functional : CalibrationTrial
         The movement, with the optical system; sensor stamps not yet corrected for lag.
-    alignment : Alignment or None
+    alignment : PlateAlignment or None
         None: all sensor worlds are taken for the optical one, and ``headings_from_static`` says so.
     previous : Calibration, optional
         Gives lags where this movement shows none.
@@ -215,7 +215,7 @@ def _lags(
 def _chosen_lags(
     chain: Chain,
     moving: Mapping[str, LagEstimate],
-    alignment: Alignment | None,
+    alignment: PlateAlignment | None,
     earlier: Mapping[str, ChosenLag],
     known: Mapping[str, int],
 ) -> dict[str, ChosenLag]:
@@ -264,7 +264,7 @@ def _lag_notes(lags: Mapping[str, LagEstimate], used_ns: Mapping[str, int]) -> l
 def _sensors(
     chain: Chain,
     pose: StaticPose,
-    alignment: Alignment | None,
+    alignment: PlateAlignment | None,
     anatomy: Anatomy,
     lag_ns: Mapping[str, int],
 ) -> dict[str, SensorCalibration]:
@@ -282,7 +282,7 @@ def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTrainin
     notes = []
     for segment, group in zip(chain.segments, chain.sensors, strict=True):
         for s in group:
-            found = mount.fit_alignment("heading", raw[s], training.reference[segment])
+            found = fit_sensor_alignment("heading", raw[s], training.reference[segment])
             turn = float(rotation.heading_of(found.q_world))
             if abs(turn) > MISALIGNED:
                 notes.append(

@@ -8,7 +8,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon import __version__
-from jointfit_daemon.calibration.alignment_phase import AlignedSensor, Alignment, fit_alignment
+from jointfit_daemon.calibration.alignment_phase import (
+    AlignedSensor,
+    PlateAlignment,
+    fit_plate_alignment,
+)
 from jointfit_daemon.calibration.fit import better, fit_calibration
 from jointfit_daemon.calibration.online_fit import learn
 from jointfit_daemon.calibration.refused import CalibrationRefused
@@ -47,12 +51,12 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
 def _alignment(payload: Mapping[str, Any]) -> Any:
     """Return the alignment of this session, else the one of the calibration in force, else None."""
     if payload.get("alignment") is not None:
-        return Alignment.from_dict(payload["alignment"])
+        return PlateAlignment.from_dict(payload["alignment"])
     previous = _previous(payload)
     if previous is None or "headings_from_static" in previous.flags:
         return None
     # Worlds are a matter of the room, not of the wearer: they outlive a calibration.
-    return Alignment(
+    return PlateAlignment(
         {
             name: AlignedSensor(item.q_optical_world, "stored", 0.0, 0.0, 0.0, item.lag_ns)
             for name, item in previous.sensor.items()
@@ -68,11 +72,11 @@ def _previous(payload: Mapping[str, Any]) -> Any:
     return calibration if calibration.fits(payload["chain"]) else None
 
 
-def _newer_worlds(payload: Mapping[str, Any], previous: Calibration) -> Alignment | None:
+def _newer_worlds(payload: Mapping[str, Any], previous: Calibration) -> PlateAlignment | None:
     """Return the alignment of this session, if the models of `previous` live in such worlds."""
     if payload.get("alignment") is None or "headings_from_static" in previous.flags:
         return None
-    return Alignment.from_dict(payload["alignment"])
+    return PlateAlignment.from_dict(payload["alignment"])
 
 
 def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,7 +86,7 @@ def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
         raise CalibrationRefused(
             *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
         )
-    found = fit_alignment(payload["trial"], payload["settings"], lag_ns=payload.get("lag_ns"))
+    found = fit_plate_alignment(payload["trial"], payload["settings"], lag_ns=payload.get("lag_ns"))
     return {"alignment": found.to_dict(), "quality": found.quality}
 
 

@@ -13,8 +13,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.calibration import kernel_features as features
 from jointfit_daemon.calibration.held_out_spread import SMALLEST_LEVERAGE, hull, ratios
+from jointfit_daemon.calibration.kernel_features import (
+    WIDTHS,
+    bumps,
+    smooth_terms,
+    spread_centers,
+    widths_of,
+)
 from jointfit_daemon.calibration.kernel_ridge import Basis, choose, fit
 
 if TYPE_CHECKING:
@@ -62,10 +68,10 @@ class Expert:
             m.
         """
         seen = u if self.tilted else u[:, : 3 * sensors]
-        smooth = features.smooth_terms(seen)
-        x = seen / features.widths_of(self.width, sensors, tilted=self.tilted)
+        smooth = smooth_terms(seen)
+        x = seen / widths_of(self.width, sensors, tilted=self.tilted)
         centers = np.array(self.centers, dtype=np.float64).reshape(-1, x.shape[1])
-        phi = np.concatenate([smooth, features.bumps(x, centers)], axis=1)
+        phi = np.concatenate([smooth, bumps(x, centers)], axis=1)
         far = np.einsum("ij,jk,ik->i", smooth, np.array(self.leverage), smooth)
         correction = np.clip(phi @ np.array(self.coefficients).T, -LARGEST, LARGEST)
         return correction, far / self.hull_leverage
@@ -122,12 +128,12 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         Ways of leaving out, each with its groups.
     """
     seen = u if tilted else u[:, : 3 * sensors]
-    smooth = features.smooth_terms(seen)
+    smooth = smooth_terms(seen)
     best = None
-    for width in features.WIDTHS:
-        x = seen / features.widths_of(width, sensors, tilted=tilted)
-        centers = features.spread_centers(x)
-        basis = Basis.of(smooth, features.bumps(x, centers), features.bumps(centers, centers))
+    for width in WIDTHS:
+        x = seen / widths_of(width, sensors, tilted=tilted)
+        centers = spread_centers(x)
+        basis = Basis.of(smooth, bumps(x, centers), bumps(centers, centers))
         held = [choose(basis, rho, groups) for groups in ways]
         score = sum(float(np.sum(each.residuals**2)) for each in held)
         if best is None or score < best[0]:

@@ -26,9 +26,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from typing_extensions import override  # typing has it from Python 3.12
 
-from jointfit_daemon.calibration import kernel_features as features
 from jointfit_daemon.calibration.held_out_spread import Spread, measure_spread
 from jointfit_daemon.calibration.kernel_expert import Expert, fit_expert
+from jointfit_daemon.calibration.kernel_features import (
+    relative_rotations,
+    relative_rotations_one,
+    tilts,
+    tilts_one,
+)
 from jointfit_daemon.calibration.kernel_tables import Tables
 from jointfit_daemon.calibration.kernel_trend import fit_trend, trend, unseen_trend
 from jointfit_daemon.calibration.segment_model import Prediction, SegmentModel, SegmentTraining
@@ -99,8 +104,8 @@ class KernelModel(SegmentModel):
         mean = fuse_one(sensors, _equal(len(sensors)))
         if q_other is None:
             return Prediction(mean, self.mean_sd, False)
-        u = features.relative_rotations_one(sensors, mean, q_other)
-        a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, features.tilts_one(mean))
+        u = relative_rotations_one(sensors, mean, q_other)
+        a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, tilts_one(mean))
         p = 1.0 - SHARE if ratio <= HULL else (1.0 - SHARE) * sqrt(HULL / ratio)
         s = SHARE / b_ratio if b_ratio > 1.0 else SHARE
         (ax, ay, az), (bx, by, bz) = a, b
@@ -138,7 +143,7 @@ class KernelModel(SegmentModel):
             sensors=data["sensors"],
             plain=Expert.read(data["plain"]),
             tilted=Expert.read(data["tilted"]),
-            trend=_read_trend(data),
+            trend=_rows_xy(data["trend"]),
             spread=Spread.read(data["spread"]),
             residual_sd=data["residual_sd"],
             mean_sd=data["mean_sd"],
@@ -195,8 +200,8 @@ def learn_kernel(training: SegmentTraining) -> tuple[KernelModel, Array]:
 
 
 def _seen(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:
-    u = features.relative_rotations(sensors, mean, q_other)
-    return np.concatenate([u, features.tilts(mean)], axis=1)
+    u = relative_rotations(sensors, mean, q_other)
+    return np.concatenate([u, tilts(mean)], axis=1)
 
 
 def _mixed(line: Array, a: Array, a_ratio: Array, b: Array, b_ratio: Array) -> Array:
@@ -219,8 +224,6 @@ def _equal(count: int) -> tuple[float, ...]:
     return (1.0 / count,) * count
 
 
-def _read_trend(data: Mapping[str, Any]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the trend; a model of an earlier version has none."""
-    none = [0.0] * (1 + 3 * data["sensors"] + features.TILTS)
-    x, y = data.get("trend", (none, none))
+def _rows_xy(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    x, y = rows
     return tuple(x), tuple(y)

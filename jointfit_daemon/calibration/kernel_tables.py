@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration import kernel_features as features
 from jointfit_daemon.calibration.kernel_expert import LARGEST, Expert
+from jointfit_daemon.calibration.kernel_features import TILTS, smooth_terms_one, widths_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,7 +49,7 @@ class Tables:
     def of(plain: Expert, tilted: Expert, trend: Sequence[Sequence[float]]) -> Tables:
         """Return the tables of two experts and the trend about x and y."""
         width = len(trend[0]) - 1
-        sensors, q = (width - features.TILTS) // 3, len(tilted.leverage)
+        sensors, q = (width - TILTS) // 3, len(tilted.leverage)
         a, b = (_Part.of(expert, sensors, width, q) for expert in (plain, tilted))
         smooth = np.concatenate([a.root, b.root, a.of_smooth, b.of_smooth])
         bumps, roots = len(a.exponents) + len(b.exponents), len(a.root) + len(b.root)
@@ -72,7 +72,7 @@ class Tables:
     ) -> tuple[Vector, float, Vector, float, tuple[float, float]]:
         """Return correction, rad, and leverage ratio, of a and of b; then T_x and T_y, rad."""
         seen = [*u, *tilts]
-        smooth = features.smooth_terms_one(seen)
+        smooth = smooth_terms_one(seen)
         row = [*smooth, *[v * v for v in seen], 1.0]
         terms = self.terms.dot(np.array(row, np.float64))  # told the type, numpy need not look
         bumps, roots = terms[: self.bumps], terms[self.bumps : self.roots]
@@ -98,7 +98,7 @@ class _Part:
     def of(expert: Expert, sensors: int, width: int, terms: int) -> _Part:
         """`width` columns of u and `terms` smooth terms are seen by whoever sees most."""
         scale = np.zeros(width)
-        lengths = features.widths_of(expert.width, sensors, tilted=expert.tilted)
+        lengths = widths_of(expert.width, sensors, tilted=expert.tilted)
         scale[: len(lengths)] = 1.0 / lengths
         C = np.array(expert.coefficients)
         s = len(expert.leverage)

@@ -46,7 +46,7 @@ class AlignmentLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
+class SensorAlignment:
     """What was found, how well, and what was refused."""
 
     kind: Kind
@@ -69,9 +69,9 @@ class Alignment:
     """Why each richer kind was not accepted."""
 
 
-def align(
+def fit_observable_alignment(
     q_world_sensor: ArrayLike, q_optical_body: ArrayLike, limits: AlignmentLimits | None = None
-) -> Alignment:
+) -> SensorAlignment:
     """Return the richest alignment the movement supports: full, else heading, else mount only.
 
     Parameters
@@ -88,24 +88,26 @@ def align(
     """
     limits = limits or AlignmentLimits()
     refused: list[str] = []
-    full = fit_alignment("full", q_world_sensor, q_optical_body)
+    full = fit_sensor_alignment("full", q_world_sensor, q_optical_body)
     if full.kappa <= limits.kappa_full and full.weak_error <= limits.weak_error:
         return full
     refused.append(
         f"full world alignment: kappa {full.kappa:.3f} (at most {limits.kappa_full}), error of the "
         f"weakest direction {np.rad2deg(full.weak_error):.2f} deg: turn about two or more axes"
     )
-    heading = fit_alignment("heading", q_world_sensor, q_optical_body)
+    heading = fit_sensor_alignment("heading", q_world_sensor, q_optical_body)
     if heading.kappa <= limits.kappa_heading:
         return _with_refused(heading, refused)
     refused.append(
         f"heading alignment: kappa {heading.kappa:.3f} (at most {limits.kappa_heading}): turn "
         "about a horizontal axis, too"
     )
-    return _with_refused(fit_alignment("mount", q_world_sensor, q_optical_body), refused)
+    return _with_refused(fit_sensor_alignment("mount", q_world_sensor, q_optical_body), refused)
 
 
-def fit_alignment(kind: Kind, q_world_sensor: ArrayLike, q_optical_body: ArrayLike) -> Alignment:
+def fit_sensor_alignment(
+    kind: Kind, q_world_sensor: ArrayLike, q_optical_body: ArrayLike
+) -> SensorAlignment:
     r"""Fit one kind of alignment by robust least squares, without judging it.
 
     With :math:`b = q_B` and :math:`v = q_W^*` the model reads :math:`L(q_s) b = \pm R(q_{ref}) v`;
@@ -148,7 +150,7 @@ def _starts(q_s: Array, q_ref: Array, T: Array) -> tuple[Array, Array]:
     return steady, np.where(flat @ alike < 0.0, -1.0, 1.0)
 
 
-def _solve(kind: Kind, q_s: Array, q_ref: Array, T: Array, signs: Array) -> Alignment:
+def _solve(kind: Kind, q_s: Array, q_ref: Array, T: Array, signs: Array) -> SensorAlignment:
     weights = np.ones(len(T))
     q_world, b, kappa = _decompose(kind, T, signs)
     for _ in range(MAX_PASSES):
@@ -181,7 +183,7 @@ def _model(q_world: Array, q_s: Array, q_mount: Array) -> Array:
 
 def _judged(
     kind: Kind, streams: tuple[Array, Array], q_world: Array, q_mount: Array, kappa: float
-) -> Alignment:
+) -> SensorAlignment:
     q_s, q_ref = streams
     model = _model(q_world, q_s, q_mount)
     residuals = rotation.log(rotation.multiply(rotation.conjugate(model), q_ref))
@@ -195,8 +197,8 @@ def _judged(
     weak = weighted_rms / np.sqrt(apart) if kappa < 1.0 - _SAME else np.inf
     q_world = rotation.align_hemisphere(q_world, rotation.IDENTITY)
     q_mount = rotation.align_hemisphere(q_mount, rotation.IDENTITY)
-    return Alignment(kind, q_world, q_mount, kappa, float(weak), rms, scale, count)
+    return SensorAlignment(kind, q_world, q_mount, kappa, float(weak), rms, scale, count)
 
 
-def _with_refused(found: Alignment, refused: list[str]) -> Alignment:
+def _with_refused(found: SensorAlignment, refused: list[str]) -> SensorAlignment:
     return replace(found, refused=tuple(refused))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.limb_training import twins
-from jointfit_daemon.calibration.mount import fit_alignment
+from jointfit_daemon.calibration.mount import fit_sensor_alignment
 from jointfit_daemon.calibration.static import robust_mean
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import joint_rotation
@@ -90,7 +90,7 @@ def _far_sensors(
 def _turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str]:
     """Tell of worlds turned about the vertical, where the movement parts heading from mount."""
     for _, sensor, q, reference in _streams(chain, trials):
-        alignment = fit_alignment("heading", q, reference)
+        alignment = fit_sensor_alignment("heading", q, reference)
         angle = float(rotation.heading_of(alignment.q_world))
         if alignment.kappa <= HEADING_SEPARABLE and abs(angle) > MISALIGNED:
             yield (

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, get_args
 
 from jointfit_daemon.calibration.aligned_mean import AlignedModel, fit_aligned
-from jointfit_daemon.calibration.anchored import AnchoredModel
 from jointfit_daemon.calibration.kernel_model import KernelModel, fit_kernel
 from jointfit_daemon.calibration.mean_model import MeanModel, best_single, fit_mean, plain_mean
 from jointfit_daemon.calibration.patent import PatentModel, fit_patent
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AlignedModel",
-    "AnchoredModel",
     "KernelModel",
     "MeanModel",
     "PatentModel",

@@ -15,13 +15,8 @@ import numpy as np
 from jointfit_daemon.calibration.robust import huber_weights, robust_scale
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
     from jointfit_daemon.arrays import Array
 
-PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 PASSES = 5
 _SMALLEST_SCALE = 1e-9
 
@@ -41,21 +36,6 @@ class Ridge:
         """Return the leverage of each row, shape (n,)."""
         found: Array = np.einsum("ij,jk,ik->i", phi, self.leverage, phi)
         return found
-
-
-@dataclass(frozen=True, slots=True)
-class CrossValidated:
-    """Held-out behaviour of a fit, all blocks together."""
-
-    residuals: Array
-    """rho minus prediction, rad, shape (n, 3)."""
-    leverage_ratios: Array
-    """Leverage of each held-out row over the mean of its own training rows, shape (n,)."""
-
-    @property
-    def score(self) -> float:
-        """Summed squared residual."""
-        return float(np.sum(self.residuals**2))
 
 
 def fit_ridge(
@@ -78,24 +58,3 @@ def fit_ridge(
         weights = huber_weights(sizes, robust_scale(sizes))
     inverse = n * np.linalg.inv(H) / np.outer(scales, scales)
     return Ridge(C / scales[:, None], 0.5 * (inverse + inverse.T), scales)
-
-
-def cross_validate(
-    phi: Array, rho: Array, penalty: float, folds: Iterable[NDArray[np.bool_]]
-) -> CrossValidated:
-    """Fit without each fold in turn and look at that fold."""
-    residuals, ratios = [], []
-    for held in folds:
-        fit = fit_ridge(phi[~held], rho[~held], penalty)
-        residuals.append(rho[held] - phi[held] @ fit.coefficients)
-        ratios.append(fit.leverages(phi[held]) / np.mean(fit.leverages(phi[~held])))
-    return CrossValidated(np.concatenate(residuals), np.concatenate(ratios))
-
-
-def best_penalty(
-    phi: Array, rho: Array, folds: Iterable[NDArray[np.bool_]]
-) -> tuple[float, CrossValidated]:
-    """Return the penalty with the smallest held-out score, and how it did."""
-    blocks = list(folds)
-    tried = [(penalty, cross_validate(phi, rho, penalty, blocks)) for penalty in PENALTIES]
-    return min(tried, key=lambda pair: pair[1].score)

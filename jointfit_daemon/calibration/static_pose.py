@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.calibration.alignment_phase import Alignment
+    from jointfit_daemon.calibration.alignment_phase import PlateAlignment
     from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Chain, Quaternion
 
@@ -129,7 +129,7 @@ def sensor_calibration(
 
 def fit_static_only(
     pose: StaticPose,
-    alignment: Alignment | None,
+    alignment: PlateAlignment | None,
     chain: Chain,
     *,
     software: str = "",
@@ -184,7 +184,7 @@ def _plain_means(sensors: tuple[str, ...]) -> dict[str, SegmentModel]:
 
 
 def with_new_static(
-    calibration: Calibration, pose: StaticPose, alignment: Alignment | None = None
+    calibration: Calibration, pose: StaticPose, alignment: PlateAlignment | None = None
 ) -> Calibration:
     """Return the calibration after sensors were put on anew: only the biases change.
 
@@ -193,7 +193,7 @@ def with_new_static(
 
     Parameters
     ----------
-    alignment : Alignment, optional
+    alignment : PlateAlignment, optional
         Newer than the calibration: gives the worlds, and the lags it has found.
 
     Raises

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.alignment_phase import Alignment, fit_alignment
+from jointfit_daemon.calibration.alignment_phase import PlateAlignment, fit_plate_alignment
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.trial import CalibrationSettings
 from tests.calibration.synthetic_limb import (
@@ -23,7 +23,7 @@ from tests.calibration.synthetic_limb import (
 PLATE = np.array([[0.1, 0, 0], [-0.1, 0.05, 0], [0, -0.1, 0.03], [0.03, 0.08, 0.05]])
 
 
-def errors_deg(found: Alignment, subject: Subject) -> list[float]:
+def errors_deg(found: PlateAlignment, subject: Subject) -> list[float]:
     return [
         float(
             np.degrees(
@@ -36,7 +36,7 @@ def errors_deg(found: Alignment, subject: Subject) -> list[float]:
 
 def test_worlds_up_to_90_degrees_apart_are_aligned_in_spite_of_a_lag() -> None:
     subject = Subject(5, flaws=Imperfections(sensor_deg=0.5, lag_s=0.02, occluded=0.05))
-    found = fit_alignment(plate_trial(subject), SETTINGS)
+    found = fit_plate_alignment(plate_trial(subject), SETTINGS)
     assert max(errors_deg(found, subject)) < 0.3
     for item in found.sensors.values():
         assert item.kind == "full"
@@ -47,7 +47,7 @@ def test_worlds_up_to_90_degrees_apart_are_aligned_in_spite_of_a_lag() -> None:
 def test_a_lag_handed_in_is_believed() -> None:
     subject = Subject(5, flaws=Imperfections(lag_s=0.05))
     lags = dict.fromkeys(subject.worlds(), 50_000_000)
-    found = fit_alignment(plate_trial(subject), SETTINGS, lag_ns=lags)
+    found = fit_plate_alignment(plate_trial(subject), SETTINGS, lag_ns=lags)
     assert max(errors_deg(found, subject)) < 0.1
 
 
@@ -61,13 +61,13 @@ def test_a_plate_of_markers_serves_as_well() -> None:
     names = ("P1", "P2", "P3", "P4")
     optical = optical_track(trial.optical.t_ns.astype(np.float64) / 1e9, positions, names)
     settings = CalibrationSettings(markers={"plate": names})
-    found = fit_alignment(replace(trial, optical=optical), settings)
+    found = fit_plate_alignment(replace(trial, optical=optical), settings)
     assert max(errors_deg(found, subject)) < 0.2
 
 
 def test_turning_about_one_horizontal_axis_gives_the_heading_and_says_so() -> None:
     subject = Subject(7)
-    found = fit_alignment(plate_trial(subject, axes=1), SETTINGS)
+    found = fit_plate_alignment(plate_trial(subject, axes=1), SETTINGS)
     assert {item.kind for item in found.sensors.values()} == {"heading"}
     assert max(errors_deg(found, subject)) < 1.0
     assert any("heading only" in note for note in found.notes)
@@ -76,14 +76,14 @@ def test_turning_about_one_horizontal_axis_gives_the_heading_and_says_so() -> No
 def test_an_unknown_plate_is_refused_with_the_nearest_spelling() -> None:
     settings = CalibrationSettings(plate="Plaet")
     with pytest.raises(CalibrationRefused, match="did you mean 'Plate'"):
-        fit_alignment(plate_trial(Subject(), 8.0), settings)
+        fit_plate_alignment(plate_trial(Subject(), 8.0), settings)
 
 
 def test_no_plate_and_no_movement_are_refused() -> None:
     with pytest.raises(CalibrationRefused, match="no plate"):
-        fit_alignment(plate_trial(Subject(), 8.0), CalibrationSettings())
+        fit_plate_alignment(plate_trial(Subject(), 8.0), CalibrationSettings())
     with pytest.raises(CalibrationRefused, match=r"S1.*S2.*S3.*S4"):
-        fit_alignment(plate_trial(Subject(), 8.0, axes=0), SETTINGS)
+        fit_plate_alignment(plate_trial(Subject(), 8.0, axes=0), SETTINGS)
 
 
 def test_a_sensor_that_came_loose_is_named() -> None:
@@ -95,10 +95,10 @@ def test_a_sensor_that_came_loose_is_named() -> None:
     q = Rotation.from_quat(track.q_world_sensor, scalar_first=True) * loose
     sensors = {**trial.sensors, "S3": replace(track, q_world_sensor=q.as_quat(scalar_first=True))}
     with pytest.raises(CalibrationRefused) as caught:
-        fit_alignment(replace(trial, sensors=sensors), SETTINGS)
+        fit_plate_alignment(replace(trial, sensors=sensors), SETTINGS)
     assert [reason[:2] for reason in caught.value.reasons] == ["S3"]
 
 
 def test_json_is_exact() -> None:
-    found = fit_alignment(plate_trial(Subject(), 12.0), SETTINGS)
-    assert Alignment.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+    found = fit_plate_alignment(plate_trial(Subject(), 12.0), SETTINGS)
+    assert PlateAlignment.from_dict(json.loads(json.dumps(found.to_dict()))) == found

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.alignment_phase import Alignment, fit_alignment
+from jointfit_daemon.calibration.alignment_phase import PlateAlignment, fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
@@ -36,9 +36,9 @@ QUICK = replace(LEARNING, method="mean")
 
 
 @cache
-def trials() -> tuple[CalibrationTrial, CalibrationTrial, Alignment]:
+def trials() -> tuple[CalibrationTrial, CalibrationTrial, PlateAlignment]:
     static, functional, _ = static_and_functional(SUBJECT, 12.0)
-    return static, functional, fit_alignment(plate_trial(SUBJECT), SETTINGS)
+    return static, functional, fit_plate_alignment(plate_trial(SUBJECT), SETTINGS)
 
 
 def fit(

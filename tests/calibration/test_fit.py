@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.content_check import content_faults
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.judgement import better
@@ -46,7 +46,7 @@ WORN = Imperfections(
 def clean() -> tuple[Subject, Calibration]:
     subject = Subject(11)
     static, functional, _ = static_and_functional(subject, 24.0)
-    alignment = fit_alignment(plate_trial(subject), SETTINGS)
+    alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
     return subject, fit_calibration(
         static, functional, alignment, SETTINGS, CHAIN, software="1.2", created_utc="2026-01-01"
     )
@@ -103,7 +103,7 @@ def test_every_alive_set_has_a_model(clean: tuple[Subject, Calibration]) -> None
 def test_the_correction_beats_the_mean_on_worn_sensors_in_three_seconds() -> None:
     subject = Subject(12, flaws=WORN)
     static, functional, _ = static_and_functional(subject, 40.0)
-    alignment = fit_alignment(plate_trial(subject), SETTINGS)
+    alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
     began = time.process_time()
     found = fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
     assert time.process_time() - began < 15.0  # generous: three seconds on a quiet machine
@@ -245,7 +245,7 @@ def test_the_digest_tells_trials_apart(clean: tuple[Subject, Calibration]) -> No
     other = replace(
         functional, sensors={**functional.sensors, "S1": replace(track, q_world_sensor=q)}
     )
-    alignment = fit_alignment(plate_trial(subject), SETTINGS)
+    alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
     same = fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
     assert same.digest == calibration.digest
     assert fit_calibration(static, other, alignment, SETTINGS, CHAIN).digest != calibration.digest

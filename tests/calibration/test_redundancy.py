@@ -8,7 +8,6 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.anchored import AnchoredModel, fit_anchored
 from jointfit_daemon.calibration.redundancy import (
     AlignedModel,
     KernelModel,
@@ -204,21 +203,6 @@ def test_where_nothing_can_be_learned_the_mean_stays() -> None:
     model = fit_segment("anchored", limb.sensors, limb.other, limb.segment, labels)
     mean = fit_segment("mean", limb.sensors, limb.other, limb.segment)
     assert limb.error(model, slice(0, N)) < 1.02 * limb.error(mean, slice(0, N))
-
-
-def test_the_linear_correction_of_older_calibrations_still_reads_and_runs() -> None:
-    limb = Limb()
-    training = SegmentTraining.of(limb.sensors, limb.other, limb.segment)
-    model = fit_anchored(training)
-    assert isinstance(
-        SegmentModel.from_dict(json.loads(json.dumps(model.to_dict()))), AnchoredModel
-    )
-    for i in range(0, N, 50):
-        said = model.predict_one(
-            [as_quaternion(q[i]) for q in limb.sensors], as_quaternion(limb.other[i])
-        )
-        assert rot.angle_between(said.q, model.predict(limb.sensors, limb.other)[i]) < 1e-9
-    assert limb.error(model, slice(0, N)) < 0.35 * limb.error(limb.fit("mean"))
 
 
 def test_patent6_shares_the_coefficients_and_patent12_does_not() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from tests.calibration.synthetic_limb import (
     CHAIN,
@@ -22,5 +22,5 @@ if TYPE_CHECKING:
 def calibrated(subject: Subject, chain: Chain = CHAIN) -> Calibration:
     """Return what the align phase, a static pose and half a minute of movement give."""
     static, functional, _ = static_and_functional(subject, 30.0)
-    alignment = fit_alignment(plate_trial(subject), SETTINGS)
+    alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
     return fit_calibration(static, functional, alignment, SETTINGS, chain)

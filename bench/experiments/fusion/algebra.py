@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.baselines.recursive_least_squares import InformationForm, RecursiveLeastSquares
 from bench.framework.experiment import Experiment, Figure
-from jointfit_daemon.calibration.recursive import InformationForm, RecursiveLeastSquares
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import grood_suntay, patent_angles
 

@@ -17,7 +17,7 @@ import numpy as np
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.faulty_wearer import Worn, play
 from bench.subjects.simulated_wearer import NS, bench_rig
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.online_fit import Fresh, learn
 from jointfit_daemon.calibration.refused import CalibrationRefused
@@ -124,7 +124,7 @@ def calibrated(seed: int) -> Calibration | None:
     rig, one = bench_rig(), person(seed)
     settings = replace(rig.calibration, functional_min_s=0.0)
     try:
-        alignment = fit_alignment(one.trial(2.0, 24.0), settings)
+        alignment = fit_plate_alignment(one.trial(2.0, 24.0), settings)
         return fit_calibration(
             one.trial(26.0, 33.0), one.trial(33.0, LEARN_S), alignment, settings, rig.chain
         )

@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.refused import CalibrationRefused
 from jointfit_daemon.calibration.static_pose import StaticPose, fit_static
@@ -150,7 +150,7 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
     found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
     for seed in seeds:
         trials, live = phases(seed), wear_live(seed)
-        alignment = fit_alignment(trials.align, rig.calibration)
+        alignment = fit_plate_alignment(trials.align, rig.calibration)
         pose = take_pose(trials.static, rig)
         if pose is None:
             continue

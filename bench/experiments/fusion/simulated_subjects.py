@@ -19,7 +19,7 @@ from bench.experiments.fusion.simulated_leg import take_pose, wear_live
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.recorded_knee import Judge, KneeTrial
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.markers import track_clusters
 from jointfit_daemon.calibration.sampling import sensor_at
@@ -47,7 +47,7 @@ def person(seed: int) -> tuple[KneeTrial, KneeTrial] | None:
     if pose is None or optical is None:
         return None
     settings = replace(rig.calibration, method="mean")
-    alignment = fit_alignment(trials.align, settings)
+    alignment = fit_plate_alignment(trials.align, settings)
     found = fit_calibration(pose, trials.functional, alignment, settings, rig.chain)
     tracks = track_clusters(optical, pose.clusters)
     bones = [rotation.multiply(tracks[name].q, found.segment[name].q_static) for name in SEGMENTS]

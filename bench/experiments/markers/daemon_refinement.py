@@ -15,7 +15,7 @@ import numpy as np
 from bench.experiments.fusion.simulated_leg import SEEDS, SEGMENTS, errors_of, take_pose, wear_live
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.fit import fit_calibration
 from jointfit_daemon.calibration.markers import track_cluster
 from jointfit_daemon.kinematics import rotation
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from bench.experiments.fusion.simulated_leg import Live
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.alignment_phase import Alignment
+    from jointfit_daemon.calibration.alignment_phase import PlateAlignment
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.calibration.static_pose import StaticPose
     from jointfit_daemon.calibration.trial import CalibrationTrial
@@ -50,7 +50,7 @@ def refined(_: Path) -> list[Figure]:
         pose = take_pose(trials.static, rig)
         if pose is None:
             continue
-        alignment = fit_alignment(trials.align, rig.calibration)
+        alignment = fit_plate_alignment(trials.align, rig.calibration)
 
         change, calibration = _change(rig, pose, trials.functional, alignment, live)
         worn.append(change)
@@ -75,7 +75,7 @@ def refined(_: Path) -> list[Figure]:
 
 
 def _change(
-    rig: Rig, pose: StaticPose, functional: CalibrationTrial, alignment: Alignment, live: Live
+    rig: Rig, pose: StaticPose, functional: CalibrationTrial, alignment: PlateAlignment, live: Live
 ) -> tuple[Array, Calibration]:
     """Return errors of knee, thigh and shank with refining less those without, deg."""
     found = [

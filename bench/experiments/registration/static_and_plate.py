@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
-from jointfit_daemon.calibration.mount import align, fit_alignment
+from jointfit_daemon.calibration.mount import fit_observable_alignment, fit_sensor_alignment
 from jointfit_daemon.calibration.static import robust_mean
 from jointfit_daemon.calibration.stillness import still_from_rates
 from jointfit_daemon.kinematics import rotation
@@ -88,7 +88,7 @@ def plate(_: Path) -> list[Figure]:
         world, mount = [], []
         for seed in range(10):
             q_s, q_body, q_world, q_mount = random_walk(np.random.default_rng(seed), share)
-            found = fit_alignment("full", q_s, q_body)
+            found = fit_sensor_alignment("full", q_s, q_body)
             world.append(_degrees(rotation.angle_between(found.q_world, q_world)))
             mount.append(_degrees(rotation.angle_between(found.q_mount, q_mount)))
         figures += [
@@ -101,8 +101,8 @@ def plate(_: Path) -> list[Figure]:
 def one_axis(_: Path) -> list[Figure]:
     """B-4: turning about one axis only must be refused."""
     q_s, q_body, *_truth = random_walk(np.random.default_rng(4), axis=(1.0, 0.0, 0.0))
-    found = align(q_s, q_body)
-    kappa = fit_alignment("full", q_s, q_body).kappa
+    found = fit_observable_alignment(q_s, q_body)
+    kappa = fit_sensor_alignment("full", q_s, q_body).kappa
     return [
         Figure("kappa", kappa, 1.0, 0.999, ""),
         Figure("full fit accepted", float(found.kind == "full"), 0.0, unit=""),
@@ -113,7 +113,7 @@ def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Figure]:
     rng = np.random.default_rng(5)
     q_world, q_mount = rotation.exp(rng.normal(size=3)), rotation.exp(rng.normal(size=3))
     q_body = rotation.multiply(rotation.multiply(q_world, q_opt), q_mount)
-    found = align(q_s[kept], q_body[kept])
+    found = fit_observable_alignment(q_s[kept], q_body[kept])
     return [
         Figure("world", _degrees(rotation.angle_between(found.q_world, q_world)), 1.5),
         Figure("mount", _degrees(rotation.angle_between(found.q_mount, q_mount)), 1.0),

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from bench.framework.measurement import Bench, Row
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 from jointfit_daemon.calibration.jobs import run_job
 
 DAEMON = (
@@ -45,7 +45,7 @@ def fit_rows(quick: bool) -> list[Row]:
     del quick  # one fit is quick enough
     trials, rig = phases(), bench_rig()
     payload = {"chain": rig.chain, "settings": rig.calibration, "previous": None}
-    payload["alignment"] = fit_alignment(trials.align, rig.calibration).to_dict()
+    payload["alignment"] = fit_plate_alignment(trials.align, rig.calibration).to_dict()
     began = time.thread_time(), time.perf_counter()
     found = run_job(
         "functional", payload | {"static": trials.static, "functional": trials.functional}

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_alignment
+from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,7 +27,7 @@ def on_the_plate(_: Path) -> list[Figure]:
     settings = bench_rig().calibration
     lags, sigmas, refused = [], [], 0
     for seed in SEEDS:
-        for found in fit_alignment(phases(seed).align, settings).sensors.values():
+        for found in fit_plate_alignment(phases(seed).align, settings).sensors.values():
             if found.lag_ns is None or not found.lag_sigma_ns:
                 refused += 1
                 continue

@@ -1,25 +1,23 @@
-r"""The recommended model: a soft-tissue correction that turns with the subject.
+# ruff: noqa: N806 - matrices have capital names
+r"""Baseline: a linear soft-tissue correction of the weighted mean, without kernels.
 
 .. math:: \hat q = f_0 \otimes \exp(\eta\, \mathrm{clip}(C^T \varphi))
 
-f0 is the weighted mean of the segment's sensors, phi the relative rotations of `joint_features`, C
-a robust ridge fit of :math:`\rho = \log(f_0^* \otimes q_{ref})`.
-
-Law: zero correction in the static pose; exactly equivariant under turns of the world; outside the
-hull of the training movements the correction fades (eta) instead of growing.
+:math:`f_0` is the weighted mean of the sensors of a segment, :math:`\varphi` the relative rotations
+of `features`, and C a robust ridge fit of :math:`\rho = \log(f_0^* \otimes q_{ref})`. Outside the
+training range the correction fades (:math:`\eta`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import sqrt
+from math import sin, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from typing_extensions import override  # typing has it from Python 3.12
 
-from jointfit_daemon.calibration.joint_features import features, features_one
-from jointfit_daemon.calibration.robust_ridge import best_penalty, fit_ridge
+from jointfit_daemon.calibration.robust_ridge import fit_ridge
 from jointfit_daemon.calibration.segment_model import (
     Prediction,
     SegmentModel,
@@ -28,16 +26,23 @@ from jointfit_daemon.calibration.segment_model import (
 )
 from jointfit_daemon.calibration.weighted_mean import fuse, fuse_one, fusion_weights
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.rotation_scalar import exp_one, multiply_one
+from jointfit_daemon.kinematics.rotation_scalar import (
+    between_one,
+    exp_one,
+    log_one,
+    multiply_one,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
 
+PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""Ridge penalties compared on held-out blocks."""
 LARGEST = 0.4
 """No component of a correction exceeds this, rad."""
 HULL = 10.0
@@ -47,10 +52,10 @@ OUTSIDE = 3.0
 
 
 @dataclass(frozen=True)
-class AnchoredModel(SegmentModel):
+class LinearCorrection(SegmentModel):
     """Weighted mean and its correction by relative rotations."""
 
-    kind: ClassVar[str] = "anchored"
+    kind: ClassVar[str] = "linear"
 
     weights: tuple[float, ...]
     """One a sensor, sum 1."""
@@ -117,44 +122,17 @@ class AnchoredModel(SegmentModel):
 
     @override
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "kind": self.kind,
-            "weights": list(self.weights),
-            "coefficients": [list(row) for row in self.coefficients],
-            "leverage": [list(row) for row in self.leverage],
-            "scales": list(self.scales),
-            "hull_leverage": self.hull_leverage,
-            "mean_leverage": self.mean_leverage,
-            "ratio_offset": self.ratio_offset,
-            "covariance": [list(row) for row in self.covariance],
-            "residual_sd": self.residual_sd,
-            "mean_sd": self.mean_sd,
-            "penalty": self.penalty,
-            "movements": self.movements,
-        }
+        """A baseline is never stored."""
+        raise NotImplementedError
 
     @classmethod
     @override
-    def read(cls, data: Mapping[str, Any]) -> AnchoredModel:
-        """Return the model of its JSON form."""
-        return cls(
-            weights=tuple(data["weights"]),
-            coefficients=_tuples(data["coefficients"]),
-            leverage=_tuples(data["leverage"]),
-            scales=tuple(data["scales"]),
-            hull_leverage=data["hull_leverage"],
-            mean_leverage=data["mean_leverage"],
-            ratio_offset=data["ratio_offset"],
-            covariance=_tuples(data["covariance"]),
-            residual_sd=data["residual_sd"],
-            mean_sd=data["mean_sd"],
-            penalty=data["penalty"],
-            movements=data["movements"],
-        )
+    def read(cls, data: Mapping[str, Any]) -> LinearCorrection:
+        """A baseline is never stored."""
+        raise NotImplementedError
 
 
-def fit_anchored(training: SegmentTraining) -> AnchoredModel:
+def fit_linear_correction(training: SegmentTraining) -> LinearCorrection:
     """Fit the correction; its penalty and its claimed variance come from held-out blocks.
 
     Raises
@@ -163,7 +141,7 @@ def fit_anchored(training: SegmentTraining) -> AnchoredModel:
         There is no neighbouring segment to look at.
     """
     if training.q_other is None:
-        raise ValueError("the anchored model needs a sensor of the neighbouring segment")
+        raise ValueError("the linear correction needs a sensor of the neighbouring segment")
     weights = fusion_weights(training.sensors, training.q_reference)
     mean = fuse(training.sensors, weights.tolist())
     rho = rotation.log(rotation.multiply(rotation.conjugate(mean), training.q_reference))
@@ -172,7 +150,7 @@ def fit_anchored(training: SegmentTraining) -> AnchoredModel:
     ridge = fit_ridge(phi, rho, penalty)
     h = ridge.leverages(phi)
     covariance = held.residuals.T @ held.residuals / len(held.residuals)
-    return AnchoredModel(
+    return LinearCorrection(
         weights=tuple(weights.tolist()),
         coefficients=_tuples(ridge.coefficients.T.tolist()),
         leverage=_tuples(ridge.leverage.tolist()),
@@ -194,3 +172,73 @@ def _tuples(rows: Iterable[Iterable[float]]) -> tuple[tuple[float, ...], ...]:
 
 def _clipped(value: float) -> float:
     return min(max(value, -LARGEST), LARGEST)
+
+
+def features(sensors: Sequence[Array], q_other: Array) -> Array:
+    r"""Return the regressors of a segment, shape (n, 12 + 3 (m - 1)) for m sensors.
+
+    .. math:: \varphi = [k,\ d_2 \dots d_m,\ |k| \circ k,\ k_1 k_2,\ k_1 k_3,\ k_2 k_3,\ \sin 2k]
+
+    with :math:`k = \log(x^* \otimes o)` the joint rotation seen by the first sensor and
+    :math:`d_j = \log(x^* \otimes y_j)` its disagreement with each further one, all rad.
+
+    Parameters
+    ----------
+    sensors : sequence of ndarray, shape (n, 4)
+        Bone-aligned sensors of the segment.
+    q_other : ndarray, shape (n, 4)
+        Bone-aligned sensor of the neighbouring segment.
+    """
+    inverse = rotation.conjugate(sensors[0])
+    k = rotation.log(rotation.multiply(inverse, q_other))
+    pairs = [rotation.log(rotation.multiply(inverse, q)) for q in sensors[1:]]
+    products = k[:, [0, 0, 1]] * k[:, [1, 2, 2]]
+    return np.concatenate([k, *pairs, np.abs(k) * k, products, np.sin(2.0 * k)], axis=1)
+
+
+def features_one(sensors: Sequence[Quaternion], q_other: Quaternion) -> list[float]:
+    """Return the same of one frame."""
+    first = sensors[0]
+    a, b, c = log_one(between_one(first, q_other))
+    found = [a, b, c]
+    for q in sensors[1:]:
+        found += log_one(between_one(first, q))
+    found += (abs(a) * a, abs(b) * b, abs(c) * c, a * b, a * c, b * c)
+    found += (sin(2.0 * a), sin(2.0 * b), sin(2.0 * c))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class CrossValidated:
+    """Held-out behaviour of a fit, all blocks together."""
+
+    residuals: Array
+    """rho minus prediction, rad, shape (n, 3)."""
+    leverage_ratios: Array
+    """Leverage of each held-out row over the mean of its own training rows, shape (n,)."""
+
+    @property
+    def score(self) -> float:
+        """Summed squared residual."""
+        return float(np.sum(self.residuals**2))
+
+
+def cross_validate(
+    phi: Array, rho: Array, penalty: float, folds: Iterable[NDArray[np.bool_]]
+) -> CrossValidated:
+    """Fit without each fold in turn and look at that fold."""
+    residuals, ratios = [], []
+    for held in folds:
+        fit = fit_ridge(phi[~held], rho[~held], penalty)
+        residuals.append(rho[held] - phi[held] @ fit.coefficients)
+        ratios.append(fit.leverages(phi[held]) / np.mean(fit.leverages(phi[~held])))
+    return CrossValidated(np.concatenate(residuals), np.concatenate(ratios))
+
+
+def best_penalty(
+    phi: Array, rho: Array, folds: Iterable[NDArray[np.bool_]]
+) -> tuple[float, CrossValidated]:
+    """Return the penalty with the smallest held-out score, and how it did."""
+    blocks = list(folds)
+    tried = [(penalty, cross_validate(phi, rho, penalty, blocks)) for penalty in PENALTIES]
+    return min(tried, key=lambda pair: pair[1].score)

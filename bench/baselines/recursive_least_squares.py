@@ -1,7 +1,8 @@
-r"""The fits of this room sample by sample, with forgetting: for tracking drift while optics run.
+# ruff: noqa: N806 - matrices have capital names
+r"""Recursive least squares with forgetting, compared with its batch form.
 
-Law: O(1) per sample, no history. With forgetting 1 each gives what its batch form gives.
-A forgetting factor of :math:`\mu = e^{-\Delta t/\tau}` remembers for about tau seconds.
+Every update costs O(1). With a forgetting factor of 1 the result equals the batch fit; a factor of
+:math:`\mu = e^{-\Delta t/\tau}` averages over about tau seconds.
 """
 
 from __future__ import annotations
@@ -9,8 +10,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from jointfit_daemon.kinematics.rotation import first_eigenvector
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -104,21 +103,3 @@ class InformationForm:
     def coefficients(self) -> Array:
         """Theta, shape (p, m)."""
         return np.asarray(np.linalg.solve(self._A, self._B), dtype=np.float64)
-
-
-class RecursiveMean:
-    r"""The mean rotation, :math:`M \leftarrow \mu M + w b b^T`; its first eigenvector on demand."""
-
-    def __init__(self, forgetting: float = 1.0) -> None:
-        self._M: Array = np.zeros((4, 4))
-        self._forgetting = forgetting
-
-    def feed(self, q: ArrayLike, weight: float = 1.0) -> None:
-        """Take one unit quaternion; its sign does not matter."""
-        q = np.asarray(q, dtype=np.float64)
-        self._M = self._forgetting * self._M + weight * np.outer(q, q)
-
-    @property
-    def q(self) -> Array:
-        """The mean so far, shape (4,), w >= 0."""
-        return first_eigenvector(self._M)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.recursive import (
+from bench.baselines.recursive_least_squares import (
     IDLE_SAMPLES,
     InformationForm,
     RecursiveLeastSquares,
-    RecursiveMean,
 )
-from jointfit_daemon.kinematics import rotation as rot
 
 
 def test_without_forgetting_recursive_is_ridge_regression() -> None:
@@ -61,12 +59,3 @@ def test_a_lighter_sample_moves_the_estimate_less() -> None:
     assert heavy.coefficients[0, 0] == pytest.approx(0.5)
     with pytest.raises(ValueError, match="forgetting 0"):
         RecursiveLeastSquares(1, 1, 1.0, 0.0)
-
-
-def test_the_recursive_mean_is_the_mean() -> None:
-    rng = np.random.default_rng(3)
-    q = rot.multiply(rot.exp([0.5, 1.0, -2.0]), rot.exp(rng.normal(0, 0.2, (100, 3))))
-    mean = RecursiveMean()
-    for row in q * rng.choice([-1.0, 1.0], 100)[:, None]:
-        mean.feed(row)
-    assert rot.angle_between(mean.q, rot.average(q)) < 1e-12
