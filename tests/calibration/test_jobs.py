@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.alignment_phase import AlignedSensor, Alignment
+from jointfit_daemon.calibration.alignment_phase import AlignedSensor, PlateAlignment
 from jointfit_daemon.calibration.jobs import run_job
 from jointfit_daemon.calibration.result import Calibration, quaternion
 from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
@@ -31,9 +31,9 @@ def mounts() -> dict[str, np.ndarray]:
     return {name: rotation.exp(RNG.normal(size=3)) for name in SENSORS}
 
 
-def worlds(angles: dict[str, float]) -> Alignment:
+def worlds(angles: dict[str, float]) -> PlateAlignment:
     """Return an alignment in which every world is turned by its angle about the vertical."""
-    return Alignment(
+    return PlateAlignment(
         {
             name: AlignedSensor(quaternion(about_z(angle)), "full", 0.1, 0.01, 0.01, 4_000_000)
             for name, angle in angles.items()
@@ -41,7 +41,7 @@ def worlds(angles: dict[str, float]) -> Alignment:
     )
 
 
-def standing(alignment: Alignment, worn: dict[str, np.ndarray]) -> CalibrationTrial:
+def standing(alignment: PlateAlignment, worn: dict[str, np.ndarray]) -> CalibrationTrial:
     """Return five seconds of all segments upright, as the sensors see it."""
     t_ns = np.arange(500, dtype=np.int64) * 10_000_000
     tracks = {}
@@ -52,13 +52,17 @@ def standing(alignment: Alignment, worn: dict[str, np.ndarray]) -> CalibrationTr
     return CalibrationTrial(tracks, None)
 
 
-def said(alignment: Alignment, worn: dict[str, np.ndarray], name: str, q: np.ndarray) -> np.ndarray:
+def said(
+    alignment: PlateAlignment, worn: dict[str, np.ndarray], name: str, q: np.ndarray
+) -> np.ndarray:
     """Return what a sensor says of a segment at `q`: its world's inverse, then its mount's."""
     seen = rotation.multiply(rotation.conjugate(np.array(alignment.world(name))), q)
     return np.asarray(rotation.multiply(seen, rotation.conjugate(worn[name])))
 
 
-def static_job(trial: CalibrationTrial, previous: Calibration, alignment: Alignment | None) -> Any:
+def static_job(
+    trial: CalibrationTrial, previous: Calibration, alignment: PlateAlignment | None
+) -> Any:
     stored = None if alignment is None else alignment.to_dict()
     payload = {
         "chain": CHAIN, "settings": SETTINGS, "static": trial, "alignment": stored,
