@@ -111,6 +111,8 @@ def _thin(points: Array) -> Array:
 
 
 def _objection(found: CenterEstimate, shown: Array) -> str | None:
+    if found.radii.size == 0:
+        return found.refused
     if (basic := objection(found.arc, float(np.median(found.radii)), np.inf, LIMITS)) is not None:
         return basic
     sd = float(np.sqrt(np.linalg.norm(shown, 2)))

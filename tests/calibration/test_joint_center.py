@@ -84,6 +84,12 @@ def test_a_hinge_shows_its_axis_and_leaves_the_rest_to_the_start() -> None:
     assert np.sqrt(axis @ found.covariance @ axis) == pytest.approx(0.03, rel=0.05)
 
 
+def test_markers_that_never_move_are_refused() -> None:
+    still = np.tile(np.array([0.0, 1.0, 0.0]), (60, 2, 1))
+    for start in (np.zeros(3), np.array([0.0, 0.5, 0.0]), still[0, 0]):
+        assert fit_center(still, start).refused is not None
+
+
 def test_one_marker_torn_off_and_gaps_move_the_center_little() -> None:
     rng = np.random.default_rng(4)
     points = ball(rng, 80, n=400)

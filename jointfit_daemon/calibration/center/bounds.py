@@ -98,6 +98,6 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     along = 1.0 + c - (0.0 if known_radius else 2.0 * s**2)
     if not known_radius and arc < 0.05:
         along = arc**4 / 360.0  # its series: the difference has no digits there
-    if arc <= 0.0 or frames <= 0:
+    if c >= 1.0 or along <= 0.0 or frames <= 0:  # no arc, or one that is lost in rounding
         return float("inf")
     return float(noise * np.sqrt((2.0 / (1.0 - c) + 2.0 / along) / frames))

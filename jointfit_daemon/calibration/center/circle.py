@@ -15,6 +15,7 @@ from jointfit_daemon.calibration.center.moments import (
     ROUNDING,
     CircleMoments,
     Number,
+    arc_shows,
     judge,
     moments_of,
     moments_of_one,
@@ -127,6 +128,15 @@ def circle_from_root(
     return a, b, a * a + b * b + z + more * eta
 
 
+def circle_of(m: CircleMoments[float], method: str = "hyper") -> tuple[float, float, float] | None:
+    """Return `circle_from_root` of one circle; None where the moments have none."""
+    eta = smallest_root(m, method)
+    if (m.xx - eta) * (m.yy - eta) == m.xy * m.xy:
+        return None
+    a, b, square = circle_from_root(m, eta, method)
+    return (a, b, square) if square > 0.0 else None
+
+
 def temper(
     a: Number, b: Number, square: Number, cov: tuple[Number, Number, Number]
 ) -> tuple[Number, Number, tuple[Number, Number, Number]]:
@@ -195,8 +205,7 @@ def fit_circles(
         conditioning = np.sqrt(square / (wider * judged.largest))
         if tempered:
             a, b, cov = temper(a, b, square, cov)
-        valid = usable(m, square) & ((judged.largest > 0.0) | (judged.noise == 0.0))
-        valid &= (m.xx - judged.noise) * (m.yy - judged.noise) > m.xy**2
+        valid = usable(m, square) & arc_shows(m, judged.noise)
         valid &= np.isfinite(a) & np.isfinite(b)
     nan = np.nan
     center = np.where(valid[..., None], np.stack((m.x + a, m.y + b), axis=-1), nan)
@@ -224,14 +233,17 @@ def fit_circle(points: ArrayLike, *, method: Method = "hyper") -> tuple[float, f
     Raises
     ------
     ValueError
-        Fewer than three points, points on a line or at one place: there is no circle.
+        Fewer than three points, points on a line or at one place, or points that show no arc.
     """
     p = np.asarray(points, dtype=np.float64)
     m = moments_of_one(p) if len(p) > 2 else None
     if m is None or not m.xx * m.yy - m.xy * m.xy > ROUNDING * (m.xx + m.yy) ** 2:
         raise ValueError("no circle: three points or more are needed, seen and not on a line")
-    a, b, square = circle_from_root(m, smallest_root(m, method), method)
-    return m.x + a, m.y + b, abs(square) ** 0.5
+    found = circle_of(m, method)
+    if found is None:
+        raise ValueError("no circle: the points show no arc")
+    a, b, square = found
+    return m.x + a, m.y + b, square**0.5
 
 
 def _lagged(points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, square: Array) -> Array:
@@ -239,7 +251,10 @@ def _lagged(points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, squa
     p = np.asarray(points, dtype=np.float64)
     d = p - np.stack((m.x + a, m.y + b), axis=-1)[..., None, :]
     e = ((d**2).sum(axis=-1) - square[..., None]) / (2.0 * np.sqrt(square))[..., None]
-    return np.asarray(np.nanmean(e[..., 1:] * e[..., :-1], axis=-1))
+    product = e[..., 1:] * e[..., :-1]
+    both = np.isfinite(product)
+    total = np.where(both, product, 0.0).sum(axis=-1)
+    return np.asarray(total / np.maximum(both.sum(axis=-1), 1))
 
 
 def persistence(correlation: Array) -> Array:

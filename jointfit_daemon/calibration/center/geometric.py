@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.center.circle import fit_circles
-from jointfit_daemon.calibration.center.moments import ellipse_scale, seen_places
+from jointfit_daemon.calibration.center.moments import ROUNDING, ellipse_scale, seen_places
 from jointfit_daemon.calibration.center.planar_estimate import (
     Limits,
     arc_about,
@@ -153,7 +153,8 @@ def _told(
     )
     H -= variance * across
     frames = int(seen.any(axis=1).sum())
-    if not np.linalg.eigvalsh(H)[0] > 0.0:
+    least, most = np.linalg.eigvalsh(H)
+    if not least > ROUNDING * most:
         reason = "noise hides the arc: move the joint further, or bring the cameras closer"
         return nothing(METHOD, (float(c[0]), float(c[1])), frames, reason)
     wider = _wider(persistence(e, seen))

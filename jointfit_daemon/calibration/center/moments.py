@@ -8,7 +8,7 @@ arrays (many circles at once) alike.
 from __future__ import annotations
 
 from math import exp, inf, log
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class Judged(NamedTuple, Generic[Number]):
     xy: Number
     yy: Number
     largest: Number
-    """Its larger eigenvalue, m²; not above zero where the noise hides the arc."""
+    """Its larger eigenvalue, m²."""
 
 
 def seen_places(points: Array) -> NDArray[np.bool_]:
@@ -137,6 +137,29 @@ def sum_of_squares(m: CircleMoments[Number], a: Number, b: Number, square: Numbe
     )
 
 
+def noise_of(
+    m: CircleMoments[Number], a: Number, b: Number, square: Number
+) -> tuple[Number, Number]:
+    """Return the noise of a coordinate and the mean square of the radial residuals, m².
+
+    Parameters are those of `judge`.
+    """
+    u = sum_of_squares(m, a, b, square)
+    u = (u + abs(u)) * 0.5  # rounding may take a perfect fit below zero
+    residual = u / (4.0 * square)
+    return residual * m.effective / (m.effective - 3.0), residual
+
+
+def arc_shows(m: CircleMoments[Number], noise: Number) -> Any:
+    """Tell whether the covariance of the points is positive definite without their noise.
+
+    Where it is not, noise hides the arc and `judge` has no meaning: its variances may be negative.
+    """
+    sxx, syy = m.xx - noise, m.yy - noise
+    trace = sxx + syy
+    return (trace > 0.0) & (sxx * syy - m.xy * m.xy > ROUNDING * trace * trace)
+
+
 def judge(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Judged[Number]:
     r"""Return noise and covariance of a fitted circle.
 
@@ -156,16 +179,13 @@ def judge(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Jud
     Parameters
     ----------
     m : CircleMoments
-        Of at least four effective points.
+        Of at least four effective points, of which `arc_shows` is true.
     a, b : float or ndarray
         Center from the centroid, m.
     square : float or ndarray
         R², m², above zero.
     """
-    u = sum_of_squares(m, a, b, square)
-    u = (u + abs(u)) * 0.5  # rounding may take a perfect fit below zero
-    residual = u / (4.0 * square)
-    noise = residual * m.effective / (m.effective - 3.0)
+    noise, residual = noise_of(m, a, b, square)
     sxx, syy = m.xx - noise, m.yy - noise
     determinant = sxx * syy - m.xy * m.xy
     half, middle = 0.5 * (sxx - syy), 0.5 * (sxx + syy)

@@ -14,8 +14,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.center.circle import (
     Method,
-    circle_from_root,
-    smallest_root,
+    circle_of,
     temper,
 )
 from jointfit_daemon.calibration.center.moments import (
@@ -23,9 +22,11 @@ from jointfit_daemon.calibration.center.moments import (
     ROUNDING,
     CircleMoments,
     Judged,
+    arc_shows,
     ellipse_scale,
     judge,
     moments_of_one,
+    noise_of,
     seen_places,
 )
 from jointfit_daemon.calibration.center.result import CenterEstimate
@@ -124,13 +125,13 @@ def publish(
     reason = _no_circle(m, frames)
     if reason is not None:
         return nothing(method, (m.x, m.y), frames, reason)
-    a, b, square = circle_from_root(m, smallest_root(m, method), method)
-    judged = judge(m, a, b, square) if square > 0.0 else None
-    if judged is None or not (judged.largest > 0.0 or judged.noise == 0.0):
+    circle = circle_of(m, method)
+    if circle is None or not arc_shows(m, noise_of(m, *circle)[0]):
         reason = "noise hides the arc: move the joint further, or bring the cameras closer"
         return nothing(method, (m.x, m.y), frames, reason)
-    wider = _persistence(lagged(a, b, square), judged.residual)
-    return _told(m, (a, b, square), judged, wider, method=method, frames=frames, limits=limits)
+    judged = judge(m, *circle)
+    wider = _persistence(lagged(*circle), judged.residual)
+    return _told(m, circle, judged, wider, method=method, frames=frames, limits=limits)
 
 
 def _told(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.center.circle import Method, circle_from_root, smallest_root
+from jointfit_daemon.calibration.center.circle import Method, circle_of
 from jointfit_daemon.calibration.center.moments import (
     FARTHEST_M,
     ROUNDING,
@@ -200,7 +200,7 @@ class RunningCircle:
         cxx, cxy, cyy = xx - xb * xb, xy - xb * yb, yy - yb * yb
         return CircleMoments(
             w,
-            w * w / self._squares,
+            w * w / self._squares if self._squares > 0.0 else 0.0,  # forgotten for too long
             self._origin[0] + xb,
             self._origin[1] + yb,
             cxx,
@@ -221,9 +221,10 @@ class RunningCircle:
         z = m.xx + m.yy
         if m.effective <= 3.0 or m.xx * m.yy - m.xy * m.xy <= ROUNDING * z * z:
             return None
-        a, b, square = circle_from_root(m, smallest_root(m, self._method), self._method)
-        if square <= 0.0:
+        found = circle_of(m, self._method)
+        if found is None:
             return None
+        a, b, square = found
         return m.x + a, m.y + b, sqrt(square)
 
     def estimate(self) -> CenterEstimate:

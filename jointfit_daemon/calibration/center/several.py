@@ -7,6 +7,7 @@ covariance loses its weight and is named.
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -86,6 +87,8 @@ def _information(estimate: CenterEstimate) -> Array:
 
 def _seen(total: Array) -> Array:
     """Return the directions that information shows, the columns."""
+    if total.size == 0:
+        return total
     known, axes = np.linalg.eigh(total)
     return np.asarray(axes[:, known > 1e-9 * max(float(known[-1]), 1e-300)])
 
@@ -103,7 +106,8 @@ def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
     P = B @ own
     spread = np.linalg.inv(P.T @ knowledge[i] @ P) + P.T @ B @ np.linalg.inv(shown) @ B.T @ P
     gap = P.T @ (centers[i] - m)
-    distance = float(np.sqrt(gap @ np.linalg.solve(spread, gap) / len(gap)))
+    square = float(gap @ np.linalg.solve(spread, gap)) / len(gap)
+    distance = sqrt(max(square, 0.0))  # a nearly singular spread may round below zero
     return min(1.0, TOLERATED / max(distance, 1e-12)) ** 2
 
 
@@ -112,6 +116,9 @@ def _fused(
 ) -> CenterEstimate:
     total = np.einsum("k,kab->ab", w, knowledge)
     B = _seen(total)
+    if B.shape[1] == 0:
+        reason = "no estimate shows a direction of the center: move the joint further"
+        return refusal("several", len(total), max(e.frames for e in estimates), reason)
     C = np.linalg.inv(B.T @ total @ B)
     d = len(total)
     m = B @ C @ B.T @ np.einsum("k,kab,kb->a", w, knowledge, centers)

@@ -116,6 +116,9 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
             break
         Jb = J @ basis
         H = np.einsum("tj,tja,tjb->ab", w, Jb, Jb)
+        if not np.trace(H) > 0.0:  # nothing moved at all
+            basis = np.zeros((3, 0))
+            break
         g = np.einsum("tj,tja,tj->a", w, Jb, e)
         # far from the answer the radii are wrong and full steps overshoot
         step = basis @ np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(len(H)), -g)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.calibration.center.circle import fit_circles
@@ -124,6 +124,17 @@ def test_paths_without_a_second_dimension_warn_of_nothing_and_are_judged(points:
 @given(
     st.lists(st.tuples(values, values, st.floats(-4.0, 4.0)), max_size=30),
 )
+@example(  # noise larger than one variance of the points
+    [
+        (0.0, 0.75, 1.0),
+        (0.75, 0.0, 0.0),
+        (-0.75, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.5, 0.0),
+    ]
+)
 @settings(deadline=None, max_examples=60)
 def test_any_input_gives_a_finite_center_or_a_reason(rows: Any) -> None:
     data = np.reshape(rows, (-1, 3))
@@ -133,6 +144,19 @@ def test_any_input_gives_a_finite_center_or_a_reason(rows: Any) -> None:
         assert np.isfinite(found.covariance).all()
         if found.refused is not None:
             assert ":" in found.refused or ";" in found.refused
+
+
+@given(st.lists(st.tuples(values, values), min_size=4, max_size=30))
+@example([(0.0, 0.75), (0.75, 0.0), (-0.75, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.5)])
+@settings(deadline=None, max_examples=60)
+def test_circle_estimates_of_any_points_have_no_negative_variance(rows: Any) -> None:
+    points = np.reshape(rows, (-1, 2))
+    for method in ("kasa", "pratt", "taubin", "hyper"):
+        found = circle_estimate(points, method=method, limits=WIDE)
+        assert found.bound >= 0.0
+        assert (np.linalg.eigvalsh(found.covariance) >= -1e-12).all()
+    many = fit_circles(points)
+    assert bool(many.valid) == bool(np.isfinite(many.covariance).all())
 
 
 def test_least_distance_is_hyper_on_clean_points_and_bears_outliers() -> None:

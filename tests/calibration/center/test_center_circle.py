@@ -208,6 +208,25 @@ def test_settings_that_contradict_each_other_are_a_wrong_call() -> None:
             RunningCircle(**wrong)
 
 
+def test_running_circle_is_refused_after_all_weight_is_forgotten() -> None:
+    running = fed(np.concatenate((swing(), np.full((2000, 2), nan))), forgetting=0.5)
+    found = running.estimate()
+    assert found.refused is not None
+    assert "at least 4" in found.refused
+
+
+def test_running_circle_bears_weights_that_cancel_by_rounding() -> None:
+    running = RunningCircle(window=4)
+    for (x, y), weight in zip(swing().tolist(), [1e9] + 399 * [1.0], strict=True):
+        running.feed(x, y, weight)
+        assert isfinite(running.estimate().effective_frames)
+
+
+def test_correlated_circles_of_unseen_points_are_not_valid() -> None:
+    found = fit_circles(np.full((2, 9, 2), nan), correlated=True)
+    assert not found.valid.any()
+
+
 def test_a_long_gap_costs_no_memory() -> None:
     running = fed(swing(n=30), window=20)
     for _ in range(500):

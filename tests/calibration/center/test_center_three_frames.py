@@ -225,3 +225,5 @@ def test_what_shows_no_center_has_an_infinite_bound(angles: Any) -> None:
     assert np.isinf(np.diag(circle_bound(angles, 0.001))).all()
     assert oriented_rms_bound(angles[:1], 0.001) == inf
     assert uniform_arc_rms(0.0, 10, 0.001) == inf
+    assert uniform_arc_rms(1e-100, 10, 0.001) == inf
+    assert uniform_arc_rms(1e-9, 10, 0.001, known_radius=True) == inf
