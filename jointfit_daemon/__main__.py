@@ -104,13 +104,13 @@ def _log_handler(rig: str, *, all_of_it: bool) -> logging.Handler:
     from jointfit_daemon.outputs.log import (
         JournalHandler,
         LevelFormatter,
-        LimitedHandler,
+        RateLimitedHandler,
         is_journal,
     )
 
     if is_journal(sys.stderr):
         return JournalHandler(rig, limited=not all_of_it)
-    handler = (logging.StreamHandler if all_of_it else LimitedHandler)(sys.stderr)
+    handler = (logging.StreamHandler if all_of_it else RateLimitedHandler)(sys.stderr)
     if "JOURNAL_STREAM" in os.environ or "INVOCATION_ID" in os.environ:
         handler.setFormatter(LevelFormatter())
     else:
@@ -137,7 +137,7 @@ def describe(rig: Rig) -> str:
 
 def _run(config: Path, rig: Rig) -> int:
     from jointfit_daemon.supervisor.daemon import run_daemon
-    from jointfit_daemon.supervisor.process_exit import leave_within
+    from jointfit_daemon.supervisor.process_exit import exit_within
 
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon takes it: no reload yet
     code = 0
@@ -147,7 +147,7 @@ def _run(config: Path, rig: Rig) -> int:
         except Exception:
             log.exception("a bug ends the daemon; please report it with what follows")
             code = EXIT_BUG
-        leave_within(LAST_WAIT_S, code, "a thread")
+        exit_within(LAST_WAIT_S, code, "a thread")
     return code
 
 

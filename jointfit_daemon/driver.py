@@ -35,16 +35,16 @@ SLOWEST_BAUD, FASTEST_BAUD = 300, 12_000_000
 """Speeds of serial ports, baud; no adapter is faster."""
 
 
-class DeviceLost(Exception):  # noqa: N818 - named for what happened, as CONVENTIONS.md asks
+class DeviceLostError(Exception):
     """The device is absent, taken, unplugged or silent: worth another try."""
 
 
-class DeviceMisconfigured(Exception):  # noqa: N818 - named for what happened
+class DeviceMisconfiguredError(Exception):
     """The device cannot work with these settings: the message says what to change.
 
     The source is stopped until another device is on its port, for a minute, or until a reload.
     Whatever may pass by itself (a port taken, no descriptor left, a bus that is down) is a
-    ``DeviceLost``.
+    ``DeviceLostError``.
     """
 
 
@@ -58,7 +58,7 @@ _SLCAN_BITRATES = (
     10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
 )  # fmt: skip
 _LONGEST_INTERFACE = 15  # bytes: IFNAMSIZ of the kernel, less its NUL
-NO_INTERFACE = (
+INTERFACE_NAME_EXPECTED = (
     "expected the name of a network interface, as `ip link` shows it: up to "
     f"{_LONGEST_INTERFACE} bytes without slash or space"
 )
@@ -103,7 +103,9 @@ class CanBusSettings(Settings):
         if not channel:
             raise ValueError("must not be empty")
         if info.data.get("interface") == "socketcan" and not is_interface_name(channel):
-            raise ValueError(f'{NO_INTERFACE}; a serial adapter needs interface = "slcan"')
+            raise ValueError(
+                f'{INTERFACE_NAME_EXPECTED}; a serial adapter needs interface = "slcan"'
+            )
         return channel
 
     @field_validator("bitrate")
@@ -224,13 +226,13 @@ class Driver(Protocol):
         """Return a fresh decoder."""
 
     async def run(self, emit: Emit) -> None:
-        """Open, configure, read until cancelled; raise DeviceLost or DeviceMisconfigured.
+        """Open, configure, read until cancelled; raise DeviceLostError or DeviceMisconfiguredError.
 
         Called again, on the same object, for every further attempt.
         """
 
 
-class UnknownDriver(LookupError):  # noqa: N818 - named for what happened
+class UnknownDriverError(LookupError):
     """No installed package registers a driver of this name."""
 
 
@@ -244,7 +246,7 @@ def find_driver(name: str) -> type[Driver]:
 
     Raises
     ------
-    UnknownDriver
+    UnknownDriverError
         Nothing registers that name; the message gives the nearest spelling and the choices.
     """
     found = [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name == name]
@@ -252,5 +254,7 @@ def find_driver(name: str) -> type[Driver]:
         known = driver_names()
         near = get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise UnknownDriver(f"no driver {name!r}; {hint}installed: {', '.join(known) or 'none'}")
+        raise UnknownDriverError(
+            f"no driver {name!r}; {hint}installed: {', '.join(known) or 'none'}"
+        )
     return cast("type[Driver]", found[0].load())

@@ -11,8 +11,8 @@ from pydantic import Field
 
 from jointfit_daemon.driver import (
     CanBusSettings,
-    DeviceLost,
-    DeviceMisconfigured,
+    DeviceLostError,
+    DeviceMisconfiguredError,
     Emit,
     ImuSettings,
     MocapSettings,
@@ -112,9 +112,9 @@ class FakeImu:
         """Behave as the mood says."""
         match getattr(self._settings, "mood", "well"):
             case "lost":
-                raise DeviceLost("nobody is there")
+                raise DeviceLostError("nobody is there")
             case "wrong":
-                raise DeviceMisconfigured("it is a toaster; set mood = well")
+                raise DeviceMisconfiguredError("it is a toaster; set mood = well")
             case "bug":
                 raise ZeroDivisionError("a bug")
         self.running.append(self._settings.id)

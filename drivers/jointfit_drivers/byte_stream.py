@@ -1,7 +1,8 @@
 """Serial ports: opened and configured by pyserial, read and written by the event loop.
 
 Law: this is the only module that knows pyserial, and nothing of pyserial leaves it: whatever goes
-wrong becomes ``DeviceLost`` (may heal) or ``DeviceMisconfigured`` (cannot). Bytes are stamped with
+wrong becomes ``DeviceLostError`` (may heal) or ``DeviceMisconfiguredError`` (cannot). Bytes are
+stamped with
 the monotonic clock as soon as they are read, before anything else happens to them, for a tty has no
 kernel stamp. No device and no protocol is named here.
 """
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import serial
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
@@ -67,9 +68,9 @@ class SerialPort:
 
     Raises
     ------
-    DeviceLost
+    DeviceLostError
         On entry: absent, taken or not permitted (yet). Later: unplugged or silent.
-    DeviceMisconfigured
+    DeviceMisconfiguredError
         On entry: not a serial port, or a speed it cannot run at.
     """
 
@@ -117,9 +118,9 @@ class SerialPort:
 
         Raises
         ------
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             The port cannot run at it.
-        DeviceLost
+        DeviceLostError
             The port is gone.
         """
         if self._port is None:
@@ -135,7 +136,7 @@ class SerialPort:
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
-            raise DeviceLost(f"{self.path}: unplugged ({error.args[-1]})") from error
+            raise DeviceLostError(f"{self.path}: unplugged ({error.args[-1]})") from error
 
     async def pump(self, emit: Callable[[Chunk], None], silence_s: float | None) -> None:
         """Hand every chunk to `emit` until cancelled.
@@ -150,7 +151,7 @@ class SerialPort:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Unplugged, or silent for `silence_s`.
         """
         loop = asyncio.get_running_loop()
@@ -169,7 +170,7 @@ class SerialPort:
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
                 raise
-            raise DeviceLost(f"{self.path}: silent for {silence_s:g} s") from error
+            raise DeviceLostError(f"{self.path}: silent for {silence_s:g} s") from error
         finally:
             loop.remove_reader(self._fd)
             if ended.done() and not ended.cancelled():
@@ -183,7 +184,7 @@ class SerialPort:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Unplugged.
         """
         loop = asyncio.get_running_loop()
@@ -229,7 +230,7 @@ class SerialPort:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Unplugged, or the port takes no byte for 2 s.
         """
         fd, rest = self._fd, memoryview(data)
@@ -239,7 +240,7 @@ class SerialPort:
             except BlockingIOError:
                 await self._writable(fd)
             except OSError as error:
-                raise DeviceLost(f"{self.path}: unplugged ({error.strerror})") from error
+                raise DeviceLostError(f"{self.path}: unplugged ({error.strerror})") from error
 
     async def _writable(self, fd: int) -> None:
         """Wait until the port takes bytes again."""
@@ -250,7 +251,9 @@ class SerialPort:
             async with asyncio.timeout(_WRITE_TIMEOUT_S):
                 await ready.wait()
         except TimeoutError as error:
-            raise DeviceLost(f"{self.path}: takes no byte for {_WRITE_TIMEOUT_S:g} s") from error
+            raise DeviceLostError(
+                f"{self.path}: takes no byte for {_WRITE_TIMEOUT_S:g} s"
+            ) from error
         finally:
             loop.remove_writer(fd)
 
@@ -259,7 +262,7 @@ class SerialPort:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Hang-up: end of file, or an error of the port.
         """
         try:
@@ -267,9 +270,9 @@ class SerialPort:
         except BlockingIOError:
             return None
         except OSError as error:
-            raise DeviceLost(f"{self.path}: unplugged ({error.strerror})") from error
+            raise DeviceLostError(f"{self.path}: unplugged ({error.strerror})") from error
         if not data:
-            raise DeviceLost(f"{self.path}: unplugged (hang-up)")
+            raise DeviceLostError(f"{self.path}: unplugged (hang-up)")
         return data
 
 
@@ -281,17 +284,17 @@ def _opened(path: str, baud: int) -> serial.Serial:
         raise _typed(path, baud, error) from error
 
 
-def _typed(path: str, baud: int, error: Exception) -> DeviceLost | DeviceMisconfigured:
+def _typed(path: str, baud: int, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
     """Name what happened: thing, found, expected, remedy."""
     number = _errno(error)
     if number is not None and number not in _NOT_A_PORT:
         found = _LOST.get(number, f"cannot be opened ({os.strerror(number)})")
-        return DeviceLost(f"{path}: {found}{_remedy(path, number)}")
+        return DeviceLostError(f"{path}: {found}{_remedy(path, number)}")
     if isinstance(error, ValueError):  # pyserial: the driver of this port refused the speed
-        return DeviceMisconfigured(
+        return DeviceMisconfiguredError(
             f"{path}: cannot run at {baud} baud: set `baud` to a speed that port and device share"
         )
-    return DeviceMisconfigured(
+    return DeviceMisconfiguredError(
         f"{path}: not a serial port ({error}): set `port` to a tty, best one of /dev/serial/by-id"
     )
 

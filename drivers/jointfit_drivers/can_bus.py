@@ -2,7 +2,8 @@
 
 Law: this is the only module that knows python-can, and nothing of python-can leaves it. A bus lives
 as long as somebody uses it. Every device gets chunks with its own frames only; when a bus fails,
-all its devices are lost, each by its own ``DeviceLost``. No device and no message is named here.
+all its devices are lost, each by its own ``DeviceLostError``. No device and no message is named
+here.
 
 A bus is drained from ``loop.add_reader`` on its descriptor, up to 64 frames a wake-up; a backend
 without descriptor by one thread that hands over batches. python-can's own Notifier would ignore
@@ -19,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 from weakref import WeakKeyDictionary
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
 from jointfit_drivers.python_can_bus import PythonCanBus
 from jointfit_drivers.slcan_bus import SlcanBus
@@ -47,7 +48,7 @@ class Backend(Protocol):
     async def open(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
     ) -> None:
-        """Begin to read; raise DeviceLost or DeviceMisconfigured. Errors later go to `failed`."""
+        """Start reading; pass later errors to `failed`. Raises as `DeviceLostError` describes."""
 
     def listen(self, ids: Collection[CanKey] | None) -> None:
         """Let these identifiers through; more may come. None: all."""
@@ -175,9 +176,9 @@ class SharedBus:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             The bus failed, or nothing with the identifier `needed` comes while the bus is well.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             Another device of the rig claims one of the identifiers.
         """
         self._refuse_taken(name, ids)
@@ -185,7 +186,7 @@ class SharedBus:
         limit = asyncio.timeout(silence_s)
         subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s, needed, self._others)
         if self._failed is not None:
-            raise DeviceLost(str(self._failed))
+            raise DeviceLostError(str(self._failed))
         self._subscribers.append(subscriber)
         try:
             async with limit:
@@ -196,7 +197,7 @@ class SharedBus:
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
                 raise
-            raise DeviceLost(self._explain_silence(subscriber, resembles)) from error
+            raise DeviceLostError(self._explain_silence(subscriber, resembles)) from error
         finally:
             self._subscribers.remove(subscriber)
             self._route()
@@ -240,7 +241,7 @@ class SharedBus:
         for key, carries in ids.items():
             other = self._routes.get(key)
             if other is not None:
-                raise DeviceMisconfigured(
+                raise DeviceMisconfiguredError(
                     f"{name} ({self.channel}): CAN identifier {_hex(key)} ({carries}) is also "
                     f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
                     "(over UART, Xsens MT Manager) and set `ids` of both"
@@ -311,8 +312,8 @@ class SharedBus:
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():
-                lost = isinstance(error, DeviceLost)
-                each.ended.set_exception(DeviceLost(str(error)) if lost else error)
+                lost = isinstance(error, DeviceLostError)
+                each.ended.set_exception(DeviceLostError(str(error)) if lost else error)
 
     async def _close(self) -> None:
         backend, self._backend, self._failed = self._backend, None, None
@@ -334,9 +335,9 @@ async def shared_bus(settings: CanBusSettings) -> AsyncIterator[SharedBus]:
 
     Raises
     ------
-    DeviceLost
+    DeviceLostError
         Absent, down or taken: may heal.
-    DeviceMisconfigured
+    DeviceMisconfiguredError
         No such kind of bus here, or one that cannot run like this.
     """
     buses = _BUSES.setdefault(asyncio.get_running_loop(), {})

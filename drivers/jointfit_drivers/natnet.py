@@ -10,7 +10,7 @@ import asyncio
 import socket
 from typing import TYPE_CHECKING, ClassVar
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.natnet_events import NatNetEvents
 from jointfit_drivers.natnet_session import Session
 from jointfit_drivers.natnet_settings import NatNetSettings
@@ -38,10 +38,10 @@ class NatNetMocap:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             No such host, no answer, nobody listening, no frame for ``silence_s``, another server
             in its place; worth another try.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             Not a NatNet server, a bitstream that cannot be read, no such network card.
         """
         host = await self._resolve()
@@ -54,7 +54,7 @@ class NatNetMocap:
         try:
             found = await loop.getaddrinfo(name, None, family=socket.AF_INET)
         except (OSError, UnicodeError) as error:
-            raise DeviceLost(f"NatNet server {name}: no such host: {error}") from error
+            raise DeviceLostError(f"NatNet server {name}: no such host: {error}") from error
         return str(found[0][4][0])
 
     def _local(self, host: str) -> str:
@@ -64,7 +64,7 @@ class NatNetMocap:
             return local_address(host, interface)
         except OSError as error:
             if interface is None:
-                raise DeviceLost(f"NatNet server {host}: {error.strerror or error}") from error
-            raise DeviceMisconfigured(
+                raise DeviceLostError(f"NatNet server {host}: {error.strerror or error}") from error
+            raise DeviceMisconfiguredError(
                 f"mocap.interface = {interface!r}: no such network card with an IPv4 address"
             ) from error

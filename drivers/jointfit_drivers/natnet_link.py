@@ -1,7 +1,7 @@
 """Sockets to one NatNet server inside the event loop.
 
 Invariant: what fails in a callback is raised in `pause`. A reader callback has no caller to raise
-to, so its failure is stored and raised where the driver's coroutine waits: `DeviceLost` for
+to, so its failure is stored and raised where the driver's coroutine waits: `DeviceLostError` for
 failures of the network, the exception itself for a bug.
 
 Frames are accepted from any port of the server, because multicast frames leave its data port.
@@ -15,7 +15,7 @@ import errno
 import time
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.driver import DeviceLost
+from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import Chunk
 from jointfit_drivers.natnet_socket import StampedSocket
 from jointfit_protocols.natnet_messages import MessageId, encode
@@ -83,7 +83,7 @@ class Link:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             There is no way to the server.
         """
         try:
@@ -145,10 +145,10 @@ class Link:
         recent = time.monotonic_ns() - self._heard_ns < _FORGED_NS
         return recent and isinstance(error, ConnectionRefusedError)
 
-    def _lost(self, error: OSError) -> DeviceLost:
+    def _lost(self, error: OSError) -> DeviceLostError:
         host, port = self._server
         if isinstance(error, ConnectionRefusedError):
             text = "nothing listens there: is Motive running, and streaming switched on?"
         else:
             text = error.strerror or str(error)
-        return DeviceLost(f"NatNet server {host}:{port}: {text}")
+        return DeviceLostError(f"NatNet server {host}:{port}: {text}")

@@ -18,7 +18,7 @@ import struct
 import time
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.natnet_answers import OpenQuestions
 from jointfit_drivers.natnet_bitstream import Bitstream
 from jointfit_drivers.natnet_link import Link
@@ -119,7 +119,9 @@ class Session:
                 await self._learn_model()
                 await self._stream(info, unicast)
             finally:
-                with contextlib.suppress(DeviceLost):  # whatever ends this must not be replaced
+                with contextlib.suppress(
+                    DeviceLostError
+                ):  # whatever ends this must not be replaced
                     link.send(Bare(MessageId.DISCONNECT))
 
     # --- what arrives -------------------------------------------------------------------------
@@ -199,8 +201,8 @@ class Session:
         if self._info is not None:
             return self._info
         if self._strange:
-            raise DeviceMisconfigured(misheard(self._name))
-        raise DeviceLost(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
+            raise DeviceMisconfiguredError(misheard(self._name))
+        raise DeviceLostError(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
 
     def _join(self, info: ServerInfo) -> None:
         port = self._settings.data_port or info.data_port
@@ -209,7 +211,7 @@ class Session:
             self._link.join(info.group, port)
         except OSError as error:
             text = f"cannot join {info.group}:{port}: {error.strerror or error}"
-            raise DeviceLost(f"{self._name}: {text}") from error
+            raise DeviceLostError(f"{self._name}: {text}") from error
 
     async def _choose_bitstream(self) -> None:
         """Ask a server that starts with another bitstream than wanted, once, and go on anyway."""
@@ -232,7 +234,7 @@ class Session:
         asked = Bare(MessageId.REQUEST_MODELDEF)
         await self._ask(asked, MODEL_S, lambda: self._known is not None)
         if self._known is None:
-            raise DeviceLost(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
+            raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
 
     async def _stream(self, info: ServerInfo, unicast: bool) -> None:
         began_ns = time.monotonic_ns()
@@ -260,15 +262,17 @@ class Session:
             self._send(Bare(MessageId.REQUEST_MODELDEF))
 
     def _check_alive(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
-        """Raise DeviceLost without readable frames, or when another server answers in its place."""
+        """Raise DeviceLostError if frames are unreadable or another server answers."""
         if self._info is not None and not same_instance(self._info, info):
-            raise DeviceLost(f"{self._name}: another instance answers: {self._info.application}")
+            raise DeviceLostError(
+                f"{self._name}: another instance answers: {self._info.application}"
+            )
         silent_s = (time.monotonic_ns() - heard_ns) / 1e9
         if silent_s < self._settings.silence_s:
             return
         if self._misfits:
             version = "{}.{}".format(*self._bitstream.version)
-            raise DeviceLost(
+            raise DeviceLostError(
                 f"{self._name}: frames arrive, but for {silent_s:.1f} s none could be decoded as "
                 f"NatNet {version}: check that Motive streams the bitstream it announces"
             )
@@ -276,4 +280,4 @@ class Session:
         if unicast == info.multicast:
             announced = "multicast" if info.multicast else "unicast"
             hint = f"; it announces {announced}, but transport = {self._settings.transport!r}"
-        raise DeviceLost(f"{self._name}: no frame for {silent_s:.1f} s{hint}")
+        raise DeviceLostError(f"{self._name}: no frame for {silent_s:.1f} s{hint}")

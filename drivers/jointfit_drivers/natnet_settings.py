@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from jointfit_daemon.driver import NO_INTERFACE, MocapSettings, is_interface_name
+from jointfit_daemon.driver import INTERFACE_NAME_EXPECTED, MocapSettings, is_interface_name
 
 
 class NatNetSettings(MocapSettings):
@@ -51,7 +51,7 @@ class NatNetSettings(MocapSettings):
     def _interface_that_can_exist(cls, interface: str | None) -> str | None:
         """Refuse what is neither an address nor a name the kernel allows."""
         if interface is not None and not is_interface_name(interface):
-            raise ValueError(f"{NO_INTERFACE}; or an IPv4 address")
+            raise ValueError(f"{INTERFACE_NAME_EXPECTED}; or an IPv4 address")
         return interface
 
     @property

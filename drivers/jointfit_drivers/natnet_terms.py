@@ -8,7 +8,7 @@ from __future__ import annotations
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.driver import DeviceMisconfigured
+from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_protocols.natnet_connect import Connect
 from jointfit_protocols.natnet_frame import OLDEST, supported
 
@@ -51,28 +51,30 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
 
     Raises
     ------
-    DeviceMisconfigured
+    DeviceMisconfiguredError
         Too old, too new, without a clock, or asked for what multicast cannot give.
     """
     said = f"{name} ({info.application}) speaks NatNet {info.bitstream[0]}.{info.bitstream[1]}"
     if not supported(info.bitstream):
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{said}; {OLDEST[0]}.{OLDEST[1]} or newer is needed: update Motive to 2.0 or later"
         )
     if not info.clock_hz:
-        raise DeviceMisconfigured(f"{said} but names no clock frequency: its stamps mean nothing")
+        raise DeviceMisconfiguredError(
+            f"{said} but names no clock frequency: its stamps mean nothing"
+        )
     if usable_hz(info) is None:
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{said} and names a clock frequency of {info.clock_hz} Hz, expected {LEAST_CLOCK_HZ}"
             f" to {MOST_CLOCK_HZ}: check that server and command_port lead to Motive"
         )
     if info.bitstream[0] > NEWEST_MAJOR and settings.wanted_version is None:
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{said}, which is newer than this driver:"
             " switch Motive to unicast and set bitstream = '4.1'"
         )
     if settings.wanted_version not in (None, info.bitstream) and not is_unicast(settings, info):
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{said} in multicast, where a client cannot choose: remove bitstream ="
             f" {settings.bitstream!r}, or switch Motive to unicast"
         )
@@ -89,16 +91,16 @@ def check_group(name: str, info: ServerInfo, port: int) -> None:
 
     Raises
     ------
-    DeviceMisconfigured
+    DeviceMisconfiguredError
         The server announces it so.
     """
     if not IPv4Address(info.group).is_multicast:
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{name} announces {info.group}, which is no multicast address:"
             " set Motive's multicast interface, or transport = 'unicast'"
         )
     if not port:
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{name} announces data port 0: set mocap.data_port to the one of Motive (1511)"
         )
 

@@ -1,7 +1,9 @@
 """A bus of any kind that python-can knows: SocketCAN on its descriptor, others as they can.
 
-Law: nothing of python-can leaves this module: whatever goes wrong becomes ``DeviceLost`` (may heal)
-or ``DeviceMisconfigured`` (cannot). Frames carry the kernel's stamp where there is one (SocketCAN),
+Law: nothing of python-can leaves this module: whatever goes wrong becomes ``DeviceLostError``
+(may heal)
+or ``DeviceMisconfiguredError`` (cannot). Frames carry the kernel's stamp where there is one
+(SocketCAN),
 else the time of the read.
 """
 
@@ -20,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import can
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.can_stamp import KernelStamps
 from jointfit_protocols.can_frame import EXTENDED_MAX, STANDARD_MAX, CanFrame, host_dropped
 
@@ -68,9 +70,9 @@ class PythonCanBus:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             The interface is absent or taken.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             Unknown kind of interface, missing package, or a kernel without CAN.
         """
         bus = await self._opened()
@@ -209,15 +211,15 @@ class PythonCanBus:
             message.is_remote_frame,
         )
 
-    def _refused(self, error: Exception) -> DeviceLost | DeviceMisconfigured:
+    def _refused(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
         """Name why the bus does not open: thing, found, expected, remedy."""
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
-            return DeviceMisconfigured(f"{channel}: {_unknown(kind, error)}")
+            return DeviceMisconfiguredError(f"{channel}: {_unknown(kind, error)}")
         if isinstance(error, (can.CanError, OSError)):
             return self._numbered(error)
         said = f"{type(error).__name__}: {error}"
-        return DeviceMisconfigured(
+        return DeviceMisconfiguredError(
             f"{channel}: cannot be opened as {kind} ({said}): check its [can] table, and the "
             "vendor's library"
         )
@@ -228,24 +230,24 @@ class PythonCanBus:
             return self._numbered(error)
         return error
 
-    def _numbered(self, error: Exception) -> DeviceLost | DeviceMisconfigured:
+    def _numbered(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
         """Decide by the kernel's error number."""
         channel = self._settings.channel
         number = getattr(error, "error_code", None) or getattr(error, "errno", None)
         if number == errno.EAFNOSUPPORT:
-            return DeviceMisconfigured(
+            return DeviceMisconfiguredError(
                 f"{channel}: no CAN in this kernel, or not allowed to this service: load the "
                 "modules can and can_raw, allow AF_CAN, or use an adapter with "
                 'interface = "slcan"'
             )
         if number in {errno.ENODEV, errno.ENXIO}:
-            return DeviceLost(f"{channel}: no such CAN interface: plug it in (see `ip link`)")
+            return DeviceLostError(f"{channel}: no such CAN interface: plug it in (see `ip link`)")
         if number == errno.ENETDOWN:
-            return DeviceLost(
+            return DeviceLostError(
                 f"{channel}: the interface is down: `ip link set {channel} up type can bitrate "
                 f"{self._settings.bitrate}`"
             )
-        return DeviceLost(f"{channel} ({self._settings.interface}): {error}")
+        return DeviceLostError(f"{channel} ({self._settings.interface}): {error}")
 
 
 def _require_interface(name: str) -> None:

@@ -13,7 +13,7 @@ import logging
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.byte_stream import SerialPort
 from jointfit_protocols.can_frame import CanFrame, host_corrupt
 from jointfit_protocols.corrupt import Corrupt
@@ -59,15 +59,15 @@ class SlcanBus:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             The port is absent or taken; the adapter refuses to open.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             The port is none, what answers is not SLCAN, or the bit rate is not one of its nine.
         """
         code = bitrate_code(self._settings.bitrate)
         if code is None:
             known = ", ".join(str(rate) for rate in BITRATES)
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._settings.channel}: SLCAN has no bit rate {self._settings.bitrate}: "
                 f"set `bitrate` of the [can] table to one of {known}"
             )
@@ -94,7 +94,7 @@ class SlcanBus:
         if not self._is_open:
             return
         try:
-            with suppress(DeviceLost, TimeoutError):
+            with suppress(DeviceLostError, TimeoutError):
                 async with asyncio.timeout(0.1):
                     await self._port.write(b"C\r")
                     # Closing the port throws away what is not sent yet.
@@ -144,14 +144,14 @@ class SlcanBus:
         self._early.clear()
         await self._ask(b"V\r", "V")
         if await self._ask(b"S%d\r" % code) == "\a":
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{settings.channel}: the adapter refuses {settings.bitrate} bit/s: "
                 "set `bitrate` of the [can] table to what adapter and sensors share"
             )
         answer = await self._ask(b"O\r")
         self._check_is_slcan()
         if answer == "\a":
-            raise DeviceLost(f"{settings.channel}: the adapter refuses to open its bus")
+            raise DeviceLostError(f"{settings.channel}: the adapter refuses to open its bus")
         if answer is None:
             log.debug("%s: the adapter answers nothing; reading all the same", settings.channel)
 
@@ -185,7 +185,7 @@ class SlcanBus:
         """Refuse a device that talks, but never SLCAN."""
         lost = self._decoder.discarded_bytes
         if lost > _NOT_SLCAN and not self._understood:
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._settings.channel}: no SLCAN adapter answers at {self._settings.baud} baud "
                 f"({lost} bytes came, no SLCAN among them): set `channel` to the adapter's port "
                 "and `baud` to its speed"

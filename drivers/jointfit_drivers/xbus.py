@@ -50,9 +50,9 @@ class XbusImu:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Port absent, taken, unplugged or silent for ``silence_s``; worth another try.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             Not a serial port, another speed, no Xbus device, or an output configuration that
             differs while ``persist`` is false.
         """

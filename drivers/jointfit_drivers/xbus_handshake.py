@@ -2,7 +2,7 @@
 
 Law: what the device has stored is read and compared, and changed only where it differs in a way
 that matters and ``persist`` allows it, for every set of an Xbus device is stored in flash at once.
-What can heal is DeviceLost, what cannot is DeviceMisconfigured.
+What can heal is DeviceLostError, what cannot is DeviceMisconfiguredError.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, NoReturn
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers import xbus_sync
 from jointfit_drivers.xbus_conversation import OUTSTANDING_S, Conversation
 from jointfit_drivers.xbus_needs import ORIENTATION, message_bytes, needs_of
@@ -67,9 +67,9 @@ class Handshake:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Silent, unplugged, or it stopped answering.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             Another speed, another kind of device, or an output configuration that differs and may
             not be written.
         """
@@ -86,7 +86,7 @@ class Handshake:
         settings = self._settings
         needs = settings.rate_hz * message_bytes(self._needs) * _BITS
         if needs > settings.baud:
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
                 f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
             )
@@ -115,7 +115,7 @@ class Handshake:
         """Return the reply to a request the device owes an answer, which may be an error."""
         reply = await self._talk.ask(mid, data, tries=3)
         if reply is None:
-            raise DeviceLost(f"{self._who}: stopped answering during configuration")
+            raise DeviceLostError(f"{self._who}: stopped answering during configuration")
         return reply
 
     async def _ensure_outputs(self) -> None:
@@ -141,7 +141,9 @@ class Handshake:
         left = differences(_outputs_of(reply), rate, self._triggers, self._needs)
         if left:
             hint = _rate_hint(_outputs_of(reply), self._needs)
-            raise DeviceMisconfigured(f"{self._who}: cannot do as asked: {'; '.join(left)}{hint}")
+            raise DeviceMisconfiguredError(
+                f"{self._who}: cannot do as asked: {'; '.join(left)}{hint}"
+            )
 
     def _world(self, need: Need) -> World:
         """Return the world an item is asked in: raw readings are in the sensor's own axes."""
@@ -150,7 +152,7 @@ class Handshake:
     def _refuse_to_write(self, faults: list[str], hint: str = "") -> None:
         """Say what would have to be written, unless it may be."""
         if not self._settings.persist:
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._who}: {'; '.join(faults)}{hint}: set persist = true once to write it "
                 "into the device's flash, or configure the device with the vendor's tool"
             )
@@ -169,7 +171,7 @@ class Handshake:
         self._refuse_error(reply, "refuses these sync settings", "`sync`")
         left = xbus_sync.differences(await self._sync_stored(), asked)
         if left:
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._who}: cannot do as `sync` asks: {'; '.join(left)}: change `sync`"
             )
 
@@ -188,7 +190,7 @@ class Handshake:
     ) -> None:
         if reply.mid == MessageId.ERROR:
             code = reply.data[0] if reply.data else 0
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._who}: {what} ({setup.error_text(code)}): change {change}"
             )
 
@@ -196,26 +198,26 @@ class Handshake:
         """Raise what fits a device that does not answer GoToConfig."""
         heard, talk = self._talk.heard, self._talk
         if talk.understood:
-            raise DeviceLost(
+            raise DeviceLostError(
                 f"{self._who}: streams but does not answer GoToConfig: check the wire from host "
                 "to device, or set reset_if_stuck = true"
             )
         speed = await self._other_speed() if self._hunt or heard else None
         if speed is not None and await self._listen_at(self._settings.baud):  # USB has no speed
-            raise DeviceLost(f"{self._who}: answered too late; asking again")
+            raise DeviceLostError(f"{self._who}: answered too late; asking again")
         if speed is not None:
-            raise DeviceMisconfigured(
+            raise DeviceMisconfiguredError(
                 f"{self._who}: {self._settings.baud} baud but nothing decodes; "
                 f"the device answers at {speed}: set baud = {speed}"
             )
         if not heard:
-            raise DeviceLost(
+            raise DeviceLostError(
                 f"{self._who}: silent: check its power, and that TX and RX are not swapped"
             )
         await self._listen_at(self._settings.baud)
         if not talk.heard:
-            raise DeviceLost(f"{self._who}: {heard} bytes of noise, then silence")
-        raise DeviceMisconfigured(
+            raise DeviceLostError(f"{self._who}: {heard} bytes of noise, then silence")
+        raise DeviceMisconfiguredError(
             f"{self._who}: what answers on this port is not an Xbus device: {heard} bytes, none "
             "of them Xbus at any usual speed: set `port` to the right one, or `driver`"
         )
@@ -227,7 +229,7 @@ class Handshake:
                 continue
             try:
                 answered = await self._listen_at(baud)
-            except DeviceMisconfigured:  # the port cannot run at it
+            except DeviceMisconfiguredError:  # the port cannot run at it
                 continue
             if answered:  # and wait: closing the port throws away what was not sent yet
                 await self._talk.ask(MessageId.GOTO_MEASUREMENT)

@@ -158,9 +158,9 @@ class XcdiImu:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Bus absent or down, adapter unplugged, or this sensor silent for `silence_s`.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             No such bus here, or another sensor of the rig claims the same identifiers.
         """
         settings, by_id = self._settings, self._ids.by_id()

@@ -25,7 +25,7 @@ from jointfit_daemon.driver import (
     CanBusSettings,
     ImuSettings,
     MocapSettings,
-    UnknownDriver,
+    UnknownDriverError,
     driver_names,
     find_driver,
 )
@@ -256,7 +256,7 @@ class _Reader:
             return None  # missing or no text: the settings model says so
         try:
             driver = find_driver(name)
-        except UnknownDriver:
+        except UnknownDriverError:
             self.faults += _checks.known_name(f"{key}.driver", name, driver_names(), "driver")
             return None
         except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig, not ours

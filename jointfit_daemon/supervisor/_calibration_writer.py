@@ -26,7 +26,7 @@ RETRY_S = 10.0
 """Time between attempts to store a calibration that could not be stored."""
 
 
-class StoreRunner:
+class CalibrationWriter:
     """Stores a calibration and delivers ``CalibrationStored``.
 
     Parameters

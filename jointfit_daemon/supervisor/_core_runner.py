@@ -17,16 +17,16 @@ from jointfit_daemon.pipeline.events import Tick, UnixOffset
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.outputs.recording import EventLog
+    from jointfit_daemon.outputs.recording import EventLogWriter
     from jointfit_daemon.pipeline.events import Event, Output
 
-HEARTBEAT_NS = 100_000_000
+LONGEST_TICK_INTERVAL_NS = 100_000_000
 """The core hears of time at least this often."""
 _LEAST_NS = 1_000_000  # a deadline that is past and stays past must not spin
 _NS_PER_S = 1e9
 
 
-class CoreLike(Protocol):
+class CoreInterface(Protocol):
     """What the shell needs of the core."""
 
     @property
@@ -40,7 +40,7 @@ class CoreLike(Protocol):
         """Return counters and clocks."""
 
 
-class Heart:
+class CoreRunner:
     """Feeds the core.
 
     Parameters
@@ -51,9 +51,9 @@ class Heart:
         Takes every output, synchronously; must not feed events itself.
     """
 
-    def __init__(self, core: CoreLike, dispatch: Callable[[Output], None]) -> None:
+    def __init__(self, core: CoreInterface, dispatch: Callable[[Output], None]) -> None:
         self.core = core
-        self.log: EventLog | None = None
+        self.log: EventLogWriter | None = None
         self.states = 0
         """Limb states that came out."""
         self._fed_ns = time.monotonic_ns()
@@ -80,7 +80,7 @@ class Heart:
 
     def _arm(self) -> None:
         """Set the timer, if it must ring earlier than it will; if later, it looks again then."""
-        due_ns = self._fed_ns + HEARTBEAT_NS
+        due_ns = self._fed_ns + LONGEST_TICK_INTERVAL_NS
         deadline_ns = self.core.next_deadline_ns
         if deadline_ns is not None and deadline_ns < due_ns:
             due_ns = max(deadline_ns, self._fed_ns + _LEAST_NS)
@@ -97,7 +97,7 @@ class Heart:
         due = deadline_ns is not None and now_ns >= deadline_ns
         try:
             self._tell_unix_time()
-            if due or now_ns >= self._fed_ns + HEARTBEAT_NS:
+            if due or now_ns >= self._fed_ns + LONGEST_TICK_INTERVAL_NS:
                 self.feed(Tick(now_ns))
             else:
                 self._arm()

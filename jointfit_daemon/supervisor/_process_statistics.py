@@ -16,7 +16,7 @@ _KEPT = 600
 """Loop delays kept for the percentile: a minute at ten a second."""
 
 
-class ProcessWatch:
+class ProcessStatistics:
     """Figures of this process since the last time they were read."""
 
     def __init__(self) -> None:

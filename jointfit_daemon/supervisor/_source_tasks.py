@@ -15,7 +15,7 @@ import random
 import time
 from typing import TYPE_CHECKING, Literal
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured, device_path
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, device_path
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class _Task:
         self.task: asyncio.Task[None] | None = None
 
 
-async def keep_running(
+async def run_source(
     source: Source, deliver: Callable[[Event], None], state: _Task | None = None
 ) -> None:
     """Run one source for ever.
@@ -105,11 +105,11 @@ async def keep_running(
         try:
             await driver.run(life.emit)
             life.closed("lost", "its driver ended by itself")
-        except DeviceLost as lost:
+        except DeviceLostError as lost:
             if loop.time() - began > HEALTHY_S:
                 delay = FIRST_RETRY_S
             life.closed("lost", str(lost))  # the core reports it, on the log too
-        except DeviceMisconfigured as wrong:
+        except DeviceMisconfiguredError as wrong:
             again = f"tried again with another device on the port, or every {PAUSE_S:g} s"
             life.closed("misconfigured", f"{wrong} ({again})")
             state.paused = True
@@ -180,7 +180,7 @@ class SourceTasks:
             if name not in self._running:
                 state = self._running[name] = _Task(source)
                 state.task = self._tasks.create_task(
-                    keep_running(source, self._deliver, state), name=f"source {name}"
+                    run_source(source, self._deliver, state), name=f"source {name}"
                 )
 
     async def known(self, within_s: float) -> None:

@@ -28,10 +28,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import ConfigError, load_rig
-from jointfit_daemon.outputs.log import LogTopic, about
-from jointfit_daemon.outputs.mqtt import LoopNoise, MqttPublisher, Outbox
-from jointfit_daemon.outputs.payloads import Reporter
-from jointfit_daemon.outputs.recording import EventLog
+from jointfit_daemon.outputs.log import MqttLogHandler, about
+from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
+from jointfit_daemon.outputs.payloads import TopicWriter
+from jointfit_daemon.outputs.recording import EventLogWriter
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -44,22 +44,22 @@ from jointfit_daemon.pipeline.events import (
     Reply,
 )
 from jointfit_daemon.supervisor import _stored_calibrations
-from jointfit_daemon.supervisor._calibration_writer import StoreRunner
-from jointfit_daemon.supervisor._core_runner import Heart
+from jointfit_daemon.supervisor._calibration_writer import CalibrationWriter
+from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
-from jointfit_daemon.supervisor._process_statistics import ProcessWatch
+from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import Progress
 from jointfit_daemon.supervisor._source_tasks import SourceTasks, stop
 from jointfit_daemon.supervisor._status_line import Pace, Seen, phase_of, status_line
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
-from jointfit_daemon.supervisor.process_exit import leave_within
+from jointfit_daemon.supervisor.process_exit import exit_within
 from jointfit_daemon.supervisor.requests import (
-    RequestGuard,
+    RequestAuthenticator,
+    parse_request,
     reply_correlation,
     reply_topic,
-    request_of,
 )
-from jointfit_daemon.supervisor.state_directory import state_directory, writing_fault
+from jointfit_daemon.supervisor.state_directory import state_directory, write_fault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.pipeline.events import Output
-    from jointfit_daemon.supervisor._core_runner import CoreLike
+    from jointfit_daemon.supervisor._core_runner import CoreInterface
 
 log = logging.getLogger(__name__)
 
@@ -98,12 +98,12 @@ class Daemon:
         The pure core.
     """
 
-    def __init__(self, config: Path, rig: Rig, core: CoreLike) -> None:
+    def __init__(self, config: Path, rig: Rig, core: CoreInterface) -> None:
         self._config, self._rig = config, rig
-        self._heart = Heart(core, self._send)
-        self._process, self._systemd = ProcessWatch(), SystemdNotifier()
+        self._heart = CoreRunner(core, self._send)
+        self._process, self._systemd = ProcessStatistics(), SystemdNotifier()
         self._progress, self._pace = Progress(), Pace()
-        self._noise = LoopNoise()
+        self._noise = DisconnectErrorFilter()
         self._asking: Incoming | None = None
         self._online: set[str] = set()
         self._version: int | None = None
@@ -115,7 +115,7 @@ class Daemon:
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._fits: FitRunner
-        self._stores: StoreRunner
+        self._stores: CalibrationWriter
         self._state_check: asyncio.Task[None]
         self._mqtt: asyncio.Task[None]
         self._use_broker(rig)
@@ -123,11 +123,11 @@ class Daemon:
     def _use_broker(self, rig: Rig) -> None:
         self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
         self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
-        self._reporter = Reporter(rig, self._outbox)
+        self._reporter = TopicWriter(rig, self._outbox)
         self._take_request_key(rig)
 
     def _take_request_key(self, rig: Rig) -> None:
-        self._guard = RequestGuard(rig.mqtt)
+        self._guard = RequestAuthenticator(rig.mqtt)
         if self._guard.fault:
             log.error("mqtt: all requests are refused: %s", self._guard.fault)
 
@@ -149,7 +149,7 @@ class Daemon:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._noise)
         loop.add_signal_handler(signal.SIGHUP, self._hung_up.set)
-        warnings = LogTopic(self._log_line)
+        warnings = MqttLogHandler(self._log_line)
         logging.getLogger().addHandler(warnings)
         try:
             async with asyncio.TaskGroup() as self._tasks:
@@ -168,7 +168,7 @@ class Daemon:
     async def _start(self, tasks: asyncio.TaskGroup) -> None:
         self._sources = SourceTasks(tasks, self._heart.feed)
         self._fits = FitRunner(tasks, self._heart.feed)
-        self._stores = StoreRunner(tasks, self._heart.feed, self._tell_not_stored)
+        self._stores = CalibrationWriter(tasks, self._heart.feed, self._tell_not_stored)
         self._open_log(tasks)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
@@ -192,7 +192,7 @@ class Daemon:
             return
         folder = state_directory() / recording.directory
         try:
-            self._heart.log = EventLog(folder, self._rig.name)
+            self._heart.log = EventLogWriter(folder, self._rig.name)
         except OSError as fault:
             self._tell("recording", f"nothing is recorded: {folder}: {fault.strerror}", "error")
         else:
@@ -202,7 +202,7 @@ class Daemon:
     async def _check_state(self) -> None:
         """Report a state directory that cannot be written before a calibration needs it."""
         folder = state_directory() / "calibrations"
-        before, fault = self._state_fault, await asyncio.to_thread(writing_fault, folder)
+        before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)
         self._state_fault = fault
         if fault is not None:
             self._tell(
@@ -270,7 +270,7 @@ class Daemon:
 
     def _asked(self, message: Incoming) -> None:
         """Take one request from the broker: answered once, by the core or for it."""
-        request = request_of(message, self._guard)
+        request = parse_request(message, self._guard)
         if request is None:
             return
         self._asking = message
@@ -381,7 +381,7 @@ class Daemon:
         log.info("%s: reloaded, %d sources", rig.name, len(rig.sources))
 
 
-async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreLike] = Core) -> None:
+async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] = Core) -> None:
     """Run the daemon until SIGTERM or SIGINT.
 
     Parameters
@@ -401,7 +401,7 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreLike] = Core
         nonlocal stopping
         if not stopping and main is not None:
             stopping = True
-            leave_within(STOP_S, 1, "stopping")
+            exit_within(STOP_S, 1, "stopping")
             main.cancel()
 
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -10,7 +10,7 @@ import threading
 log = logging.getLogger(__name__)
 
 
-def leave_within(seconds: float, code: int, why: str) -> None:
+def exit_within(seconds: float, code: int, why: str) -> None:
     """End the process with `code` after `seconds`, unless it ended before.
 
     A thread that looks up a name, or a driver that does not let go, cannot be interrupted. A

@@ -95,7 +95,7 @@ def _written(directory: Path) -> Iterator[Path]:
         yield directory
 
 
-def writing_fault(directory: Path) -> str | None:
+def write_fault(directory: Path) -> str | None:
     """Return why no file can be written to `directory`, or None if one can."""
     probe = directory / f".probe-{os.getpid()}"
     try:

@@ -12,7 +12,7 @@ import os
 import random
 from typing import TYPE_CHECKING, Any, Protocol
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
@@ -146,7 +146,9 @@ async def raises(kind: type[Exception], task: asyncio.Task[None], within_s: floa
     if error is not None and type(error) is not kind:
         raise error
     require(error is not None, f"{kind.__name__} is raised, run does not just return")
-    require(kind not in {DeviceLost, DeviceMisconfigured} or str(error), "it says something")
+    require(
+        kind not in {DeviceLostError, DeviceMisconfiguredError} or str(error), "it says something"
+    )
 
 
 def open_descriptors() -> int:

@@ -39,7 +39,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
 from unittest import SkipTest
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured, Settings, find_driver
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, Settings, find_driver
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
 from jointfit_simulators.contract_scene import (
     Listener,
@@ -75,9 +75,9 @@ class DriverContract(ABC):
     """What its decoder yields for a sample."""
     starts_within_s: ClassVar[float] = 10.0
     lost_within_s: ClassVar[float] = 1.0
-    """From unplugging, or from the last byte, to DeviceLost."""
+    """From unplugging, or from the last byte, to DeviceLostError."""
     refused_within_s: ClassVar[float] = 15.0
-    """From meeting a wrong device to DeviceMisconfigured."""
+    """From meeting a wrong device to DeviceMisconfiguredError."""
     has_noise: ClassVar[bool] = True
     has_plug: ClassVar[bool] = True
 
@@ -238,12 +238,12 @@ class DriverContract(ABC):
                 task = asyncio.create_task(driver.run(heard.emit))
                 first = await self._first(device, heard, task)
                 await self._send_all(device, heard, first, 5)
-                await raises(DeviceLost, task, self.lost_within_s)
+                await raises(DeviceLostError, task, self.lost_within_s)
 
         run_scene(scene())
 
     def test_unplugging_is_noticed_and_replugging_heals(self, tmp_path: Path) -> None:
-        """Unplugged: DeviceLost in time. Plugged in again: the same driver runs again."""
+        """Unplugged: DeviceLostError in time. Plugged in again: the same driver runs again."""
         if not self.has_plug:
             raise SkipTest("this wire cannot be unplugged")
 
@@ -255,9 +255,11 @@ class DriverContract(ABC):
                 task = asyncio.create_task(driver.run(heard.emit))
                 first = await self._first(device, heard, task)
                 device.unplug()
-                await raises(DeviceLost, task, self.lost_within_s)
+                await raises(DeviceLostError, task, self.lost_within_s)
                 await raises(
-                    DeviceLost, asyncio.create_task(driver.run(heard.emit)), self.starts_within_s
+                    DeviceLostError,
+                    asyncio.create_task(driver.run(heard.emit)),
+                    self.starts_within_s,
                 )
                 device.plug()
                 async with self._reading(device, driver, first) as (heard, number):
@@ -266,7 +268,7 @@ class DriverContract(ABC):
         run_scene(scene())
 
     def test_a_device_that_is_not_there_may_come(self, tmp_path: Path) -> None:
-        """Absent is DeviceLost: the supervisor tries again."""
+        """Absent is DeviceLostError: the supervisor tries again."""
         if not self.has_plug:
             raise SkipTest("this wire cannot be unplugged")
 
@@ -274,12 +276,12 @@ class DriverContract(ABC):
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             device.unplug()
             task = asyncio.create_task(driver.run(lambda _: None))
-            await raises(DeviceLost, task, self.starts_within_s)
+            await raises(DeviceLostError, task, self.starts_within_s)
 
         run_scene(scene())
 
     def test_a_wrong_device_is_named_not_retried(self, tmp_path: Path) -> None:
-        """What can never work is DeviceMisconfigured, with words to act on."""
+        """What can never work is DeviceMisconfiguredError, with words to act on."""
         device = self.make_wrong_device(tmp_path)
         if device is None:
             raise SkipTest("a wrong device cannot be told apart on this wire")
@@ -287,7 +289,7 @@ class DriverContract(ABC):
         async def scene() -> None:
             async with served(device):
                 task = asyncio.create_task(self.make_driver(tmp_path).run(lambda _: None))
-                await raises(DeviceMisconfigured, task, self.refused_within_s)
+                await raises(DeviceMisconfiguredError, task, self.refused_within_s)
 
         run_scene(scene())
 

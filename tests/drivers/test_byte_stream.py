@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 import serial
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.byte_stream import SerialPort
 
 if TYPE_CHECKING:
@@ -59,7 +59,10 @@ async def test_bytes_arrive_stamped_with_the_monotonic_clock(pty: Pty) -> None:
 
 
 async def test_silence_is_a_lost_device(pty: Pty) -> None:
-    with SerialPort(pty.path, 115200) as port, pytest.raises(DeviceLost, match=r"silent for 0.05"):
+    with (
+        SerialPort(pty.path, 115200) as port,
+        pytest.raises(DeviceLostError, match=r"silent for 0.05"),
+    ):
         await port.pump(lambda _: None, 0.05)
 
 
@@ -70,7 +73,7 @@ async def test_each_byte_restarts_the_silence(pty: Pty) -> None:
             await asyncio.sleep(0.08)
             os.write(pty.master, b"x")
         assert not task.done()
-        with pytest.raises(DeviceLost):
+        with pytest.raises(DeviceLostError):
             await task
 
 
@@ -80,12 +83,12 @@ async def test_unplugging_is_noticed_at_once(pty: Pty) -> None:
         await asyncio.sleep(0.02)
         began = time.monotonic()
         pty.close()
-        with pytest.raises(DeviceLost, match="unplugged"):
+        with pytest.raises(DeviceLostError, match="unplugged"):
             await task
         assert time.monotonic() - began < 0.5
-        with pytest.raises(DeviceLost):
+        with pytest.raises(DeviceLostError):
             await port.write(b"x")
-        with pytest.raises(DeviceLost):
+        with pytest.raises(DeviceLostError):
             await port.receive(1.0)
 
 
@@ -145,19 +148,25 @@ async def test_a_write_longer_than_the_buffer_arrives_whole(pty: Pty) -> None:
 
 async def test_a_port_that_takes_no_byte_is_lost(pty: Pty, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jointfit_drivers.byte_stream._WRITE_TIMEOUT_S", 0.1)
-    with SerialPort(pty.path, 115200) as port, pytest.raises(DeviceLost, match="takes no byte"):
+    with (
+        SerialPort(pty.path, 115200) as port,
+        pytest.raises(DeviceLostError, match="takes no byte"),
+    ):
         await port.write(bytes(1_000_000))
 
 
 def test_a_port_that_is_not_there_may_come_back(tmp_path: Path) -> None:
-    with pytest.raises(DeviceLost, match="not there"), SerialPort(str(tmp_path / "gone"), 9600):
+    with (
+        pytest.raises(DeviceLostError, match="not there"),
+        SerialPort(str(tmp_path / "gone"), 9600),
+    ):
         pass
 
 
 def test_a_taken_port_may_become_free(pty: Pty) -> None:
     with (
         SerialPort(pty.path, 115200),
-        pytest.raises(DeviceLost, match="another program"),
+        pytest.raises(DeviceLostError, match="another program"),
         SerialPort(pty.path, 115200),
     ):
         pass
@@ -166,11 +175,11 @@ def test_a_taken_port_may_become_free(pty: Pty) -> None:
 def test_a_file_is_not_a_port_and_never_will_be(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with (
-        pytest.raises(DeviceMisconfigured, match="not a serial port"),
+        pytest.raises(DeviceMisconfiguredError, match="not a serial port"),
         SerialPort(str(tmp_path / "file"), 9600),
     ):
         pass
-    with pytest.raises(DeviceMisconfigured), SerialPort(str(tmp_path), 9600):
+    with pytest.raises(DeviceMisconfiguredError), SerialPort(str(tmp_path), 9600):
         pass
 
 
@@ -180,7 +189,7 @@ def test_a_forbidden_port_names_the_group_and_the_rule(monkeypatch: pytest.Monke
 
     monkeypatch.setattr("serial.Serial", refuse)
     with (
-        pytest.raises(DeviceLost, match=r"dialout.*udev"),
+        pytest.raises(DeviceLostError, match=r"dialout.*udev"),
         SerialPort("/dev/ttyUSB0", 9600),
     ):
         pass
@@ -198,7 +207,7 @@ def test_an_error_of_system_or_hardware_may_pass(
         raise kind(number, "as the kernel has it")
 
     monkeypatch.setattr("serial.Serial", refuse)
-    with pytest.raises(DeviceLost, match="/dev/ttyUSB0"), SerialPort("/dev/ttyUSB0", 9600):
+    with pytest.raises(DeviceLostError, match="/dev/ttyUSB0"), SerialPort("/dev/ttyUSB0", 9600):
         pass
 
 

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can_frame import CanFrame
@@ -91,7 +91,7 @@ async def opened(adapter: SlcanAdapter) -> None:
 
 async def lost(running: Running, within_s: float = 1.0) -> str:
     async with asyncio.timeout(within_s):
-        with pytest.raises(DeviceLost) as told:
+        with pytest.raises(DeviceLostError) as told:
             await running.task
     return str(told.value)
 
@@ -277,7 +277,7 @@ async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None
     async with serving(device):
         first = Running(driver_of("S3", bus))
         await opened(adapter)
-        with pytest.raises(DeviceMisconfigured, match=r"S4.*0x\d+.*S3.*block of its own"):
+        with pytest.raises(DeviceMisconfiguredError, match=r"S4.*0x\d+.*S3.*block of its own"):
             await Running(driver_of("S4", bus)).task
         device.push(0, IDENTITY)
         await first.wait_for(1)
@@ -329,7 +329,7 @@ async def test_a_bit_rate_slcan_does_not_have_is_refused(tmp_path: Path) -> None
     with pytest.raises(ValidationError, match=r"no such bit rate in SLCAN.*1000000"):
         bus_at(tmp_path, bitrate=83_333)
     unchecked = bus_at(tmp_path).model_copy(update={"bitrate": 83_333})
-    with pytest.raises(DeviceMisconfigured, match=r"bit rate 83333.*1000000"):
+    with pytest.raises(DeviceMisconfiguredError, match=r"bit rate 83333.*1000000"):
         await driver_of("S3", unchecked).run(lambda _: None)
 
 
@@ -367,5 +367,7 @@ class Chatter:
 
 async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> None:
     async with serving(Chatter(tmp_path / "adapter")):
-        with pytest.raises(DeviceMisconfigured, match="no SLCAN adapter answers at 115200 baud"):
+        with pytest.raises(
+            DeviceMisconfiguredError, match="no SLCAN adapter answers at 115200 baud"
+        ):
             await driver_of("S3", bus_at(tmp_path)).run(lambda _: None)

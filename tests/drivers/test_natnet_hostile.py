@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from jointfit_daemon.driver import DeviceMisconfigured
+from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, ClockEcho, Corrupt, MocapFrame
 from jointfit_drivers.natnet_answers import ANSWER_NS, ECHO_NS, OpenQuestions
 from jointfit_drivers.natnet_settings import NatNetSettings
@@ -47,12 +47,14 @@ def test_a_clock_frequency_that_no_counter_has_is_not_used(hz: int) -> None:
     (info,) = told(feeder(INFO._replace(clock_hz=hz)), "info")
     assert info.data["clock_hz"] is None
     assert feeder.decoder.tick_clock is None
-    with pytest.raises(DeviceMisconfigured, match=f"clock frequency of {hz} Hz, expected 1000 to"):
+    with pytest.raises(
+        DeviceMisconfiguredError, match=f"clock frequency of {hz} Hz, expected 1000 to"
+    ):
         check_server("NatNet server x:1510", SETTINGS, INFO._replace(clock_hz=hz))
 
 
 def test_a_multicast_server_without_a_data_port_is_refused() -> None:
-    with pytest.raises(DeviceMisconfigured, match=r"data port 0: set mocap\.data_port"):
+    with pytest.raises(DeviceMisconfiguredError, match=r"data port 0: set mocap\.data_port"):
         check_group("NatNet server x:1510", INFO, 0)
 
 

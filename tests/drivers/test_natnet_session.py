@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typing_extensions import override
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.files.capture import read_capture
 from jointfit_daemon.model import ClockEcho, MocapFrame
 from jointfit_drivers import natnet_session
@@ -182,19 +182,21 @@ async def test_a_port_where_nobody_listens_is_lost_at_once_and_named() -> None:
         NatNetSettings(driver="natnet", server="127.0.0.1", command_port=server.command_port)
     )
     async with asyncio.timeout(1):
-        with pytest.raises(DeviceLost, match=f"127.0.0.1:{server.command_port}: nothing listens"):
+        with pytest.raises(
+            DeviceLostError, match=f"127.0.0.1:{server.command_port}: nothing listens"
+        ):
             await driver.run(lambda _: None)
 
 
 async def test_a_host_that_does_not_exist_is_lost_and_named() -> None:
     driver = NatNetMocap(NatNetSettings(driver="natnet", server="no-such-host.invalid"))
-    with pytest.raises(DeviceLost, match=r"no-such-host\.invalid"):
+    with pytest.raises(DeviceLostError, match=r"no-such-host\.invalid"):
         await driver.run(lambda _: None)
 
 
 async def test_a_network_card_that_does_not_exist_is_a_wrong_setting() -> None:
     driver = NatNetMocap(NatNetSettings(driver="natnet", server="127.0.0.1", interface="eth77"))
-    with pytest.raises(DeviceMisconfigured, match="eth77"):
+    with pytest.raises(DeviceMisconfiguredError, match="eth77"):
         await driver.run(lambda _: None)
 
 
@@ -238,7 +240,7 @@ async def test_a_server_that_can_never_work_is_refused_with_a_remedy(
     async with at_work(server, **settings) as (_, task):
         await asyncio.wait([task], timeout=2)
         error = task.exception()
-    assert isinstance(error, DeviceMisconfigured)
+    assert isinstance(error, DeviceMisconfiguredError)
     assert words in str(error)
 
 
@@ -250,7 +252,7 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
     async with at_work(server, transport="unicast", silence_s=0.2) as (_, task):
         await asyncio.wait([task], timeout=3)
         error = task.exception()
-    assert isinstance(error, DeviceLost)
+    assert isinstance(error, DeviceLostError)
     assert "announces multicast, but transport = 'unicast'" in str(error)
 
 

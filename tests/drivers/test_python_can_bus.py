@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_drivers.can_bus import shared_bus
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
@@ -95,9 +95,9 @@ class Broken(can.BusABC):
 @pytest.mark.parametrize(
     ("error", "kind"),
     [
-        (can.CanOperationError("adapter pulled out", 19), DeviceLost),
-        (can.CanOperationError("something of the vendor's"), DeviceLost),
-        (ValueError("the backend cannot parse a line"), DeviceLost),
+        (can.CanOperationError("adapter pulled out", 19), DeviceLostError),
+        (can.CanOperationError("something of the vendor's"), DeviceLostError),
+        (ValueError("the backend cannot parse a line"), DeviceLostError),
         (ZeroDivisionError(), ZeroDivisionError),
     ],
 )
@@ -114,22 +114,22 @@ async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
     bus = CanBusSettings(interface="socketcna", channel="can0")
     with pytest.raises(ValidationError, match="did you mean 'socketcan'"):
         driver_of("S3", bus)
-    with pytest.raises(DeviceMisconfigured, match="did you mean 'socketcan'"):
+    with pytest.raises(DeviceMisconfiguredError, match="did you mean 'socketcan'"):
         async with shared_bus(bus):
             pass
 
 
 async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
     bus = CanBusSettings(interface="kvaser", channel="0")
-    with pytest.raises(DeviceMisconfigured, match="opened as kvaser"):
+    with pytest.raises(DeviceMisconfiguredError, match="opened as kvaser"):
         await driver_of("S3", bus).run(lambda _: None)
 
 
 @pytest.mark.parametrize(
     ("number", "kind", "words"),
     [
-        (97, DeviceMisconfigured, "no CAN in this kernel.*can_raw"),
-        (19, DeviceLost, "no such CAN interface"),
+        (97, DeviceMisconfiguredError, "no CAN in this kernel.*can_raw"),
+        (19, DeviceLostError, "no such CAN interface"),
     ],
 )
 async def test_kernels_without_can_and_absent_links(
@@ -200,7 +200,7 @@ async def test_a_link_that_goes_down_is_told_once_and_frames_before_it_count(
     for number in range(100):
         made[0].far.send(bytes([number] * 8))
     made[0].far.send(b"down")
-    with pytest.raises(DeviceLost, match="ip link set can0 up"):
+    with pytest.raises(DeviceLostError, match="ip link set can0 up"):
         await task
     found = [frame for chunk in chunks for frame in unpack_frames(chunk.data)]
     assert [frame.data[0] for frame in found if isinstance(frame, CanFrame)] == list(range(100))

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 from typing_extensions import override
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusImu
 from jointfit_drivers.xbus_handshake import differences
@@ -122,7 +122,7 @@ async def test_a_difference_is_named_and_not_written_without_permission(tmp_path
     options = XbusDeviceOptions(outputs=((Item.QUATERNION, 50),))
     device = XbusDevice(tmp_path / "imu", options=options)
     async with powered(device):
-        said = await refusal(make(tmp_path), DeviceMisconfigured)
+        said = await refusal(make(tmp_path), DeviceMisconfiguredError)
     assert device.flash_writes == 0
     for part in ("S1", "packet counter", "time", "50 Hz, not 100 Hz", "persist = true"):
         assert part in said
@@ -131,7 +131,7 @@ async def test_a_difference_is_named_and_not_written_without_permission(tmp_path
 async def test_a_rate_alone_is_offered_as_the_setting_it_takes(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu")
     async with powered(device):
-        said = await refusal(make(tmp_path, rate_hz=200), DeviceMisconfigured)
+        said = await refusal(make(tmp_path, rate_hz=200), DeviceMisconfiguredError)
     assert "set rate_hz = 100" in said
 
 
@@ -155,7 +155,7 @@ async def test_raw_outputs_are_written_once_where_the_gateway_computes_the_orien
     device = XbusDevice(tmp_path / "imu")
     asked = {"orientation": "gateway", "magnetometer": True}
     async with powered(device, feeding=True):
-        said = await refusal(make(tmp_path, **asked), DeviceMisconfigured)
+        said = await refusal(make(tmp_path, **asked), DeviceMisconfiguredError)
         await chunks_of(make(tmp_path, persist=True, **asked))
         await chunks_of(make(tmp_path, **asked))
     for part in ("no rate of turn (0x8020)", "no acceleration (0x4020)", "no magnetic field"):
@@ -183,7 +183,7 @@ def test_increments_will_do_where_the_device_sends_them_already() -> None:
 async def test_a_rate_the_device_rounds_is_named(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu")
     async with powered(device):
-        said = await refusal(make(tmp_path, rate_hz=120, persist=True), DeviceMisconfigured)
+        said = await refusal(make(tmp_path, rate_hz=120, persist=True), DeviceMisconfiguredError)
     assert "quaternions at 100 Hz, not 120 Hz" in said
     assert "set rate_hz = 100" in said
 
@@ -198,7 +198,7 @@ async def test_an_error_of_the_device_is_told_in_words(tmp_path: Path) -> None:
 
     device = Refusing(tmp_path / "imu")
     async with powered(device):
-        said = await refusal(make(tmp_path, persist=True), DeviceMisconfigured)
+        said = await refusal(make(tmp_path, persist=True), DeviceMisconfiguredError)
     assert "0x21" in said
     assert "parameter" in said
 
@@ -207,7 +207,7 @@ async def test_a_wrong_speed_is_named_with_the_right_one(tmp_path: Path) -> None
     options = XbusDeviceOptions(baud=921_600, measures_at_once=True)
     device = XbusDevice(tmp_path / "imu", options=options)
     async with powered(device, feeding=True):
-        said = await refusal(make(tmp_path), DeviceMisconfigured)
+        said = await refusal(make(tmp_path), DeviceMisconfiguredError)
         assert device.streaming  # left as it was
     assert "set baud = 921600" in said
     assert "S1" in said
@@ -218,7 +218,7 @@ async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(
 ) -> None:
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(baud=9_600))
     async with powered(device):
-        said = await refusal(make(tmp_path), DeviceMisconfigured)
+        said = await refusal(make(tmp_path), DeviceMisconfiguredError)
     assert "set baud = 9600" in said
 
 
@@ -267,16 +267,16 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
 
     device = Late(tmp_path / "imu")
     async with powered(device):
-        assert "too late" in await refusal(make(tmp_path), DeviceLost)
+        assert "too late" in await refusal(make(tmp_path), DeviceLostError)
 
 
 async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
     line = PtyLine(tmp_path / "imu")
     driver = make(tmp_path)
-    assert "silent" in await refusal(driver, DeviceLost)
+    assert "silent" in await refusal(driver, DeviceLostError)
     loop = asyncio.get_running_loop()
     began = loop.time()
-    assert "silent" in await refusal(driver, DeviceLost)
+    assert "silent" in await refusal(driver, DeviceLostError)
     assert loop.time() - began < 2.0  # the second time it is not looked for at every speed
     line.unplug()
 
@@ -284,7 +284,7 @@ async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
 async def test_a_stuck_device_is_reset_only_with_permission(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(stuck=True))
     async with powered(device, feeding=True):
-        said = await refusal(make(tmp_path), DeviceLost)
+        said = await refusal(make(tmp_path), DeviceLostError)
         assert "reset_if_stuck" in said
         chunks = await chunks_of(make(tmp_path, reset_if_stuck=True))
     assert MessageId.MT_DATA2 in mids(chunks)
@@ -331,7 +331,7 @@ async def test_more_than_the_line_carries_is_refused_before_anything_is_sent(
 ) -> None:
     device = XbusDevice(tmp_path / "imu")
     async with powered(device):
-        said = await refusal(make(tmp_path, rate_hz=400), DeviceMisconfigured)
+        said = await refusal(make(tmp_path, rate_hz=400), DeviceMisconfiguredError)
     assert "144000 bit/s" in said
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from jointfit_daemon.driver import DeviceMisconfigured
+from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample, SyncPulse
 from jointfit_drivers.xbus import XbusImu
 from jointfit_drivers.xbus_settings import XbusSettings
@@ -102,7 +102,9 @@ async def test_what_is_not_asked_is_neither_read_nor_told(tmp_path: Path) -> Non
 async def test_settings_that_differ_are_not_written_unasked(tmp_path: Path) -> None:
     driver = XbusImu(settings(tmp_path, sync=[CLOCKED]))
     async with serving(tmp_path, sync=(STORED,)) as device:
-        with pytest.raises(DeviceMisconfigured, match=r"clock_bias.*it has trigger_ind.*persist"):
+        with pytest.raises(
+            DeviceMisconfiguredError, match=r"clock_bias.*it has trigger_ind.*persist"
+        ):
             await told(driver, device)
         assert (device.sync, device.flash_writes) == ((STORED,), 0)
 

@@ -23,7 +23,7 @@ from jointfit_daemon.config._fault_messages import ConfigError
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.mqtt import Incoming, Outbox
 from jointfit_daemon.outputs.mqtt._signature import signed
-from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.recording import read_events
 from jointfit_daemon.outputs.recording._event_log import encode_event
 from jointfit_daemon.pipeline import Core
@@ -35,10 +35,10 @@ from jointfit_daemon.pipeline.events import (
     Tick,
 )
 from jointfit_daemon.supervisor.requests import (
-    RequestGuard,
+    RequestAuthenticator,
+    parse_request,
     reply_correlation,
     reply_topic,
-    request_of,
 )
 from tests.fuzz.target import Target
 from tests.fuzz.wire_targets import rig
@@ -73,13 +73,13 @@ def folder() -> Path:
 
 
 @cache
-def guards() -> tuple[RequestGuard | None, ...]:
+def guards() -> tuple[RequestAuthenticator | None, ...]:
     """Return the guards: none, and one with a key."""
     key_file = folder() / "request.key"
     key_file.write_bytes(KEY)
     key_file.chmod(0o600)
     settings = MqttSettings.model_validate({"host": "127.0.0.1", "request_key_file": str(key_file)})
-    return None, RequestGuard(settings)
+    return None, RequestAuthenticator(settings)
 
 
 def run_request(data: bytes) -> None:
@@ -93,9 +93,9 @@ def run_request(data: bytes) -> None:
         response_topic=response.decode("utf-8", "replace"),
         correlation=correlation,
     )
-    reporter = Reporter(rig(), Outbox("b/bridge/state"))
+    reporter = TopicWriter(rig(), Outbox("b/bridge/state"))
     for guard in guards():
-        answer = request_of(message, guard)
+        answer = parse_request(message, guard)
         if isinstance(answer, Reply):
             reporter.reply(answer, reply_topic(message), reply_correlation(message))
         elif answer is not None:
@@ -128,7 +128,7 @@ def run_rig(data: bytes) -> None:
     path = folder() / "rig.toml"
     path.write_bytes(data)
     loaded = load_rig(path)
-    core, reporter = Core(), Reporter(loaded, Outbox("b/bridge/state"))
+    core, reporter = Core(), TopicWriter(loaded, Outbox("b/bridge/state"))
     for output in core.feed(Configured(BEGIN_NS, loaded, None)):
         reporter.handle(output)
     encode_event(Configured(BEGIN_NS, loaded, None))
@@ -155,7 +155,7 @@ def good_calibration() -> Calibration:
 
 def use_calibration(calibration: Calibration) -> None:
     """Run the core with a calibration that was accepted, with samples of every sensor."""
-    core, reporter = Core(), Reporter(rig(), Outbox("b/bridge/state"))
+    core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"))
     events: list[Event] = [Configured(BEGIN_NS, rig(), calibration, 1)]
     events += [SourceOpened(BEGIN_NS, name) for name in SENSORS]
     for number in range(12):

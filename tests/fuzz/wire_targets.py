@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_daemon.outputs.mqtt import Outbox
-from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
@@ -83,7 +83,7 @@ def rig() -> Rig:
 
 def feed_core(source: str, chunks: Iterable[bytes]) -> None:
     """Take chunks through decoder, clock, fusion and payloads of the whole core."""
-    core, reporter = Core(), Reporter(rig(), Outbox("b/bridge/state"))
+    core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"))
     t_ns = BEGIN_NS
     events: list[Event] = [Configured(t_ns, rig(), None), SourceOpened(t_ns, source)]
     if source == "mocap":

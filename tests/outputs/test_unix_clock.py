@@ -13,10 +13,10 @@ import pytest
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.mqtt import Outbox
-from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import UnixOffset
-from jointfit_daemon.supervisor._core_runner import Heart
+from jointfit_daemon.supervisor._core_runner import CoreRunner
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -93,7 +93,7 @@ async def sent(outbox: Outbox) -> dict[str, list[Any]]:
 
 async def test_poses_across_a_step_back_keep_their_order(table: dict[str, Any], host: Host) -> None:
     outbox = Outbox("b/bridge/state")
-    reporter = Reporter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox)
+    reporter = TopicWriter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox)
     poses: list[dict[str, Any]] = []
     for number in range(400):
         if number == 200:
@@ -134,7 +134,7 @@ async def test_the_core_hears_of_unix_time_before_anything_else_and_again_when_i
     true_unix_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: true_unix_ns() + set_ns)
     core = Listening()
-    beating = asyncio.create_task(Heart(core, lambda _: None).run(), name="heart")
+    beating = asyncio.create_task(CoreRunner(core, lambda _: None).run(), name="heart")
     await asyncio.sleep(0.3)
     set_ns = -3_600 * S
     await asyncio.sleep(1.5)

@@ -20,7 +20,7 @@ from jointfit_daemon.pipeline.events import (
     Request,
 )
 from jointfit_daemon.supervisor import _stored_calibrations
-from jointfit_daemon.supervisor._calibration_writer import StoreRunner
+from jointfit_daemon.supervisor._calibration_writer import CalibrationWriter
 from jointfit_daemon.supervisor.daemon import Daemon
 from tests.calibration.plain_calibration import plain_calibration
 
@@ -65,7 +65,7 @@ async def test_two_calibrations_are_written_one_after_the_other(
     events: list[Event] = []
     complaints: list[str] = []
     async with asyncio.TaskGroup() as tasks:
-        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner = CalibrationWriter(tasks, events.append, complaints.append)
         runner.start(rig, calibration_of(rig, "first"))
         runner.start(rig, calibration_of(rig, "second"))
         await asyncio.sleep(0.05)
@@ -90,7 +90,7 @@ async def test_what_could_not_be_written_stays_in_force_over_a_reload(
     complaints: list[str] = []
     events: list[Event] = []
     async with asyncio.TaskGroup() as tasks:
-        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner = CalibrationWriter(tasks, events.append, complaints.append)
         runner.start(rig, calibration_of(rig, "new"))
     assert "no space left" in complaints[0]
     assert events == []
@@ -191,7 +191,7 @@ async def test_what_could_not_be_written_is_tried_again(
     events: list[Event] = []
     complaints: list[str] = []
     async with asyncio.TaskGroup() as tasks, asyncio.timeout(5):
-        runner = StoreRunner(tasks, events.append, complaints.append)
+        runner = CalibrationWriter(tasks, events.append, complaints.append)
         runner.start(rig, calibration_of(rig, "new"))
         while not events:
             await asyncio.sleep(0.01)

@@ -15,7 +15,7 @@ import orjson
 import pytest
 
 from jointfit_daemon.config import Rig, parse_rig
-from jointfit_daemon.driver import DeviceLost
+from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.pipeline import Core
@@ -30,10 +30,10 @@ from jointfit_daemon.pipeline.events import (
     SourceOpened,
     Tick,
 )
-from jointfit_daemon.supervisor._core_runner import HEARTBEAT_NS, Heart
+from jointfit_daemon.supervisor._core_runner import LONGEST_TICK_INTERVAL_NS, CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._progress_monitor import Progress
-from jointfit_daemon.supervisor._source_tasks import keep_running
+from jointfit_daemon.supervisor._source_tasks import run_source
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.daemon import Daemon
 from tests.broker_fixture import free_port
@@ -140,7 +140,7 @@ class Script:
             from jointfit_daemon.model import Chunk  # noqa: PLC0415 - here only
 
             emit(Chunk(1, b"x"))
-            raise DeviceLost("unplugged")
+            raise DeviceLostError("unplugged")
         raise cast("Exception", step)
 
 
@@ -148,7 +148,7 @@ async def run_script(rig: Rig, steps: list[Any]) -> tuple[list[Event], asyncio.T
     driver = type("Scripted", (Script,), {"steps": steps})
     source = rig.sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
     events: list[Event] = []
-    task = asyncio.create_task(keep_running(source, events.append), name="source")
+    task = asyncio.create_task(run_source(source, events.append), name="source")
     await asyncio.wait([task], timeout=1.2)
     task.cancel()
     await asyncio.wait([task])
@@ -156,9 +156,9 @@ async def run_script(rig: Rig, steps: list[Any]) -> tuple[list[Event], asyncio.T
 
 
 async def test_a_lost_device_is_tried_again_and_told_once_a_reason(table: dict[str, Any]) -> None:
-    gone = DeviceLost("is not there")
+    gone = DeviceLostError("is not there")
     events, _ = await run_script(
-        parse_rig(table), ["send then go", gone, DeviceLost("is not there"), "send then go"]
+        parse_rig(table), ["send then go", gone, DeviceLostError("is not there"), "send then go"]
     )
     told = [(type(event).__name__, getattr(event, "text", "")) for event in events]
     assert told == [
@@ -368,7 +368,7 @@ async def test_a_run_of_the_real_core_gives_poses_and_health(
 async def test_a_deadline_that_stays_past_does_not_spin() -> None:
     core = RecordingCore()
     core.next_deadline_ns = 0
-    heart = Heart(core, lambda _: None)
+    heart = CoreRunner(core, lambda _: None)
     running = asyncio.create_task(heart.run(), name="heart")
     await asyncio.sleep(0.1)
     running.cancel()
@@ -378,8 +378,8 @@ async def test_a_deadline_that_stays_past_does_not_spin() -> None:
 
 async def test_the_core_hears_its_deadline_in_time() -> None:
     core = RecordingCore()
-    heart = Heart(core, lambda _: None)
-    core.next_deadline_ns = time.monotonic_ns() + HEARTBEAT_NS // 2
+    heart = CoreRunner(core, lambda _: None)
+    core.next_deadline_ns = time.monotonic_ns() + LONGEST_TICK_INTERVAL_NS // 2
     running = asyncio.create_task(heart.run(), name="heart")
     await until(lambda: any(isinstance(event, Tick) for event in core.events))
     tick = next(event for event in core.events if isinstance(event, Tick))

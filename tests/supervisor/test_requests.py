@@ -15,10 +15,10 @@ from jointfit_daemon.outputs.mqtt import Incoming
 from jointfit_daemon.outputs.payloads._encoding import encode
 from jointfit_daemon.pipeline.events import Reply, Request
 from jointfit_daemon.supervisor.requests import (
-    RequestGuard,
+    RequestAuthenticator,
+    parse_request,
     reply_correlation,
     reply_topic,
-    request_of,
 )
 
 
@@ -41,7 +41,7 @@ def incoming(payload: bytes, command: str = "calibrate", **more: Any) -> Incomin
     ],
 )
 def test_a_bad_request_is_told_what_is_wrong(payload: bytes, said: str) -> None:
-    reply = request_of(incoming(payload))
+    reply = parse_request(incoming(payload))
     assert isinstance(reply, Reply)
     assert reply.error is not None
     assert said in str(reply.error["message"])
@@ -76,7 +76,7 @@ ANSWERS = "b/bridge/response"
 def test_an_answer_goes_only_below_the_response_topic(topic: str, usable: bool) -> None:
     asked = incoming(b'{"phase":"static"}', response_topic=topic)
     assert (reply_topic(asked) == topic) is usable
-    found = request_of(asked)
+    found = parse_request(asked)
     assert isinstance(found, Request) is usable
     if isinstance(found, Reply):
         assert found.error is not None
@@ -85,7 +85,7 @@ def test_an_answer_goes_only_below_the_response_topic(topic: str, usable: bool) 
 
 def test_correlation_data_over_the_limit_is_refused_and_not_sent_back() -> None:
     asked = incoming(b'{"phase":"static"}', correlation=bytes(257))
-    found = request_of(asked)
+    found = parse_request(asked)
     assert isinstance(found, Reply)
     assert found.error is not None
     assert "257 bytes, expected at most 256" in str(found.error["message"])
@@ -95,7 +95,7 @@ def test_correlation_data_over_the_limit_is_refused_and_not_sent_back() -> None:
 
 @pytest.mark.parametrize("command", ["", "x" * 33, "a b", "a\nb", "caf\xe9", "\x9b2J", "a\0"])
 def test_a_topic_that_cannot_be_a_command_gets_no_answer(command: str) -> None:
-    assert request_of(incoming(b"{}", command)) is None
+    assert parse_request(incoming(b"{}", command)) is None
 
 
 deep = st.integers(1, 4000).flatmap(
@@ -126,8 +126,8 @@ many_keys = st.integers(1, 1500).map(
 
 @given(st.binary(max_size=6000) | deep | odd_tables | many_keys)
 def test_any_payload_gives_a_request_or_a_bounded_answer(payload: bytes) -> None:
-    for guard in (None, RequestGuard(MqttSettings())):
-        found = request_of(incoming(payload), guard)
+    for guard in (None, RequestAuthenticator(MqttSettings())):
+        found = parse_request(incoming(payload), guard)
         assert found is not None
         if isinstance(found, Reply):
             assert len(encode({"transaction": found.transaction, "error": found.error})) < 16_384

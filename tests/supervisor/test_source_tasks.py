@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.driver import DeviceMisconfigured
+from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_daemon.pipeline.events import SourceClosed
 from jointfit_daemon.supervisor import _source_tasks as sources_module
 from jointfit_daemon.supervisor._source_tasks import SourceTasks
@@ -28,7 +28,7 @@ class Refused:
 
     async def run(self, emit: Any) -> None:  # noqa: ARG002 - a driver's interface
         if not type(self).mended:
-            raise DeviceMisconfigured("no permission: add the user to group dialout")
+            raise DeviceMisconfiguredError("no permission: add the user to group dialout")
         type(self).opened += 1
         await asyncio.Event().wait()
 

@@ -13,7 +13,7 @@ from jointfit_daemon.supervisor.state_directory import (
     StateDirectoryInUseError,
     lock_state,
     make_private,
-    writing_fault,
+    write_fault,
 )
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ def test_a_directory_that_cannot_be_made_is_not_locked_and_named(tmp_path: Path)
     blocked = tmp_path / "file" / "state"
     blocked.parent.write_text("")
     assert lock_state(blocked) is None
-    assert writing_fault(blocked) == f"{blocked}: Not a directory"
-    assert writing_fault(tmp_path / "new") is None
+    assert write_fault(blocked) == f"{blocked}: Not a directory"
+    assert write_fault(tmp_path / "new") is None
     assert list((tmp_path / "new").iterdir()) == []
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.supervisor._source_tasks import SourceTasks
 from jointfit_daemon.supervisor._status_line import Pace, Seen, phase_of, status_line
 
@@ -71,9 +71,9 @@ class Driver:
     async def run(self, emit: Any) -> None:
         await GO[self._id].wait()
         if self._id == "lost":
-            raise DeviceLost("away")
+            raise DeviceLostError("away")
         if self._id == "wrong":
-            raise DeviceMisconfigured("a toaster")
+            raise DeviceMisconfiguredError("a toaster")
         emit(CHUNK)
         await asyncio.Event().wait()
 

@@ -16,7 +16,7 @@ from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
 from jointfit_daemon.calibration.store import CalibrationStore
 from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
 from jointfit_daemon.config import MqttSettings, load_rig
-from jointfit_daemon.outputs.mqtt import BrokerLost, MqttClient
+from jointfit_daemon.outputs.mqtt import BrokerLostError, MqttClient
 from jointfit_daemon.tools.calibrate import CalibrationWatch
 from jointfit_daemon.tools.child_processes import Child, Simulator
 from jointfit_daemon.tools.child_processes import daemon as daemon_child
@@ -59,7 +59,7 @@ class Listener:
     async def run(self) -> None:
         """Listen until cancelled."""
         while True:
-            with contextlib.suppress(BrokerLost):
+            with contextlib.suppress(BrokerLostError):
                 async with MqttClient(self.settings) as self.client:
                     await self.client.subscribe(*TOPICS)
                     async for topic, payload in self.client.messages():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusSettings, DeviceLost, DeviceMisconfigured
+from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.can_bus import shared_bus
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu
@@ -204,7 +204,7 @@ async def test_frames_that_the_kernel_dropped_are_counted_exactly(wire: PythonCa
 
 async def test_a_link_that_is_down_is_lost_and_says_how_to_bring_it_up() -> None:
     ip("set", LINK, "down")
-    with pytest.raises(DeviceLost, match=f"ip link set {LINK} up"):
+    with pytest.raises(DeviceLostError, match=f"ip link set {LINK} up"):
         async with asyncio.timeout(2):
             await XcdiImu(settings(silence_s=1.5)).run(lambda _: None)
 
@@ -227,7 +227,7 @@ async def test_every_device_is_lost_when_the_link_goes_down_and_all_come_back() 
     began = time.monotonic()
     await asyncio.wait(tasks, timeout=2)
     assert time.monotonic() - began < 1
-    assert [type(task.exception()) for task in tasks] == [DeviceLost] * len(names)
+    assert [type(task.exception()) for task in tasks] == [DeviceLostError] * len(names)
     ip("set", LINK, "up")
     wire = PythonCanWire("socketcan", LINK)
     try:
@@ -240,7 +240,7 @@ async def test_every_device_is_lost_when_the_link_goes_down_and_all_come_back() 
 
 async def test_an_interface_that_is_not_there_is_lost_not_fatal() -> None:
     bus = CanBusSettings(interface="socketcan", channel="can9")
-    with pytest.raises(DeviceLost, match="can9: no such CAN interface"):
+    with pytest.raises(DeviceLostError, match="can9: no such CAN interface"):
         await XcdiImu(settings().model_copy(update={"can": bus})).run(lambda _: None)
 
 
@@ -255,12 +255,12 @@ async def test_a_silent_sensor_is_lost_alone_on_a_live_bus(wire: PythonCanWire) 
             identity(device, 1, first=number)
             await asyncio.sleep(0.01)
         missing = r"S4.*no quaternion \(0x221\) comes, while other sensors send"
-        with pytest.raises(DeviceLost, match=missing):
+        with pytest.raises(DeviceLostError, match=missing):
             await task
         assert len(heard.samples) == 80
 
 
 async def test_two_sensors_with_one_identifier_are_refused_by_name(wire: PythonCanWire) -> None:
     async with running(XcdiImu(settings("S3"))):
-        with pytest.raises(DeviceMisconfigured, match=r"S4.*0x.*S3"):
+        with pytest.raises(DeviceMisconfiguredError, match=r"S4.*0x.*S3"):
             await XcdiImu(settings("S4")).run(lambda _: None)

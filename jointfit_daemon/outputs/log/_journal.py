@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from typing_extensions import override
 
 from jointfit_daemon.outputs.log._printable_text import printable
-from jointfit_daemon.outputs.log._rate_limit import BURST, RATE_HZ, Allowance, LimitedHandler
+from jointfit_daemon.outputs.log._rate_limit import BURST, RATE_HZ, RateLimitedHandler, TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -79,7 +79,7 @@ class LevelFormatter(logging.Formatter):
         return "\n".join(f"<{level}>{line}" for line in super().format(record).splitlines())
 
 
-class JournalHandler(LimitedHandler):
+class JournalHandler(RateLimitedHandler):
     """Writes to the journal, at a bounded rate.
 
     Parameters
@@ -91,7 +91,7 @@ class JournalHandler(LimitedHandler):
     address
         Where journald listens.
     stream, clock
-        As ``LimitedHandler`` has them.
+        As ``RateLimitedHandler`` has them.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class JournalHandler(LimitedHandler):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         burst = BURST if limited else math.inf
-        super().__init__(stream, clock, Allowance(RATE_HZ, burst, clock()))
+        super().__init__(stream, clock, TokenBucket(RATE_HZ, burst, clock()))
         self.setFormatter(LevelFormatter())
         self._plain = logging.Formatter("%(name)s: %(message)s")
         self._rig, self._address = rig, address

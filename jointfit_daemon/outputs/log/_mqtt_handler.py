@@ -7,7 +7,7 @@ import logging
 import threading
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.outputs.log._rate_limit import Allowance
+from jointfit_daemon.outputs.log._rate_limit import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 RATE_HZ = 5.0
 
 
-class LogTopic(logging.Handler):
+class MqttLogHandler(logging.Handler):
     """Hands warnings and errors to `tell`, on the loop's thread, at a bounded rate.
 
     Parameters
@@ -29,7 +29,7 @@ class LogTopic(logging.Handler):
         self._tell = tell
         self._loop = asyncio.get_running_loop()
         self._thread = threading.get_ident()
-        self._allowance = Allowance(RATE_HZ, RATE_HZ, self._loop.time())
+        self._allowance = TokenBucket(RATE_HZ, RATE_HZ, self._loop.time())
         self._suppressed = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 RATE_HZ, BURST = 5.0, 50.0
 
 
-class Allowance:
+class TokenBucket:
     """A bucket that fills at `rate_hz` up to `burst`; whoever takes from it may speak.
 
     Parameters
@@ -44,7 +44,7 @@ class Allowance:
         return True
 
 
-class LimitedHandler(logging.StreamHandler["TextIO"]):
+class RateLimitedHandler(logging.StreamHandler["TextIO"]):
     """Writes lines at a bounded rate; errors always pass.
 
     Parameters
@@ -61,11 +61,11 @@ class LimitedHandler(logging.StreamHandler["TextIO"]):
         self,
         stream: TextIO,
         clock: Callable[[], float] = time.monotonic,
-        allowance: Allowance | None = None,
+        allowance: TokenBucket | None = None,
     ) -> None:
         super().__init__(stream)
         self._clock = clock
-        self._allowance = allowance or Allowance(RATE_HZ, BURST, clock())
+        self._allowance = allowance or TokenBucket(RATE_HZ, BURST, clock())
         self._left_out = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's

@@ -1,38 +1,38 @@
 """Connection to an MQTT broker, publisher, outbox, client, TLS, secrets and signatures."""
 
-from jointfit_daemon.outputs.mqtt._client import MqttClient, NoAnswer
+from jointfit_daemon.outputs.mqtt._client import MqttClient, NoAnswerError
 from jointfit_daemon.outputs.mqtt._connection import (
     PAYLOAD_VERSION,
-    BrokerLost,
+    BrokerLostError,
+    DisconnectErrorFilter,
     Incoming,
-    LoopNoise,
 )
 from jointfit_daemon.outputs.mqtt._outbox import Outbox
 from jointfit_daemon.outputs.mqtt._publisher import OFFLINE, ONLINE, MqttPublisher, command_of
-from jointfit_daemon.outputs.mqtt._secret_files import NoKey, request_key_of
+from jointfit_daemon.outputs.mqtt._secret_files import RequestKeyError, request_key_of
 from jointfit_daemon.outputs.mqtt._signature import (
-    FRESH_US,
+    SIGNATURE_LIFETIME_US,
     SIGNING_KEYS,
-    NotSigned,
+    SignatureRejectedError,
     signed,
     verify,
 )
 
 __all__ = [
-    "FRESH_US",
     "OFFLINE",
     "ONLINE",
     "PAYLOAD_VERSION",
+    "SIGNATURE_LIFETIME_US",
     "SIGNING_KEYS",
-    "BrokerLost",
+    "BrokerLostError",
+    "DisconnectErrorFilter",
     "Incoming",
-    "LoopNoise",
     "MqttClient",
     "MqttPublisher",
-    "NoAnswer",
-    "NoKey",
-    "NotSigned",
+    "NoAnswerError",
     "Outbox",
+    "RequestKeyError",
+    "SignatureRejectedError",
     "command_of",
     "request_key_of",
     "signed",

@@ -12,8 +12,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 import orjson
 
-from jointfit_daemon.outputs.mqtt._connection import BrokerLost, Incoming, MqttConnection, Outgoing
-from jointfit_daemon.outputs.mqtt._secret_files import NoKey, request_key_of
+from jointfit_daemon.outputs.mqtt._connection import (
+    BrokerLostError,
+    Incoming,
+    MqttConnection,
+    Outgoing,
+)
+from jointfit_daemon.outputs.mqtt._secret_files import RequestKeyError, request_key_of
 from jointfit_daemon.outputs.mqtt._signature import signed
 
 if TYPE_CHECKING:
@@ -28,7 +33,7 @@ _LONGEST_BYTES = 1024 * 1024
 _EXPIRY_S = 30  # a request nobody took for so long must not run
 
 
-class NoAnswer(Exception):  # noqa: N818 - named for what happened
+class NoAnswerError(Exception):
     """No daemon answered the request in time."""
 
 
@@ -42,7 +47,7 @@ class MqttClient:
 
     Raises
     ------
-    BrokerLost
+    BrokerLostError
         On entering, from any method, and from iterating: the broker is not there or went away.
     """
 
@@ -56,7 +61,7 @@ class MqttClient:
         """Last level of the topics on which this client wants its answers (MQTT 5)."""
         self._unread: deque[Incoming] = deque()
         self._arrived = asyncio.Event()
-        self._lost: BrokerLost | None = None
+        self._lost: BrokerLostError | None = None
         self._waiting: dict[str, asyncio.Future[dict[str, Any]]] = {}
 
     async def __aenter__(self) -> Self:
@@ -100,7 +105,7 @@ class MqttClient:
 
         Raises
         ------
-        NoAnswer
+        NoAnswerError
             Nobody answered within `timeout_s`, or the key to sign with cannot be read.
         """
         transaction = uuid.uuid4().hex
@@ -127,7 +132,7 @@ class MqttClient:
                 f"no daemon answers on {topic}: is jointfitd running, with this base? It ignores "
                 "requests beyond ten a second: is somebody else sending many?"
             )
-            raise NoAnswer(text) from error
+            raise NoAnswerError(text) from error
         finally:
             del self._waiting[transaction]
             answer.cancel()
@@ -135,15 +140,15 @@ class MqttClient:
     def _payload(self, topic: str, request: dict[str, object]) -> bytes:
         try:
             key = request_key_of(self._settings)
-        except NoKey as missing:
-            raise NoAnswer(f"cannot sign the request: {missing}") from missing
+        except RequestKeyError as missing:
+            raise NoAnswerError(f"cannot sign the request: {missing}") from missing
         return orjson.dumps(request if key is None else signed(key, topic, request))
 
     async def _read(self) -> None:
         try:
             async for message in self._connection.messages():
                 self._take(message)
-        except BrokerLost as error:
+        except BrokerLostError as error:
             self._lost = error
             for answer in self._waiting.values():
                 if not answer.done():

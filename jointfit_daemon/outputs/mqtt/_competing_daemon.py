@@ -27,7 +27,7 @@ SETTLED_S = 5.0
 """
 
 
-class RivalDetector:
+class TakeoverDetector:
     """Counts the short connections that may have been ended by another daemon."""
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ async def is_publishing(settings: MqttSettings, within_s: float) -> bool:
 
     Raises
     ------
-    BrokerLost
+    BrokerLostError
         The broker went away.
     """
     async with MqttConnection(settings) as watch:
@@ -74,7 +74,7 @@ async def await_departure(settings: MqttSettings, offline: bytes) -> None:
 
     Raises
     ------
-    BrokerLost
+    BrokerLostError
         The broker went away.
     """
     life, health = f"{settings.base}/bridge/state", f"{settings.base}/bridge/health"

@@ -1,6 +1,7 @@
 """One connection to an MQTT broker. Law: the only module of the daemon that knows aiomqtt and paho.
 
-Nothing of theirs leaves it: whatever goes wrong with a broker is ``BrokerLost``. A connection is
+Nothing of theirs leaves it: whatever goes wrong with a broker is ``BrokerLostError``. A
+connection is
 used once; whoever wants another makes another.
 """
 
@@ -21,7 +22,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from jointfit_daemon.outputs.mqtt._error_messages import broker_fault, session_fault
 from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
 from jointfit_daemon.outputs.mqtt._secret_files import password_of
-from jointfit_daemon.outputs.mqtt._tls import TlsFault, tls_context, tls_remedy
+from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_remedy
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -57,7 +58,7 @@ _SOCKET_OPTIONS = (
 )
 
 
-class BrokerLost(Exception):  # noqa: N818 - named for what happened
+class BrokerLostError(Exception):
     """The broker is absent, refuses, fell silent or went away: worth another try."""
 
 
@@ -119,7 +120,7 @@ class MqttConnection:
 
     Raises
     ------
-    BrokerLost
+    BrokerLostError
         From any method: the message says what was tried.
     """
 
@@ -151,7 +152,7 @@ class MqttConnection:
         except aiomqtt.MqttError as error:
             self._client.abandon()
             why = f"{broker_fault(error)}{self._hint(error)}"
-            raise BrokerLost(f"{self._place()}: {why}") from error
+            raise BrokerLostError(f"{self._place()}: {why}") from error
         except BaseException:
             self._client.abandon()
             raise
@@ -201,7 +202,7 @@ class MqttConnection:
             await self._publish(message)
         except (aiomqtt.MqttError, ValueError) as error:
             why = session_fault(error)
-            raise BrokerLost(f"{self._place()}: {message.topic}: {why}") from error
+            raise BrokerLostError(f"{self._place()}: {message.topic}: {why}") from error
         stop_if_cancelled()
         return self._client.refusal
 
@@ -235,7 +236,7 @@ class MqttConnection:
             codes = await self._client.subscribe(asked, timeout=SUBSCRIBED_S)
         except aiomqtt.MqttError as error:
             why = session_fault(error)
-            raise BrokerLost(f"{self._place()}: cannot subscribe: {why}") from error
+            raise BrokerLostError(f"{self._place()}: cannot subscribe: {why}") from error
         stop_if_cancelled()
         values = [code if isinstance(code, int) else int(code.value) for code in codes]
         return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
@@ -246,7 +247,7 @@ class MqttConnection:
             await self._client.unsubscribe(topic)
         except aiomqtt.MqttError as error:
             why = session_fault(error)
-            raise BrokerLost(f"{self._place()}: cannot unsubscribe: {why}") from error
+            raise BrokerLostError(f"{self._place()}: cannot unsubscribe: {why}") from error
         stop_if_cancelled()
 
     async def messages(self) -> AsyncIterator[Incoming]:
@@ -257,9 +258,9 @@ class MqttConnection:
                 message = await anext(arriving)
             except aiomqtt.MqttError as error:
                 why = broker_fault(error.__cause__ or error)
-                raise BrokerLost(f"{self._place()}: {why}") from error
+                raise BrokerLostError(f"{self._place()}: {why}") from error
             except OSError as error:  # what the reader met
-                raise BrokerLost(f"{self._place()}: {broker_fault(error)}") from error
+                raise BrokerLostError(f"{self._place()}: {broker_fault(error)}") from error
             stop_if_cancelled()
             yield Incoming(
                 message.topic.value,
@@ -277,8 +278,8 @@ class MqttConnection:
         if settings.tls is not None:
             try:  # in a thread: reading the system's certificates takes tens of milliseconds
                 context = await asyncio.to_thread(tls_context, settings.tls)
-            except TlsFault as fault:
-                raise BrokerLost(f"{self._place()}: [mqtt.tls]: {fault}") from fault
+            except TlsFilesError as fault:
+                raise BrokerLostError(f"{self._place()}: [mqtt.tls]: {fault}") from fault
 
         limit: Any = None
         if self._modern:
@@ -453,7 +454,7 @@ class _Client(aiomqtt.Client):
         super()._on_publish(client, userdata, mid, reason_code, properties)
 
 
-class LoopNoise:
+class DisconnectErrorFilter:
     """Loop exception handler that drops the two complaints aiomqtt causes at a disconnect.
 
     They are an ``MqttError`` in a future that nobody awaits any more, and a bad file descriptor in

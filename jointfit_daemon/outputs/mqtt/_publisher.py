@@ -12,21 +12,21 @@ import random
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.outputs.log import Allowance
+from jointfit_daemon.outputs.log import TokenBucket
 from jointfit_daemon.outputs.mqtt._competing_daemon import (
     GLANCE_S,
-    RivalDetector,
+    TakeoverDetector,
     await_departure,
     is_publishing,
 )
 from jointfit_daemon.outputs.mqtt._connection import (
-    BrokerLost,
+    BrokerLostError,
     Incoming,
     MqttConnection,
     Outgoing,
     stop_if_cancelled,
 )
-from jointfit_daemon.outputs.mqtt._secret_files import exposures, password_of
+from jointfit_daemon.outputs.mqtt._secret_files import password_of, security_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,10 +77,10 @@ class MqttPublisher:
         self._base = settings.base
         self._requests = f"{settings.base}/bridge/request/"
         self._said = ""
-        self._rivals = RivalDetector()
+        self._rivals = TakeoverDetector()
         self._lasted_s, self._taken_over = 0.0, False
         self._loop = asyncio.get_running_loop()
-        self._allowance = Allowance(REQUEST_RATE_HZ, REQUEST_BURST, self._loop.time())
+        self._allowance = TokenBucket(REQUEST_RATE_HZ, REQUEST_BURST, self._loop.time())
         self._notice_due_s = 0.0
         self._modern = settings.version == "5"
         # With MQTT 3.1.1 only a message that comes back shows that it was let through.
@@ -115,7 +115,7 @@ class MqttPublisher:
 
     async def run(self) -> None:
         """Connect, serve, and begin again, until cancelled."""
-        for exposure in exposures(self._settings):
+        for exposure in security_warnings(self._settings):
             log.warning("mqtt: %s", exposure)
         if self._settings.username is not None and password_of(self._settings) is None:
             log.warning(
@@ -128,13 +128,13 @@ class MqttPublisher:
             reason = ""
             try:
                 await attempt  # no TaskGroup: it forgets a cancellation that meets a loss
-            except* BrokerLost as lost:
+            except* BrokerLostError as lost:
                 reason = _first(lost)
             stop_if_cancelled()
             try:
                 if not await self._gave_way():
                     self._tell(self._contested if self._taken_over else reason)
-            except BrokerLost as lost:
+            except BrokerLostError as lost:
                 self._tell(str(lost))
             if self._loop.time() - began_s > _HEALTHY_S:
                 delay_s = _FIRST_RETRY_S
@@ -152,8 +152,8 @@ class MqttPublisher:
     def _contested(self) -> str:
         return (
             f"broker {self._settings.host}:{self._settings.tcp_port}: another client connected "
-            f"with our client id {client_id(self._settings.base)!r}: a second jointfitd with "
-            f"base {self._settings.base}? Stop one, or give each rig its own name"
+            f"with our client id {client_identifier(self._settings.base)!r}: a second jointfitd "
+            f"with base {self._settings.base}? Stop one, or give each rig its own name"
         )
 
     async def _gave_way(self) -> bool:
@@ -181,7 +181,7 @@ class MqttPublisher:
         """
         life = self._outbox.life
         will = Outgoing(life, OFFLINE, 1, retain=True)
-        name = client_id(self._settings.base)
+        name = client_identifier(self._settings.base)
         async with MqttConnection(
             self._settings, name, will=will, farewell=will, admit=self._admit
         ) as connection:
@@ -326,7 +326,7 @@ class _Echo:
         self.came.clear()
 
 
-def client_id(base: str) -> str:
+def client_identifier(base: str) -> str:
     """Return the daemon's client id: fixed, so that it takes over from its dead predecessor.
 
     Only letters, digits and dashes: rumqttd breaks on a slash.
@@ -341,7 +341,7 @@ def command_of(message: Incoming) -> str:
     return message.topic.rpartition("/")[2]
 
 
-def _first(group: BaseExceptionGroup[BrokerLost]) -> str:
+def _first(group: BaseExceptionGroup[BrokerLostError]) -> str:
     error: BaseException = group
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]

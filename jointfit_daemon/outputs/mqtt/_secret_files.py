@@ -22,7 +22,7 @@ LEAST_KEY_BYTES = 16
 _OTHERS = stat.S_IROTH | stat.S_IWOTH
 
 
-class NoKey(Exception):  # noqa: N818 - named for what happened
+class RequestKeyError(Exception):
     """Requests must be signed, and the key to check them with cannot be had."""
 
 
@@ -47,7 +47,7 @@ def request_key_of(settings: MqttSettings) -> bytes | None:
 
     Raises
     ------
-    NoKey
+    RequestKeyError
         There ought to be one, and it is missing or too short.
     """
     if settings.request_key_file is None:
@@ -58,16 +58,16 @@ def request_key_of(settings: MqttSettings) -> bytes | None:
     try:
         key = path.read_bytes().strip()
     except OSError as error:
-        raise NoKey(f"request_key_file = {named}: {error.strerror}") from error
+        raise RequestKeyError(f"request_key_file = {named}: {error.strerror}") from error
     if len(key) < LEAST_KEY_BYTES:
-        raise NoKey(
+        raise RequestKeyError(
             f"request_key_file = {named}: shorter than {LEAST_KEY_BYTES} bytes; make one with: "
             "openssl rand -hex 32"
         )
     return key
 
 
-def exposures(settings: MqttSettings) -> list[str]:
+def security_warnings(settings: MqttSettings) -> list[str]:
     """Return what is open to others than it should be, a line each; empty when nothing is."""
     found = []
     if settings.insecure and not settings.is_local:

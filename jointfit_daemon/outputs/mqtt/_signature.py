@@ -27,13 +27,13 @@ import orjson
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-FRESH_US = 30_000_000
+SIGNATURE_LIFETIME_US = 30_000_000
 """A signature is good for this long, and may come from a clock that is ahead by as much."""
 SIGNING_KEYS = ("nonce", "signature", "t_us")
 _NONCE = re.compile(r"[A-Za-z0-9-]{16,64}")
 
 
-class NotSigned(Exception):  # noqa: N818 - named for what happened
+class SignatureRejectedError(Exception):
     """The request is not signed as it must be; the message says what is wrong with it."""
 
 
@@ -59,23 +59,28 @@ def verify(key: bytes, topic: str, request: Mapping[str, Any], now_us: int) -> t
 
     Raises
     ------
-    NotSigned
+    SignatureRejectedError
         A key is missing or no such thing, the signature is another, or it is too old or too new.
     """
     if missing := [name for name in SIGNING_KEYS if name not in request]:
-        raise NotSigned(f"this rig takes signed requests only: {', '.join(missing)} missing")
+        raise SignatureRejectedError(
+            f"this rig takes signed requests only: {', '.join(missing)} missing"
+        )
     nonce, signature, t_us = (request[name] for name in SIGNING_KEYS)
     if not isinstance(nonce, str) or not _NONCE.fullmatch(nonce):
-        raise NotSigned("nonce: expected 16 to 64 letters, digits or dashes")
+        raise SignatureRejectedError("nonce: expected 16 to 64 letters, digits or dashes")
     if not isinstance(t_us, int) or isinstance(t_us, bool):
-        raise NotSigned("t_us: expected UNIX time in whole microseconds")
+        raise SignatureRejectedError("t_us: expected UNIX time in whole microseconds")
     right = signature_of(key, topic, request).encode()
     if not hmac.compare_digest(str(signature).encode(errors="replace"), right):
-        raise NotSigned("signature: made with another key, for another topic, or of other content")
-    if abs(off_us := now_us - t_us) > FRESH_US:
+        raise SignatureRejectedError(
+            "signature: made with another key, for another topic, or of other content"
+        )
+    if abs(off_us := now_us - t_us) > SIGNATURE_LIFETIME_US:
         where = "old" if off_us > 0 else "ahead"
-        raise NotSigned(
-            f"t_us: {abs(off_us) / 1e6:.0f} s {where}, at most {FRESH_US // 1_000_000} s are "
+        raise SignatureRejectedError(
+            f"t_us: {abs(off_us) / 1e6:.0f} s {where}, at most "
+            f"{SIGNATURE_LIFETIME_US // 1_000_000} s are "
             "allowed: sign it anew, and compare the clocks of both machines"
         )
     return nonce, t_us

@@ -31,7 +31,7 @@ class _TlsSocket(ssl.SSLSocket):
             raise
 
 
-class TlsFault(Exception):  # noqa: N818 - named for what happened
+class TlsFilesError(Exception):
     """The files of ``[mqtt.tls]`` cannot be used; the message says which and why."""
 
 
@@ -40,7 +40,7 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
 
     Raises
     ------
-    TlsFault
+    TlsFilesError
         A file is missing, unreadable or no PEM, or key and certificate are not of one pair.
     """
     for name, path in (("ca", tls.ca), ("cert", tls.cert), ("key", tls.key)):
@@ -48,7 +48,7 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=tls.ca)
     except ssl.SSLError as error:
-        raise TlsFault(f"ca = {tls.ca}: holds no certificate in PEM") from error
+        raise TlsFilesError(f"ca = {tls.ca}: holds no certificate in PEM") from error
     context.sslsocket_class = _TlsSocket
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     if tls.cert is not None:
@@ -56,7 +56,7 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
             context.load_cert_chain(tls.cert, tls.key, password=_no_passphrase)
         except (ssl.SSLError, ValueError) as error:
             files = f"cert = {tls.cert}, key = {tls.key or tls.cert}"
-            raise TlsFault(
+            raise TlsFilesError(
                 f"{files}: not a certificate and its own key, both in PEM, the key without a "
                 "passphrase"
             ) from error
@@ -69,7 +69,7 @@ def _check_readable(name: str, path: str | None) -> None:
     try:
         Path(path).read_bytes()
     except OSError as error:
-        raise TlsFault(f"{name} = {path}: {error.strerror}") from error
+        raise TlsFilesError(f"{name} = {path}: {error.strerror}") from error
 
 
 def _no_passphrase() -> str:

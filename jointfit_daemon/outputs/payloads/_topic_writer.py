@@ -52,7 +52,7 @@ class _Pace:
         return True
 
 
-class Reporter:
+class TopicWriter:
     """Writes one rig's topics into an outbox.
 
     Parameters

@@ -1,10 +1,10 @@
 """Recording of all core input events, and their decoding for a replay."""
 
 from jointfit_daemon.outputs.recording._event_log import (
-    EventLog,
+    EventLogWriter,
     encode_state,
     read_events,
     read_states,
 )
 
-__all__ = ["EventLog", "encode_state", "read_events", "read_states"]
+__all__ = ["EventLogWriter", "encode_state", "read_events", "read_states"]

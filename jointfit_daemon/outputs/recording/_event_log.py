@@ -197,7 +197,7 @@ def _lines(path: Path) -> Iterator[bytes]:
 # --- writing ----------------------------------------------------------------------------------
 
 
-class EventLog:
+class EventLogWriter:
     """Writes events and states to a new file in `directory`, at the latest half a second later.
 
     Parameters

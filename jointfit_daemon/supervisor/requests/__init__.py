@@ -1,10 +1,10 @@
 """Validation and authentication of MQTT requests."""
 
-from jointfit_daemon.supervisor.requests._authentication import RequestGuard
+from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
 from jointfit_daemon.supervisor.requests._validation import (
+    parse_request,
     reply_correlation,
     reply_topic,
-    request_of,
 )
 
-__all__ = ["RequestGuard", "reply_correlation", "reply_topic", "request_of"]
+__all__ = ["RequestAuthenticator", "parse_request", "reply_correlation", "reply_topic"]

@@ -10,10 +10,10 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.outputs.mqtt import (
-    FRESH_US,
+    SIGNATURE_LIFETIME_US,
     SIGNING_KEYS,
-    NoKey,
-    NotSigned,
+    RequestKeyError,
+    SignatureRejectedError,
     request_key_of,
     verify,
 )
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import MqttSettings
 
-MOST_NONCES = 4096
+NONCE_CAPACITY = 4096
 """Requests within a minute; only those of who has the key count, so nobody else can fill it."""
-_KEPT_NS = 2 * FRESH_US * 1000
+_KEPT_NS = 2 * SIGNATURE_LIFETIME_US * 1000
 
 
-class RequestGuard:
+class RequestAuthenticator:
     """Lets signed requests pass, each once.
 
     What was signed before the guard was made is refused: it could have run under its predecessor,
@@ -46,7 +46,7 @@ class RequestGuard:
         """Why no request can be let pass; empty: they can."""
         try:
             self._key = request_key_of(settings)
-        except NoKey as missing:
+        except RequestKeyError as missing:
             self.fault = str(missing)
         self._since_us = time.time_ns() // 1000
         self._used: OrderedDict[str, int] = OrderedDict()
@@ -56,15 +56,17 @@ class RequestGuard:
 
         Raises
         ------
-        NotSigned
+        SignatureRejectedError
             It must be signed, and is not as it should be.
         """
         if self.fault:
-            raise NotSigned("the daemon has no key to check requests with; its log says why")
+            raise SignatureRejectedError(
+                "the daemon has no key to check requests with; its log says why"
+            )
         if self._key is not None:
             nonce, t_us = verify(self._key, topic, request, time.time_ns() // 1000)
             if t_us < self._since_us:
-                raise NotSigned("t_us: from before the daemon started: sign it anew")
+                raise SignatureRejectedError("t_us: from before the daemon started: sign it anew")
             self._use_up(nonce, time.monotonic_ns())
         return {name: value for name, value in request.items() if name not in SIGNING_KEYS}
 
@@ -72,7 +74,7 @@ class RequestGuard:
         while self._used and now_ns - next(iter(self._used.values())) > _KEPT_NS:
             self._used.popitem(last=False)
         if nonce in self._used:
-            raise NotSigned("nonce: used already: every request needs a new one")
-        if len(self._used) >= MOST_NONCES:
-            raise NotSigned("too many requests within a minute")
+            raise SignatureRejectedError("nonce: used already: every request needs a new one")
+        if len(self._used) >= NONCE_CAPACITY:
+            raise SignatureRejectedError("too many requests within a minute")
         self._used[nonce] = now_ns

@@ -14,12 +14,12 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jointfit_daemon.config import Fault, faults_of, nearest
-from jointfit_daemon.outputs.mqtt import NotSigned, command_of
+from jointfit_daemon.outputs.mqtt import SignatureRejectedError, command_of
 from jointfit_daemon.pipeline.events import Reply, Request
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import Incoming
-    from jointfit_daemon.supervisor.requests._authentication import RequestGuard
+    from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
 
 LONGEST_BYTES = 4096
 """Limit of a payload; a signed request with a long transaction takes a quarter of it."""
@@ -64,7 +64,9 @@ class CalibrateArguments(_Arguments):
 COMMANDS: dict[str, type[_Arguments]] = {"calibrate": CalibrateArguments}
 
 
-def request_of(message: Incoming, guard: RequestGuard | None = None) -> Request | Reply | None:
+def parse_request(
+    message: Incoming, guard: RequestAuthenticator | None = None
+) -> Request | Reply | None:
     """Return the request in `message`, or the reply that says all that is wrong with it.
 
     Parameters
@@ -87,7 +89,7 @@ def request_of(message: Incoming, guard: RequestGuard | None = None) -> Request 
     if guard is not None and fault is None:
         try:
             table = guard.check(message.topic, table)
-        except NotSigned as refused:
+        except SignatureRejectedError as refused:
             fault = Fault("signature", str(refused))
     transaction = _transaction(table)
     if fault is not None:

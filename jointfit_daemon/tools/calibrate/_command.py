@@ -258,13 +258,13 @@ async def _watching(client: MqttClient, console: Console) -> AsyncIterator[Calib
 
 
 async def _listen(client: MqttClient, watch: CalibrationWatch, console: Console) -> None:
-    from jointfit_daemon.outputs.mqtt import BrokerLost
+    from jointfit_daemon.outputs.mqtt import BrokerLostError
 
     try:
         async for topic, payload in client.messages():
             if isinstance(payload, dict) and (line := _heard(watch, topic, payload)):
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
-    except BrokerLost as lost:
+    except BrokerLostError as lost:
         watch.lose(lost)
     except (OSError, SystemExit) as gone:  # rich turns a broken pipe into SystemExit
         watch.lose(OutputLostError(str(gone)))

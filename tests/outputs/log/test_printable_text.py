@@ -20,7 +20,7 @@ from jointfit_daemon.outputs.log import (
     printable_data,
 )
 from jointfit_daemon.outputs.log._printable_text import LONGEST
-from jointfit_daemon.outputs.payloads import Reporter
+from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.pipeline.events import DeviceInfo, Notice
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class _Outbox:
 
 def test_events_and_device_info_hold_no_control_characters(table: dict[str, Any]) -> None:
     outbox: Any = _Outbox()
-    reporter = Reporter(parse_rig(table), outbox)
+    reporter = TopicWriter(parse_rig(table), outbox)
     outbox.payloads.clear()
     reporter.handle(Notice(1, "device", "S1", FORGED, "warning", {"name": [FORGED]}))
     reporter.handle(DeviceInfo("S1", {"model": FORGED}))

@@ -8,18 +8,18 @@ import logging
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.outputs.log import Allowance, LimitedHandler
+from jointfit_daemon.outputs.log import RateLimitedHandler, TokenBucket
 from jointfit_daemon.outputs.log._rate_limit import BURST, RATE_HZ
 
 
-def said(handler: LimitedHandler, count: int, level: int = logging.WARNING) -> None:
+def said(handler: RateLimitedHandler, count: int, level: int = logging.WARNING) -> None:
     for number in range(count):
         handler.handle(logging.LogRecord("a", level, "", 0, f"line {number}", None, None))
 
 
 @given(st.lists(st.floats(0, 3), min_size=1, max_size=300))
 def test_no_stretch_of_time_has_more_than_its_share(gaps_s: list[float]) -> None:
-    allowance, now_s, taken = Allowance(RATE_HZ, BURST, 0.0), 0.0, 0
+    allowance, now_s, taken = TokenBucket(RATE_HZ, BURST, 0.0), 0.0, 0
     for gap_s in gaps_s:
         now_s += gap_s
         taken += allowance.take(now_s)
@@ -29,7 +29,7 @@ def test_no_stretch_of_time_has_more_than_its_share(gaps_s: list[float]) -> None
 def test_a_flood_is_cut_and_its_size_told() -> None:
     now_s = [0.0]
     stream = io.StringIO()
-    handler = LimitedHandler(stream, lambda: now_s[0])
+    handler = RateLimitedHandler(stream, lambda: now_s[0])
     said(handler, 1000)
     assert stream.getvalue().count("\n") == BURST
     now_s[0] = 1.0
@@ -41,11 +41,11 @@ def test_a_flood_is_cut_and_its_size_told() -> None:
 
 def test_errors_always_pass() -> None:
     stream = io.StringIO()
-    said(LimitedHandler(stream), 200, logging.ERROR)
+    said(RateLimitedHandler(stream), 200, logging.ERROR)
     assert stream.getvalue().count("line ") == 200
 
 
 def test_few_lines_are_left_alone() -> None:
     stream = io.StringIO()
-    said(LimitedHandler(stream), 20)
+    said(RateLimitedHandler(stream), 20)
     assert stream.getvalue().count("\n") == 20

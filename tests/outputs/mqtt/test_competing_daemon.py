@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.config import MqttSettings
-from jointfit_daemon.outputs.mqtt import LoopNoise, MqttPublisher, Outbox
-from jointfit_daemon.outputs.mqtt._competing_daemon import SHORT_S, RivalDetector
+from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
+from jointfit_daemon.outputs.mqtt._competing_daemon import SHORT_S, TakeoverDetector
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -24,7 +24,7 @@ POSE_S = 0.05
 @contextlib.asynccontextmanager
 async def daemon_link(port: int, version: str) -> AsyncIterator[MqttPublisher]:
     """Yield the link of one daemon that publishes poses all the time."""
-    asyncio.get_running_loop().set_exception_handler(LoopNoise())
+    asyncio.get_running_loop().set_exception_handler(DisconnectErrorFilter())
     outbox = Outbox(f"{BASE}/bridge/state")
     more: dict[str, Any] = {"version": version}
     settings = MqttSettings(host="127.0.0.1", port=port, base=BASE, **more)
@@ -107,14 +107,14 @@ async def test_the_reason_of_the_broker_is_enough(caplog: pytest.LogCaptureFixtu
 
 
 def test_one_short_connection_is_no_rival_unless_the_broker_says_so() -> None:
-    detector = RivalDetector()
+    detector = TakeoverDetector()
     assert detector.suspects(1.0, taken_over=True)
-    detector = RivalDetector()
+    detector = TakeoverDetector()
     assert [detector.suspects(1.0, taken_over=False) for _ in range(3)] == [False, False, True]
 
 
 def test_the_first_daemon_takes_its_connection_back() -> None:
-    detector = RivalDetector()
+    detector = TakeoverDetector()
     assert not detector.suspects(SHORT_S + 1, taken_over=True)
     ended = [1.0, 1.0, SHORT_S + 1, 1.0, 0.0, 1.0]
     assert not any(detector.suspects(lasted_s, taken_over=False) for lasted_s in ended)

@@ -19,14 +19,14 @@ from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt import (
     OFFLINE,
     ONLINE,
-    BrokerLost,
+    BrokerLostError,
+    DisconnectErrorFilter,
     Incoming,
-    LoopNoise,
     MqttClient,
     MqttPublisher,
     Outbox,
 )
-from jointfit_daemon.outputs.mqtt._client import NoAnswer
+from jointfit_daemon.outputs.mqtt._client import NoAnswerError
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.outputs.mqtt._error_messages import broker_fault, session_fault
 from tests.broker_fixture import free_port
@@ -56,7 +56,7 @@ class Link:
 
 @contextlib.asynccontextmanager
 async def running(link: Link) -> AsyncIterator[Link]:
-    asyncio.get_running_loop().set_exception_handler(LoopNoise())
+    asyncio.get_running_loop().set_exception_handler(DisconnectErrorFilter())
     task = asyncio.create_task(link.publisher.run(), name="publisher")
     try:
         yield link
@@ -69,7 +69,7 @@ async def running(link: Link) -> AsyncIterator[Link]:
 async def test_a_socket_closed_before_its_turn_leaves_no_traceback_in_the_log(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    noise, client = LoopNoise(), aiomqtt.Client("127.0.0.1")
+    noise, client = DisconnectErrorFilter(), aiomqtt.Client("127.0.0.1")
     asyncio.get_running_loop().set_exception_handler(noise)
     with socket.socket() as sock:
         client._on_socket_register_write(client._client, None, sock)
@@ -309,7 +309,7 @@ async def test_it_stops_under_load_thirty_times_of_thirty(broker: Broker) -> Non
 async def test_a_broker_without_mqtt_5_gets_a_hint_and_no_silent_fallback(
     embedded_broker: Broker,
 ) -> None:
-    with pytest.raises(BrokerLost, match=r'version = "3\.1\.1"'):
+    with pytest.raises(BrokerLostError, match=r'version = "3\.1\.1"'):
         async with MqttConnection(settings(embedded_broker.port_of("3.1.1"))):
             pass
     async with MqttConnection(settings(embedded_broker.port_of("3.1.1"), version="3.1.1")):
@@ -358,7 +358,7 @@ async def test_a_wrong_password_says_so(
     secret = tmp_path / "secret"
     secret.write_text("wrong\n")
     login = settings(broker.port, username="daemon", password_file=str(secret))
-    with pytest.raises(BrokerLost, match=r"(?i)not auth|bad user"):
+    with pytest.raises(BrokerLostError, match=r"(?i)not auth|bad user"):
         async with MqttConnection(login):
             pass
 
@@ -402,14 +402,14 @@ async def test_a_client_gets_the_answer_to_its_own_request(broker: Broker) -> No
 
 async def test_a_client_that_nobody_answers_says_so(broker: Broker) -> None:
     async with MqttClient(settings(broker.port)) as client:
-        with pytest.raises(NoAnswer, match="is jointfitd running"):
+        with pytest.raises(NoAnswerError, match="is jointfitd running"):
             await client.request("calibrate", {}, timeout_s=0.2)
 
 
 async def test_a_client_whose_broker_goes_says_so(broker: Broker) -> None:
     async with MqttClient(settings(broker.port)) as client:
         broker.stop()
-        with pytest.raises(BrokerLost):
+        with pytest.raises(BrokerLostError):
             await anext(client.messages())
 
 

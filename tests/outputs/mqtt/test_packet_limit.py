@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.outputs.mqtt import BrokerLost, Incoming
+from jointfit_daemon.outputs.mqtt import BrokerLostError, Incoming
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
 from jointfit_daemon.outputs.mqtt._publisher import REQUEST_BURST, REQUEST_RATE_HZ
@@ -290,5 +290,5 @@ async def read_all(port: int) -> None:
 @given(answer=st.binary(max_size=40) | (st.binary(max_size=40) | publishes).map(ACCEPTED.__add__))
 async def test_any_bytes_from_a_broker_are_a_lost_broker(answer: bytes) -> None:
     async with broken_broker(answer, reset=False) as (port, _):
-        with pytest.raises(BrokerLost):
+        with pytest.raises(BrokerLostError):
             await asyncio.wait_for(read_all(port), 2.5)

@@ -18,10 +18,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jointfit_daemon.config import MqttSettings
-from jointfit_daemon.outputs.mqtt import FRESH_US, Incoming, NotSigned, verify
+from jointfit_daemon.outputs.mqtt import (
+    SIGNATURE_LIFETIME_US,
+    Incoming,
+    SignatureRejectedError,
+    verify,
+)
 from jointfit_daemon.outputs.mqtt._signature import canonical, signature_of, signed
 from jointfit_daemon.pipeline.events import Reply, Request
-from jointfit_daemon.supervisor.requests import RequestGuard, request_of
+from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,9 +43,9 @@ requests = st.dictionaries(
 
 
 @pytest.fixture
-def guard(tmp_path: Path) -> RequestGuard:
+def guard(tmp_path: Path) -> RequestAuthenticator:
     (tmp_path / "key").write_bytes(KEY + b"\n")
-    return RequestGuard(MqttSettings(request_key_file=str(tmp_path / "key")))
+    return RequestAuthenticator(MqttSettings(request_key_file=str(tmp_path / "key")))
 
 
 def now_us() -> int:
@@ -84,29 +89,36 @@ def test_the_signature_is_plain_hmac_sha256_of_topic_and_sorted_json(
 def test_a_changed_request_is_refused(change: Callable[[dict[str, Any]], None], told: str) -> None:
     sent = signed(KEY, TOPIC, ASKED)
     change(sent)
-    with pytest.raises(NotSigned, match=told):
+    with pytest.raises(SignatureRejectedError, match=told):
         verify(KEY, TOPIC, sent, now_us())
 
 
 def test_another_key_and_another_topic_are_refused() -> None:
     sent = signed(KEY, TOPIC, ASKED)
     for key, topic in ((KEY[::-1], TOPIC), (KEY, TOPIC.replace("bench-1", "bench-2"))):
-        with pytest.raises(NotSigned, match="another key, for another topic"):
+        with pytest.raises(SignatureRejectedError, match="another key, for another topic"):
             verify(key, topic, sent, now_us())
 
 
-@pytest.mark.parametrize(("off_us", "told"), [(FRESH_US + 1, "old"), (-FRESH_US - 1, "ahead")])
+@pytest.mark.parametrize(
+    ("off_us", "told"), [(SIGNATURE_LIFETIME_US + 1, "old"), (-SIGNATURE_LIFETIME_US - 1, "ahead")]
+)
 def test_an_old_or_future_request_is_refused(off_us: int, told: str) -> None:
     sent = signed(KEY, TOPIC, ASKED)
-    verify(KEY, TOPIC, sent, sent["t_us"] + off_us * FRESH_US // (FRESH_US + 1))
-    with pytest.raises(NotSigned, match=told):
+    verify(
+        KEY,
+        TOPIC,
+        sent,
+        sent["t_us"] + off_us * SIGNATURE_LIFETIME_US // (SIGNATURE_LIFETIME_US + 1),
+    )
+    with pytest.raises(SignatureRejectedError, match=told):
         verify(KEY, TOPIC, sent, sent["t_us"] + off_us)
 
 
-def test_a_request_runs_once(guard: RequestGuard) -> None:
+def test_a_request_runs_once(guard: RequestAuthenticator) -> None:
     sent = signed(KEY, TOPIC, ASKED)
     assert guard.check(TOPIC, sent) == ASKED
-    with pytest.raises(NotSigned, match="used already"):
+    with pytest.raises(SignatureRejectedError, match="used already"):
         guard.check(TOPIC, sent)
 
 
@@ -114,25 +126,25 @@ def test_what_was_signed_before_the_daemon_started_is_refused(tmp_path: Path) ->
     (tmp_path / "key").write_bytes(KEY)
     sent = signed(KEY, TOPIC, ASKED)
     time.sleep(0.001)
-    late = RequestGuard(MqttSettings(request_key_file=str(tmp_path / "key")))
-    with pytest.raises(NotSigned, match="before the daemon started"):
+    late = RequestAuthenticator(MqttSettings(request_key_file=str(tmp_path / "key")))
+    with pytest.raises(SignatureRejectedError, match="before the daemon started"):
         late.check(TOPIC, sent)
 
 
 def test_the_memory_of_nonces_is_bounded_and_forgets(
-    guard: RequestGuard, monkeypatch: pytest.MonkeyPatch
+    guard: RequestAuthenticator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication.MOST_NONCES", 3)
+    monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication.NONCE_CAPACITY", 3)
     for _ in range(3):
         guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
-    with pytest.raises(NotSigned, match="too many"):
+    with pytest.raises(SignatureRejectedError, match="too many"):
         guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
     monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication._KEPT_NS", 0)
     guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
 
 
 def test_without_a_key_in_the_rig_signatures_are_not_needed() -> None:
-    guard = RequestGuard(MqttSettings())
+    guard = RequestAuthenticator(MqttSettings())
     assert guard.check(TOPIC, ASKED) == ASKED
     assert guard.check(TOPIC, signed(KEY, TOPIC, ASKED)) == ASKED
 
@@ -142,10 +154,10 @@ def test_a_key_that_cannot_be_had_closes_the_door(tmp_path: Path, content: bytes
     path = tmp_path / "key"
     if content is not None:
         path.write_bytes(content)
-    guard = RequestGuard(MqttSettings(request_key_file=str(path)))
+    guard = RequestAuthenticator(MqttSettings(request_key_file=str(path)))
     assert "request_key_file" in guard.fault
     for request in (ASKED, signed(b"short", TOPIC, ASKED)):
-        with pytest.raises(NotSigned, match="no key to check"):
+        with pytest.raises(SignatureRejectedError, match="no key to check"):
             guard.check(TOPIC, request)
 
 
@@ -156,15 +168,17 @@ def test_a_credential_of_the_same_name_is_taken_first(
     (tmp_path / "credentials").mkdir()
     (tmp_path / "credentials" / "key").write_bytes(KEY)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "credentials"))
-    guard = RequestGuard(MqttSettings(request_key_file=str(tmp_path / "key")))
+    guard = RequestAuthenticator(MqttSettings(request_key_file=str(tmp_path / "key")))
     assert guard.check(TOPIC, signed(KEY, TOPIC, ASKED)) == ASKED
 
 
-def asked(guard: RequestGuard, request: dict[str, Any]) -> Request | Reply | None:
-    return request_of(Incoming(TOPIC, orjson.dumps(request), retained=False), guard)
+def asked(guard: RequestAuthenticator, request: dict[str, Any]) -> Request | Reply | None:
+    return parse_request(Incoming(TOPIC, orjson.dumps(request), retained=False), guard)
 
 
-def test_the_daemon_takes_signed_requests_and_answers_the_others(guard: RequestGuard) -> None:
+def test_the_daemon_takes_signed_requests_and_answers_the_others(
+    guard: RequestAuthenticator,
+) -> None:
     good = asked(guard, signed(KEY, TOPIC, ASKED))
     assert isinstance(good, Request)
     assert good.arguments == {"phase": "static", "force": False}  # no trace of the signature

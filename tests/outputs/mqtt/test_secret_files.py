@@ -17,7 +17,7 @@ import pytest
 from jointfit_daemon.config import ConfigError, MqttSettings, TlsSettings, parse_rig
 from jointfit_daemon.outputs.mqtt import MqttClient, MqttPublisher, Outbox
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection
-from jointfit_daemon.outputs.mqtt._secret_files import exposures, password_of
+from jointfit_daemon.outputs.mqtt._secret_files import password_of, security_warnings
 from tests import fake_drivers
 from tests.broker_fixture import MOSQUITTO_MISSING, MosquittoBroker
 
@@ -161,14 +161,14 @@ def test_a_file_that_all_can_read_is_told(tmp_path: Path) -> None:
     for mode, open_to_others in ((0o644, True), (0o640, False), (0o600, False)):
         secret.chmod(mode)
         for each in settings:
-            assert bool(exposures(each)) is open_to_others
-    assert exposures(MqttSettings(password_file=str(tmp_path / "nowhere"))) == []
+            assert bool(security_warnings(each)) is open_to_others
+    assert security_warnings(MqttSettings(password_file=str(tmp_path / "nowhere"))) == []
 
 
 async def test_plain_mqtt_to_another_machine_is_told_at_every_start(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    assert exposures(MqttSettings(insecure=True)) == []  # on this machine nobody listens in
+    assert security_warnings(MqttSettings(insecure=True)) == []  # on this machine nobody listens in
     settings = MqttSettings(host="broker.invalid", insecure=True, base="b")
     with caplog.at_level(logging.WARNING):
         link = asyncio.create_task(MqttPublisher(settings, Outbox("b/s"), lambda _: None).run())

@@ -11,9 +11,9 @@ import pytest
 from pydantic import ValidationError
 
 from jointfit_daemon.config import MqttSettings, TlsSettings
-from jointfit_daemon.outputs.mqtt import BrokerLost
+from jointfit_daemon.outputs.mqtt import BrokerLostError
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection
-from jointfit_daemon.outputs.mqtt._tls import TlsFault, tls_context, tls_remedy
+from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_remedy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,7 +82,7 @@ def settings(broker: Broker, host: str = "127.0.0.1", **tls: Any) -> MqttSetting
 
 async def said(settings: MqttSettings) -> str:
     """Return why the connection cannot be made."""
-    with pytest.raises(BrokerLost) as lost:
+    with pytest.raises(BrokerLostError) as lost:
         async with MqttConnection(settings):
             pass
     return str(lost.value)
@@ -150,7 +150,7 @@ def test_files_that_cannot_be_used_are_named(pki: Path, files: dict[str, str], t
         "ec", "-in", pki / "daemon.key", "-aes128", "-passout", "pass:abcd",
         "-out", pki / "locked.key",
     )  # fmt: skip
-    with pytest.raises(TlsFault, match=told):
+    with pytest.raises(TlsFilesError, match=told):
         tls_context(TlsSettings(**{key: str(pki / name) for key, name in files.items()}))
 
 

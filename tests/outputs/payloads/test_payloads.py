@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import JointAngles, JointState, LimbState, SegmentState
 from jointfit_daemon.outputs.mqtt import Outbox
-from jointfit_daemon.outputs.payloads import Reporter, encode_pose
+from jointfit_daemon.outputs.payloads import TopicWriter, encode_pose
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
 from jointfit_daemon.pipeline.events import (
     CalibrationProgress,
@@ -199,7 +199,7 @@ def numbers(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 async def test_ten_seconds_of_poses_are_decimated_as_promised(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
     await sent(outbox)
     counts: dict[str, int] = {}
     for number in range(1000):
@@ -217,7 +217,7 @@ async def test_ten_seconds_of_poses_are_decimated_as_promised(
 async def test_devices_are_absent_until_heard_and_cleared_when_gone(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
     reporter.handle(DeviceStatus("S1", online=True))
     reporter.handle(DeviceInfo("S2", {"model": "fake"}))
     found = await sent(outbox)
@@ -235,7 +235,7 @@ async def test_devices_are_absent_until_heard_and_cleared_when_gone(
 async def test_changes_of_state_go_where_the_contract_says(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
     reporter.handle(Notice(0, "device", "S1", "streaming"))
     reporter.handle(CalibrationStatus(0, "calibrated", "done", 3, {"rms_m": 0.004}))
     reporter.handle(CalibrationProgress(0, "functional", 0.5, "keep moving", {"arc_deg": 40.0}))
@@ -260,7 +260,7 @@ async def test_changes_of_state_go_where_the_contract_says(
 async def test_an_answer_goes_where_the_caller_wants_it(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = Reporter(parse_rig(rig_table(table)), outbox)
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
     await sent(outbox)
     reply = Reply("calibrate", "7", "accepted", {"phase": "static"})
     reporter.reply(reply, None, None)

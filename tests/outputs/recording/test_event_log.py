@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, JointAngles, JointState, LimbState, SegmentState
 from jointfit_daemon.outputs.recording import (
-    EventLog,
+    EventLogWriter,
     _event_log,
     encode_state,
     read_events,
@@ -87,7 +87,7 @@ def test_states_are_equal_exactly_when_their_bytes_are(one: LimbState, other: Li
 
 
 async def test_a_log_gives_back_events_and_states_in_order(tmp_path: Path) -> None:
-    log = EventLog(tmp_path / "logs", "rig")
+    log = EventLogWriter(tmp_path / "logs", "rig")
     writing = asyncio.create_task(log.run(), name="log")
     state = LimbState(1, 2, 3, "imu", "locked", (), (), ())
     given_events = [Tick(n) for n in range(1000)]
@@ -104,7 +104,7 @@ async def test_a_log_gives_back_events_and_states_in_order(tmp_path: Path) -> No
 
 
 async def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
-    log = EventLog(tmp_path, "rig")
+    log = EventLogWriter(tmp_path, "rig")
     log.event(Tick(1))
     log.event(Tick(2))
     log.close()
@@ -123,7 +123,7 @@ def test_what_is_no_event_log_says_so(tmp_path: Path, content: bytes) -> None:
 async def test_a_full_disk_ends_the_log_and_not_the_daemon(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    log = EventLog(tmp_path, "rig")
+    log = EventLogWriter(tmp_path, "rig")
     log._file.close()
     log._file = await asyncio.to_thread(Path("/dev/full").open, "wb", 0)
     log.event(Tick(1))
@@ -138,7 +138,7 @@ async def test_a_disk_too_slow_ends_the_log_before_memory_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("jointfit_daemon.outputs.recording._event_log.PENDING_BYTES", 1000)
-    log = EventLog(tmp_path, "rig")
+    log = EventLogWriter(tmp_path, "rig")
     for n in range(200):
         log.event(Tick(n))
     assert "too slow" in str(log.figures()["failure"])

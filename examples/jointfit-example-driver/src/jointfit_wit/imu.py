@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from jointfit_daemon.driver import DeviceLost, DeviceMisconfigured, ImuSettings
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, ImuSettings
 from jointfit_daemon.model import Corrupt, ImuSample
 from jointfit_drivers.byte_stream import SerialPort
 from jointfit_protocols.orientation import OrientationGate, canonical
@@ -120,9 +120,9 @@ class WitImu:
 
         Raises
         ------
-        DeviceLost
+        DeviceLostError
             Port absent, taken, unplugged or silent; worth another try.
-        DeviceMisconfigured
+        DeviceMisconfiguredError
             Not a serial port, or not a WitMotion device at this speed.
         """
         settings = self._settings
@@ -131,7 +131,7 @@ class WitImu:
             if not await self._quaternions_come(port, emit):
                 await self._ask_for_quaternions(port)
                 if not await self._quaternions_come(port, emit):
-                    raise DeviceMisconfigured(
+                    raise DeviceMisconfiguredError(
                         f"{settings.id} ({settings.port}): sends frames but no quaternions, even "
                         "when told to: set content bit 9 with the vendor's tool"
                     )
@@ -154,9 +154,9 @@ class WitImu:
         if watch.frames:
             return False
         if not heard:
-            raise DeviceLost(f"{settings.id} ({settings.port}): silent: check its power")
+            raise DeviceLostError(f"{settings.id} ({settings.port}): silent: check its power")
         found = "it is of the 55 61 kind" if frames.OTHER_VARIANT in heard else "set `port`"
-        raise DeviceMisconfigured(
+        raise DeviceMisconfiguredError(
             f"{settings.id} ({settings.port}): {len(heard)} bytes at {settings.baud} baud, none "
             f"of them a WitMotion frame: {found}, or `baud` (factory: 9600)"
         )
