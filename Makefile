@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-figures test-cpu test-root fuzz test-vm lint types imports bench docs wheel deb sbom audit lock clean
+.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench docs wheel deb sbom audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
@@ -25,8 +25,8 @@ demo: $(STAMP)  ## the main job on simulated hardware, with an embedded broker
 test: $(STAMP)  ## all tests that this machine can run, on all cores; what is skipped says why
 	@$(BIN)/python .ci/suite.py $(ARGS)
 
-test-figures: $(STAMP)  ## the short experiments of bench against their goals
-	@$(BIN)/python -m pytest --part figures -n 2 --dist worksteal --junitxml=build/figures/figures.xml $(ARGS)
+test-experiments: $(STAMP)  ## the short experiments of bench against their targets
+	@$(BIN)/python .ci/suite.py --experiments $(ARGS)
 
 test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)

@@ -1,9 +1,12 @@
 """Run the tests on all cores, then those that measure time alone: `make test`.
 
-    .ci/suite.py [PYTEST ARGUMENTS]
+    .ci/suite.py [--experiments] [PYTEST ARGUMENTS]
 
-Invariant: the exit status is 0 only if both parts passed. Each part leaves a JUnit report in
-``build/tests``; the last line counts the tests of both and the seconds.
+With ``--experiments`` the tests with the marker ``experiment`` run, otherwise all others. Each part
+leaves a JUnit report in ``build/tests`` or ``build/experiments``; the last line counts the tests of
+both parts and the seconds.
+
+Invariant: the exit status is 0 only if both parts passed.
 """
 
 from __future__ import annotations
@@ -16,7 +19,9 @@ import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-REPORTS = Path(__file__).resolve().parents[1] / "build" / "tests"
+BUILD = Path(__file__).resolve().parents[1] / "build"
+WORKERS_PER_CORE = 2
+"""Half of the time of the long tests is waiting, for devices and daemons in real time."""
 NO_TESTS = 5
 """Exit status of pytest when it collected nothing."""
 
@@ -24,29 +29,40 @@ NO_TESTS = 5
 def main(arguments: list[str]) -> int:
     """Run both parts; return the exit status."""
     began = time.monotonic()
-    shutil.rmtree(REPORTS, ignore_errors=True)
+    experiments = "--experiments" in arguments
+    name, parts = (
+        ("experiments", ("experiments", "experiments-alone"))
+        if experiments
+        else ("tests", ("parallel", "alone"))
+    )
+    arguments = [word for word in arguments if word != "--experiments"]
+    reports = BUILD / name
+    shutil.rmtree(reports, ignore_errors=True)
     cores = len(os.sched_getaffinity(0))
-    # A worker that is idle takes tests from others: the long system tests are a few.
-    parallel = _run("parallel", ["-n", str(cores), "--dist", "worksteal", *arguments])
-    alone = _run("alone", arguments)
+    workers = cores if experiments else WORKERS_PER_CORE * cores  # experiments compute
 
-    print(f"{_counts()} in {time.monotonic() - began:.0f} s on {cores} cores", flush=True)
+    # An idle worker takes tests from the others: there are few long ones.
+    parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])
+    alone = _run(parts[1], reports, arguments)
+
+    duration_s = time.monotonic() - began
+    print(f"{name}: {_counts(reports)} in {duration_s:.0f} s on {cores} cores", flush=True)
     failed = [status for status in (parallel, alone) if status not in {0, NO_TESTS}]
     if failed:
         return failed[0]
     return min(parallel, alone)  # nothing was collected only if neither part collected anything
 
 
-def _run(part: str, arguments: list[str]) -> int:
-    report = REPORTS / f"{part}.xml"
+def _run(part: str, reports: Path, arguments: list[str]) -> int:
+    report = reports / f"{part}.xml"
     command = [sys.executable, "-m", "pytest", "--part", part, f"--junitxml={report}", *arguments]
     return subprocess.run(command, check=False).returncode  # noqa: S603 - our own command
 
 
-def _counts() -> str:
+def _counts(reports: Path) -> str:
     suites = [
         suite
-        for report in sorted(REPORTS.glob("*.xml"))
+        for report in sorted(reports.glob("*.xml"))
         for suite in ET.parse(report).getroot().iter("testsuite")  # noqa: S314 - pytest's, just made
     ]
     total, failed, errors, skipped = (
@@ -54,7 +70,7 @@ def _counts() -> str:
         for key in ("tests", "failures", "errors", "skipped")
     )
     passed = total - failed - errors - skipped
-    return f"make test: {passed} passed, {failed} failed, {errors} errors, {skipped} skipped"
+    return f"{passed} passed, {failed} failed, {errors} errors, {skipped} skipped"
 
 
 if __name__ == "__main__":

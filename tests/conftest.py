@@ -28,7 +28,8 @@ settings.load_profile("ci" if os.environ.get("CI") else "home")
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
 
-PARTS = ("parallel", "alone", "figures")
+PARTS = ("parallel", "alone", "experiments", "experiments-alone")
+"""Which tests run together: by the markers `experiment` and `alone`."""
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
 
@@ -38,7 +39,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--part",
         choices=PARTS,
-        help="only the tests with the marker alone or figures, or only the others (parallel)",
+        help="only the tests of this part of the suite",
     )
 
 
@@ -49,8 +50,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
 
     def belongs(item: pytest.Item) -> bool:
-        marked = [name for name in PARTS if item.get_closest_marker(name) is not None]
-        return bool(part == (marked[0] if marked else "parallel"))
+        experiment, alone = (
+            item.get_closest_marker(name) is not None for name in ("experiment", "alone")
+        )
+        return bool(part == PARTS[2 * experiment + alone])
 
     config.hook.pytest_deselected(items=[item for item in items if not belongs(item)])
     items[:] = [item for item in items if belongs(item)]

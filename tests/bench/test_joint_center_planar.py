@@ -8,7 +8,7 @@ from bench.experiments.joint_center import planar, planar_oriented
 from bench.framework.experiment import DATA, Experiment
 from bench.subjects.planar_arcs import runs_on, share_covered
 
-pytestmark = pytest.mark.figures
+pytestmark = pytest.mark.experiment
 EXPERIMENTS = (*planar.EXPERIMENTS, *planar_oriented.EXPERIMENTS)
 
 

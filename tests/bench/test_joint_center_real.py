@@ -11,7 +11,7 @@ import pytest
 
 from bench.framework.experiment import find_experiments
 
-pytestmark = pytest.mark.figures
+pytestmark = pytest.mark.experiment
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -55,6 +55,7 @@ def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
 
 
 @pytest.mark.alone
+@pytest.mark.experiment
 @pytest.mark.system
 @pytest.mark.timeout(90)
 def test_the_daemon_is_measured_between_hardware_and_broker(tmp_path: Path) -> None:

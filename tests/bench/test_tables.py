@@ -24,7 +24,7 @@ OPEN = {
 SHORT = [(name, row) for name, rows in EXPERIMENTS.items() for row in rows if not row.long]
 
 
-@pytest.mark.figures
+@pytest.mark.experiment
 @pytest.mark.timeout(180)
 @pytest.mark.parametrize(
     "experiment", [row for _, row in SHORT], ids=[f"{name}-{row.id}" for name, row in SHORT]

@@ -6,7 +6,7 @@ import pytest
 
 from bench.experiments.fusion.simulated_leg import people
 
-pytestmark = pytest.mark.figures
+pytestmark = pytest.mark.experiment
 
 
 @pytest.mark.timeout(180)

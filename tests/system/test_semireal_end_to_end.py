@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bench.rigs.recorded_trial import Played
     from jointfit_daemon.calibration.trial import Method
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(150)]
 
 METHODS: tuple[Method, ...] = ("patent12", "mean")
 PUBLISHED = {"patent12": (3.45, 2.81, 2.11), "mean": (9.29, 9.61, 3.21)}

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from tests.broker_fixture import Broker
 
-pytestmark = [pytest.mark.system, pytest.mark.alone]
+pytestmark = [pytest.mark.system, pytest.mark.alone, pytest.mark.experiment]
 
 MOST_ERROR_NS = 500_000
 """Beyond what a machine short of time excuses; the bench holds a quiet one to it (row T9)."""

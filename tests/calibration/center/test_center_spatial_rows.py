@@ -7,7 +7,7 @@ import pytest
 from bench.experiments.joint_center.spatial import AT_20, AT_45, EXPERIMENTS, ball_joint
 from bench.framework.experiment import DATA, Experiment
 
-pytestmark = pytest.mark.figures
+pytestmark = pytest.mark.experiment
 
 
 @pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if not e.long], ids=lambda e: e.id)
