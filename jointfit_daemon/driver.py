@@ -11,13 +11,13 @@ daemon feeds every emitted chunk to a fresh decoder; a replay does the same with
 from __future__ import annotations
 
 from collections.abc import Callable
-from difflib import get_close_matches
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from jointfit_daemon.model import Chunk
+from jointfit_daemon.nearest_name import unknown_name
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded, TickClock
@@ -251,10 +251,5 @@ def find_driver(name: str) -> type[Driver]:
     """
     found = [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name == name]
     if not found:
-        known = driver_names()
-        near = get_close_matches(name, known, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise UnknownDriverError(
-            f"no driver {name!r}; {hint}installed: {', '.join(known) or 'none'}"
-        )
+        raise UnknownDriverError(unknown_name("driver", name, driver_names()))
     return cast("type[Driver]", found[0].load())

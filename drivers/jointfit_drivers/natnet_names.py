@@ -19,11 +19,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from difflib import get_close_matches
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import MocapLayout
+from jointfit_daemon.nearest_name import did_you_mean
 from jointfit_protocols.natnet_model import (
     AssetDescription,
     BodyDescription,
@@ -252,8 +252,8 @@ def _problem(name: str, fitting: list[Entry], plain: Mapping[str, list[Entry]]) 
     if fitting:
         choices = [repr(e.aliases[0]) if e.owner else repr(e.name) for e in fitting[:_MOST_NAMED]]
         return f"is ambiguous: write {' or '.join(choices)}"
-    near = get_close_matches(name, islice(plain, _MOST_COMPARED), n=1, cutoff=0.4)
-    return f"is not in the stream; did you mean {near[0]!r}?" if near else "is not in the stream"
+    hint = did_you_mean(name, islice(plain, _MOST_COMPARED))
+    return "; ".join(filter(None, ("is not in the stream", hint)))
 
 
 def _unused_name(entry: Entry, plain: Mapping[str, list[Entry]], used: set[str]) -> str | None:

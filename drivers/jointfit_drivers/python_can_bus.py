@@ -17,12 +17,12 @@ import struct
 import threading
 import time
 from contextlib import suppress
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import can
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.nearest_name import unknown_name
 from jointfit_drivers.can_stamp import KernelStamps
 from jointfit_protocols.can_frame import EXTENDED_MAX, STANDARD_MAX, CanFrame, host_dropped
 
@@ -268,10 +268,7 @@ def unknown_kind(kind: str) -> str | None:
     """Return why no bus of this kind can be opened here, or None."""
     if kind == "slcan" or kind in can.VALID_INTERFACES:
         return None
-    known = sorted({*can.VALID_INTERFACES, "slcan"})
-    near = get_close_matches(kind, known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"no CAN interface {kind!r}; {hint}known: {', '.join(known)}"
+    return unknown_name("CAN interface", kind, sorted({*can.VALID_INTERFACES, "slcan"}))
 
 
 def _shut(making: asyncio.Future[can.BusABC]) -> None:

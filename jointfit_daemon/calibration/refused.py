@@ -5,8 +5,9 @@ Law: every sentence names the thing, what was found and the remedy.
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
+
+from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -29,7 +30,6 @@ class CalibrationRefused(Exception):  # noqa: N818 - named for what happened, as
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
     """Return the sentence for a name the stream does not have, with the nearest spelling."""
     choices: Sequence[str] = sorted(known)
-    folded = {choice.casefold(): choice for choice in choices}
-    near = get_close_matches(name.casefold(), list(folded), n=1)
-    hint = f"did you mean {folded[near[0]]!r}? " if near else ""
-    return f"{kind} {name!r} is not in the stream; {hint}it has: {', '.join(choices) or 'none'}"
+    listed = f"it has: {', '.join(choices) or 'none'}"
+    hint = " ".join(filter(None, (did_you_mean(name, choices), listed)))
+    return f"{kind} {name!r} is not in the stream; {hint}"

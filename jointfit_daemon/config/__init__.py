@@ -4,7 +4,7 @@ Invariant: degrees and millimetres exist in this package only; no device is open
 """
 
 from jointfit_daemon.config._checks import drifting, headings
-from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of, nearest
+from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._load import load_rig, parse_rig
 from jointfit_daemon.config._rig import Rig, Source
 from jointfit_daemon.config._schema import rig_schema
@@ -22,7 +22,6 @@ __all__ = [
     "faults_of",
     "headings",
     "load_rig",
-    "nearest",
     "parse_rig",
     "rig_schema",
 ]

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from jointfit_daemon.config._fault_messages import Fault, nearest
+from jointfit_daemon.config._fault_messages import Fault
 from jointfit_daemon.config._rig import MOCAP
+from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -112,7 +113,7 @@ def known_name(
     if name in known:
         return []
     choices = ", ".join(known) or "none"
-    near = nearest(name, [other for other in known if other not in taken])
+    near = nearest_name(name, [other for other in known if other not in taken])
     return [Fault(key, f"no such {what}; known: {choices}", name, near)]
 
 

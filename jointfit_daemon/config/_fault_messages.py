@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
+from jointfit_daemon.nearest_name import nearest_name
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from pydantic_core import ErrorDetails
 
@@ -21,12 +22,6 @@ _SHOWN = 60  # characters of a value worth repeating
 _NO_VALUE = object()
 _SECRET = re.compile(r"passw|passphrase|secret|token|api_?key|private_?key|request_?key")
 """Names of keys whose values must not be told in a message."""
-
-
-def nearest(word: object, known: Iterable[str]) -> str | None:
-    """Return the spelling in `known` closest to `word`, or None if none is close."""
-    found = get_close_matches(str(word), list(known), n=1, cutoff=0.5)
-    return found[0] if found and found[0] != word else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +90,14 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             )
         case "extra_forbidden":
             known = f"no such key; known here: {', '.join(fields)}"
-            return Fault(path, known, detail["input"], nearest(loc[-1], fields))
+            return Fault(path, known, detail["input"], nearest_name(loc[-1], fields))
         case "missing":
             return Fault(path, f"missing; {_described(fields, loc[-1])}")
         case "literal_error":
             choices = str(detail["ctx"]["expected"])
             words = choices.replace("'", "").replace(" or ", ", ").split(", ")
             return Fault(
-                path, f"expected {choices}", detail["input"], nearest(detail["input"], words)
+                path, f"expected {choices}", detail["input"], nearest_name(detail["input"], words)
             )
         case _:
             name = next((part for part in reversed(loc) if part in fields), loc[-1] if loc else "")

@@ -11,7 +11,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from jointfit_daemon.calibration.trial import CalibrationSettings
 from jointfit_daemon.config import _bandwidth, _checks
-from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of, nearest
+from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
 from jointfit_daemon.config._syntax import read_table
 from jointfit_daemon.config._tables import (
@@ -31,6 +31,7 @@ from jointfit_daemon.driver import (
 )
 from jointfit_daemon.files.structured_text import plain_fault
 from jointfit_daemon.model import Chain
+from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -135,7 +136,7 @@ class _Reader:
         for key in table:
             if key not in SECTIONS:
                 known = f"no such table; known: {', '.join(SECTIONS)}"
-                self.faults.append(Fault(key, known, near=nearest(key, SECTIONS)))
+                self.faults.append(Fault(key, known, near=nearest_name(key, SECTIONS)))
 
     def rig(self) -> Rig | None:
         """Return the rig if every table could be read; cross-checks add their faults."""
@@ -245,7 +246,7 @@ class _Reader:
         named = self.table.get("can", {})
         if isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(buses) or 'none'}"
-            self.faults.append(Fault(f"{key}.can", text, name, nearest(name, buses)))
+            self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, buses)))
         return imu | {"can": CanBusSettings(channel="unknown").model_dump()}  # told already
 
     def _driver(

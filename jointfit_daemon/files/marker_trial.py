@@ -8,7 +8,6 @@ one ever is, and programs that have no other word for missing write it so.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from jointfit_daemon.files.c3d import read_c3d_with_up
 from jointfit_daemon.files.text_table import Malformed
 from jointfit_daemon.files.trc import MarkerTrajectories, read_trc
+from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Axis = Literal["x", "y", "z"]
 _TO_Z_UP: dict[str, list[int]] = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
-_NEAR = 0.6
 
 
 class UnknownMarker(ValueError):  # noqa: N818 - named for what happened
@@ -77,20 +76,16 @@ class MarkerTrial:
 
         Markers that are asked for anyway (`taken`) are not what a misspelt name meant.
         """
-        hints = [(name, self._near(name, taken)) for name in unknown]
-        said = [
-            f"no marker {name!r}" + (f": did you mean {' or '.join(near)}?" if near else "")
-            for name, near in hints
+        free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
+        spellings = [*free, *map(_bare, free)]
+        hints = [did_you_mean(name, spellings, count=3) for name in unknown]
+        problems = [
+            f"no marker {name!r}" + (f": {hint}" if hint else "")
+            for name, hint in zip(unknown, hints, strict=True)
         ]
-        if all(near for _, near in hints):
-            return "; ".join(said)
-        return f"{'; '.join(said)}; there are: {', '.join(self.trajectories.names)}"
-
-    def _near(self, name: str, taken: set[str]) -> list[str]:
-        known = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
-        folded = {full.lower(): full for full in known}
-        folded |= {_bare(full).lower(): _bare(full) for full in known}
-        return [folded[key] for key in get_close_matches(name.lower(), folded, n=3, cutoff=_NEAR)]
+        if not all(hints):
+            problems.append(f"there are: {', '.join(self.trajectories.names)}")
+        return "; ".join(problems)
 
 
 def _bare(name: str) -> str:

@@ -7,7 +7,6 @@ All that is wrong is told at once. docs/kinematics.md describes the format.
 from __future__ import annotations
 
 import json
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, get_args
 
 from jointfit_daemon.files.model_units import in_metres
@@ -21,6 +20,7 @@ from jointfit_daemon.kinematics.chain_model import (
     Marker,
     Segment,
 )
+from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -156,8 +156,7 @@ def _wrong(data: Any) -> list[str]:
 def _unknown(what: str, label: str, row: dict[str, Any]) -> list[str]:
     wrong = []
     for key in sorted(set(row) - _KEYS[what]):
-        near = get_close_matches(key, _KEYS[what], n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(_KEYS[what]))}"
+        hint = did_you_mean(key, _KEYS[what]) or f"known: {', '.join(sorted(_KEYS[what]))}"
         wrong.append(f"{label}: no key {key!r}; {hint}")
     return wrong
 

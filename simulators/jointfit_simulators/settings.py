@@ -10,12 +10,12 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jointfit_daemon.files.structured_text import read_toml
+from jointfit_daemon.nearest_name import unknown_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -140,9 +140,7 @@ def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
     for setting in settings:
         name, _, value = setting.partition("=")
         if name not in kinds:
-            near = get_close_matches(name, kinds, n=1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            raise ValueError(f"no knob {name!r}; {hint}knobs: {', '.join(kinds)}")
+            raise ValueError(unknown_name("knob", name, kinds))
         try:
             changed[name] = kinds[name](value)
         except ValueError as error:

@@ -118,7 +118,7 @@ def test_a_subjects_prefix_may_be_left_out_and_misspellings_are_met_halfway(
     write_c3d(tmp_path / "trial.c3d", positions)
     trial = read_marker_trial(tmp_path / "trial.c3d")
     assert np.array_equal(trial.points(["LKNE"]), trial.points(["Tom:LKNE"]), equal_nan=True)
-    with pytest.raises(UnknownMarker, match=r"'LKNEE': did you mean LKNE.*'XX'; there are: Tom"):
+    with pytest.raises(UnknownMarker, match=r"'LKNEE': did you mean 'LKNE.*'XX'; there are: Tom"):
         trial.points(["LKNEE", "LASI", "XX"])
 
 

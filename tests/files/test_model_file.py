@@ -86,7 +86,7 @@ def test_a_model_is_short_by_hand(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("segment = 3", "segment must be a list"),
-        ("[[segment]]\nname = 'a'\ncentre = [0, 0, 0]", "did you mean center"),
+        ("[[segment]]\nname = 'a'\ncentre = [0, 0, 0]", "did you mean 'center'"),
         ("[[segment]]\nname = 'a'\njoint = 'pin'", "'pin', expected free, ball, hinge"),
         ("[[segment]]\nname = 'a'\naxis = [1, 0]", "axis must be 3 numbers"),
         ("[[segment]]\nname = 'a'\njoint = ['hinge']", "joint must be text"),

@@ -273,7 +273,7 @@ def test_wrong_options(
 
 def test_a_misspelt_marker_never_means_one_that_is_asked_for_already() -> None:
     message = fault_of(["center", "squats.trc", "--parent", "T1,T2,T33", "--markers", "C1"], "T33")
-    assert "did you mean T3 or T4?" in message or "did you mean T3?" in message
+    assert "did you mean 'T3' or 'T4'?" in message or "did you mean 'T3'?" in message
 
 
 SIMULATOR: list[tuple[tuple[str, ...], str]] = [

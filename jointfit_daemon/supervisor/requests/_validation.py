@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import orjson
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jointfit_daemon.config import Fault, faults_of, nearest
+from jointfit_daemon.config import Fault, faults_of
+from jointfit_daemon.nearest_name import nearest_name
 from jointfit_daemon.outputs.mqtt import SignatureRejectedError, command_of
 from jointfit_daemon.pipeline.events import Reply, Request
 
@@ -98,7 +99,7 @@ def parse_request(
     model = COMMANDS.get(command)
     if model is None:
         known = f"no such request; known: {', '.join(COMMANDS)}"
-        fault = Fault("command", known, command, nearest(command, COMMANDS))
+        fault = Fault("command", known, command, nearest_name(command, COMMANDS))
         return _refusal(command, transaction, [fault])
     try:
         arguments = model.model_validate(table)

@@ -8,7 +8,6 @@ same in every trial of one placement of markers.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +24,7 @@ from jointfit_daemon.calibration.markers import (
     visible,
 )
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -247,10 +247,9 @@ def _check_method(method: str, movement: Movement) -> None:
     if method == "auto":
         return
     if method not in METHODS:
-        near = get_close_matches(method.lower(), METHODS, n=1)
-        hint = f"did you mean {near[0]}? " if near else ""
+        hint = did_you_mean(method, METHODS) or "known:"
         about = "\n".join(f"  {m.name:16}{m.about}" for m in METHODS.values())
-        raise Unanswerable(f"--method: there is no {method!r}; {hint}There are:\n{about}")
+        raise Unanswerable(f"--method: no method {method!r}; {hint}\n{about}")
     chosen = METHODS[method]
     if "angles" in chosen.needs:
         raise Unanswerable(

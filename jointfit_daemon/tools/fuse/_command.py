@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from jointfit_daemon.nearest_name import unknown_name
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -223,15 +225,11 @@ def _axis(up: str) -> Any:
 
 
 def _method(name: str) -> Any:
-    from difflib import get_close_matches
-
     from jointfit_daemon.calibration.model_fit import METHODS
 
     if name in METHODS:
         return name
-    near = get_close_matches(name, METHODS, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ValueError(f"no method {name!r}; {hint}there are: {', '.join(METHODS)}")
+    raise ValueError(f"--method: {unknown_name('method', name, METHODS)}")
 
 
 def _read_model(path: Path) -> Any:

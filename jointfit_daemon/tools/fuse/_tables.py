@@ -7,7 +7,6 @@ order or another clock is refused with what to change, never converted on a gues
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from jointfit_daemon.files.npz import quaternions_z_up, read_arrays, read_orientations_npz
 from jointfit_daemon.files.sto import read_orientations_sto
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.nearest_name import unknown_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -121,7 +121,7 @@ def sensors_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Arra
     """Return the sensors of a table; `Unusable` names who is not there, or says nothing at all."""
     if missing := [name for name in names if name not in table.q]:
         free = [name for name in table.q if name not in names]
-        said = "; ".join(unknown("sensor", name, table.q, free) for name in missing)
+        said = "; ".join(unknown_name("sensor", name, table.q, candidates=free) for name in missing)
         raise Unusable(f"{path}: {said}")
     silent = [name for name in names if not np.isfinite(table.q[name]).all(axis=1).any()]
     if silent:
@@ -135,25 +135,9 @@ def sensors_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Arra
 def bones_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Array]:
     """Return the reference orientations of a table; `Unusable` names what is not there."""
     if missing := [name for name in names if name not in table.bones]:
-        what = "; ".join(unknown("reference of segment", name, table.bones) for name in missing)
+        problems = [unknown_name("reference of segment", name, table.bones) for name in missing]
         raise Unusable(
-            f"{path}: {what}; if it is in another file write SENSORS=REFERENCE, if the reference "
-            "calls it differently --segment NAME=SENSORS:BONE, if there is none leave out the trial"
+            f"{path}: {'; '.join(problems)}; if another file has it, write SENSORS=REFERENCE; if"
+            " its name differs, --segment NAME=SENSORS:BONE; if there is none, omit the trial"
         )
     return {name: table.bones[name] for name in names}
-
-
-def unknown(
-    what: str,
-    name: str,
-    known: Sequence[str] | Mapping[str, object],
-    free: Sequence[str] | None = None,
-) -> str:
-    """Return a sentence that a name is not there, with the nearest that is.
-
-    `free` are the names that are not asked for already: only these can have been meant.
-    """
-    folded = {other.casefold(): other for other in (known if free is None else free)}
-    near = get_close_matches(name.casefold(), list(folded), n=1)
-    hint = f"did you mean {folded[near[0]]!r}? " if near else ""
-    return f"no {what} {name!r}; {hint}there are: {', '.join(known) or 'none'}"

@@ -24,6 +24,7 @@ from jointfit_daemon.files.marker_trial import read_marker_trial
 from jointfit_daemon.files.npz import quaternions_z_up
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chain
+from jointfit_daemon.nearest_name import unknown_name
 from jointfit_daemon.tools.fuse._tables import (
     FEWEST,
     Table,
@@ -32,7 +33,6 @@ from jointfit_daemon.tools.fuse._tables import (
     read_table,
     refuse_other_units,
     sensors_of,
-    unknown,
 )
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def _markers(texts: Sequence[str], segments: Sequence[str]) -> dict[str, tuple[s
     for text in texts:
         name, _, rest = text.partition("=")
         if name not in segments:
-            raise Unusable(f"--markers {text!r}: {unknown('segment', name, segments)}")
+            raise Unusable(f"--markers {text!r}: {unknown_name('segment', name, segments)}")
         found[name] = tuple(part.strip() for part in rest.split(",") if part.strip())
     return found
 
@@ -176,12 +176,12 @@ def read_worn(path: Path, chain: Chain, up: Axis, without: Sequence[str]) -> Tab
     """
     everyone = [s for group in chain.sensors for s in group]
     if strange := [name for name in without if name not in everyone]:
-        told = "; ".join(unknown("sensor", name, everyone) for name in strange)
+        told = "; ".join(unknown_name("sensor", name, everyone) for name in strange)
         raise Unusable(f"--without: the model has {told}")
     table = read_table(path, up)
     wanted = [name for name in everyone if name not in without]
     if missing := [name for name in wanted if name not in table.q]:
-        told = "; ".join(unknown("sensor", name, table.q) for name in missing)
+        told = "; ".join(unknown_name("sensor", name, table.q) for name in missing)
         raise Unusable(f"{path}: {told}; --without {missing[0]} goes on without it")
     return Table(table.t_s, {name: table.q[name] for name in wanted}, table.bones)
 
@@ -250,7 +250,7 @@ def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
     found = {}
     for name in (s for group in chain.sensors for s in group):
         if name not in mounts:
-            raise Unusable(f"{path}: {unknown('sensor', name, mounts)}")
+            raise Unusable(f"{path}: {unknown_name('sensor', name, mounts)}")
         q = np.asarray(mounts[name], dtype=np.float64)
         refuse_other_units(path, name, q[None])
         found[name] = rotation.normalize(q) if said.get("up") == "z" else quaternions_z_up(q)

@@ -6,13 +6,13 @@ Law: a marker that a trial lacks is missing there, NaN; a name that nothing has 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
 from jointfit_daemon.files.marker_trial import UnknownMarker, read_marker_trial
+from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -98,13 +98,9 @@ def _split(chain: ChainModel, text: str) -> tuple[str, int | None]:
 def _known(chain: ChainModel, name: str, option: str) -> None:
     if name in chain.marker_names:
         return
-    near = get_close_matches(name, chain.marker_names, n=3)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {_listed(chain)}"
+    names = chain.marker_names
+    hint = did_you_mean(name, names, count=3) or f"there are: {', '.join(names)}"
     raise ValueError(f"{option} {name}: no such marker in the model; {hint}")
-
-
-def _listed(chain: ChainModel) -> str:
-    return ", ".join(chain.marker_names)
 
 
 def _motion(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:

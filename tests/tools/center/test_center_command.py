@@ -185,7 +185,7 @@ def test_standing_still_is_refused_with_a_remedy_and_exit_code_1(tmp_path: Path)
         (["--parent", "P1,P2,PP3", "--markers", "C1"], ["'PP3'", "P3"]),
         (["--parent", "P1,P2", "--markers", "C1"], ["3 are needed", "--plane"]),
         (["--parent", "P1,P2,C1", "--markers", "C1"], ["C1", "take out"]),
-        ([*OPTIONS, "--method", "spheer"], ["did you mean sphere", "score"]),
+        ([*OPTIONS, "--method", "spheer"], ["did you mean 'sphere'", "score"]),
         ([*OPTIONS, "--method", "oriented"], ["inertial"]),
         (["--parent", "P1,P2,P3", "--markers", "C1,C2", "--method", "score"], ["three"]),
         ([*OPTIONS, "--up", "w"], ["--up", "x, y or z"]),

@@ -268,4 +268,4 @@ def test_markers_that_are_named_wrongly_are_named_with_the_nearest(files: Path) 
     names = [*MARKER_OPTIONS[:-1], "shank=shank0,shank1,shnak2"]
     static = ["--static", *pairs(files, "still")]
     text = said(run("evaluate", *pairs(files, "m0"), *LIMB, *names, *static))
-    assert "'shnak2': did you mean shank2" in text
+    assert "'shnak2': did you mean 'shank2'" in text

@@ -136,7 +136,7 @@ def test_opensim_reads_the_marker_set(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["--lock", "T3"], 2, ["--lock T3", "did you mean T3.x"]),
+        (["--lock", "T3"], 2, ["--lock T3", "did you mean 'T3.x'"]),
         (["--without", "Z"], 2, ["--without Z"]),
         (["--method", "magic"], 2, ["joint, block, search"]),
         (["--out", "new.osim"], 2, [".toml, .json, .xml or .trc"]),

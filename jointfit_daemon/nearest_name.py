@@ -1,0 +1,51 @@
+"""Nearest valid spelling of an unknown name, for error messages.
+
+Comparison ignores case and uses the similarity ratio of `difflib.SequenceMatcher` (Ratcliff and
+Obershelp): twice the number of matching characters over the total number of characters.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_CUTOFF = 0.5
+"""Least similarity, 0 to 1, of a spelling worth suggesting: half of the characters agree."""
+
+
+def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list[str]:
+    """Return up to `count` names of `known` that resemble `name`, the most similar first.
+
+    `name` itself is never returned, and a value that is not text is compared by its `str`.
+    """
+    wanted = str(name)
+    by_folded = {other.casefold(): other for other in known if other != wanted}
+    found = get_close_matches(wanted.casefold(), list(by_folded), n=count, cutoff=_CUTOFF)
+    return [by_folded[folded] for folded in found]
+
+
+def nearest_name(name: object, known: Iterable[str]) -> str | None:
+    """Return the name of `known` that resembles `name` most, or None if none is similar."""
+    return next(iter(nearest_names(name, known)), None)
+
+
+def did_you_mean(name: object, known: Iterable[str], *, count: int = 1) -> str:
+    """Return the question ``did you mean 'NAME'?``, or an empty string if no name is similar."""
+    near = nearest_names(name, known, count=count)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else ""
+
+
+def unknown_name(
+    kind: str, name: str, known: Iterable[str], *, candidates: Iterable[str] | None = None
+) -> str:
+    """Return an error message for an unknown name: nearest spelling, then all known names.
+
+    `candidates` are the names worth suggesting, `known` by default.
+    """
+    names = list(known)
+    hint = did_you_mean(name, names if candidates is None else candidates)
+    listed = f"known: {', '.join(names) or 'none'}"
+    return f"no {kind} {name!r}; {hint} {listed}" if hint else f"no {kind} {name!r}; {listed}"

@@ -1,0 +1,39 @@
+"""Suggestions for misspelt names: similarity, case, and the sentence in error messages."""
+
+from __future__ import annotations
+
+import pytest
+
+from jointfit_daemon.nearest_name import did_you_mean, nearest_name, nearest_names, unknown_name
+
+SEGMENTS = ("thigh", "shank", "foot")
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [("tigh", "thigh"), ("SHANK", "shank"), ("shnak", "shank"), ("zzz", None), (5, None)],
+)
+def test_nearest_name_ignores_case_and_rejects_dissimilar_names(
+    name: object, nearest: str | None
+) -> None:
+    assert nearest_name(name, SEGMENTS) == nearest
+
+
+def test_nearest_name_does_not_suggest_the_name_itself() -> None:
+    assert nearest_name("foot", SEGMENTS) is None
+
+
+def test_nearest_names_are_ordered_by_similarity() -> None:
+    assert nearest_names("LKNE1", ["LKNEE", "LKNE", "RANK"], count=2) == ["LKNE", "LKNEE"]
+
+
+def test_did_you_mean_quotes_suggestions_and_is_empty_without_any() -> None:
+    assert did_you_mean("tigh", SEGMENTS) == "did you mean 'thigh'?"
+    assert did_you_mean("T9", ["T1", "T2"], count=2) == "did you mean 'T2' or 'T1'?"
+    assert did_you_mean("zzz", SEGMENTS) == ""
+
+
+def test_unknown_name_lists_all_names_and_suggests_candidates_only() -> None:
+    assert unknown_name("driver", "zzz", ()) == "no driver 'zzz'; known: none"
+    text = unknown_name("sensor", "s3", ["s1", "s2"], candidates=["s2"])
+    assert text == "no sensor 's3'; did you mean 's2'? known: s1, s2"
