@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from jointfit_daemon.files.model_file import read_model
+from jointfit_daemon.files.models import read_model
 from tests.documented_commands import (
     PLACEHOLDER,
     Block,

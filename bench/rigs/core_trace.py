@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Corrupt, DeviceEvent, LimbState
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.sources import SourceState
-    from jointfit_daemon.timing.align import AlignedFrame
+    from jointfit_daemon.timing.alignment import AlignedFrame
     from jointfit_daemon.timing.clock import DeviceClock
     from jointfit_daemon.timing.lag import LagEstimate
 

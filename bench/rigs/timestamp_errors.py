@@ -24,7 +24,7 @@ from typing_extensions import override
 from jointfit_daemon.model import ImuSample, LimbState
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.sources import Stamped
-from jointfit_daemon.timing.stamps import SLEW
+from jointfit_daemon.timing.clock import SLEW
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Corrupt, DeviceEvent
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.sources import SourceState
-    from jointfit_daemon.timing.align import AlignedFrame
-    from jointfit_daemon.timing.stamps import Stamp
+    from jointfit_daemon.timing.alignment import AlignedFrame
+    from jointfit_daemon.timing.clock import Stamp
 
 _NS_PER_MS = 1e6
 OPTICAL = "mocap"

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.marker_trial import MarkerTrial, read_marker_trial
-from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, JointKind, Marker, Segment
+from jointfit_daemon.files.mocap import MarkerTrial, read_marker_trial
+from jointfit_daemon.kinematics.chains import ChainModel, Joint, JointKind, Marker, Segment
 
 if TYPE_CHECKING:
     from pathlib import Path

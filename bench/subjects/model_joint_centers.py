@@ -19,16 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.files.marker_trial import read_marker_trial
-from jointfit_daemon.files.npz import vectors_z_up
-from jointfit_daemon.files.sto import TimeTable, read_sto
+from jointfit_daemon.files.mocap import read_marker_trial
+from jointfit_daemon.files.orientations import TimeTable, read_sto, vectors_z_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.files.marker_trial import MarkerTrial
+    from jointfit_daemon.files.mocap import MarkerTrial
 
 _EVERY = {"squats1": 5, "STS1": 5}
 """Model poses computed: every so many frames."""

@@ -18,16 +18,16 @@ import numpy as np
 
 from bench.subjects.model_joint_centers import quiet
 from jointfit_daemon.calibration.marker_refinement.block import Carriers
-from jointfit_daemon.files.osim import to_y_up
-from jointfit_daemon.files.sto import read_sto
-from jointfit_daemon.files.trc import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.models import to_y_up
+from jointfit_daemon.files.orientations import read_sto
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 _ACCURACY = 1e-5
 """InverseKinematicsTool's own default."""

@@ -13,15 +13,15 @@ import numpy as np
 
 from bench.subjects.opensim_reference import judge, shared_markers, trial_frames
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
-from jointfit_daemon.files.osim import read_osim, to_z_up
+from jointfit_daemon.files.models import read_osim, to_z_up
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from bench.subjects.opensim_reference import Verdict
-    from jointfit_daemon.files.trc import MarkerTrajectories
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.files.mocap import MarkerTrajectories
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 GAIT, OPENCAP = "opensim_gait2354", "opencap_subject4"
 _WALK_S = (0.4, 1.6)

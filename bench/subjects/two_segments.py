@@ -6,9 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, Marker, Segment
-from jointfit_daemon.kinematics.chain_motion import (
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
     ChainState,
+    Joint,
+    Marker,
+    Segment,
     apply_step,
     marker_positions,
     rest_state,

@@ -21,7 +21,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial, Unrefinable
 from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
-from jointfit_daemon.kinematics.chain_model import ChainModel, Marker, Segment
+from jointfit_daemon.kinematics.chains import ChainModel, Marker, Segment
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames
 
 if TYPE_CHECKING:

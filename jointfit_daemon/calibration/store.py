@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.content_check import content_faults
 from jointfit_daemon.calibration.result import Calibration, UnknownSchema
-from jointfit_daemon.files.structured_text import parse_json, plain_fault, read_bounded
-from jointfit_daemon.files.text_table import Malformed
+from jointfit_daemon.files.text import Malformed, parse_json, plain_fault, read_bounded
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -29,7 +29,7 @@ from jointfit_daemon.driver import (
     driver_names,
     find_driver,
 )
-from jointfit_daemon.files.structured_text import plain_fault
+from jointfit_daemon.files.text import plain_fault
 from jointfit_daemon.model import Chain
 from jointfit_daemon.nearest_name import nearest_name
 

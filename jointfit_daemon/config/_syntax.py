@@ -9,8 +9,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config._fault_messages import ConfigError, Fault
-from jointfit_daemon.files.structured_text import DEEPEST, parse_toml, plain_fault, read_text
-from jointfit_daemon.files.text_table import Malformed
+from jointfit_daemon.files.text import DEEPEST, Malformed, parse_toml, plain_fault, read_text
 
 if TYPE_CHECKING:
     from pathlib import Path

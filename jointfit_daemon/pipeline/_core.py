@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event, Output
-    from jointfit_daemon.timing.align import AlignedFrame, FrameAligner
+    from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
     from jointfit_daemon.timing.clock import Stamp
 
 _CLOSED: dict[str, Literal["info", "warning", "error"]] = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.timing.align import FrameAligner, StreamSpec
+from jointfit_daemon.timing.alignment import FrameAligner, StreamSpec
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Rig

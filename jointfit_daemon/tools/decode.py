@@ -75,7 +75,7 @@ def decode(
     import orjson
 
     from jointfit_daemon.driver import find_driver
-    from jointfit_daemon.files.capture import read_capture
+    from jointfit_daemon.files.captures import read_capture
 
     driver = find_driver(protocol)
     decoder = driver(_settings(driver, protocol, setting or [])).decoder()

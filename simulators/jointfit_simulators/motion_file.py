@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from jointfit_daemon.files.sto import read_sto
-from jointfit_daemon.files.structured_text import read_toml
+from jointfit_daemon.files.orientations import read_sto
+from jointfit_daemon.files.text import read_toml
 from jointfit_simulators.limb import ANKLE, HIP, KNEE, PELVIS_POSITION, PELVIS_TURN
 from jointfit_simulators.orientation import Rotation
 from jointfit_simulators.posture import Style, upright

@@ -12,9 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from jointfit_daemon.files.npz import OrientationTrial, write_orientations_npz
-from jointfit_daemon.files.sto import OrientationTable, write_orientations_sto
-from jointfit_daemon.files.trc import MarkerTrajectories, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
+from jointfit_daemon.files.orientations import (
+    OrientationTable,
+    OrientationTrial,
+    write_orientations_npz,
+    write_orientations_sto,
+)
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.c3d_file import c3d_bytes
 from jointfit_simulators.cameras import Cameras

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.files.structured_text import read_toml
+from jointfit_daemon.files.text import read_toml
 from jointfit_daemon.nearest_name import unknown_name
 
 if TYPE_CHECKING:

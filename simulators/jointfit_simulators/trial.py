@@ -5,8 +5,8 @@ are in the recording, so nothing is added to them here. Two motions: ``trial`` p
 once and holds its end; ``stand`` holds the static pose, which is the sensors' bias where that is
 known (so that every segment is upright by definition), else the first instant of the recording.
 
-Files, told apart by their ends: ``.npz`` (jointfit_daemon.files.npz) or a ``.sto`` of quaternions
-for the sensors, ``.trc`` for the markers, ``.json`` for the biases (``{"q_bias": {"S1": [w, x, y,
+Files, told apart by their ends: ``.npz`` or a ``.sto`` of quaternions for
+the sensors, ``.trc`` for the markers, ``.json`` for the biases (``{"q_bias": {"S1": [w, x, y,
 z]}}``). All of them y up, as OpenSim writes them, but for NPZ that say otherwise.
 """
 
@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.npz import (
+from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc
+from jointfit_daemon.files.orientations import (
     OrientationTrial,
     quaternions_z_up,
     read_orientations_npz,
+    read_orientations_sto,
     vectors_z_up,
 )
-from jointfit_daemon.files.sto import read_orientations_sto
-from jointfit_daemon.files.structured_text import read_json
-from jointfit_daemon.files.trc import MarkerTrajectories, read_trc
+from jointfit_daemon.files.text import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -15,8 +15,15 @@ from jointfit_daemon.calibration.marker_refinement.motion import (
     Unrefinable,
 )
 from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
-from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, Marker, Segment
-from jointfit_daemon.kinematics.chain_motion import apply_step, marker_positions, rest_state
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
+    Joint,
+    Marker,
+    Segment,
+    apply_step,
+    marker_positions,
+    rest_state,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement

@@ -14,18 +14,17 @@ from jointfit_daemon.calibration.marker_refinement.joint import errors, place, s
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial, RefinementSettings
 from jointfit_daemon.calibration.marker_refinement.objective import Problem
 from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
-from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, Marker, Segment
-from jointfit_daemon.kinematics.chain_motion import (
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
     ChainState,
+    Joint,
+    Marker,
+    Segment,
     apply_step,
     marker_positions,
     rest_state,
 )
-from jointfit_daemon.kinematics.inverse_kinematics import (
-    IkOptions,
-    solve_frames,
-    tracking_error,
-)
+from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.files.capture import read_capture
+from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.model import (
     Chunk,
     ClockEcho,

@@ -14,7 +14,7 @@ import pytest
 from typing_extensions import override
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.files.capture import read_capture
+from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.model import ClockEcho, MocapFrame
 from jointfit_drivers import natnet_session
 from jointfit_drivers.natnet import NatNetMocap

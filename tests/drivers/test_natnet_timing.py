@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pytest
 
-from jointfit_daemon.files.packet_capture import read_udp
+from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.model import Chunk, ClockEcho
-from jointfit_daemon.timing.echo_clock import EchoFit
+from jointfit_daemon.timing.clock._echo_fit import EchoFit
 from jointfit_drivers.natnet_events import NatNetEvents
 from jointfit_drivers.natnet_settings import NatNetSettings
 from jointfit_protocols.natnet_frame import FrameOfData

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from jointfit_daemon.driver import CanBusSettings
-from jointfit_daemon.files.candump import read_candump
+from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_drivers.xcdi_events import XcdiEvents

@@ -18,25 +18,24 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jointfit_daemon.files.c3d import read_c3d
-from jointfit_daemon.files.capture import CaptureUnreadable, read_capture
-from jointfit_daemon.files.npz import (
-    OrientationTrial,
-    read_orientations_npz,
-    write_orientations_npz,
-)
-from jointfit_daemon.files.osim import read_osim
-from jointfit_daemon.files.packet_capture import read_udp
-from jointfit_daemon.files.sto import (
+from jointfit_daemon.files.captures import read_capture
+from jointfit_daemon.files.captures._capture import CaptureUnreadable
+from jointfit_daemon.files.captures._packet_capture import read_udp
+from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.mocap._c3d import read_c3d
+from jointfit_daemon.files.models import read_osim
+from jointfit_daemon.files.orientations import (
     OrientationTable,
+    OrientationTrial,
     TimeTable,
+    read_orientations_npz,
     read_orientations_sto,
     read_sto,
+    write_orientations_npz,
     write_orientations_sto,
     write_sto,
 )
-from jointfit_daemon.files.text_table import Malformed
-from jointfit_daemon.files.trc import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.text import Malformed
 from jointfit_simulators.c3d_file import c3d_bytes
 from jointfit_simulators.sample_data import _write_models
 from jointfit_simulators.settings import Knobs
@@ -201,7 +200,7 @@ def test_an_array_never_takes_more_memory_than_its_data(tmp_path: Path, shape: s
 def test_a_zip_bomb_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jointfit_daemon.files.npz.LARGEST", 1 << 20)
+    monkeypatch.setattr("jointfit_daemon.files.orientations._npz.LARGEST", 1 << 20)
     path = tmp_path / "a.npz"
     path.write_bytes(npz_claiming("(1000000,)", bytes(8_000_000)))
     assert path.stat().st_size < 100_000

@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.c3d import read_c3d
-from jointfit_daemon.files.capture import read_capture
-from jointfit_daemon.files.model_file import read_model
-from jointfit_daemon.files.npz import read_orientations_npz
-from jointfit_daemon.files.osim import read_marker_set, read_osim
-from jointfit_daemon.files.sto import read_orientations_sto, read_sto
-from jointfit_daemon.files.trc import read_trc
+from jointfit_daemon.files.captures import read_capture
+from jointfit_daemon.files.mocap import read_trc
+from jointfit_daemon.files.mocap._c3d import read_c3d
+from jointfit_daemon.files.models import read_model, read_osim
+from jointfit_daemon.files.models._osim import read_marker_set
+from jointfit_daemon.files.orientations import (
+    read_orientations_npz,
+    read_orientations_sto,
+    read_sto,
+)
 from jointfit_protocols.candump import parse_candump
 from jointfit_simulators.c3d_file import c3d_bytes
 from jointfit_simulators.sample_data import write_sample

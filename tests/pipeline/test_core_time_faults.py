@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event
-    from jointfit_daemon.timing.align import AlignedFrame
+    from jointfit_daemon.timing.alignment import AlignedFrame
 
 NS = 1_000_000_000
 TICK_NS = 100_000

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.files.packet_capture import read_udp
+from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_protocols.corrupt import Corrupt
 from jointfit_protocols.natnet_frame import MARKER_OCCLUDED, FrameOfData, decode_frame
 from jointfit_protocols.natnet_messages import ServerInfo, decode, encode

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.files.npz import read_orientations_npz
+from jointfit_daemon.files.orientations import read_orientations_npz
 from jointfit_simulators.cameras import Cameras
 from jointfit_simulators.programme import Step, UnknownMotion, parse_programme
 from jointfit_simulators.replayed import Replayed

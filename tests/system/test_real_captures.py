@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.config import MqttSettings
-from jointfit_daemon.files.packet_capture import read_udp
+from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon
 from jointfit_simulators.natnet_replay import NatNetReplay

@@ -207,7 +207,7 @@ def test_output_files_are_checked_before_the_work(
     # Where they are used: a module imported meanwhile would keep the substitute for ever.
     for reader in ("jointfit_daemon.tools.markers._trials.read_marker_trial",
                    "jointfit_daemon.tools.fuse._trial.read_table",
-                   "jointfit_daemon.files.marker_trial.read_marker_trial",
+                   "jointfit_daemon.files.mocap.read_marker_trial",
                    "jointfit_daemon.tools.demo._command._run"):  # fmt: skip
         monkeypatch.setattr(reader, work)
     ending = ENDINGS.get(command, ".png")

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from jointfit_daemon.files.c3d import read_c3d_with_up
-from jointfit_daemon.files.model_file import read_model
-from jointfit_daemon.files.npz import read_orientations_npz
-from jointfit_daemon.files.osim import read_osim
-from jointfit_daemon.files.sto import read_orientations_sto
-from jointfit_daemon.files.trc import read_trc
+from jointfit_daemon.files.mocap import read_trc
+from jointfit_daemon.files.mocap._c3d import read_c3d_with_up
+from jointfit_daemon.files.models import read_model, read_osim
+from jointfit_daemon.files.orientations import read_orientations_npz, read_orientations_sto
 from jointfit_daemon.tools.__main__ import app
 from jointfit_simulators.c3d_file import c3d_bytes
 from jointfit_simulators.sample_data import write_sample

@@ -11,25 +11,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from bench.framework.experiment import Experiment, Figure, near
 from bench.framework.measurement import cpu_s
 from bench.subjects.adult_lower_limbs import FOLDER, TRIALS, measured, oc4_lower
 from bench.subjects.two_segments import swing, two_segments
-from jointfit_daemon.kinematics.chain_motion import (
-    apply_step,
-    jacobian,
-    marker_positions,
-    step_between,
-)
+from jointfit_daemon.kinematics.chains import apply_step, jacobian, marker_positions, step_between
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
-from jointfit_daemon.kinematics.live_inverse_kinematics import LiveInverseKinematics
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.kinematics.chain_model import ChainModel
-    from jointfit_daemon.kinematics.chain_motion import ChainState
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 EXPECTED_MM = dict(zip(TRIALS, (2.37, 6.57, 10.61, 8.62, 11.29), strict=True))
 REPEATS = 20

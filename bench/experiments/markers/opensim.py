@@ -20,12 +20,8 @@ from bench.subjects.opensim_trials import GAIT, OPENCAP, gait2354, opencap
 from jointfit_daemon.calibration.marker_refinement.motion import RefinementSettings
 from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
 from jointfit_daemon.calibration.marker_refinement.search import search
-from jointfit_daemon.files.osim import to_z_up
-from jointfit_daemon.kinematics.inverse_kinematics import (
-    IkOptions,
-    solve_frames,
-    tracking_error,
-)
+from jointfit_daemon.files.models import to_z_up
+from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -20,7 +20,7 @@ from bench.framework.experiment import Experiment, Figure
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial, RefinementSettings
 from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
-from jointfit_daemon.kinematics.chain_motion import marker_positions, step_between
+from jointfit_daemon.kinematics.chains import marker_positions, step_between
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
-    from jointfit_daemon.kinematics.chain_model import ChainModel
-    from jointfit_daemon.kinematics.chain_motion import ChainState
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _MM = 1000.0
 _EVERY = {"walking1": 1, "squats1": 8, "DJ1": 2, "STS1": 8}

@@ -18,7 +18,7 @@ from jointfit_daemon.model import LimbState, TickClock
 from jointfit_daemon.outputs.payloads import encode_pose
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
-from jointfit_daemon.timing.align import FrameAligner, StreamSpec
+from jointfit_daemon.timing.alignment import FrameAligner, StreamSpec
 from jointfit_daemon.timing.clock import DeviceClock
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.wearer import SENSORS

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from bench.framework.experiment import DATA
 from bench.framework.measurement import Bench, Row, per_item
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
 from bench.subjects.two_segments import swing, two_segments
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
-from jointfit_daemon.kinematics.live_inverse_kinematics import LiveInverseKinematics
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 
 def rows(quick: bool) -> list[Row]:

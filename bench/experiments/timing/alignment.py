@@ -24,15 +24,14 @@ from jointfit_daemon.kinematics.rotation_scalar import (
     multiply_one,
     normalize_one,
 )
-from jointfit_daemon.timing import interpolate
-from jointfit_daemon.timing.align import FrameAligner, StreamSpec
+from jointfit_daemon.timing.alignment import BEND, FrameAligner, StreamSpec, beyond
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from jointfit_daemon.model import Quaternion, Vector
-    from jointfit_daemon.timing.align import AlignedFrame, Mode
+    from jointfit_daemon.timing.alignment import AlignedFrame, Mode
 
     Motion = Callable[[int], Quaternion]
 
@@ -178,17 +177,13 @@ def _ahead_rms(
     for k in range(0, len(truth), 3):
         x, y, z = (dice.standard_normal(3) * scatter_rad / np.sqrt(3)).tolist()
         samples.append(_Sample(k * period_ns, multiply_one(truth[k], exp_one((x, y, z)))))
-    ours, found = interpolate.BEND, []
-    interpolate.BEND = bend
-    try:
-        for last in range(2, len(samples) - 1):
-            for ahead in (1, 2, 3):
-                k = 3 * last + ahead
-                earlier, before, a = samples[last - 2 : last + 1]
-                q = interpolate.beyond(earlier, before, a, k * period_ns)
-                found.append(degrees(angle_between_one(q, truth[k])))
-    finally:
-        interpolate.BEND = ours
+    found = []
+    for last in range(2, len(samples) - 1):
+        for ahead in (1, 2, 3):
+            k = 3 * last + ahead
+            earlier, before, a = samples[last - 2 : last + 1]
+            q = beyond(earlier, before, a, k * period_ns, bend)
+            found.append(degrees(angle_between_one(q, truth[k])))
     return _rms(found)
 
 
@@ -202,8 +197,7 @@ def ahead(data: Path) -> list[Figure]:
     ):
         truth, rate_hz = _board(data, trial)
         straight, bent, full = (
-            _ahead_rms(truth, rate_hz, np.radians(scatter_deg), bend)
-            for bend in (0.0, interpolate.BEND, 1.0)
+            _ahead_rms(truth, rate_hz, np.radians(scatter_deg), bend) for bend in (0.0, BEND, 1.0)
         )
         figures += [
             Figure(f"{name}: RMS", bent, goal),

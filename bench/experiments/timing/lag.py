@@ -14,9 +14,13 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.timing.lag import LagEstimate, estimate_lag_of_rates
-from jointfit_daemon.timing.lag_tracker import LagTracker
-from jointfit_daemon.timing.rates import rates_from_gyro, rates_from_orientations
+from jointfit_daemon.timing.lag import (
+    LagEstimate,
+    LagTracker,
+    estimate_lag_of_rates,
+    rates_from_gyro,
+    rates_from_orientations,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -21,12 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.kinematics.chain_motion import (
-    ChainState,
-    apply_step,
-    jacobian,
-    segment_poses,
-)
+from jointfit_daemon.kinematics.chains import ChainState, apply_step, jacobian, segment_poses
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement.outcome import Fit, MarkerOutcome, TrialOutcome
-from jointfit_daemon.kinematics.chain_motion import step_between
+from jointfit_daemon.kinematics.chains import step_between
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, IkResult
 
 

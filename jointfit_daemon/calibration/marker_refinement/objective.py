@@ -22,16 +22,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.kinematics.chain_layout import layout_of
-from jointfit_daemon.kinematics.pose_search import limits_of
+from jointfit_daemon.kinematics.chains import layout_of
+from jointfit_daemon.kinematics.inverse_kinematics import limits_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.kinematics.chain_model import ChainModel
-    from jointfit_daemon.kinematics.chain_motion import ChainState
-    from jointfit_daemon.kinematics.pose_search import Band
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
+    from jointfit_daemon.kinematics.inverse_kinematics import Band
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.gauge import Gauge
     from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
 
     Progress = Callable[[float, float], None]
     """Told how far the work is, 0 to 1, and the training error, m."""

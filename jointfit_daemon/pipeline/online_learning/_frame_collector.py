@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Quaternion
     from jointfit_daemon.pipeline.events import Notice
-    from jointfit_daemon.timing.align import AlignedFrame
+    from jointfit_daemon.timing.alignment import AlignedFrame
 
 EVERY_NS = 100_000_000
 """Between frames that are looked at."""

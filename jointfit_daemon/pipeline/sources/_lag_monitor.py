@@ -16,9 +16,13 @@ from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.calibration.static_pose import live_cluster
 from jointfit_daemon.driver import ImuSettings
 from jointfit_daemon.pipeline.events import Notice
-from jointfit_daemon.timing.lag import LagEstimate, LagSettings, estimate_in_steps
-from jointfit_daemon.timing.lag_tracker import LagTracker
-from jointfit_daemon.timing.rates import rates_from_orientations
+from jointfit_daemon.timing.lag import (
+    LagEstimate,
+    LagSettings,
+    LagTracker,
+    estimate_in_steps,
+    rates_from_orientations,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
@@ -29,7 +33,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
-    from jointfit_daemon.timing.lag_tracker import TrackedLag
+    from jointfit_daemon.timing.lag import TrackedLag
 
     Track = tuple[NDArray[np.int64], NDArray[np.float64]]
 

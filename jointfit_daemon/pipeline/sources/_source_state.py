@@ -19,8 +19,7 @@ from jointfit_daemon.model import (
 )
 from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
 from jointfit_daemon.pipeline.sources._sync_lines import SyncLines
-from jointfit_daemon.timing.clock import DeviceClock
-from jointfit_daemon.timing.sync_line import Edge
+from jointfit_daemon.timing.clock import DeviceClock, Edge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

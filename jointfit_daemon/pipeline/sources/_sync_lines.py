@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.timing.direct import TIE_STALE_NS
-from jointfit_daemon.timing.sync_line import Edge, SyncLine
+from jointfit_daemon.timing.clock import TIE_STALE_NS, Edge, SyncLine
 
 if TYPE_CHECKING:
     from jointfit_daemon.timing.clock import DeviceClock

@@ -12,7 +12,7 @@ from jointfit_daemon.tools.command_group import EXIT_FAILED
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
+    from jointfit_daemon.files.mocap import Axis, MarkerTrial
     from jointfit_daemon.tools.center.trial import Answer, Reduced
 
 
@@ -86,7 +86,7 @@ def _found(
 ) -> tuple[MarkerTrial, Reduced, list[Answer]]:
     from typing import cast
 
-    from jointfit_daemon.files.marker_trial import read_marker_trial
+    from jointfit_daemon.files.mocap import read_marker_trial
     from jointfit_daemon.tools.center.trial import answers, reduce
 
     trial = read_marker_trial(path, cast("Axis | None", up))

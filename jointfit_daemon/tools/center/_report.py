@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.files.marker_trial import MarkerTrial
+    from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.tools.center.trial import Answer, Reduced
 
 _MM = 1000.0

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.center.result import CenterEstimate
-    from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
+    from jointfit_daemon.files.mocap import Axis, MarkerTrial
 
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}

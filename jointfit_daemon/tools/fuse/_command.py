@@ -235,7 +235,7 @@ def _method(name: str) -> Any:
 def _read_model(path: Path) -> Any:
     from jointfit_daemon.calibration.result import Calibration, UnknownSchema
     from jointfit_daemon.calibration.store import MOST_BYTES
-    from jointfit_daemon.files.structured_text import read_json
+    from jointfit_daemon.files.text import read_json
 
     said = read_json(path, MOST_BYTES)
     try:

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.markers import visible
-from jointfit_daemon.files.npz import OrientationTrial, write_orientations_npz
-from jointfit_daemon.files.sto import (
+from jointfit_daemon.files.orientations import (
     OrientationTable,
+    OrientationTrial,
     TimeTable,
+    write_orientations_npz,
     write_orientations_sto,
     write_sto,
 )
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.files.marker_trial import Axis
+    from jointfit_daemon.files.mocap import Axis
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.tools.fuse._tables import Table
 

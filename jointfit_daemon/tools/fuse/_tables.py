@@ -11,8 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.npz import quaternions_z_up, read_arrays, read_orientations_npz
-from jointfit_daemon.files.sto import read_orientations_sto
+from jointfit_daemon.files.orientations import (
+    quaternions_z_up,
+    read_arrays,
+    read_orientations_npz,
+    read_orientations_sto,
+)
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.nearest_name import unknown_name
 
@@ -21,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.files.marker_trial import Axis
+    from jointfit_daemon.files.mocap import Axis
 
 
 SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0

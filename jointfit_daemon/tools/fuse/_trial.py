@@ -20,8 +20,8 @@ from jointfit_daemon.calibration.offline import OfflineTrial, mounts_of
 from jointfit_daemon.calibration.sampling import orientations_at
 from jointfit_daemon.calibration.static import robust_mean
 from jointfit_daemon.calibration.trial import CalibrationSettings, OpticalTrack
-from jointfit_daemon.files.marker_trial import read_marker_trial
-from jointfit_daemon.files.npz import quaternions_z_up
+from jointfit_daemon.files.mocap import read_marker_trial
+from jointfit_daemon.files.orientations import quaternions_z_up
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chain
 from jointfit_daemon.nearest_name import unknown_name
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.markers import Cluster
     from jointfit_daemon.calibration.static import RobustMean
-    from jointfit_daemon.files.marker_trial import Axis
+    from jointfit_daemon.files.mocap import Axis
 
 
 MARKER_FILES = (".trc", ".c3d")
@@ -237,8 +237,7 @@ def _refuse_moving(path: Path, found: Mapping[str, RobustMean]) -> None:
 
 def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
     """Return mounts from a JSON file ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``."""
-    from jointfit_daemon.files.structured_text import read_json
-    from jointfit_daemon.files.text_table import Malformed
+    from jointfit_daemon.files.text import Malformed, read_json
 
     try:
         said = read_json(path)

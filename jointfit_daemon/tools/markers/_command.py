@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         RefinementSettings,
     )
     from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.tools.markers._trials import Asked
 
 Trials = Annotated[list[Path], typer.Argument(help="Trials to learn from, .trc or .c3d.")]

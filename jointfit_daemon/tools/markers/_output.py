@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.model_file import write_model
-from jointfit_daemon.files.osim import to_y_up
-from jointfit_daemon.files.trc import MarkerTrajectories, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
+from jointfit_daemon.files.models import to_y_up, write_model
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 ENDINGS = (".toml", ".json", ".xml", ".trc")
 _OPENSIM_VERSION = "40000"

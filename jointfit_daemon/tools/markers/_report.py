@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         Refinement,
         TrialOutcome,
     )
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 _MM = 1000.0
 _MM2 = 1e6

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
-from jointfit_daemon.files.marker_trial import UnknownMarker, read_marker_trial
+from jointfit_daemon.files.mocap import UnknownMarker, read_marker_trial
 from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from jointfit_daemon.files.marker_trial import Axis, MarkerTrial
-    from jointfit_daemon.kinematics.chain_model import ChainModel
+    from jointfit_daemon.files.mocap import Axis, MarkerTrial
+    from jointfit_daemon.kinematics.chains import ChainModel
 
 _AXES = "xyz"
 _ALL = "*"
@@ -58,8 +58,7 @@ def load(
 
 def _chain(asked: Asked) -> tuple[ChainModel, tuple[str, ...]]:
     """Return the chain and the remarks of its import."""
-    from jointfit_daemon.files.model_file import read_model
-    from jointfit_daemon.files.osim import read_osim
+    from jointfit_daemon.files.models import read_model, read_osim
 
     remarks: tuple[str, ...] = ()
     if asked.model.suffix.lower() == ".osim":

@@ -24,7 +24,7 @@ from jointfit_daemon.pipeline.events import (
     Request,
 )
 from jointfit_daemon.pipeline.online_learning import OnlineLearner, _frame_collector, models_only
-from jointfit_daemon.timing.align import AlignedFrame
+from jointfit_daemon.timing.alignment import AlignedFrame
 from tests.calibration.taught_limb import CHAIN, calibration, fresh, moving
 
 MS, S = 1_000_000, 1_000_000_000

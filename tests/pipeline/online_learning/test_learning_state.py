@@ -12,7 +12,7 @@ import pytest
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.online_learning import Learned, OnlineLearner, models_only
 from jointfit_daemon.pipeline.online_learning._learning_state import TOLD_NS, LearningWatch, hidden
-from jointfit_daemon.timing.align import AlignedFrame
+from jointfit_daemon.timing.alignment import AlignedFrame
 from tests.calibration.taught_limb import CHAIN, calibration
 
 MS, S = 1_000_000, 1_000_000_000

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from jointfit_daemon.files.trc import MarkerTrajectories, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
 from jointfit_daemon.tools.__main__ import app
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from typer.testing import CliRunner
 
-from jointfit_daemon.files.npz import OrientationTrial, write_orientations_npz
-from jointfit_daemon.files.trc import MarkerTrajectories, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
+from jointfit_daemon.files.orientations import OrientationTrial, write_orientations_npz
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.tools.__main__ import app
 

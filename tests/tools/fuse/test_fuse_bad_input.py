@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.files.npz import (
+from jointfit_daemon.files.orientations import (
     OrientationTrial,
     read_orientations_npz,
     write_orientations_npz,

@@ -16,15 +16,13 @@ import pytest
 
 from jointfit_daemon.calibration.model_fit import METHODS
 from jointfit_daemon.calibration.result import Calibration
-from jointfit_daemon.files.npz import (
+from jointfit_daemon.files.orientations import (
+    OrientationTable,
     OrientationTrial,
     read_orientations_npz,
-    write_orientations_npz,
-)
-from jointfit_daemon.files.sto import (
-    OrientationTable,
     read_orientations_sto,
     read_sto,
+    write_orientations_npz,
     write_orientations_sto,
 )
 from jointfit_daemon.kinematics import rotation

@@ -12,10 +12,17 @@ import orjson
 import pytest
 from typer.testing import CliRunner
 
-from jointfit_daemon.files.model_file import read_model, write_model
-from jointfit_daemon.files.trc import MarkerTrajectories, read_trc, write_trc
-from jointfit_daemon.kinematics.chain_model import ChainModel, Joint, Marker, Segment
-from jointfit_daemon.kinematics.chain_motion import apply_step, marker_positions, rest_state
+from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.models import read_model, write_model
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
+    Joint,
+    Marker,
+    Segment,
+    apply_step,
+    marker_positions,
+    rest_state,
+)
 from jointfit_daemon.tools.__main__ import app
 
 if TYPE_CHECKING:

@@ -1,0 +1,287 @@
+r"""Inverse kinematics one instant at a time, with the covariance of each pose.
+
+Law: an instant begins where the last one would have been led by its own motion and takes one or a
+few safeguarded Gauss-Newton steps; if its markers are then still far off, it begins anew from the
+markers alone. The covariance of a pose,
+in the columns of a step, is
+
+.. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
+
+with :math:`\sigma` the error of a marker per axis, given or learnt from the residuals. What the
+markers leave open is held to the last instant, and :math:`\Sigma` is wide there, never infinite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg import lapack
+
+from jointfit_daemon.kinematics.chains import ChainState, moved, rest_state
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    OPEN_M2,
+    Band,
+    Fit,
+    IkOptions,
+    fit,
+    lower_equations,
+    slots_of,
+    solve_frames,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+_TRIES = 6
+_LAST_STEP = 3e-3
+"""rad, m: what a step below it leaves is below what markers can tell."""
+_DAMPING = 1e-2
+_RIDGE = 1e-9
+_ROUNDING = 1e-9
+_OPEN_SLACK = 1e-2  # the hold may cost the markers a little
+_FORGETTING = 0.02
+_FIRST_SD_M = 0.003
+_STRAIGHTEN = 32
+"""Instants after which what rounding bent is taken out of the rotations."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """How to follow; the defaults are for markers on skin at 100 Hz."""
+
+    steps: int = 2
+    """Steps an instant at most; two are within a thousandth of the least error at 100 Hz."""
+    huber_m: float | None = None
+    """Errors beyond weigh as c/|e|, m; None: plain least squares."""
+    hold_m2: float = 1e-4
+    """Weight, m^2/rad^2, that holds all turns to the last instant where markers leave one open."""
+    marker_sd_m: float | None = None
+    """Error of a marker per axis, m; None: learnt from the residuals of the last 50 instants."""
+    lost_m: float = 0.06
+    """Tracking error, m, above which an instant begins anew from the markers alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class LivePose:
+    """The chain at one instant."""
+
+    state: ChainState
+    """Of length one."""
+    rotations: Array
+    """R_world_segment, shape (S, 3, 3)."""
+    origins: Array
+    """World, m, shape (S, 3)."""
+    residuals: Array
+    """Marker of the model minus measured, m, shape (M, 3); NaN where missing."""
+    covariance: Array
+    """Of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
+    underdetermined: bool
+    """The markers left something open, which was held to the last instant."""
+    restarted: bool
+    """Did not begin where the last instant ended."""
+
+
+class LiveInverseKinematics:
+    """Follows a chain through its markers.
+
+    Parameters
+    ----------
+    model
+        The chain.
+    options
+        `LiveOptions()` if None.
+    """
+
+    def __init__(self, model: ChainModel, options: LiveOptions | None = None) -> None:
+        self._model = model
+        self._options = options or LiveOptions()
+        self._slots = slots_of(model)
+        self._state: ChainState | None = None
+        self._variance = (self._options.marker_sd_m or _FIRST_SD_M) ** 2
+        weighing = model.weights[model.weights > 0.0]
+        self._typical = float(np.median(weighing)) if weighing.size else 1.0
+        self._fed = 0
+        self._lead = np.zeros(model.nq)
+
+    def feed(self, markers: ArrayLike) -> LivePose:
+        """Return the pose of the next instant.
+
+        Parameters
+        ----------
+        markers : array_like, shape (M, 3)
+            Measured, in the order of the model's, world, m; NaN where missing.
+
+        Raises
+        ------
+        ValueError
+            Another shape.
+        """
+        given = np.asarray(markers, dtype=np.float64)
+        if given.shape != (len(self._model.markers), 3):
+            raise ValueError(
+                f"markers have shape {given.shape}, expected ({len(self._model.markers)}, 3)"
+            )
+        seen: NDArray[np.bool_] = np.asarray(np.isfinite(given).all(axis=-1))
+        measured = self._slots.filled_vectors(np.where(seen[:, None], given, 0.0)[None])
+        weights = self._slots.filled((self._model.weights * seen)[None])
+        place, restarted = self._found(given, measured, weights)
+        self._fed += 1
+        self._lead = np.zeros(self._model.nq) if place.is_open or restarted else place.moved
+        self._state = place.state if self._fed % _STRAIGHTEN else _straightened(place.state)
+        return self._pose(place, seen, restarted=restarted)
+
+    def _found(self, given: Array, measured: Array, weights: Array) -> tuple[_Place, bool]:
+        """Return where the chain is, and whether it was found anew."""
+        if self._state is None:
+            start = self._anew(given)
+            return self._follow(start, np.zeros(self._model.nq), measured, weights), True
+        place = self._follow(self._state, self._lead, measured, weights)
+        if not self._is_lost(place):
+            return place, False
+        start = self._anew(given)
+        again = self._follow(start, np.zeros(self._model.nq), measured, weights)
+        return (again, True) if again.cost < place.cost else (place, False)
+
+    def _anew(self, given: Array) -> ChainState:
+        if not np.isfinite(given).any():
+            return rest_state(self._model)
+        options = IkOptions(iterations=15, huber_m=self._options.huber_m)
+        return solve_frames(self._model, given[None], options=options).state
+
+    def _is_lost(self, place: _Place) -> bool:
+        return place.cost > float(place.at.weighted[..., 3, :].sum()) * self._options.lost_m**2
+
+    def _follow(self, last: ChainState, lead: Array, measured: Array, weights: Array) -> _Place:
+        """Take the steps of one instant, from the last one's state led on by `lead`.
+
+        The factor that goes with the result is that of the last step's beginning: it differs by the
+        turn of that step, which is far below what a covariance is good for.
+        """
+        place = self._moved(last, lead, measured, weights)
+        travelled, equations = lead, None
+        for _ in range(max(self._options.steps, 1)):
+            w = self._robust(place.at, weights)
+            if w is not weights:
+                place = self._moved(place.state, None, measured, w)
+            equations = self._equations(place, last)
+            step, place = self._one_step(place, equations, measured, w)
+            travelled = travelled + step
+            if np.abs(step).max() < _LAST_STEP:
+                break
+        return replace(place, moved=travelled, equations=equations)
+
+    def _moved(
+        self, state: ChainState, step: Array | None, measured: Array, weights: Array
+    ) -> _Place:
+        if step is not None:
+            state = moved(self._slots.layout, state, step[None])
+        at = fit(self._slots, state, measured, weights)
+        return _Place(state, at, float(at.cost[0]))
+
+    def _robust(self, at: Fit, weights: Array) -> Array:
+        if self._options.huber_m is None:
+            return weights
+        errors = at.errors
+        size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
+        return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
+
+    def _equations(self, place: _Place, reference: ChainState) -> _Equations:
+        """Return normal matrix and gradient, held to `reference` if the markers leave one open."""
+        lower, gradient = lower_equations(self._slots, place.at)
+        H, g = lower[0], gradient[0]
+        diagonal = H.ravel()[:: len(g) + 1]
+        diagonal += _RIDGE
+        factor, failed = lapack.dpotrf(H, lower=1)
+        is_open = failed != 0 or float(factor.diagonal().min()) ** 2 < OPEN_M2 * self._typical
+        if is_open:
+            weight = self._options.hold_m2 * self._typical
+            hold = Band(reference, np.full((1, len(g)), weight), _ZERO, _ZERO)
+            g = g + weight * hold.excess(self._slots.layout, place.state)[0]
+            diagonal += weight
+            factor, _ = lapack.dpotrf(H, lower=1)
+        return _Equations(H, g, factor, is_open)
+
+    def _one_step(
+        self, place: _Place, equations: _Equations, measured: Array, weights: Array
+    ) -> tuple[Array, _Place]:
+        """Return a step that does not raise the cost, and where it leads."""
+        factor, damping = equations.factor, 0.0
+        most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
+        for _ in range(_TRIES):
+            step = lapack.dpotrs(factor, -equations.g, lower=1)[0]
+            there = self._moved(place.state, step, measured, weights)
+            if there.cost <= most:
+                return step, there
+            damping = max(_DAMPING, 10.0 * damping)
+            damped = equations.H + damping * np.diag(equations.H.diagonal())
+            factor, _ = lapack.dpotrf(damped, lower=1)
+        return np.zeros(self._model.nq), place
+
+    def _pose(self, place: _Place, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
+        residuals = self._slots.taken(place.at.errors)[0]
+        residuals[~seen] = np.nan
+        self._learn(place.cost, int(seen.sum()))
+        half, _ = lapack.dpotri(place.factor, lower=1)
+        covariance = self._variance * (half + half.T)
+        covariance.ravel()[:: len(half) + 1] *= 0.5
+        return LivePose(
+            place.state,
+            place.at.world[0, :, :3, :3],
+            place.at.world[0, :, :3, 3],
+            residuals,
+            covariance,
+            place.is_open,
+            restarted,
+        )
+
+    def _learn(self, cost: float, seen: int) -> None:
+        freedom = 3 * seen - self._model.nq
+        if self._options.marker_sd_m is None and freedom > 0:
+            self._variance += _FORGETTING * (cost / freedom - self._variance)
+
+
+_ZERO = np.zeros(1)
+
+
+class _Equations(NamedTuple):
+    """What a step is computed from."""
+
+    H: Array
+    """Its lower triangle, shape (nq, nq)."""
+    g: Array
+    factor: Array
+    """Lower Cholesky factor of H."""
+    is_open: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the chain may be."""
+
+    state: ChainState
+    at: Fit
+    cost: float
+    moved: Array = field(default_factory=lambda: _ZERO)
+    """Step from the last instant."""
+    equations: _Equations | None = None
+    """Those of the last step."""
+
+    @property
+    def factor(self) -> Array:
+        """Lower Cholesky factor of the normal matrix; of the unit matrix before any step."""
+        return np.eye(len(self.moved)) if self.equations is None else self.equations.factor
+
+    @property
+    def is_open(self) -> bool:
+        return self.equations is None or self.equations.is_open
+
+
+def _straightened(state: ChainState) -> ChainState:
+    """Return the state with what rounding bent taken out: one Newton step to A^T A = 1."""
+    A = state.rotations
+    return replace(state, rotations=1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)))

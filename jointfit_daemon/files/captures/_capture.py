@@ -1,0 +1,112 @@
+"""Recorded bytes of any wire as chunks, for `jointfit decode`. Law: files in, chunks out.
+
+The kind of file is seen from its first bytes, never from its name:
+
+| file | wire | chunks |
+|---|---|---|
+| pcapng, pcap | datagram | one a UDP datagram, both directions, at the packet's own time |
+| ``candump -L`` text | can | one a line, a record of `jointfit_protocols.can_frame` |
+| raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
+| raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
+| raw bytes | can | records of `jointfit_protocols.can_frame` back to back |
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.files.captures._candump import RECORD_BYTES, is_candump, read_candump
+from jointfit_daemon.files.captures._packet_capture import PCAP_MAGICS, PCAPNG_MAGIC, read_udp
+from jointfit_daemon.files.text import refuse_device
+from jointfit_daemon.model import Chunk
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Wire
+
+PIECE = 4096
+"""Bytes in a chunk of a raw stream."""
+
+NS_PER_BYTE = 10 * 10**9 // 921_600
+"""Invented time of a raw stream: ten bits a byte at 921 600 baud."""
+
+
+class CaptureUnreadable(ValueError):  # noqa: N818 - named for what the file is
+    """The file cannot be a capture of this wire: the message says what was found and expected."""
+
+
+def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Chunk]:
+    """Yield the chunks recorded in a file, in file order.
+
+    Parameters
+    ----------
+    path : Path
+        pcapng, pcap, ``candump -L`` text or raw bytes.
+    wire : {"stream", "datagram", "can"}
+        How the driver's chunks are cut.
+    port : int, optional
+        Keep only UDP datagrams from or to this port.
+
+    Raises
+    ------
+    CaptureUnreadable
+        The file holds another wire than the driver reads.
+    OSError
+        The file cannot be read.
+    """
+    refuse_device(path)
+    data = path.read_bytes()
+    if data.startswith(PCAPNG_MAGIC) or data[:4] in PCAP_MAGICS:
+        if wire != "datagram":
+            raise CaptureUnreadable(
+                f"{path}: a network capture, where a {wire} is expected: name the driver of the"
+                " device that was recorded"
+            )
+        return _datagrams(data, port)
+    if is_candump(data):
+        if wire != "can":
+            raise CaptureUnreadable(
+                f"{path}: candump text, where a {wire} is expected: name the driver of the device"
+                " that was recorded"
+            )
+        return read_candump(data)
+    return _raw(data, wire, path)
+
+
+def _datagrams(data: bytes, port: int | None) -> Iterator[Chunk]:
+    for packet in read_udp(data):
+        if port is None or port in (packet.source_port, packet.target_port):
+            yield Chunk(packet.t_ns, packet.payload)
+
+
+def _raw(data: bytes, wire: Wire, path: Path) -> Iterator[Chunk]:
+    if wire == "datagram":
+        return _walk(data)
+    if wire == "stream":
+        return _pieces(data, PIECE)
+    if len(data) % RECORD_BYTES:
+        raise CaptureUnreadable(
+            f"{path}: neither `candump -L` text nor CAN records of {RECORD_BYTES} bytes: record"
+            " with `candump -L can0`"
+        )
+    return _pieces(data, PIECE // RECORD_BYTES * RECORD_BYTES)
+
+
+def _pieces(data: bytes, size: int) -> Iterator[Chunk]:
+    for at in range(0, len(data), size):
+        yield Chunk(at * NS_PER_BYTE, data[at : at + size])
+
+
+def _walk(data: bytes) -> Iterator[Chunk]:
+    """Cut messages of ``u16 id, u16 length`` if they fill the file exactly; else take it whole."""
+    cuts = [0]
+    while cuts[-1] + 4 <= len(data):
+        (size,) = struct.unpack_from("<H", data, cuts[-1] + 2)
+        cuts.append(cuts[-1] + 4 + size)
+    if cuts[-1] != len(data):
+        cuts = [0, len(data)]
+    for number, at in enumerate(cuts[:-1]):
+        yield Chunk(number, data[at : cuts[number + 1]])

@@ -1,0 +1,19 @@
+"""Marker trials of motion-capture systems: TRC and C3D."""
+
+from jointfit_daemon.files.mocap._marker_trial import (
+    Axis,
+    MarkerTrial,
+    UnknownMarker,
+    read_marker_trial,
+)
+from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc, write_trc
+
+__all__ = [
+    "Axis",
+    "MarkerTrajectories",
+    "MarkerTrial",
+    "UnknownMarker",
+    "read_marker_trial",
+    "read_trc",
+    "write_trc",
+]

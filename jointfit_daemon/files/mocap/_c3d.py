@@ -1,0 +1,124 @@
+"""C3D, trials as most motion-capture programs keep them, through the optional package ``c3d``.
+
+Law: positions are handed over in metres, in the file's own axes. A point is missing where its
+residual is negative, whatever its coordinates say (most writers put zeros there): it is NaN. Times
+follow the frame numbers: frame 1 is at 0 s, as in a TRC of the same trial.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.files.mocap._trc import METRES, MarkerTrajectories
+from jointfit_daemon.files.text import Malformed, refuse_device
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+class PackageMissing(ImportError):  # noqa: N818 - named for what happened
+    """The optional package that reads this kind of file is not installed; says how to get it."""
+
+
+def read_c3d(path: Path) -> MarkerTrajectories:
+    """Return the points of a C3D file; analog channels are left where they are.
+
+    Labels are kept as written (``Subject:LASI``). Frame numbers and `t_s` come from the first frame
+    of the trial, which is rarely 1.
+
+    Raises
+    ------
+    PackageMissing
+        The package ``c3d`` is not installed.
+    Malformed
+        Not a C3D file, a broken one, or one without points, or a unit that is no length.
+    """
+    return _open(path)[0]
+
+
+def read_c3d_with_up(path: Path) -> tuple[MarkerTrajectories, str | None]:
+    """Return `read_c3d` and the axis that is up on the screen: "x", "y" or "z"; None if unsaid."""
+    return _open(path)
+
+
+def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
+    try:
+        import c3d  # noqa: PLC0415 - optional, and slow to import
+    except ModuleNotFoundError as missing:
+        raise PackageMissing(
+            f"{path}: reading C3D needs a package: pip install 'jointfitd[c3d]'"
+        ) from missing
+    refuse_device(path)
+    with path.open("rb") as handle, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns of every file without analog channels
+        try:
+            return _read(path, c3d.Reader(handle))
+        except Malformed:
+            raise
+        except Exception as fault:
+            raise Malformed(f"{path}: not a C3D file, or cut off: export it again") from fault
+
+
+def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
+    names = tuple(_labels(reader))[: reader.point_used]
+    if not names:
+        raise Malformed(f"{path}: no points with labels in this C3D file: export it with markers")
+    unit = (_text(reader, "POINT:UNITS") or "mm").lower()
+    if unit not in METRES:
+        raise Malformed(f"{path}: POINT:UNITS is {unit!r}, expected one of {', '.join(METRES)}")
+    frames = [points[: len(names), :4].copy() for _, points, _ in reader.read_frames(copy=False)]
+    if not frames:
+        raise Malformed(f"{path}: a header without frames: export the trial again")
+    cells = np.array(frames, dtype=np.float64).reshape(-1, len(names), 4)
+    first, rate_hz = int(reader.first_frame), float(reader.point_rate)
+    if not 0.0 < rate_hz < math.inf:
+        raise Malformed(
+            f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
+        )
+    numbers = np.arange(first, first + len(cells), dtype=np.int64)
+    trajectories = MarkerTrajectories(
+        names,
+        (numbers - 1) / rate_hz,
+        numbers,
+        _positions(cells) * METRES[unit],
+        rate_hz,
+        _doubts(len(cells), int(reader.last_frame) - first + 1),
+    )
+    return trajectories, _up(reader)
+
+
+def _positions(cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return positions (n, k, 3) of x, y, z, residual (n, k, 4); NaN where there was no point."""
+    positions: NDArray[np.float64] = cells[..., :3].copy()
+    positions[cells[..., 3] < 0.0] = np.nan
+    return positions
+
+
+def _labels(reader: Any) -> Iterator[str]:
+    """Yield point labels; beyond 255 they go on in LABELS2, LABELS3 ..."""
+    for suffix in ("", *(str(i) for i in range(2, 257))):
+        found = reader.get(f"POINT:LABELS{suffix}")
+        if found is None:
+            return
+        yield from (str(label).strip() for label in found.string_array)
+
+
+def _up(reader: Any) -> str | None:
+    screen = _text(reader, "POINT:Y_SCREEN").lstrip("+").lower()
+    return screen if screen in ("x", "y", "z") else None
+
+
+def _text(reader: Any, key: str) -> str:
+    found = reader.get(key)
+    return "" if found is None else str(found.string_value).strip().strip("\0")
+
+
+def _doubts(counted: int, claimed: int) -> tuple[str, ...]:
+    return () if counted == claimed else (f"the header says {claimed} frames, counted {counted}",)

@@ -1,0 +1,126 @@
+"""Marker trials of either kind, TRC or C3D, as one thing: names, metres, z up.
+
+Law: what a file does not say is asked for or told, never guessed in silence. `up_axis` and whether
+the file said so are part of the answer. A marker exactly in the origin is missing (NaN): no real
+one ever is, and programs that have no other word for missing write it so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal, cast
+
+import numpy as np
+
+from jointfit_daemon.files.mocap._c3d import read_c3d_with_up
+from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc
+from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.nearest_name import did_you_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+Axis = Literal["x", "y", "z"]
+_TO_Z_UP: dict[str, list[int]] = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
+
+
+class UnknownMarker(ValueError):  # noqa: N818 - named for what happened
+    """A marker that is not in the trial; the message names the nearest ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerTrial:
+    """Markers over time in a world whose z is up."""
+
+    trajectories: MarkerTrajectories
+    """Positions turned to z up, m; NaN where missing."""
+    up_axis: Axis
+    """The file's own axis that became z."""
+    up_said_by: Literal["file", "caller", "custom of the format"]
+
+    def points(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the trajectories of markers by name, m, shape (n, len(names), 3).
+
+        A subject's prefix may be left out where that is unambiguous: ``LASI`` finds ``Tom:LASI``.
+
+        Raises
+        ------
+        UnknownMarker
+            All names that are not there, each with the nearest spelling.
+        """
+        wanted = [self._index(name) for name in names]
+        unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
+        if unknown:
+            raise UnknownMarker(self._explain(unknown, taken=set(names)))
+        return self.trajectories.positions[:, [at for at in wanted if at is not None]]
+
+    def direction(self, axis: Axis) -> NDArray[np.float64]:
+        """Return one of the file's axes in the world whose z is up, shape (3,)."""
+        return np.asarray(np.eye(3)["xyz".index(axis)][_TO_Z_UP[self.up_axis]])
+
+    def to_file(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take vectors (..., 3) back to the file's own axes."""
+        return np.asarray(vectors[..., np.argsort(_TO_Z_UP[self.up_axis])])
+
+    def _index(self, name: str) -> int | None:
+        if name in self.trajectories.names:
+            return self.trajectories.names.index(name)
+        bare = [at for at, full in enumerate(self.trajectories.names) if _bare(full) == name]
+        return bare[0] if len(bare) == 1 else None
+
+    def _explain(self, unknown: Sequence[str], taken: set[str]) -> str:
+        """Name the nearest of each, and all there are, once, where one has none near.
+
+        Markers that are asked for anyway (`taken`) are not what a misspelt name meant.
+        """
+        free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
+        spellings = [*free, *map(_bare, free)]
+        hints = [did_you_mean(name, spellings, count=3) for name in unknown]
+        problems = [
+            f"no marker {name!r}" + (f": {hint}" if hint else "")
+            for name, hint in zip(unknown, hints, strict=True)
+        ]
+        if not all(hints):
+            problems.append(f"there are: {', '.join(self.trajectories.names)}")
+        return "; ".join(problems)
+
+
+def _bare(name: str) -> str:
+    return name.rpartition(":")[2]
+
+
+def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
+    """Return a trial by the ending of its name: ``.trc`` or ``.c3d``.
+
+    Parameters
+    ----------
+    path
+        Units are the file's: mm, cm and m are recognized.
+    up_axis
+        The file's axis that is up. None: what a C3D says of its screen, else z; for a TRC y, which
+        is OpenSim's custom.
+
+    Raises
+    ------
+    Malformed
+        Neither TRC nor C3D, or broken; `PackageMissing` where the reader of C3D is not installed.
+    """
+    kind = path.suffix.lower()
+    if kind == ".trc":
+        trajectories, said, custom = read_trc(path), None, "y"
+    elif kind == ".c3d":
+        trajectories, said = read_c3d_with_up(path)
+        custom = "z"
+    else:
+        raise Malformed(f"{path}: expected a file that ends in .trc or .c3d")
+    up = up_axis or said or custom
+    turned = trajectories.positions[..., _TO_Z_UP[up]]
+    turned[(turned == 0.0).all(axis=-1)] = np.nan
+    return MarkerTrial(
+        replace(trajectories, positions=turned),
+        cast("Axis", up),
+        "caller" if up_axis else "file" if said else "custom of the format",
+    )

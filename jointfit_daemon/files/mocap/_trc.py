@@ -1,0 +1,143 @@
+"""TRC, marker trajectories as motion-capture programs export them.
+
+Law: positions are handed over in metres, in the file's own axes; a missing marker is NaN. The
+rows::
+
+    PathFileType  4  (X/Y/Z)  name
+    DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames
+    (their values)
+    Frame#  Time  NAME  (two empty cells)  NAME ...
+    (two empty cells)  X1  Y1  Z1  X2 ...
+    (often an empty row)
+    frame  time  x  y  z  x ...
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.text import (
+    Malformed,
+    cells_of,
+    number,
+    read_lines,
+    require_times,
+    rows_of_numbers,
+    separator_of,
+    without_trailing_blanks,
+    written,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_HEADER_ROWS = 5
+_MOST_FRAMES = 2.0**53
+METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+"""Units of length that marker files use."""
+_KEYS = (
+    "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerTrajectories:
+    """Markers over time."""
+
+    names: tuple[str, ...]
+    t_s: NDArray[np.float64]
+    """Times as written, s, shape (n,)."""
+    frames: NDArray[np.int64]
+    """Frame numbers as written, shape (n,)."""
+    positions: NDArray[np.float64]
+    """Positions in the file's axes, m, shape (n, len(names), 3); NaN where missing."""
+    rate_hz: float
+    warnings: tuple[str, ...] = ()
+    """What the header claims and the rows do not hold."""
+
+
+_MOST_FRAMES = 2.0**53
+"""A frame number beyond it has lost its last digit."""
+
+
+def read_trc(path: Path) -> MarkerTrajectories:
+    """Return the trajectories of a TRC file; tab, comma or blanks between cells.
+
+    Raises
+    ------
+    Malformed
+        Not a TRC file, one without markers or rows, or a unit that is no length.
+    """
+    lines = read_lines(path)
+    if len(lines) < _HEADER_ROWS or not lines[0].startswith("PathFileType"):
+        raise Malformed(
+            f"{path}: not a TRC file (its first cell must be PathFileType): export it again"
+        )
+    separator = separator_of(lines[3])
+    header, rate_hz = _header(path, lines)
+    names = tuple(without_trailing_blanks(cells_of(lines[3], separator))[2::3])
+    if not names:
+        raise Malformed(f"{path}, line 4: no marker names after Frame# and Time: export it again")
+    body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)
+    rows = rows_of_numbers(path, body, separator, 2 + 3 * len(names))
+    unit = header.get("Units", "mm").lower()
+    if unit not in METRES:
+        raise Malformed(f"{path}: Units is {unit!r}, expected one of {', '.join(METRES)}")
+    require_times(path, rows[:, 1])
+    if not (np.abs(rows[:, 0]) < _MOST_FRAMES).all():
+        raise Malformed(f"{path}: the first column must hold frame numbers: export it again")
+    return MarkerTrajectories(
+        names,
+        rows[:, 1],
+        np.clip(np.nan_to_num(rows[:, 0]), -_MOST_FRAMES, _MOST_FRAMES).astype(np.int64),
+        rows[:, 2:].reshape(-1, len(names), 3) * METRES[unit],
+        rate_hz,
+        _doubts(header, rows=len(rows), markers=len(names)),
+    )
+
+
+def _header(path: Path, lines: list[str]) -> tuple[dict[str, str], float]:
+    """Return the values by key, and the rate, Hz."""
+    separator = separator_of(lines[1])
+    header = dict(zip(cells_of(lines[1], separator), cells_of(lines[2], separator), strict=False))
+    rate_hz = number(path, 3, header.get("DataRate", ""))
+    if not 0.0 < rate_hz < math.inf:
+        found = header.get("DataRate", "missing")
+        raise Malformed(f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)")
+    return header, rate_hz
+
+
+def _doubts(header: dict[str, str], *, rows: int, markers: int) -> tuple[str, ...]:
+    counted = {"NumFrames": rows, "NumMarkers": markers}
+    return tuple(
+        f"{key} says {header.get(key, 'nothing')}, counted {count}"
+        for key, count in counted.items()
+        if header.get(key, "") != str(count)
+    )
+
+
+def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
+    """Write a TRC file in metres: tab-separated, 8 significant digits, empty cells for missing."""
+    count, markers = len(trajectories.t_s), len(trajectories.names)
+    rate = written(trajectories.rate_hz)
+    first = int(trajectories.frames[0]) if count else 1
+    header = (rate, rate, count, markers, "m", rate, first, count)
+    axes = (f"{axis}{i}" for i in range(1, markers + 1) for axis in "XYZ")
+    rows = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        _KEYS.replace(" ", "\t"),
+        "\t".join(map(str, header)),
+        "\t".join(["Frame#", "Time", *(f"{name}\t\t" for name in trajectories.names)]),
+        "\t".join(["", "", *axes]),
+        "",
+    ]
+    flat = trajectories.positions.reshape(count, -1)
+    for frame, t_s, cells in zip(trajectories.frames, trajectories.t_s, flat, strict=True):
+        rows.append("\t".join([str(int(frame)), written(t_s), *map(written, cells)]))
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")

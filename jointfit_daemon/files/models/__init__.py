@@ -1,0 +1,6 @@
+"""Chain models in files: the project's TOML and JSON, and OpenSim models."""
+
+from jointfit_daemon.files.models._chain_file import read_model, write_model
+from jointfit_daemon.files.models._osim import read_osim, to_y_up, to_z_up
+
+__all__ = ["read_model", "read_osim", "to_y_up", "to_z_up", "write_model"]

@@ -1,0 +1,226 @@
+"""Chain models as small files: TOML to be written by hand, JSON for programs; the same keys.
+
+Law: metres and radians in the file as in the program, z up; whatever has a default may be left out.
+All that is wrong is told at once. docs/kinematics.md describes the format.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, get_args
+
+from jointfit_daemon.files.models._units import in_metres
+from jointfit_daemon.files.text import Malformed, read_json, read_toml
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
+    ImpossibleModel,
+    Joint,
+    JointKind,
+    Marker,
+    Segment,
+)
+from jointfit_daemon.nearest_name import did_you_mean
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_AXES = "xyz"
+_KEYS = {
+    "model": {"name", "segment", "marker"},
+    "segment": {
+        "name",
+        "parent",
+        "joint",
+        "center_in_parent",
+        "center",
+        "axis",
+        "rest",
+        "limits",
+        "path",
+    },
+    "marker": {"name", "segment", "position", "weight", "locked"},
+}
+_LENGTHS = {"center_in_parent": 3, "center": 3, "axis": 3, "rest": 4, "limits": 2, "position": 3}
+_SAMPLE = 8
+
+
+def read_model(path: Path) -> ChainModel:
+    """Return the chain of a ``.toml`` or ``.json`` file.
+
+    Raises
+    ------
+    Malformed
+        Broken, keys that are not known, values of the wrong kind, segments that make no chain,
+        lengths that cannot be metres.
+    """
+    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
+    wrong = _wrong(data)
+    if wrong:
+        raise Malformed(f"{path}: {'; '.join(wrong)}")
+    try:
+        model = ChainModel(
+            tuple(_segment(s) for s in data.get("segment", ())),
+            tuple(_marker(m) for m in data.get("marker", ())),
+            data.get("name", path.stem),
+        )
+    except ImpossibleModel as error:
+        raise Malformed(f"{path}: {error}") from error
+    return in_metres(path, model)
+
+
+def write_model(path: Path, model: ChainModel) -> None:
+    """Write a chain as TOML, or as JSON if the name ends so; `read_model` returns the same."""
+    data = as_data(model)
+    if path.suffix.lower() == ".json":
+        text = json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    else:
+        text = _toml(data)
+    path.write_text(text, encoding="utf-8")
+
+
+def as_data(model: ChainModel) -> dict[str, Any]:
+    """Return a chain as plain lists and dicts, defaults left out."""
+    return {
+        "name": model.name,
+        "segment": [_segment_data(s) for s in model.segments],
+        "marker": [_marker_data(m) for m in model.markers],
+    }
+
+
+def _segment_data(s: Segment) -> dict[str, Any]:
+    data: dict[str, Any] = {"name": s.name}
+    if s.parent is not None:
+        data["parent"] = s.parent
+    data["joint"] = s.joint.kind
+    for key in ("center_in_parent", "center", "axis", "rest", "limits"):
+        value = getattr(s.joint, key)
+        if value != getattr(Joint(), key):
+            data[key] = list(value)
+    if s.joint.path:
+        data["path"] = [list(sample) for sample in s.joint.path]
+    return data
+
+
+def _marker_data(m: Marker) -> dict[str, Any]:
+    data: dict[str, Any] = {"name": m.name, "segment": m.segment, "position": list(m.position)}
+    if m.weight != 1.0:
+        data["weight"] = m.weight
+    if any(m.locked):
+        data["locked"] = "".join(a for a, yes in zip(_AXES, m.locked, strict=True) if yes)
+    return data
+
+
+def _segment(data: dict[str, Any]) -> Segment:
+    given: dict[str, Any] = {
+        key: tuple(float(x) for x in data[key])
+        for key in ("center_in_parent", "center", "axis", "rest", "limits")
+        if key in data
+    }
+    given["path"] = tuple(tuple(float(x) for x in sample) for sample in data.get("path", ()))
+    kind = data.get("joint", "ball" if "parent" in data else "free")
+    return Segment(data["name"], data.get("parent"), Joint(kind, **given))
+
+
+def _marker(data: dict[str, Any]) -> Marker:
+    x, y, z = (float(value) for value in data["position"])
+    locked = data.get("locked", "")
+    return Marker(
+        data["name"],
+        data["segment"],
+        (x, y, z),
+        float(data.get("weight", 1.0)),
+        ("x" in locked, "y" in locked, "z" in locked),
+    )
+
+
+def _wrong(data: Any) -> list[str]:
+    """Return all that keeps `data` from being read."""
+    if not isinstance(data, dict):
+        return ["expected a table with name, segment and marker"]
+    wrong = _unknown("model", "the model", data)
+    if not isinstance(data.get("name", ""), str):
+        wrong.append(f"the model: name must be text, is {data['name']!r}")
+    for what in ("segment", "marker"):
+        rows = data.get(what, [])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            wrong.append(f"{what} must be a list of tables: [[{what}]]")
+            continue
+        for i, row in enumerate(rows, start=1):
+            label = f"{what} {row.get('name', f'number {i}')!r}"
+            wrong += _unknown(what, label, row)
+            wrong += _wrong_values(what, label, row)
+    return wrong
+
+
+def _unknown(what: str, label: str, row: dict[str, Any]) -> list[str]:
+    wrong = []
+    for key in sorted(set(row) - _KEYS[what]):
+        hint = did_you_mean(key, _KEYS[what]) or f"known: {', '.join(sorted(_KEYS[what]))}"
+        wrong.append(f"{label}: no key {key!r}; {hint}")
+    return wrong
+
+
+def _wrong_values(what: str, label: str, row: dict[str, Any]) -> list[str]:
+    wrong = [
+        f"{label}: {key} must be {count} numbers, is {row[key]!r}"
+        for key, count in _LENGTHS.items()
+        if key in row and not _are_numbers(row[key], count)
+    ]
+    path = row.get("path", [])
+    if not isinstance(path, list) or not all(_are_numbers(sample, _SAMPLE) for sample in path):
+        wrong.append(f"{label}: path must be a list of samples, {_SAMPLE} numbers each")
+    texts = {"name"} | ({"segment"} if what == "marker" else set())
+    wrong += [f"{label}: needs a {key}" for key in sorted(texts) if key not in row]
+    wrong += [
+        f"{label}: {key} must be text, is {row[key]!r}"
+        for key in ("name", "parent", "segment", "joint", "locked")
+        if key in row and not isinstance(row[key], str)
+    ]
+    if what == "marker":
+        wrong += _wrong_marker(label, row)
+    elif isinstance(row.get("joint", "free"), str) and row.get("joint", "free") not in get_args(
+        JointKind
+    ):
+        wrong.append(f"{label}: joint {row['joint']!r}, expected {', '.join(get_args(JointKind))}")
+    return wrong
+
+
+def _wrong_marker(label: str, row: dict[str, Any]) -> list[str]:
+    wrong = [] if "position" in row else [f"{label}: needs a position"]
+    locked = row.get("locked", "")
+    if isinstance(locked, str) and not set(locked) <= set(_AXES):
+        wrong.append(f'{label}: locked names axes such as "x" or "xyz", is {locked!r}')
+    if not _are_numbers([row.get("weight", 1.0)], 1):
+        wrong.append(f"{label}: weight must be a number, is {row['weight']!r}")
+    return wrong
+
+
+def _are_numbers(value: Any, count: int) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == count
+        and all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
+    )
+
+
+def _toml(data: dict[str, Any]) -> str:
+    lines = [f"name = {_quoted(data['name'])}"]
+    for what in ("segment", "marker"):
+        for row in data[what]:
+            lines += ["", f"[[{what}]]", *(f"{key} = {_value(v)}" for key, v in row.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return _quoted(value)
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        return "[\n" + "".join(f"    {_value(row)},\n" for row in value) + "]"
+    if isinstance(value, list):
+        return f"[{', '.join(repr(float(x)) for x in value)}]"
+    return repr(float(value))
+
+
+def _quoted(text: str) -> str:
+    """Return a TOML basic string: JSON's escapes are TOML's, but for DEL."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

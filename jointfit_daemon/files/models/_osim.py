@@ -1,0 +1,253 @@
+"""OpenSim models as chains of ours: the joints of the chosen bodies, and their markers.
+
+Law: OpenSim's world and bodies have y up, x forward, z right; ours z up, y forward, x right. Every
+vector (x, y, z) becomes (z, x, y), axes of bodies included, so segments keep their meaning. What is
+not the same afterwards is in the remarks; what is not understood is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.models._osim_document import GROUND, markers_of, read_document, read_xml
+from jointfit_daemon.files.models._osim_joints import nearest_joint
+from jointfit_daemon.files.models._units import in_metres
+from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.chains import ChainModel, ImpossibleModel, Joint, Marker, Segment
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.models._osim_document import OsimDocument, OsimMarker
+    from jointfit_daemon.files.models._osim_joints import NearestJoint
+    from jointfit_daemon.kinematics.chains import Sample
+    from jointfit_daemon.model import Quaternion, Vector
+
+_TO_Z_UP = [2, 0, 1]
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedModel:
+    """A chain and what became of the model it was made from."""
+
+    model: ChainModel
+    remarks: tuple[str, ...]
+
+
+def to_z_up(vectors: Array) -> Array:
+    """Take vectors (..., 3) from OpenSim's axes to ours."""
+    return np.asarray(np.asarray(vectors)[..., _TO_Z_UP])
+
+
+def to_y_up(vectors: Array) -> Array:
+    """Take vectors (..., 3) from our axes to OpenSim's."""
+    return np.asarray(np.asarray(vectors)[..., np.argsort(_TO_Z_UP)])
+
+
+def read_osim(
+    path: Path,
+    *,
+    bodies: Collection[str] | None = None,
+    markers: Collection[str] | None = None,
+    marker_set: Path | None = None,
+) -> ImportedModel:
+    """Return the chain of an OpenSim 4 model.
+
+    Parameters
+    ----------
+    path
+        ``.osim``.
+    bodies
+        Only markers of these; bodies that no marker needs are left out. None: all.
+    markers
+        Only these markers. None: all.
+    marker_set
+        An XML file whose markers replace the model's.
+
+    Raises
+    ------
+    Malformed
+        No OpenSim 4 model; joints or functions that are not known; names that are not there;
+        lengths that are not metres.
+    """
+    document = read_document(path)
+    found = document.markers if marker_set is None else read_marker_set(marker_set)
+    _check(path, document, found, bodies, markers)
+    try:
+        tree = _Tree(document)
+    except ValueError as error:
+        raise Malformed(f"{path}: {error}") from error
+    chosen = [
+        m
+        for m in found
+        if (bodies is None or m.body in bodies) and (markers is None or m.name in markers)
+    ]
+    riders = [rider for m in chosen if (rider := tree.placed(m)) is not None]
+    keep = tree.needed({m.segment for m in riders}) if riders else set(tree.segments)
+    if not riders:
+        tree.remarks.append("no markers: all bodies are kept")
+    segments = tree.kept(keep)
+    try:
+        model = ChainModel(tuple(segments), tuple(riders), document.name)
+    except ImpossibleModel as error:
+        raise Malformed(f"{path}: {error}") from error
+    return ImportedModel(in_metres(path, model), tuple(tree.remarks))
+
+
+def read_marker_set(path: Path) -> tuple[OsimMarker, ...]:
+    """Return the markers of an OpenSim marker-set XML, in OpenSim's axes."""
+    try:
+        found = markers_of(read_xml(path))
+    except ValueError as error:
+        raise Malformed(f"{path}: {error}") from error
+    if not found:
+        raise Malformed(f"{path}: no markers in it (expected OpenSimDocument with a MarkerSet)")
+    return found
+
+
+def _check(
+    path: Path,
+    document: OsimDocument,
+    found: tuple[OsimMarker, ...],
+    bodies: Collection[str] | None,
+    markers: Collection[str] | None,
+) -> None:
+    names = {m.name for m in found}
+    unknown = [f"no body {b!r}" for b in bodies or () if b not in document.bodies]
+    unknown += [f"no marker {m!r}" for m in markers or () if m not in names]
+    unknown += [
+        f"marker {m.name!r} on {m.body!r}, which is no body"
+        for m in found
+        if m.body not in document.bodies and m.body != GROUND
+    ]
+    if unknown:
+        raise Malformed(f"{path}: {'; '.join(unknown)}")
+
+
+class _Tree:
+    """Bodies on joints, welded ones merged; parents first."""
+
+    def __init__(self, document: OsimDocument) -> None:
+        self.remarks = [
+            f"constraint {name} is not kept: what it couples moves on its own"
+            for name in document.constraints
+        ]
+        self.segments: dict[str, Segment] = {}
+        self._at: dict[str, tuple[str | None, Array]] = {GROUND: (None, np.eye(4))}
+        self._told: dict[str, tuple[str, ...]] = {}
+        waiting = list(document.joints)
+        while waiting:
+            ready = [j for j in waiting if j.parent.body in self._at]
+            if not ready:
+                raise ValueError(f"joints in a circle: {', '.join(j.name for j in waiting)}")
+            for joint in ready:
+                if joint.child.body in self._at:
+                    raise ValueError(f"body {joint.child.body!r} hangs on two joints")
+                nearest = nearest_joint(joint)
+                self._add(joint.parent.body, joint.child.body, nearest)
+            waiting = [j for j in waiting if j not in ready]
+        loose = [b for b in document.bodies if b not in self._at]
+        for body in loose:
+            self._add(GROUND, body, None)
+
+    def _add(self, parent_body: str, body: str, joint: NearestJoint | None) -> None:
+        """Hang a body on its parent; `joint` None: it moves freely."""
+        parent, placed = self._at[parent_body]
+        if joint is not None and joint.kind is None:
+            self._at[body] = (parent, placed @ joint.rest)
+            self.remarks += joint.remarks
+            merged = parent or "the world"
+            self.remarks.append(f"{body} is fixed to {merged} and became part of it")
+            return
+        self._at[body] = (body, np.eye(4))
+        self._told[body] = joint.remarks if joint is not None else ()
+        if joint is None or joint.kind == "free":
+            if parent is not None:
+                self._told[body] += (f"{body} moves freely: its parent {parent} is left out",)
+            self.segments[body] = Segment(body)
+            return
+        center = placed[:3, :3] @ joint.center_in_parent + placed[:3, 3]
+        rest = rotation.from_matrix(placed[:3, :3] @ joint.rest[:3, :3])
+        self.segments[body] = Segment(
+            body,
+            parent,
+            Joint(
+                joint.kind or "ball",
+                _vector(center),
+                _vector(joint.center),
+                _vector(joint.axis),
+                _turned(rest),
+                joint.limits,
+                () if joint.path is None else _path(joint.path, placed[:3, :3]),
+            ),
+        )
+
+    def placed(self, marker: OsimMarker) -> Marker | None:
+        """Return a marker on its segment; None, with a remark, if it is fixed to the world."""
+        segment, transform = self._at[marker.body]
+        if segment is None:
+            self.remarks.append(f"marker {marker.name} is fixed to the world and left out")
+            return None
+        at = transform[:3, :3] @ marker.location + transform[:3, 3]
+        fixed = marker.fixed
+        return Marker(marker.name, segment, _vector(at), locked=(fixed, fixed, fixed))
+
+    def needed(self, marked: set[str]) -> set[str]:
+        """Return the segments between the marked ones, those included."""
+        paths = {name: self._path(name) for name in marked}
+        keep = {above for path in paths.values() for above in path}
+        for root in [name for name in keep if self.segments[name].parent is None]:
+            top: str | None = root
+            while top is not None and top not in marked:
+                under = [n for n in keep if self.segments[n].parent == top]
+                if len(under) > 1:
+                    break
+                keep.discard(top)
+                top = under[0] if under else None
+        return keep
+
+    def _path(self, name: str) -> list[str]:
+        path, above = [name], self.segments[name].parent
+        while above is not None:
+            path.append(above)
+            above = self.segments[above].parent
+        return path
+
+    def kept(self, keep: set[str]) -> list[Segment]:
+        """Return these segments, roots whose parents are left out moving freely."""
+        left = [name for name in self.segments if name not in keep]
+        if left:
+            self.remarks.append(f"left out, no marker needs them: {', '.join(left)}")
+        found = []
+        for name, segment in self.segments.items():
+            if name in keep:
+                cut = segment.parent is not None and segment.parent not in keep
+                found.append(Segment(name) if cut else segment)
+                self.remarks += () if cut else self._told[name]
+        return found
+
+
+def _vector(v: Array) -> Vector:
+    x, y, z = to_z_up(v).tolist()
+    return (x, y, z)
+
+
+def _path(path: Array, placed: Array) -> tuple[Sample, ...]:
+    """Return a coupled joint's samples in our axes, its parent part of another body."""
+    turns = rotation.multiply(rotation.from_matrix(placed), path[:, 1:5])
+    shifts = path[:, 5:] @ placed.T
+    return tuple(
+        (q, *_turned(turn), *_vector(shift))
+        for q, turn, shift in zip(path[:, 0].tolist(), turns, shifts, strict=True)
+    )
+
+
+def _turned(q: Array) -> Quaternion:
+    w, x, y, z = q.tolist()
+    return (w, z, x, y)

@@ -1,0 +1,236 @@
+"""What an OpenSim file says, as plain data in its own axes: bodies, joints, frames, markers.
+
+Law: nothing is interpreted but names, numbers and frames. A document type declaration is refused
+before anything is expanded, so no entity can grow or reach elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+from xml.parsers import expat
+
+import numpy as np
+
+from jointfit_daemon.files.text import Malformed, refuse_device
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+LARGEST = 64 << 20
+GROUND = "ground"
+_METRES = "meters"
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetFrame:
+    """A frame fixed to a body."""
+
+    body: str
+    transform: Array
+    """Frame axes to body axes, shape (4, 4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinate:
+    """One generalized coordinate."""
+
+    name: str
+    default: float
+    low: float
+    high: float
+    locked: bool
+
+
+@dataclass(frozen=True, slots=True)
+class OsimJoint:
+    """A joint as written."""
+
+    name: str
+    kind: str
+    """The tag: CustomJoint, PinJoint, …"""
+    parent: OffsetFrame
+    child: OffsetFrame
+    coordinates: tuple[Coordinate, ...]
+    spatial: ET.Element | None
+    """SpatialTransform of a CustomJoint."""
+
+
+@dataclass(frozen=True, slots=True)
+class OsimMarker:
+    """A marker as written."""
+
+    name: str
+    body: str
+    location: Array
+    """Axes of the body, m, shape (3,)."""
+    fixed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class OsimDocument:
+    """What a model file says."""
+
+    name: str
+    bodies: tuple[str, ...]
+    joints: tuple[OsimJoint, ...]
+    markers: tuple[OsimMarker, ...]
+    constraints: tuple[str, ...]
+    """Constraints that are in force."""
+
+
+def read_document(path: Path) -> OsimDocument:
+    """Return what an ``.osim`` file of OpenSim 4 says.
+
+    Raises
+    ------
+    Malformed
+        No OpenSim model of version 4, broken XML, XML with a document type, a file out of size,
+        another unit of length than metres.
+    """
+    root = read_xml(path)
+    model = root.find("Model")
+    if root.tag != "OpenSimDocument" or model is None:
+        raise Malformed(f"{path}: not an OpenSim model (expected OpenSimDocument with a Model)")
+    if model.find("JointSet") is None:
+        raise Malformed(
+            f"{path}: written by OpenSim before 4.0; open it there once and save it again"
+        )
+    unit = text_of(model, "length_units", _METRES)
+    if unit != _METRES:
+        raise Malformed(f"{path}: length_units is {unit!r}, expected {_METRES!r}")
+    try:
+        return OsimDocument(
+            model.get("name", path.stem),
+            tuple(body.get("name", "") for body in model.iterfind("BodySet/objects/Body")),
+            tuple(_joint(joint) for joint in model.iterfind("JointSet/objects/*")),
+            markers_of(model),
+            tuple(
+                constraint.get("name", constraint.tag)
+                for constraint in model.iterfind("ConstraintSet/objects/*")
+                if text_of(constraint, "isEnforced", "true") == "true"
+            ),
+        )
+    except (KeyError, ValueError) as error:
+        raise Malformed(f"{path}: {error}") from error
+
+
+def read_xml(path: Path) -> ET.Element:
+    """Return the root of an XML file without a document type; `Malformed` otherwise."""
+    refuse_device(path)
+    if path.stat().st_size > LARGEST:
+        raise Malformed(f"{path}: more than {LARGEST} bytes, which no model has: check the path")
+    data = path.read_bytes()
+    builder = ET.TreeBuilder()
+    parser = expat.ParserCreate()
+
+    def refuse(*_: object) -> None:
+        raise Malformed(
+            f"{path}: has a document type declaration, which no OpenSim file has: save the model"
+            " from OpenSim again"
+        )
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise Malformed(
+            f"{path}: not XML, or cut off, at line {error.lineno}, column {error.offset}: save the"
+            " model from OpenSim again"
+        ) from error
+    except Malformed:
+        raise
+    except (ValueError, LookupError) as error:  # an encoding that Python does not know
+        raise Malformed(f"{path}: unknown text encoding: save the file as UTF-8") from error
+    return builder.close()
+
+
+def text_of(element: ET.Element, tag: str, default: str = "") -> str:
+    """Return the stripped text of a child, or `default` if there is none."""
+    return (element.findtext(tag) or default).strip()
+
+
+def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array:
+    """Return the numbers in a child's text; `ValueError` if there are others than `count`."""
+    try:
+        values = np.array([float(cell) for cell in text_of(element, tag).split()])
+    except ValueError:
+        values = np.array([np.nan])
+        count = count or 0  # what holds no numbers is wrong, however many were expected
+    if count is not None and (values.size != count or not np.isfinite(values).all()):
+        name = element.get("name", element.tag)
+        raise ValueError(f"{name}: {tag} is {text_of(element, tag)!r}, expected {count} numbers")
+    return values
+
+
+def body_of(socket: str) -> str:
+    """Return the last name of a path such as ``/bodyset/femur_r``."""
+    return socket.strip().rpartition("/")[2]
+
+
+def fixed_xyz(angles: Array) -> Array:
+    """Return the matrix of turns about x, then the new y, then the new z; rad."""
+    turns = []
+    for axis, angle in enumerate(angles):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[j, j] = turn[k, k] = np.cos(angle)
+        turn[k, j] = np.sin(angle)
+        turn[j, k] = -turn[k, j]
+        turns.append(turn)
+    return np.asarray(turns[0] @ turns[1] @ turns[2])
+
+
+def markers_of(element: ET.Element) -> tuple[OsimMarker, ...]:
+    """Return the markers of a Model or a document with a MarkerSet."""
+    found = []
+    for marker in element.iterfind("MarkerSet/objects/Marker"):
+        socket = text_of(marker, "socket_parent_frame") or text_of(marker, "body")
+        location = numbers_of(marker, "location", 3)
+        fixed = text_of(marker, "fixed") == "true"
+        found.append(OsimMarker(marker.get("name", ""), body_of(socket), location, fixed))
+    return tuple(found)
+
+
+def _joint(joint: ET.Element) -> OsimJoint:
+    frames = {frame.get("name", ""): frame for frame in joint.iterfind("frames/*")}
+    return OsimJoint(
+        joint.get("name", joint.tag),
+        joint.tag,
+        _frame(text_of(joint, "socket_parent_frame"), frames),
+        _frame(text_of(joint, "socket_child_frame"), frames),
+        tuple(_coordinate(c) for c in joint.iterfind("coordinates/Coordinate")),
+        joint.find("SpatialTransform"),
+    )
+
+
+def _frame(socket: str, frames: dict[str, ET.Element]) -> OffsetFrame:
+    transform, name = np.eye(4), body_of(socket)
+    for _ in range(len(frames) + 1):  # a frame may stand on a frame, but not for ever
+        if name not in frames:
+            return OffsetFrame(name, transform)
+        frame, step = frames[name], np.eye(4)
+        step[:3, :3] = fixed_xyz(numbers_of(frame, "orientation", 3))
+        step[:3, 3] = numbers_of(frame, "translation", 3)
+        transform = step @ transform
+        name = body_of(text_of(frame, "socket_parent"))
+    raise ValueError(f"frame {socket!r} stands on itself")
+
+
+def _coordinate(coordinate: ET.Element) -> Coordinate:
+    low, high = (
+        numbers_of(coordinate, "range", 2)
+        if coordinate.find("range") is not None
+        else (-np.pi, np.pi)
+    )
+    locked = "true" in {text_of(coordinate, "locked"), text_of(coordinate, "prescribed")}
+    default = 0.0
+    if coordinate.find("default_value") is not None:
+        (default,) = numbers_of(coordinate, "default_value", 1).tolist()
+    return Coordinate(coordinate.get("name", ""), default, float(low), float(high), locked)

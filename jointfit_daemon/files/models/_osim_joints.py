@@ -1,0 +1,239 @@
+r"""The nearest of our joints to one of OpenSim's.
+
+Law: what turns by one coordinate becomes a hinge if it is one, else a coupled joint on samples of
+its motion; what turns by two or three becomes a ball. Axis and centers are those that come nearest
+to the motion over the range of its coordinates:
+
+.. math:: A_i \approx A_{rest}\exp(a\varphi_i), \qquad
+          \min_{c, C} \sum_i |t_i + A_i c - C|^2
+
+and how far the motion is from what it became is told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.models._osim_document import GROUND
+from jointfit_daemon.files.models._osim_motion import JointMotion
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.chains import CoupledCurve
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.models._osim_document import Coordinate, OsimJoint
+    from jointfit_daemon.kinematics.chains import JointKind
+
+_ALL = 3
+_SAMPLES = 61
+_AT_HOME = 0.05
+"""Pull of a center to the joint's own frame: a centimetre away counts as half a millimetre off."""
+_WIDEST = np.pi / 2
+"""Coordinates with wider ranges are looked at this far to either side of their default."""
+_BEYOND = 0.3
+"""Samples of a coupled joint go on so far beyond its range, rad: not all programs clamp it."""
+_TELL_M, _TELL_RAD = 1e-4, 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class NearestJoint:
+    """One of our joints, or none (``weld``), in OpenSim's axes."""
+
+    kind: JointKind | None
+    rest: Array
+    """Child body axes to parent body axes, at the joint's zero; shape (4, 4)."""
+    center_in_parent: Array
+    center: Array
+    axis: Array
+    limits: tuple[float, float] | None
+    remarks: tuple[str, ...]
+    path: Array | None = None
+    """Of a coupled joint: coordinate, quaternion, shift of its center; shape (n, 8)."""
+
+
+def nearest_joint(joint: OsimJoint) -> NearestJoint:
+    """Return the nearest of our joints, and remarks where it is not the same.
+
+    Raises
+    ------
+    ValueError
+        A kind of joint or function that is not known here.
+    """
+    motion = JointMotion(joint)
+    moving = [c for c in joint.coordinates if not c.locked]
+    turning = [c for c in moving if c.name in motion.turning]
+    shifting = [c for c in moving if c.name in motion.shifting and c not in turning]
+    rest = _sampled(joint, motion, {})
+    welded = NearestJoint(
+        None, _transform(rest), rest[1][0], np.zeros(3), np.array([1.0, 0.0, 0.0]), None, ()
+    )
+    remarks = [f"{joint.name}: {c.name} is locked and stays" for c in joint.coordinates if c.locked]
+    if shifting and (joint.parent.body == GROUND or len(shifting) == _ALL):
+        if len(moving) < 2 * _ALL:
+            remarks.append(f"{joint.name}: moves freely, not only along {_names(moving)}")
+        return replace(welded, kind="free", remarks=tuple(remarks))
+    if shifting:
+        remarks.append(f"{joint.name}: does not slide along {_names(shifting)}")
+    if not turning:
+        return replace(welded, remarks=tuple(remarks))
+    if len(turning) == 1:
+        found = _about_one(joint, motion, turning[0], welded)
+    else:
+        found = _ball(joint, motion, turning, welded)
+    return replace(found, remarks=(*remarks, *found.remarks))
+
+
+def _names(coordinates: list[Coordinate]) -> str:
+    return ", ".join(c.name for c in coordinates)
+
+
+def _span(c: Coordinate) -> tuple[float, float]:
+    low, high = max(c.low, c.default - _WIDEST), min(c.high, c.default + _WIDEST)
+    if np.isfinite([c.low, c.high]).all() and c.high - c.low <= 2 * np.pi:
+        low, high = c.low, c.high
+    return (low, high) if low < high else (c.default - 0.1, c.default + 0.1)
+
+
+def _sampled(
+    joint: OsimJoint, motion: JointMotion, values: dict[str, Array]
+) -> tuple[Array, Array]:
+    """Return R, shape (n, 3, 3), and t, shape (n, 3), of the child body in the parent body."""
+    count = max((len(v) for v in values.values()), default=1)
+    defaults = {c.name: np.full(count, c.default) for c in joint.coordinates}
+    others = {name: np.zeros(count) for name in motion.turning | motion.shifting}
+    own, shifts = motion.at({**others, **defaults, **values})
+    above, below = joint.parent.transform, np.linalg.inv(joint.child.transform)
+    turned = above[:3, :3] @ own
+    shifted = shifts @ above[:3, :3].T + above[:3, 3]
+    return turned @ below[:3, :3], shifted + turned @ below[:3, 3]
+
+
+def _transform(pose: tuple[Array, Array]) -> Array:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = pose[0][0], pose[1][0]
+    return out
+
+
+def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Array, float]:
+    """Return the center in the parent and in the child, m, and the farthest it is missed by.
+
+    Where the motion hardly cares (along an axis) it is the one nearest to the joint's own frame.
+    """
+    own = joint.child.transform[:3, 3]
+    seen = shifts + turns @ own
+    middle = seen.mean(axis=0)
+    fixed = np.broadcast_to(-np.eye(3), turns.shape)
+    design = np.concatenate((turns, fixed), axis=-1).reshape(-1, 6)
+    pull = _AT_HOME * np.sqrt(len(turns)) * np.eye(6)
+    wanted = np.concatenate(((middle - seen).ravel(), np.zeros(6)))
+    shift = np.linalg.lstsq(np.concatenate((design, pull)), wanted)[0]
+    missed = np.linalg.norm(seen + turns @ shift[:3] - middle - shift[3:], axis=-1)
+    return middle + shift[3:], own + shift[:3], float(missed.max())
+
+
+def _ball(
+    joint: OsimJoint, motion: JointMotion, turning: list[Coordinate], welded: NearestJoint
+) -> NearestJoint:
+    drawn = np.random.default_rng(0).random((4 * _SAMPLES, len(turning)))
+    values = {
+        c.name: _span(c)[0] + drawn[:, i] * (_span(c)[1] - _span(c)[0])
+        for i, c in enumerate(turning)
+    }
+    above, own, missed = _centers(joint, *_sampled(joint, motion, values))
+    remarks = []
+    if len(turning) < _ALL:
+        remarks.append(f"{joint.name}: turns about any axis, not only by {_names(turning)}")
+    if missed > _TELL_M:
+        remarks.append(
+            f"{joint.name}: its moving center became a fixed one, off by {1000 * missed:.1f} mm"
+            " at most"
+        )
+    return replace(welded, kind="ball", center_in_parent=above, center=own, remarks=tuple(remarks))
+
+
+def _about_one(
+    joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
+) -> NearestJoint:
+    """Return the hinge that a coordinate turns, or the curve on which it leads its segment."""
+    span = _span(coordinate)
+    zero = min(max(0.0, span[0]), span[1])
+    values = np.concatenate(([zero, *span], np.linspace(*span, _SAMPLES)))
+    turns, shifts = _sampled(joint, motion, {coordinate.name: values})
+    rest, axis, angles, bent = _axis(np.delete(turns, [1, 2], axis=0))
+    above, own, missed = _centers(joint, turns[3:], shifts[3:])
+    if missed > _TELL_M or bent > _TELL_RAD:
+        return _coupled(joint, motion, coordinate, welded)
+    ends = _turned_about(rotation.from_matrix(rest), rotation.from_matrix(turns[1:3]), axis)[1]
+    limits = (min(ends[0], angles[1]), max(ends[1], angles[-1]))
+    transform = np.eye(4)
+    transform[:3, :3] = rest
+    return replace(
+        welded,
+        kind="hinge",
+        rest=transform,
+        center_in_parent=above,
+        center=own,
+        axis=axis,
+        limits=(float(limits[0]), float(limits[1])),
+    )
+
+
+def _coupled(
+    joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
+) -> NearestJoint:
+    """Return the joint as samples of its motion, some beyond its range; both told apart."""
+    low, high = _span(coordinate)
+    zero = min(max(0.0, low), high)
+    values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)
+    turns, shifts = _sampled(joint, motion, {coordinate.name: np.append(values, zero)})
+    own = joint.child.transform[:3, 3]
+    seen = shifts + turns @ own
+    above = seen[-1]
+    path = np.column_stack((values, rotation.from_matrix(turns[:-1]), seen[:-1] - above))
+    # every second sample stands for all; those in between tell how well
+    turned, found = CoupledCurve.through(path[::2].tolist()).at(values)
+    missed = float(np.linalg.norm(found[:, 1:4] - path[:, 5:], axis=1).max())
+    bent = float(np.linalg.norm(turned - turns[:-1], axis=(1, 2)).max() / np.sqrt(2.0))
+    remark = f"{joint.name}: {joint.kind} of {coordinate.name} became a coupled joint"
+    if missed > _TELL_M or bent > _TELL_RAD:
+        remark += f", off by {1000 * missed:.1f} mm and {np.degrees(bent):.1f} degrees at most"
+    return replace(
+        welded,
+        kind="coupled",
+        center_in_parent=above,
+        center=own,
+        limits=(low, high),
+        path=path[::2],
+        remarks=(remark,),
+    )
+
+
+def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
+    """Return rest, axis, angles and the farthest turn beside the axis, of rotations (n, 3, 3).
+
+    Rest and axis in turns: the mean of what the hinge does not explain, then the first direction
+    of what turns from there. The angle of the first rotation is zero.
+    """
+    q = rotation.from_matrix(turns)
+    rest = q[0]
+    axis, angles = _turned_about(rest, q)
+    for _ in range(20):
+        rest = rotation.average(rotation.multiply(q, rotation.exp(-angles[:, None] * axis)))
+        axis, angles = _turned_about(rest, q)
+    if angles[-1] < angles[1]:
+        axis, angles = -axis, -angles
+    rest = rotation.multiply(rest, rotation.exp(angles[0] * axis))
+    angles = angles - angles[0]
+    nearest = rotation.multiply(rest, rotation.exp(angles[:, None] * axis))
+    return rotation.to_matrix(rest), axis, angles, float(rotation.angle_between(nearest, q).max())
+
+
+def _turned_about(rest: Array, q: Array, axis: Array | None = None) -> tuple[Array, Array]:
+    """Return `axis`, or the direction about which most turns from `rest`, and the turns, rad."""
+    v = rotation.log(rotation.multiply(rotation.conjugate(rest), q))
+    if axis is None:
+        axis = np.asarray(np.linalg.svd(v, full_matrices=False)[2][0])
+    return axis, v @ axis

@@ -1,0 +1,45 @@
+"""Whether a chain read from a file can be in metres.
+
+Law: files say millimetres and mean them, or say nothing; a chain a thousand times too large would
+still fit some movement. No part of a body is ten metres from its own segment, so such a file is
+refused.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.text import Malformed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+FARTHEST_M = 10.0
+
+
+def in_metres(path: Path, model: ChainModel) -> ChainModel:
+    """Return the model.
+
+    Raises
+    ------
+    Malformed
+        A marker or a joint center lies more than 10 m from its segment's origin.
+    """
+    points = {f"marker {m.name!r}": m.position for m in model.markers}
+    for s in model.segments:
+        points[f"center of {s.name!r}"] = s.joint.center
+        points[f"center of {s.name!r} in its parent"] = s.joint.center_in_parent
+        for sample in s.joint.path:
+            points[f"path of {s.name!r} at {sample[0]:g}"] = sample[5:]
+    far = {what: float(np.abs(at).max()) for what, at in points.items()}
+    what = max(far, key=lambda name: far[name])
+    if far[what] > FARTHEST_M:
+        raise Malformed(
+            f"{path}: {what} is {far[what]:.3g} m away from its segment; lengths must be metres: is"
+            " the file in millimetres?"
+        )
+    return model

@@ -1,0 +1,187 @@
+"""NPZ, trials as arrays: orientations of sensors, and of bones where a reference knew them.
+
+Law: handed over in the project's world (z up, x right, y forward) with segment frames likewise,
+whatever axes the file has. Arrays of a file, n instants::
+
+    t        (n,)     seconds
+    ID_quat  (n, 4)   orientation of sensor ID, (w, x, y, z), sensor to world
+    q_BONE   (n, 4)   orientation of a bone, bone to world
+    p_BONE   (n, 3)   its origin, m
+    up       ()       "y" or "z": the file's upward axis; left out it is y, with x forward (OpenSim)
+
+A y-up file is turned by the cyclic renaming of OpenSim's axes (x forward, y up, z right): a vector
+(x, y, z) becomes (z, x, y), a quaternion (w, x, y, z) becomes (w, z, x, y). That renames the
+segments' axes too, which are named like the world's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from zipfile import ZipFile
+
+import numpy as np
+
+from jointfit_daemon.files.text import Malformed, refuse_device, require_times
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from zipfile import ZipInfo
+
+    from numpy.typing import ArrayLike, NDArray
+
+_GIB = 1 << 30
+LARGEST = _GIB
+"""Bytes of all arrays of a file, unpacked: 15 hours of four sensors at 100 Hz."""
+_KINDS = "biufU"
+"""Kinds of arrays that are read: truth values, numbers, text (``up``)."""
+_SENSOR = "_quat"
+_BONE, _ORIGIN = "q_", "p_"
+
+
+@dataclass(frozen=True, slots=True)
+class OrientationTrial:
+    """Sensors and bones over time, z up."""
+
+    t_s: NDArray[np.float64]
+    """Shape (n,), s."""
+    sensors: Mapping[str, NDArray[np.float64]]
+    """q_world_sensor by id, shape (n, 4), unit; NaN where missing."""
+    bones: Mapping[str, NDArray[np.float64]]
+    """q_world_segment by bone, shape (n, 4), unit."""
+    origins: Mapping[str, NDArray[np.float64]]
+    """Origin of each bone (its proximal joint center), m, shape (n, 3)."""
+
+
+def vectors_z_up(vectors: ArrayLike) -> NDArray[np.float64]:
+    """Return vectors (x, y, z) of OpenSim's axes as (z, x, y), shape (..., 3)."""
+    return np.asarray(vectors, dtype=np.float64)[..., [2, 0, 1]]
+
+
+def quaternions_z_up(quaternions: ArrayLike) -> NDArray[np.float64]:
+    """Return quaternions (w, x, y, z) of OpenSim's axes as (w, z, x, y), unit, shape (..., 4)."""
+    turned = np.asarray(quaternions, dtype=np.float64)[..., [0, 3, 1, 2]]
+    return _unit(turned)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return all arrays of an NPZ file.
+
+    Raises
+    ------
+    Malformed
+        It is none, is cut off, unpacks to more than `LARGEST`, or holds Python objects.
+    """
+    refuse_device(path)
+    with path.open("rb") as file:
+        try:
+            with ZipFile(file) as archive:
+                return _arrays(path, archive)
+        except Malformed:
+            raise
+        except Exception as fault:  # zipfile and its codecs raise ten kinds for broken archives
+            raise Malformed(f"{path}: not an NPZ file, or cut off: export it again") from fault
+
+
+def _arrays(path: Path, archive: ZipFile) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an archive; never reads a pickle, never more than the members hold."""
+    members = archive.infolist()
+    unpacked = sum(member.file_size for member in members)
+    if unpacked > LARGEST:
+        raise Malformed(
+            f"{path}: {unpacked / _GIB:.1f} GiB when unpacked, at most {LARGEST / _GIB:g} GiB are"
+            " read: split the trial"
+        )
+    return {
+        member.filename.removesuffix(".npy"): _array(path, archive, member) for member in members
+    }
+
+
+def _array(path: Path, archive: ZipFile, member: ZipInfo) -> NDArray[Any]:
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, by_columns, dtype = read_header(file)
+        if dtype.kind not in _KINDS:
+            raise Malformed(
+                f"{path}: array {member.filename} holds {dtype.name} values, expected numbers:"
+                " save it without Python objects"
+            )
+        data = file.read()
+    flat = np.frombuffer(data, dtype=dtype)
+    return flat.reshape(shape, order="F" if by_columns else "C").copy()
+
+
+def read_orientations_npz(path: Path) -> OrientationTrial:
+    """Return the trial of an NPZ file.
+
+    Raises
+    ------
+    Malformed
+        As `read_arrays`; no ``t``, or neither a sensor nor a bone.
+    """
+    arrays = read_arrays(path)
+    names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]
+    bones = [n.removeprefix(_BONE) for n in arrays if n.startswith(_BONE)]
+    if "t" not in arrays or not (names or bones):
+        found = ", ".join(arrays) or "none"
+        raise Malformed(
+            f"{path}: arrays t and ID_quat or q_BONE are missing: found {found}; rename or add them"
+        )
+    z_up = "up" in arrays and str(arrays["up"]) == "z"
+    turn = _unit if z_up else quaternions_z_up
+    move = _plain if z_up else vectors_z_up
+
+    t_s = _numbers(path, arrays, "t", None)
+    require_times(path, t_s)
+    count = len(t_s)
+    return OrientationTrial(
+        t_s,
+        {n: turn(_numbers(path, arrays, n + _SENSOR, (count, 4))) for n in names},
+        {b: turn(_numbers(path, arrays, _BONE + b, (count, 4))) for b in bones},
+        {
+            b: move(_numbers(path, arrays, _ORIGIN + b, (count, 3)))
+            for b in bones
+            if _ORIGIN + b in arrays
+        },
+    )
+
+
+def _numbers(
+    path: Path, arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, int] | None
+) -> NDArray[np.float64]:
+    """Return an array of `shape` (None: of one dimension) as numbers; `Malformed` otherwise."""
+    array = arrays[name]
+    if array.dtype.kind == "U":
+        raise Malformed(f"{path}: {name} holds text, expected numbers: save it as float64")
+    if array.shape != shape and not (shape is None and array.ndim == 1):
+        wanted = "(n,)" if shape is None else str(shape)
+        raise Malformed(
+            f"{path}: {name} has shape {array.shape}, expected {wanted}: one row for each instant"
+            " of t; gaps are NaN"
+        )
+    return array.astype(np.float64)
+
+
+def _unit(quaternions: ArrayLike) -> NDArray[np.float64]:
+    found = np.asarray(quaternions, dtype=np.float64)
+    norms = np.linalg.norm(found, axis=-1, keepdims=True)
+    unit: NDArray[np.float64] = found / np.where(norms > 0.0, norms, np.nan)  # 0 0 0 0: missing
+    return unit
+
+
+def _plain(vectors: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(vectors, dtype=np.float64)
+
+
+def write_orientations_npz(path: Path, trial: OrientationTrial) -> None:
+    """Write a trial, z up, compressed."""
+    arrays: dict[str, ArrayLike] = {"t": trial.t_s, "up": np.array("z")}
+    arrays |= {name + _SENSOR: values for name, values in trial.sensors.items()}
+    arrays |= {_BONE + bone: values for bone, values in trial.bones.items()}
+    arrays |= {_ORIGIN + bone: values for bone, values in trial.origins.items()}
+    np.savez_compressed(path, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})

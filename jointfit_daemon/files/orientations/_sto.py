@@ -1,0 +1,206 @@
+"""STO and MOT, tables over time as OpenSim writes them; and STO tables of orientations.
+
+Law: numbers are handed over as written, angles too: ``in_degrees`` says what they are. Free header
+lines and ``key=value`` lines up to ``endheader``, then the column names, then rows. In a table of
+orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body to world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.text import (
+    Malformed,
+    cells_of,
+    number,
+    read_lines,
+    refuse_vast,
+    require_times,
+    rows_of_numbers,
+    separator_of,
+    without_trailing_blanks,
+    written,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_ROW_KEYS = ("nrows", "datarows")
+_COLUMN_KEYS = ("ncolumns", "datacolumns")
+_QUATERNION = 4
+_SHOWN = 60  # characters of a cell in a message
+
+
+@dataclass(frozen=True, slots=True)
+class TimeTable:
+    """Named columns over time."""
+
+    columns: tuple[str, ...]
+    """Names without ``time``."""
+    t_s: NDArray[np.float64]
+    """Shape (n,), s."""
+    values: NDArray[np.float64]
+    """As written, shape (n, len(columns)); NaN where missing."""
+    in_degrees: bool
+    name: str = ""
+    """First header line."""
+    header: Mapping[str, str] = field(default_factory=dict)
+    """Keys in lower case, values as written."""
+    warnings: tuple[str, ...] = ()
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """Return one column, shape (n,); ValueError if there is none of that name."""
+        return self.values[:, self.columns.index(name)]
+
+
+@dataclass(frozen=True, slots=True)
+class OrientationTable:
+    """Orientations of several bodies over time."""
+
+    names: tuple[str, ...]
+    t_s: NDArray[np.float64]
+    """Shape (n,), s."""
+    quaternions: NDArray[np.float64]
+    """q_world_body in the file's axes, shape (n, len(names), 4); NaN where missing."""
+    rate_hz: float | None = None
+
+
+def read_sto(path: Path) -> TimeTable:
+    """Return the table of a STO or MOT file; tab, comma or blanks between cells.
+
+    Raises
+    ------
+    Malformed
+        No ``endheader``, no column row, no rows of data, or a first column that is not time.
+    """
+    name, header, columns, separator, body = _open(path)
+    rows = rows_of_numbers(path, body, separator, len(columns))
+    require_times(path, rows[:, 0])
+    counted = {_ROW_KEYS: len(rows), _COLUMN_KEYS: len(columns)}
+    doubts = tuple(
+        f"{key} says {header[key]}, counted {count}"
+        for keys, count in counted.items()
+        for key in keys
+        if key in header and header[key] != str(count)
+    )
+    in_degrees = header.get("indegrees", "no").lower() in {"yes", "true", "1"}
+    return TimeTable(columns[1:], rows[:, 0], rows[:, 1:], in_degrees, name, header, doubts)
+
+
+def read_orientations_sto(path: Path) -> OrientationTable:
+    """Return the orientations of a STO file with ``DataType=Quaternion``.
+
+    Raises
+    ------
+    Malformed
+        As `read_sto`, or cells that are not four numbers.
+    """
+    _, header, columns, separator, body = _open(path)
+    if header.get("datatype", "").lower() != "quaternion" or separator == ",":
+        raise Malformed(
+            f"{path}: not a table of orientations: expected DataType=Quaternion in the header and"
+            " tabs between the cells"
+        )
+    times, found, characters = [], [], 0
+    for at, line in body:
+        cells = without_trailing_blanks(cells_of(line, separator))
+        if not cells:
+            continue
+        times.append(number(path, at, cells[0]))
+        found.append([_quaternion(path, at, cell) for cell in cells[1 : len(columns)]])
+        characters += len(line)
+    t_s = np.array(times, dtype=np.float64)
+    require_times(path, t_s)
+    refuse_vast(
+        path,
+        rows=len(found),
+        columns=_QUATERNION * (len(columns) - 1),
+        characters=characters,
+    )
+
+    quaternions = np.full((len(times), len(columns) - 1, _QUATERNION), np.nan)
+    for to, row in zip(quaternions, found, strict=True):
+        to[: len(row)] = row or np.empty((0, _QUATERNION))
+    rate_hz = number(path, 1, header["datarate"]) if "datarate" in header else None
+    return OrientationTable(columns[1:], t_s, quaternions, rate_hz)
+
+
+def _quaternion(path: Path, at: int, cell: str) -> list[float]:
+    if not cell:
+        return [np.nan] * _QUATERNION
+    parts = cell.split(",")
+    if len(parts) > _QUATERNION:
+        raise Malformed(
+            f"{path}, line {at}: {cell[:_SHOWN]!r} is more than w,x,y,z: if it has decimal"
+            " commas, export the table with decimal points"
+        )
+    if len(parts) != _QUATERNION:
+        raise Malformed(
+            f"{path}, line {at}: {cell[:_SHOWN]!r} is not w,x,y,z: correct the cell, or leave it"
+            " empty"
+        )
+    return [number(path, at, part) for part in parts]
+
+
+def _open(
+    path: Path,
+) -> tuple[str, dict[str, str], tuple[str, ...], str | None, Iterator[tuple[int, str]]]:
+    """Return first line, header, column names, separator, and the numbered rows."""
+    lines = read_lines(path)
+    header: dict[str, str] = {}
+    end = 0
+    for end, line in enumerate(lines):  # noqa: B007 - the place is wanted after the loop
+        plain = line.rstrip(", \t")
+        if plain.lower() == "endheader":
+            break
+        key, equals, value = plain.partition("=")
+        if equals:
+            header[key.strip().lower()] = value.strip()
+    else:
+        raise Malformed(f"{path}: not a STO or MOT file (no endheader line): export it again")
+    if end + 1 >= len(lines):
+        raise Malformed(f"{path}: no column names after endheader: export it again")
+    separator = separator_of(lines[end + 1])
+    columns = tuple(without_trailing_blanks(cells_of(lines[end + 1], separator)))
+    if not columns or columns[0].lower() != "time":
+        raise Malformed(f"{path}, line {end + 2}: the first column must be called time: name it so")
+    body = enumerate(lines[end + 2 :], start=end + 3)
+    return lines[0].rstrip(", \t"), header, columns, separator, body
+
+
+def write_sto(path: Path, table: TimeTable) -> None:
+    """Write a STO or MOT file: tab-separated, 8 significant digits, empty cells for missing."""
+    rows = [
+        table.name or path.stem,
+        "version=1",
+        f"nRows={len(table.t_s)}",
+        f"nColumns={1 + len(table.columns)}",
+        f"inDegrees={'yes' if table.in_degrees else 'no'}",
+        "endheader",
+        "\t".join(("time", *table.columns)),
+    ]
+    for t_s, values in zip(table.t_s, table.values, strict=True):
+        rows.append("\t".join(map(written, (t_s, *values))))
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def write_orientations_sto(path: Path, table: OrientationTable) -> None:
+    """Write a STO file of quaternions as OpenSim's OpenSense reads them."""
+    rows = [
+        *([f"DataRate={written(table.rate_hz)}"] if table.rate_hz else []),
+        "DataType=Quaternion",
+        "version=3",
+        "OpenSimVersion=4.4",
+        "endheader",
+        "\t".join(("time", *table.names)),
+    ]
+    for t_s, quaternions in zip(table.t_s, table.quaternions, strict=True):
+        cells = ("" if np.isnan(q[0]) else ",".join(map(written, q)) for q in quaternions)
+        rows.append("\t".join((written(t_s), *cells)))
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -1,0 +1,179 @@
+"""TOML and JSON files from anywhere, read within bounds: every fault is `Malformed`.
+
+Invariant: no content of a file raises anything but `Malformed`, reads more than `most_bytes`, waits
+for a writer or exceeds the recursion limit of a later reader.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.files.text._tables import Malformed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+MOST_BYTES = 4 * 1024 * 1024
+"""Size of the largest TOML or JSON file written by hand, with a large margin."""
+DEEPEST = 32
+"""Levels of nesting; no format of the project needs ten."""
+_MOST_BITS = 64
+_KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+_PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*')"""
+_DEEP_KEY = re.compile(
+    rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{DEEPEST}}}{_PART}", re.MULTILINE
+)
+"""A dotted key of more than `DEEPEST` parts, as the key of a value or of a table."""
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+
+
+def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
+    """Return the table of a TOML file.
+
+    Raises
+    ------
+    Malformed
+        It cannot be read, is no regular file, too large, not UTF-8 or not TOML.
+    """
+    table: dict[str, Any] = _parsed(path, "TOML", parse_toml, read_text(path, most_bytes))
+    return table
+
+
+def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
+    """Return the value of a JSON file; NaN and infinity are refused, as in the standard.
+
+    Raises
+    ------
+    Malformed
+        It cannot be read, is no regular file, too large, not UTF-8 or not JSON.
+    """
+    return _parsed(path, "JSON", parse_json, read_text(path, most_bytes))
+
+
+def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
+    """Return the text of a UTF-8 file, without a byte order mark.
+
+    Raises
+    ------
+    Malformed
+        It cannot be read, is no regular file, too large or not UTF-8.
+    """
+    data = read_bounded(path, most_bytes)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        found = "UTF-16" if data.startswith(_UTF_16) else f"byte {data[error.start]:#04x}"
+        line = data.count(b"\n", 0, error.start) + 1
+        raise Malformed(
+            f"{path}: is not UTF-8: found {found} (line {line}): save the file as UTF-8"
+        ) from error
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Return the bytes of a regular file.
+
+    Raises
+    ------
+    Malformed
+        It cannot be read, is no regular file or holds more than `most_bytes`.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
+        try:
+            kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
+            if kind != stat.S_IFREG:
+                found = _KINDS.get(kind, "a special file")
+                raise Malformed(f"{path}: is {found}, expected a regular file")
+            with os.fdopen(descriptor, "rb", closefd=False) as file:
+                data = file.read(most_bytes + 1)
+        finally:
+            os.close(descriptor)
+    except ValueError as error:  # a NUL in the name; or Malformed, from above
+        if isinstance(error, Malformed):
+            raise
+        raise Malformed(f"{str(path)!r}: is no name of a file: {error}") from error
+    except OSError as error:
+        raise Malformed(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(data) > most_bytes:
+        raise Malformed(f"{path}: larger than {most_bytes} bytes: is it the right file?")
+    return data
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the table of a TOML text.
+
+    Raises
+    ------
+    ValueError
+        Not TOML.
+    RecursionError
+        Nested too deeply.
+    """
+    # tomllib needs time and memory that grow with the square of the parts of a dotted key.
+    if _DEEP_KEY.search(text):
+        raise RecursionError(f"a key of more than {DEEPEST} parts")
+    return tomllib.loads(text)
+
+
+def parse_json(text: str) -> Any:
+    """Return the value of a JSON text.
+
+    Raises
+    ------
+    ValueError
+        Not JSON, or holds NaN or infinity.
+    RecursionError
+        Nested too deeply.
+    """
+    return json.loads(text, parse_constant=_refuse_constant)
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> Any:
+    try:
+        value = parse(text)
+    except RecursionError as error:
+        raise Malformed(f"{path}: nested more than {DEEPEST} levels deep") from error
+    except ValueError as error:  # an integer of 5000 digits is one, too
+        raise Malformed(f"{path}: not {name}: {error}") from error
+    if fault := plain_fault(value):
+        raise Malformed(f"{path}: {fault}")
+    return value
+
+
+def plain_fault(value: object) -> str | None:
+    """Return why a parsed value would make a later reader fail, or None.
+
+    Checked are the depth and integers beyond 64 bits. Iterative, since the value may be deeper than
+    the stack.
+    """
+    waiting: list[tuple[object, str, int]] = [(value, "", 0)]
+    while waiting:
+        here, key, depth = waiting.pop()
+        if depth > DEEPEST:
+            return f"{key[:60]}…: nested more than {DEEPEST} levels deep"
+        if isinstance(here, dict):
+            waiting += [
+                (inner, f"{key}.{name}" if key else str(name), depth + 1)
+                for name, inner in here.items()
+            ]
+        elif isinstance(here, (list, tuple)):
+            waiting += [(inner, f"{key}[{at}]", depth + 1) for at, inner in enumerate(here)]
+        elif isinstance(here, int) and here.bit_length() >= _MOST_BITS:
+            return f"{key}: an integer of more than 64 bits"
+    return None

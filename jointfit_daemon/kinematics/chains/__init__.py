@@ -1,0 +1,54 @@
+"""Chain models: rigid segments on joints with markers, and the pose of a chain."""
+
+from jointfit_daemon.kinematics.chains._coupled_joint import CoupledCurve
+from jointfit_daemon.kinematics.chains._layout import Layout, layout_of
+from jointfit_daemon.kinematics.chains._model import (
+    ChainModel,
+    ImpossibleModel,
+    Joint,
+    JointKind,
+    Marker,
+    Sample,
+    Segment,
+)
+from jointfit_daemon.kinematics.chains._motion import (
+    ChainState,
+    apply_step,
+    between_coordinates,
+    exp_matrix,
+    jacobian,
+    marker_positions,
+    moved,
+    placed,
+    rest_state,
+    segment_poses,
+    step_between,
+    transforms,
+    twists,
+)
+
+__all__ = [
+    "ChainModel",
+    "ChainState",
+    "CoupledCurve",
+    "ImpossibleModel",
+    "Joint",
+    "JointKind",
+    "Layout",
+    "Marker",
+    "Sample",
+    "Segment",
+    "apply_step",
+    "between_coordinates",
+    "exp_matrix",
+    "jacobian",
+    "layout_of",
+    "marker_positions",
+    "moved",
+    "placed",
+    "rest_state",
+    "segment_poses",
+    "step_between",
+    "transforms",
+    "twists",
+]

@@ -1,0 +1,148 @@
+"""The order of a chain as arrays: who moves whom, in which column, on which level.
+
+Law: computed once for a model, then only read; nothing here depends on an instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.kinematics.chains._coupled_joint import CoupledCurve
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains._model import ChainModel
+
+Index = NDArray[np.intp]
+
+LEVI: NDArray[np.float64] = np.zeros((3, 9))
+"""``(v @ LEVI).reshape(3, 3)`` is the matrix of the cross product with v."""
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    LEVI[_i, 3 * _k + _j], LEVI[_i, 3 * _j + _k] = 1.0, -1.0
+LEVI.setflags(write=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What every computation on a chain needs; S segments, nq degrees of freedom."""
+
+    nq: int
+    levels: tuple[tuple[Index | slice, Index | slice], ...]
+    """Segments with a parent, those of equal depth together, and their parents."""
+    free: Index | slice
+    """Free segments."""
+    corners: Array
+    """Transforms to the parent but for rotations and own centers, shape (S, 4, 4)."""
+    has_own_centers: bool
+    """Some joint center is not the origin of its segment."""
+    center: Array
+    """m, shape (S, 3); zero for free segments."""
+    segment_of: Index
+    """Segment of each degree of freedom, shape (nq,)."""
+    columns: tuple[tuple[int, slice], ...]
+    """Each segment and its degrees of freedom."""
+    turns: Array
+    """Axis (x, y, z, 0) of each turn, and a point (x, y, z, 1) it leaves in place, in segment axes;
+    no axis for shifts. Shape (nq, 4, 2)."""
+    shifts: Index
+    """Columns that shift a free segment."""
+    shift_twists: Array
+    """Their twists, shape (len(shifts), 6)."""
+    spread: Array
+    """Takes a step to the rotation vectors of all segments: shape (nq, 3 S)."""
+    below: Array
+    """1 where segment j is i or moves with it, shape (S, S)."""
+    moves: Array
+    """1 where a degree of freedom moves a segment, shape (S, nq)."""
+    lower: Array
+    """1 where the column's segment is the row's or before it on its way to the world, and the
+    column is not after the row; shape (nq, nq)."""
+    strictly_lower: Array
+    """The same without the diagonal."""
+    coupled: tuple[tuple[int, int, CoupledCurve], ...]
+    """Segment, column and curve of each coupled joint."""
+
+
+def layout_of(model: ChainModel) -> Layout:
+    """Return the layout of a model; the model keeps it."""
+    kept = model.__dict__.get("_layout")
+    if not isinstance(kept, Layout):
+        kept = _layout(model)
+        model.__dict__["_layout"] = kept  # beside its cached properties, as frozen as they are
+    return kept
+
+
+def _layout(model: ChainModel) -> Layout:
+    joints = [s.joint for s in model.segments]
+    parents = model.parents.tolist()
+    is_free = np.array([j.kind == "free" for j in joints])
+    columns = [(i, k) for i, c in enumerate(model.columns) for k in range(c.stop - c.start)]
+    axes = np.zeros((len(columns), 3))
+    for row, (i, k) in enumerate(columns):
+        if k < 3 and joints[i].kind != "coupled":
+            axes[row] = joints[i].axis if joints[i].kind == "hinge" else np.eye(3)[k]
+    segment_of = np.array([i for i, _ in columns], dtype=np.intp)
+    shifts = np.array([row for row, (_, k) in enumerate(columns) if k > 2], dtype=np.intp)
+    center = np.where(is_free[:, None], 0.0, [j.center for j in joints])
+    below = _below(parents)
+    corners = np.tile(np.eye(4), (len(joints), 1, 1))
+    corners[:, :3, 3] = np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints])
+    spread = np.zeros((len(columns), len(parents), 3))
+    spread[np.arange(len(columns)), segment_of] = axes
+    turns = np.zeros((len(columns), 4, 2))
+    turns[:, :3, 0], turns[:, :3, 1], turns[:, 3, 1] = axes, center[segment_of], 1.0
+    lower = np.tril(below[np.ix_(segment_of, segment_of)].T)
+    return Layout(
+        nq=len(columns),
+        levels=_levels(parents),
+        free=_index(np.flatnonzero(is_free).tolist()),
+        corners=corners,
+        has_own_centers=bool(center.any()),
+        center=center,
+        segment_of=segment_of,
+        columns=tuple(enumerate(model.columns)),
+        turns=turns,
+        shifts=shifts,
+        shift_twists=np.tile(np.eye(6)[3:], (len(shifts) // 3, 1)),
+        spread=spread.reshape(len(columns), -1),
+        below=below,
+        moves=below.T[:, segment_of],
+        lower=lower,
+        strictly_lower=np.tril(lower, -1),
+        coupled=tuple(
+            (i, c.start, CoupledCurve.through(j.path))
+            for i, (j, c) in enumerate(zip(joints, model.columns, strict=True))
+            if j.kind == "coupled"
+        ),
+    )
+
+
+def _below(parents: list[int]) -> Array:
+    below = np.eye(len(parents))
+    for i in reversed(range(len(parents))):
+        if parents[i] >= 0:
+            below[parents[i]] = np.maximum(below[parents[i]], below[i])
+    return below
+
+
+def _levels(parents: list[int]) -> tuple[tuple[Index | slice, Index | slice], ...]:
+    depth: list[int] = []
+    for parent in parents:
+        depth.append(0 if parent < 0 else depth[parent] + 1)
+    return tuple(
+        (_index(level), _index([parents[i] for i in level]))
+        for d in range(1, max(depth) + 1)
+        if (level := [i for i, at in enumerate(depth) if at == d])
+    )
+
+
+def _index(items: list[int]) -> Index | slice:
+    """Return evenly spaced items as a slice, which costs no copy."""
+    step = items[1] - items[0] if len(items) > 1 else 1
+    if items and step > 0 and items == list(range(items[0], items[-1] + 1, step)):
+        return slice(items[0], items[-1] + 1, step)
+    return np.array(items, dtype=np.intp)

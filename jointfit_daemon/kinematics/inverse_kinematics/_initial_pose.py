@@ -1,0 +1,157 @@
+r"""Where a search begins when nothing is known: each segment laid on its markers.
+
+Law: from the world outwards, a segment takes the rotation that brings its markers, and the joint
+center its parent already has, nearest to where they are (Wahba's problem); a hinge keeps only the
+turn about its axis, a coupled joint the nearest place on its curve. A start need not be the
+optimum, but it must lie in its valley.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.chains import exp_matrix, placed, rest_state
+from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import Slots, slots_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
+
+_SQUARINGS = 10
+_THIN_M2 = 1e-4
+"""Second largest moment of a cloud, sum of squares, below which its rotation is a guess: 1 cm."""
+_PULL_TO_REST = 1e-9
+"""Share of a segment's moments that speaks for its rest: decides only what the markers cannot."""
+
+
+def start_from_markers(
+    model: ChainModel, measured: Array, weights: Array
+) -> tuple[ChainState, NDArray[np.bool_]]:
+    """Return a state near the markers, and at which instants a segment had to be guessed.
+
+    Parameters
+    ----------
+    model
+        The chain.
+    measured
+        m, shape (T, S, 3, K), finite.
+    weights
+        Shape (T, S, K), zero where nothing was measured.
+    """
+    slots, count = slots_of(model), len(measured)
+    rest = rest_state(model).rotations[0]
+    curves = {segment: curve for segment, _, curve in slots.layout.coupled}
+    amounts: list[Array] = []
+    world_R = np.empty((count, len(model.segments), 3, 3))
+    world_t = np.empty((count, len(model.segments), 3))
+    A = np.empty_like(world_R)
+    guessed = np.zeros(count, dtype=np.bool_)
+    for i, (segment, parent) in enumerate(zip(model.segments, model.parents, strict=True)):
+        joint = segment.joint
+        curve = curves.get(i)
+        own, corner = np.asarray(joint.center), np.asarray(joint.center_in_parent)
+        if curve is not None:
+            corner = corner + curve.at(np.array([curve.home]))[1][0, 1:4]
+        if parent < 0:
+            above_R, center = np.eye(3)[None], corner[None]
+        else:
+            above_R = world_R[:, parent]
+            center = world_t[:, parent] + above_R @ corner
+        cloud = (
+            np.broadcast_to(slots.points[i, :3], measured[:, i].shape),
+            measured[:, i],
+            weights[:, i],
+        )
+        if joint.kind != "free":
+            cloud = _with_center(*cloud, own, center)
+        laid, middle, spans = _laid(*cloud, above_R @ rest[i])
+        guessed |= (spans < _THIN_M2) & _has_markers(slots, i)
+        turned = np.swapaxes(above_R, -1, -2) @ laid
+        A[:, i] = _about_axis(rest[i], turned, joint.axis) if joint.kind == "hinge" else turned
+        if curve is not None:
+            amounts.append(curve.nearest(turned))
+            A[:, i], coupling = curve.at(amounts[-1])
+            shifted = np.asarray(joint.center_in_parent) + coupling[:, 1:4] - corner
+            center = center + (above_R @ shifted[..., None])[..., 0]
+        world_R[:, i] = above_R @ A[:, i]
+        if joint.kind == "free":
+            world_t[:, i] = middle
+        else:
+            world_t[:, i] = center - world_R[:, i] @ own
+    found = np.stack(amounts, axis=1) if amounts else None
+    return placed(slots.layout, A, world_t[:, slots.layout.free], found), guessed
+
+
+def _with_center(
+    points: Array, measured: Array, weights: Array, own: Array, center: Array
+) -> tuple[Array, Array, Array]:
+    """Return a cloud with the joint center, which the parent has already, as one point more."""
+    count = len(points)
+    return (
+        np.concatenate((points, np.broadcast_to(own[:, None], (count, 3, 1))), axis=-1),
+        np.concatenate((measured, np.broadcast_to(center[..., None], (count, 3, 1))), axis=-1),
+        np.concatenate((weights, np.ones((count, 1))), axis=-1),
+    )
+
+
+def _laid(
+    points: Array, measured: Array, weights: Array, rest: Array
+) -> tuple[Array, Array, Array]:
+    """Return rotation (T, 3, 3), origin (T, 3) of one cloud, and its second moment, m^2, (T,)."""
+    total = np.maximum(weights.sum(axis=-1), 1e-12)[:, None]
+    middle_p = (points @ weights[..., None])[..., 0] / total
+    middle_y = (measured @ weights[..., None])[..., 0] / total
+    p, y = points - middle_p[..., None], measured - middle_y[..., None]
+    moments = (p * weights[:, None]) @ np.swapaxes(p, -1, -2)
+    size = np.trace(moments, axis1=-2, axis2=-1)
+    B = (y * weights[:, None]) @ np.swapaxes(p, -1, -2)
+    R = _nearest_rotation(B + (_PULL_TO_REST * size + 1e-12)[:, None, None] * rest)
+    minors = 0.5 * (size**2 - np.einsum("tij,tij->t", moments, moments))
+    second = minors / np.maximum(size, 1e-12)  # a little more than it, never much
+    return R, middle_y - (R @ middle_p[..., None])[..., 0], second
+
+
+def _has_markers(slots: Slots, i: int) -> bool:
+    """Return whether a segment has markers of its own at all: without any, nothing is guessed."""
+    return bool((slots.places // slots.shape[1] == i).any())
+
+
+def _nearest_rotation(B: Array) -> Array:
+    r"""Return the rotations, shape (T, 3, 3), that maximise :math:`tr(R^T B)`.
+
+    The quaternion is the first eigenvector of Davenport's matrix (here by repeated squaring, which
+    costs ten products and no decomposition). Source: Horn 1987, doi 10.1364/JOSAA.4.000629.
+    """
+    K = np.empty((len(B), 4, 4))
+    trace = np.trace(B, axis1=-2, axis2=-1)
+    K[:, 1:, 1:] = B + np.swapaxes(B, -1, -2)
+    K[:, 0, 1:] = K[:, 1:, 0] = np.stack(
+        (B[:, 2, 1] - B[:, 1, 2], B[:, 0, 2] - B[:, 2, 0], B[:, 1, 0] - B[:, 0, 1]), axis=-1
+    )
+    K[:, 0, 0] = trace
+    shift = np.sqrt(np.einsum("tij,tij->t", B, B))  # beyond the lowest eigenvalue / sqrt(3)
+    diagonal = np.arange(4)
+    K[:, diagonal, diagonal] += 1.8 * shift[:, None]
+    K[:, diagonal[1:], diagonal[1:]] -= trace[:, None]
+    for _ in range(_SQUARINGS):
+        K /= np.trace(K, axis1=-2, axis2=-1)[:, None, None]
+        K = K @ K
+    best = np.argmax(np.diagonal(K, axis1=-2, axis2=-1), axis=-1)
+    return rotation.to_matrix(rotation.normalize(K[np.arange(len(K)), :, best]))
+
+
+def _about_axis(rest: Array, turned: Array, axis: tuple[float, float, float]) -> Array:
+    r"""Return the hinge's rotation nearest to `turned`, shape (T, 3, 3).
+
+    .. math:: \tan\theta = \frac{\sum_{ij} R_{ij} [a]_{\times,ij}}{tr R - a^T R a}, \qquad
+              R = R_{rest}^T R_{turned}
+    """
+    R, a = rest.T @ turned, np.asarray(axis)
+    along = np.einsum("tij,ij->t", R, rotation.skew(a))
+    across = np.trace(R, axis1=-2, axis2=-1) - np.einsum("i,tij,j->t", a, R, a)
+    return np.asarray(rest @ exp_matrix(np.arctan2(along, across)[:, None] * a))

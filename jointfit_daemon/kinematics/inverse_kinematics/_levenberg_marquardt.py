@@ -1,0 +1,244 @@
+r"""The search itself: Levenberg and Marquardt over many instants, each at its own pace.
+
+Law: a step is taken only where it lowers the cost; where it does not, the damping grows. An instant
+that is done is left alone. Beside its markers the cost holds bands,
+
+.. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
+          v = \log(A_{ref}^T A)
+
+which hold open joints to the instant before (a band of no width) or hinges within their limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics.chains import (
+    ChainState,
+    between_coordinates,
+    layout_of,
+    moved,
+    rest_state,
+)
+from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
+    Fit,
+    fit,
+    normal_equations,
+    slots_of,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel, Layout
+
+_DAMPING = 1e-4
+_EASIER, _HARDER, _HOPELESS = 0.2, 8.0, 1e6
+_RIDGE = 1e-10
+_STILL = 1e-8  # rad, m: steps below it are rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Where turns should be, and how much it costs to be elsewhere."""
+
+    reference: ChainState
+    """Holds A_ref; at T instants or one."""
+    weights: Array
+    """m^2/rad^2, shape (T, nq)."""
+    low: Array
+    """rad, shape (nq,)."""
+    high: Array
+
+    @classmethod
+    def holding(cls, model: ChainModel, reference: ChainState, weights: Array) -> Band:
+        """Return a band that holds all joints but free ones to `reference`; weights (T,)."""
+        layout = layout_of(model)
+        joint = np.array([s.joint.kind != "free" for s in model.segments])[layout.segment_of]
+        zero = np.zeros(layout.nq)
+        return cls(reference, weights[:, None] * joint, zero, zero)
+
+    def take(self, instants: NDArray[np.intp]) -> Band:
+        """Return the band at some instants."""
+        return replace(
+            self, reference=self.reference.take(instants), weights=self.weights[instants]
+        )
+
+    def excess(self, layout: Layout, state: ChainState) -> Array:
+        """Return how far turns are outside, rad, shape (T, nq)."""
+        between = self.reference.rotations.swapaxes(-1, -2) @ state.rotations
+        v = log_matrix(between).reshape(len(between), -1) @ layout.spread.T
+        between_coordinates(layout, self.reference, state, v)
+        return np.asarray(v - np.clip(v, self.low, self.high))
+
+
+def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
+    """Return the band of the model's limits, none if it has none or they weigh nothing."""
+    joints = [s.joint for s in model.segments]
+    low, high = np.full(model.nq, -np.inf), np.full(model.nq, np.inf)
+    for joint, columns in zip(joints, model.columns, strict=True):
+        if joint.kind in ("hinge", "coupled") and joint.limits is not None:
+            low[columns], high[columns] = joint.limits
+    for _, column, curve in layout_of(model).coupled:  # told from rest, as a hinge's are
+        low[column], high[column] = low[column] - curve.home, high[column] - curve.home
+    limited = np.isfinite(low) | np.isfinite(high)
+    if weight == 0.0 or not limited.any():
+        return ()
+    return (Band(rest_state(model), weight * limited[None], low, high),)
+
+
+def log_matrix(R: Array) -> Array:
+    """Return rotation vectors of matrices, rad; fast, and without direction near half a turn."""
+    v = 0.5 * np.stack(
+        (
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ),
+        axis=-1,
+    )
+    sine = np.sqrt(np.einsum("...i,...i->...", v, v))
+    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    small = sine < 1e-9
+    scale = np.where(small, 1.0, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))
+    return np.asarray(v * scale[..., None])
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What is searched for, at T instants."""
+
+    model: ChainModel
+    measured: Array
+    """m, shape (T, S, 3, K), finite."""
+    weights: Array
+    """Shape (T, S, K)."""
+    tolerance: float
+    iterations: int
+    huber_m: float | None
+    reweightings: int
+    bands: tuple[Band, ...] = ()
+
+    @property
+    def typical_weight(self) -> float:
+        """Return the median weight of what was measured; 1 if nothing was."""
+        weighing = self.weights[self.weights > 0.0]
+        return float(np.median(weighing)) if weighing.size else 1.0
+
+    def take(self, instants: NDArray[np.intp], hold: Band | None = None) -> Problem:
+        """Return the problem at some instants, with one band more if given."""
+        kept = tuple(b if len(b.weights) == 1 else b.take(instants) for b in self.bands)
+        return replace(
+            self,
+            measured=self.measured[instants],
+            weights=self.weights[instants],
+            bands=kept if hold is None else (*kept, hold),
+        )
+
+    def at(self, state: ChainState) -> tuple[Fit, Array]:
+        """Return the fit of a state and its cost, m^2, shape (T,)."""
+        found = fit(slots_of(self.model), state, self.measured, self.weights)
+        cost = found.cost
+        for band in self.bands:
+            excess = band.excess(layout_of(self.model), state)
+            cost = cost + np.einsum("tk,tk->t", band.weights * excess, excess)
+        return found, cost
+
+    def equations(self, state: ChainState, at: Fit) -> tuple[Array, Array]:
+        """Return the normal matrix, shape (T, nq, nq), and the gradient, shape (T, nq)."""
+        H, g = normal_equations(slots_of(self.model), at)
+        for band in self.bands:
+            excess = band.excess(layout_of(self.model), state)
+            g = g + band.weights * excess
+            diagonal = np.einsum("tkk->tk", H)
+            diagonal += band.weights * ((excess != 0.0) | (band.low == band.high))
+        return H, g
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The end of a search."""
+
+    state: ChainState
+    weights: Array
+    """Shape (T, S, K), robust factors included."""
+    converged: NDArray[np.bool_]
+    iterations: NDArray[np.intp]
+
+
+def search(problem: Problem, start: ChainState) -> Found:
+    """Return the least cost from `start`, robust weights included."""
+    found = _descend(problem, start)
+    if problem.huber_m is None:
+        return found
+    iterations = found.iterations
+    for _ in range(problem.reweightings):
+        errors = problem.at(found.state)[0].errors
+        size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
+        factor = np.minimum(1.0, problem.huber_m / np.maximum(size, 1e-12))
+        weighed = replace(problem, weights=problem.weights * factor)
+        found = _descend(weighed, found.state)
+        iterations = iterations + found.iterations
+    return replace(found, iterations=iterations)
+
+
+def _descend(problem: Problem, start: ChainState) -> Found:
+    count = len(start)
+    found = start.copy()
+    converged = np.zeros(count, dtype=np.bool_)
+    iterations = np.zeros(count, dtype=np.intp)
+    here = np.arange(count)
+    state, part, damping = start, problem, np.full(count, _DAMPING)
+    at, cost = part.at(state)
+    layout = layout_of(problem.model)
+    for _ in range(problem.iterations):
+        H, g = part.equations(state, at)
+        diagonal = np.einsum("tkk->tk", H)
+        diagonal += damping[:, None] * diagonal + _RIDGE
+        step = np.asarray(-np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
+        onward = moved(layout, state, step)
+        there, new_cost = part.at(onward)
+        better = new_cost < cost
+        done = better & (cost - new_cost < problem.tolerance * cost)
+        done |= np.abs(step).max(axis=-1) < _STILL
+        damping = np.where(better, _EASIER, _HARDER) * damping
+        given_up = damping > _HOPELESS
+        iterations[here] += 1
+        state, at = _kept(better, (onward, there), (state, at))
+        cost = np.where(better, new_cost, cost)
+        ended = done | given_up
+        if ended.any():
+            found.put(here[ended], state.take(ended))
+            converged[here[ended]] = True
+            going = np.flatnonzero(~ended)
+            here, state, part = here[going], state.take(going), part.take(going)
+            at, cost, damping = at.take(going), cost[going], damping[going]
+            if not len(here):
+                break
+    found.put(here, state)
+    return Found(found, problem.weights, converged, iterations)
+
+
+def _kept(
+    better: NDArray[np.bool_], new: tuple[ChainState, Fit], old: tuple[ChainState, Fit]
+) -> tuple[ChainState, Fit]:
+    """Return the new where it is better."""
+    keep = better[:, None, None]
+    (onward, there), (state, at) = new, old
+    couplings = (
+        None
+        if onward.couplings is None or state.couplings is None
+        else np.where(keep, onward.couplings, state.couplings)
+    )
+    state = ChainState(
+        np.where(keep[..., None], onward.rotations, state.rotations),
+        np.where(keep, onward.origins, state.origins),
+        couplings,
+    )
+    pairs = ((there.world, at.world), (there.cloud, at.cloud), (there.weighted, at.weighted))
+    world, cloud, weighted = (np.where(keep[..., None], n, o) for n, o in pairs)
+    return state, Fit(world, cloud, weighted, couplings)

@@ -1,0 +1,178 @@
+r"""The least squares of a chain's markers, through sums over each segment's markers.
+
+Law: with :math:`S_k=(\alpha_k,\beta_k)` the twist of degree of freedom k, what a marker cloud adds
+to the normal matrix is :math:`S_k^T I S_l`, where
+
+.. math:: I = \sum_m w_m \begin{pmatrix} |x|^2 1 - x x^T & [x]_\times \\ -[x]_\times & 1
+          \end{pmatrix}
+
+of all markers that both k and l move: those at and beyond the deeper of their segments. So an
+instant costs sums over markers once, then only segments and degrees of freedom; it is the
+composite rigid body algorithm with markers for masses. Source: Featherstone, Rigid Body Dynamics
+Algorithms, 2008, section 6.2.
+
+Inside, the markers of each segment fill K slots, empty ones with weight zero: shape (T, S, 3, K).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics.chains import Layout, layout_of, transforms, twists
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """Where each marker of a model sits in arrays (T, S, 3, K)."""
+
+    layout: Layout
+    points: Array
+    """(x, y, z, 1) of each slot in segment axes, shape (S, 4, K)."""
+    places: NDArray[np.intp]
+    """Of each marker in (S, K), flat; shape (M,)."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """S and K."""
+        return self.points.shape[0], self.points.shape[2]
+
+    def filled(self, values: Array) -> Array:
+        """Return (T, M) as (T, S, K), zero in empty slots."""
+        out = np.zeros((len(values), self.shape[0] * self.shape[1]))
+        out[:, self.places] = values
+        return out.reshape(len(values), *self.shape)
+
+    def filled_vectors(self, values: Array) -> Array:
+        """Return (T, M, 3) as (T, S, 3, K), zero in empty slots."""
+        out = np.zeros((len(values), self.shape[0] * self.shape[1], 3))
+        out[:, self.places] = values
+        return np.ascontiguousarray(out.reshape(len(values), *self.shape, 3).swapaxes(-1, -2))
+
+    def taken(self, slots: Array) -> Array:
+        """Return (T, S, 3, K) as (T, M, 3)."""
+        flat = slots.swapaxes(-1, -2).reshape(len(slots), -1, 3)
+        return np.asarray(flat[:, self.places])
+
+
+def slots_of(model: ChainModel) -> Slots:
+    """Return the slots of a model's markers; the model keeps them."""
+    kept = model.__dict__.get("_slots")
+    if not isinstance(kept, Slots):
+        kept = _slots(model)
+        model.__dict__["_slots"] = kept
+    return kept
+
+
+def _slots(model: ChainModel) -> Slots:
+    segments = model.marker_segments
+    count = np.bincount(segments, minlength=len(model.segments))
+    width = max(int(count.max(initial=0)), 1)
+    order = np.array([int((segments[:m] == s).sum()) for m, s in enumerate(segments)])
+    points = np.zeros((len(model.segments), 4, width))
+    points[:, 3] = 1.0
+    points[segments, :3, order.astype(np.intp)] = model.positions
+    return Slots(layout_of(model), points, (segments * width + order).astype(np.intp))
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A chain at T instants beside its measured markers."""
+
+    world: Array
+    """Transforms of the segments, shape (T, S, 4, 4)."""
+    cloud: Array
+    """Rows x, y, z, 1 of each marker of the model, then its three errors; shape (T, S, 7, K)."""
+    weighted: Array
+    """The same times the weights."""
+    couplings: Array | None = None
+    """Of the state."""
+
+    @property
+    def errors(self) -> Array:
+        """Model minus measured, m, shape (T, S, 3, K)."""
+        return self.cloud[..., 4:, :]
+
+    @property
+    def cost(self) -> Array:
+        """Sum of weighted squares, m^2, shape (T,)."""
+        return np.asarray(
+            np.einsum("tsik,tsik->t", self.cloud[..., 4:, :], self.weighted[..., 4:, :])
+        )
+
+    def take(self, instants: NDArray[np.intp]) -> Fit:
+        """Return the fit at some instants."""
+        some = None if self.couplings is None else self.couplings[instants]
+        return Fit(self.world[instants], self.cloud[instants], self.weighted[instants], some)
+
+
+def fit(slots: Slots, state: ChainState, measured: Array, weights: Array) -> Fit:
+    """Return the chain beside its markers.
+
+    Parameters
+    ----------
+    slots
+        Of the model.
+    state
+        Of the chain.
+    measured
+        Shape (T, S, 3, K), m, finite.
+    weights
+        Shape (T, S, K), zero where nothing was measured.
+    """
+    world = transforms(slots.layout, state)
+    cloud = np.empty((*world.shape[:2], 7, slots.shape[1]))
+    np.matmul(world, slots.points, out=cloud[..., :4, :])
+    np.subtract(cloud[..., :3, :], measured, out=cloud[..., 4:, :])
+    return Fit(world, cloud, cloud * weights[:, :, None, :], state.couplings)
+
+
+def _sums_to_inertia() -> Array:
+    """Return what takes the sums (x, y, z, 1) w (x, y, z, 1, e)^T to (I, (x x e, e)), 6 x 7."""
+    out = np.zeros((4, 7, 6, 7))
+    cross = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    for i, j, k in cross:
+        for other in (j, k):
+            out[other, other, i, i] += 1.0
+            out[i, other, i, other] -= 1.0
+        out[i, 3, k, 3 + j] += 1.0  # [s]x at (k, j) is s_i
+        out[i, 3, j, 3 + k] -= 1.0
+        out[i, 3, 3 + k, j] -= 1.0
+        out[i, 3, 3 + j, k] += 1.0
+        out[3, 3, 3 + i, 3 + i] += 1.0
+        out[j, 4 + k, i, 6] += 1.0
+        out[k, 4 + j, i, 6] -= 1.0
+        out[3, 4 + i, 3 + i, 6] += 1.0
+    return out.reshape(28, 42)
+
+
+_INERTIA = _sums_to_inertia()
+
+
+def normal_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
+    """Return J^T W J, shape (T, nq, nq), and J^T W e, shape (T, nq)."""
+    lower, g = lower_equations(slots, at)
+    return lower + (lower * slots.layout.strictly_lower).swapaxes(-1, -2), g
+
+
+def lower_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
+    """Return the lower triangle of J^T W J, which is all a Cholesky factor needs, and J^T W e."""
+    layout, count = slots.layout, len(at.world)
+    sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)
+    beyond = layout.below @ sums.reshape(count, -1, 28)
+    bodies = (beyond @ _INERTIA).reshape(count, -1, 6, 7)
+    motion = twists(layout, at.world, at.couplings)
+    # by segment: gathering bodies for every degree of freedom would cost memory, and so time
+    pushed = np.empty((*motion.shape[:2], 7))
+    for s, columns in layout.columns:
+        np.matmul(motion[:, columns], bodies[:, s], out=pushed[:, columns])
+    lower = (pushed[..., :6] @ motion.swapaxes(-1, -2)) * layout.lower
+    return lower, pushed[..., 6]

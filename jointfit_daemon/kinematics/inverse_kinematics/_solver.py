@@ -1,0 +1,257 @@
+r"""Where a chain must be so that its markers lie nearest to the measured ones.
+
+Law: at every instant
+
+.. math:: q_t = \arg\min_q \sum_m w_{tm} |x_m(q) - y_{tm}|^2
+
+by Levenberg and Marquardt, all instants at once, each with its own damping. A marker that is NaN
+weighs nothing. An instant whose markers leave something open is told, and in a second pass, one
+instant after the other, begins at and is held to the instant before it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics.inverse_kinematics._initial_pose import start_from_markers
+from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import (
+    Band,
+    Problem,
+    limits_of,
+    search,
+)
+from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
+    fit,
+    normal_equations,
+    slots_of,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
+
+_TOGETHER = 4096
+"""Degrees of freedom searched together: their arrays stay in the processor's cache."""
+OPEN_M2 = 4e-4
+"""Information on a degree of freedom, m^2/rad^2, below which the markers leave it open: 2 cm."""
+
+
+@dataclass(frozen=True, slots=True)
+class IkOptions:
+    """How to search; the defaults are for markers on skin."""
+
+    iterations: int = 60
+    """At most, per instant and weighting."""
+    tolerance: float = 1e-7
+    """Relative decrease of the squared error at which an instant is done."""
+    huber_m: float | None = None
+    """Errors beyond weigh as c/|e|, m; None: plain least squares."""
+    reweightings: int = 2
+    """Rounds of new robust weights."""
+    hold_m2: float = 1e-4
+    """Weight, m^2/rad^2, of a joint's turn since the instant before, if markers leave one open."""
+    limit_m2: float = 0.0
+    """Weight, m^2/rad^2, of a hinge's excess over its limits; 0: limits are not looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class IkResult:
+    """Poses at T instants and how well they fit; S segments, M markers."""
+
+    state: ChainState
+    rotations: Array
+    """R_world_segment, shape (T, S, 3, 3)."""
+    origins: Array
+    """World origins of the segments, m, shape (T, S, 3)."""
+    residuals: Array
+    """Marker of the model minus measured, m, shape (T, M, 3); NaN where none was measured."""
+    weights: Array
+    """As used in the end, shape (T, M): 0 where missing, robust factors included."""
+    converged: NDArray[np.bool_]
+    """Shape (T,)."""
+    underdetermined: NDArray[np.bool_]
+    """The markers left some degree of freedom open, which was held; shape (T,)."""
+    iterations: NDArray[np.intp]
+    """Shape (T,)."""
+
+
+def solve_frames(
+    model: ChainModel,
+    markers: ArrayLike,
+    weights: ArrayLike | None = None,
+    *,
+    start: ChainState | None = None,
+    options: IkOptions | None = None,
+) -> IkResult:
+    """Return the poses that bring the model's markers nearest to the measured ones.
+
+    Parameters
+    ----------
+    model
+        Of S segments and M markers.
+    markers : array_like, shape (T, M, 3)
+        Measured, in the order of ``model.markers``, world, m; NaN where missing.
+    weights : array_like, shape (M,) or (T, M), optional
+        Of squared errors; the model's own if None.
+    start
+        Where to begin at each instant, length T; from the markers themselves if None.
+    options
+        `IkOptions()` if None.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not belong together, negative weights.
+    """
+    options = options or IkOptions()
+    measured, seen = checked_markers(model, markers)
+    w = checked_weights(model, weights, seen)
+    if start is not None and len(start) != len(measured):
+        raise ValueError(f"start has {len(start)} instants, the markers {len(measured)}")
+    slots = slots_of(model)
+    problem = Problem(
+        model,
+        slots.filled_vectors(measured),
+        slots.filled(w),
+        tolerance=options.tolerance,
+        iterations=options.iterations,
+        huber_m=options.huber_m,
+        reweightings=options.reweightings,
+        bands=limits_of(model, options.limit_m2),
+    )
+    if start is None:
+        start, guessed = start_from_markers(model, problem.measured, problem.weights)
+    else:
+        guessed = np.zeros(len(measured), dtype=np.bool_)
+    solution = _Solution.of(problem, start)
+    size = max(_TOGETHER // model.nq, 1)
+    for first in range(0, len(measured), size):
+        solution.solve(np.arange(first, min(first + size, len(measured))))
+    is_open = solution.is_open()
+    solution.follow(guessed | is_open, is_open, options.hold_m2 * problem.typical_weight)
+    return solution.result(seen, is_open)
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """What is being found, instant by instant; its arrays are written in place."""
+
+    problem: Problem
+    state: ChainState
+    weights: Array
+    converged: NDArray[np.bool_]
+    iterations: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, problem: Problem, start: ChainState) -> _Solution:
+        count = len(start)
+        return cls(
+            problem,
+            start.copy(),
+            problem.weights.copy(),
+            np.zeros(count, dtype=np.bool_),
+            np.zeros(count, dtype=np.intp),
+        )
+
+    def solve(self, instants: NDArray[np.intp], hold: Band | None = None) -> None:
+        """Search at some instants from where they are."""
+        part = self.problem.take(instants, hold)
+        found = search(part, self.state.take(instants))
+        self.state.put(instants, found.state)
+        self.weights[instants] = found.weights
+        self.converged[instants] = found.converged
+        self.iterations[instants] += found.iterations
+
+    def is_open(self) -> NDArray[np.bool_]:
+        """Return at which instants the markers leave a degree of freedom open.
+
+        That is where a pivot of the normal matrix is small, each being what the markers say about
+        one degree of freedom when those after it are free to follow.
+        """
+        slots = slots_of(self.problem.model)
+        at = fit(slots, self.state, self.problem.measured, self.weights)
+        return open_instants(normal_equations(slots, at)[0] / self.problem.typical_weight)
+
+    def follow(
+        self, doubtful: NDArray[np.bool_], is_open: NDArray[np.bool_], hold_m2: float
+    ) -> None:
+        """Search doubtful instants once more, each from the one before it (or after, at first).
+
+        Runs of doubtful instants do not touch each other, so their first ones are searched
+        together, then their second ones, and so on.
+        """
+        for instants, before in _waves(doubtful):
+            last = self.state.take(before)
+            self.state.put(instants, last)
+            held: Array = hold_m2 * is_open[instants].astype(np.float64)
+            hold = Band.holding(self.problem.model, last, held)
+            self.solve(instants, hold)
+
+    def result(self, seen: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> IkResult:
+        slots = slots_of(self.problem.model)
+        at = fit(slots, self.state, self.problem.measured, self.weights)
+        residuals = slots.taken(at.errors)
+        residuals[~seen] = np.nan
+        return IkResult(
+            self.state,
+            at.world[..., :3, :3],
+            at.world[..., :3, 3],
+            residuals,
+            self.weights.reshape(len(seen), -1)[:, slots.places],
+            self.converged,
+            is_open,
+            self.iterations,
+        )
+
+
+def open_instants(H: Array) -> NDArray[np.bool_]:
+    """Return where normal matrices, shape (T, nq, nq), leave a degree of freedom open."""
+    ridge = 1e-9 * np.eye(H.shape[-1])
+    pivots = np.diagonal(np.linalg.cholesky(H + ridge), axis1=-2, axis2=-1)
+    return np.asarray((pivots**2 < OPEN_M2).any(axis=-1))
+
+
+def _waves(doubtful: NDArray[np.bool_]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Return instants to be searched together and the solved ones they follow."""
+    good = np.flatnonzero(~doubtful)
+    bad = np.flatnonzero(doubtful)
+    if not good.size:
+        return [(bad[i : i + 1], bad[i - 1 : i]) for i in range(1, len(bad))]
+    last = np.searchsorted(good, bad) - 1
+    leading = last < 0
+    distance = np.where(leading, good[0] - bad, bad - good[last])
+    before = np.where(leading, bad + 1, bad - 1)
+    return [(bad[at], before[at]) for d in np.unique(distance) if (at := distance == d).any()]
+
+
+def checked_markers(model: ChainModel, markers: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Return measured markers with zeros for NaN, and which of them are there, shape (T, M)."""
+    measured = np.asarray(markers, dtype=np.float64)
+    if measured.ndim != 3 or measured.shape[1:] != (len(model.markers), 3):
+        raise ValueError(
+            f"markers have shape {measured.shape}, expected (instants, {len(model.markers)}, 3)"
+        )
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=-1))
+    return np.where(seen[..., None], measured, 0.0), seen
+
+
+def checked_weights(model: ChainModel, weights: ArrayLike | None, seen: NDArray[np.bool_]) -> Array:
+    """Return weights, shape (T, M), zero where nothing was measured."""
+    w = model.weights if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape not in {seen.shape, seen.shape[1:]}:
+        raise ValueError(f"weights have shape {w.shape}, expected {seen.shape[1:]} or {seen.shape}")
+    if not (np.isfinite(w) & (w >= 0.0)).all():
+        raise ValueError("weights must be finite and not negative")
+    return np.where(seen, w, 0.0)
+
+
+def tracking_error(residuals: Array) -> float:
+    """Return the root of the mean squared distance over all markers present, m; NaN if none is."""
+    square = np.einsum("...i,...i->...", residuals, residuals)
+    seen = np.isfinite(square)
+    return float(np.sqrt(square[seen].mean())) if seen.any() else float("nan")

@@ -1,0 +1,322 @@
+"""Streams of samples to frames at a fixed rate: every stream interpolated to the same instant.
+
+Law: pure; time comes in with samples and with ``advance``. Bounded memory. Frames come out in
+order, each once, whatever comes in. Every pushed sample gets exactly one verdict.
+
+Frame k is true for ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on when
+anything started. It goes out as soon as every living stream has a sample at or after t_k, or at
+its deadline: each stream's next sample is expected at its usual delay, and is waited for 1.5 of
+its periods at most. What is lacking then is continued from the last samples for up to 2.5 periods,
+and is missing after that.
+
+Invariant: frames never stop. While no stream can serve them, they go out without orientations, as
+soon as every stream counts as lost, and then at the usual delay. Only frames that nobody asked for
+within a second (the whole process was stopped) are passed over.
+
+In mode ``fast`` a stream is content with a sample one of its own periods before t_k, and what lies
+between is extrapolated: frames leave one period earlier, never before t_k itself.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from jointfit_daemon.timing.alignment._stream import Stream, StreamSpec, Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.model import Quaternion, Vector
+
+__all__ = ["AlignedFrame", "FrameAligner", "Mode", "StreamSpec", "Verdict"]
+
+Mode = Literal["smooth", "fast"]
+"""``smooth`` waits for samples and interpolates; ``fast`` extrapolates by a period at most."""
+
+OWED_NS = 1_000_000_000
+"""Frames without orientations that are older than this are passed over, ns: a process that was
+stopped for an hour would have to send 360 000 of them."""
+
+
+class AlignedFrame(NamedTuple):
+    """All streams at one instant."""
+
+    t_ns: int
+    completed_ns: int
+    """Arrival of the sample that completed the frame, or the deadline that ended the waiting."""
+    orientations: Mapping[str, Quaternion]
+    """Of every stream that is not missing, in the order of the streams."""
+    extrapolated: frozenset[str]
+    missing: frozenset[str]
+    synced: bool
+    """Whether the clocks behind all of `orientations` had settled; without any, whether those
+    behind the last frame with some had, until a stream ends."""
+
+
+_NONE: frozenset[str] = frozenset()
+
+
+class FrameAligner:
+    """Aligns streams of orientations to frames.
+
+    Parameters
+    ----------
+    streams : mapping of str to StreamSpec
+        The streams, by id; the order is the order of what comes out.
+    period_ns : int
+        Time from frame to frame, ns.
+    mode : {"smooth", "fast"}
+        Whether to wait for samples.
+    active : bool
+        While False samples are counted as idle and no frames come out.
+    begin_ns : int, optional
+        Instant from which on frames are owed, with or without samples, ns; by default that of the
+        first sample.
+
+    Raises
+    ------
+    ValueError
+        A period is not positive.
+    """
+
+    def __init__(
+        self,
+        streams: Mapping[str, StreamSpec],
+        period_ns: int,
+        *,
+        mode: Mode = "smooth",
+        active: bool = True,
+        begin_ns: int | None = None,
+    ) -> None:
+        if period_ns <= 0 or any(spec.period_ns <= 0 for spec in streams.values()):
+            raise ValueError("periods must be positive")
+        self._streams = {name: Stream(spec) for name, spec in streams.items()}
+        self._items = tuple(self._streams.items())
+        self._period_ns = period_ns
+        self._fast = mode == "fast"
+        self._active = active
+        self._next = None if begin_ns is None else -(-begin_ns // period_ns)
+        """Number of the next frame; None until a stream begins."""
+        self._served: int | None = None  # number of a frame some stream is known to serve
+        self._serves_ns: int | None = None  # first instant a stream can serve, if not the next
+        self._completed_ns = 0
+        self._synced = False
+        """Whether the clocks behind the last frame had settled."""
+        self._deadline_ns: int | None = None
+        self._changed = True  # since `_deadline_ns` was worked out
+        self._dues: dict[str, int] = {}
+        """When each stream is ready for the next frame; empty until that is asked."""
+        self.emitted_frames = 0
+        self.skipped_frames = 0
+        """Frames that were passed over, see ``OWED_NS``."""
+        self.forced_frames = 0
+        """Frames that went out at their deadline."""
+
+    # --- samples -----------------------------------------------------------------------------
+
+    def push(
+        self,
+        name: str,
+        t_ns: int,
+        arrival_ns: int,
+        q: Quaternion,
+        *,
+        synced: bool = True,
+        epoch: int = 0,
+        rate: Vector | None = None,
+    ) -> Verdict | None:
+        """Take one sample; return its verdict if that is certain already.
+
+        Parameters
+        ----------
+        name : str
+            A stream of this aligner; another is a KeyError.
+        t_ns, arrival_ns : int
+            Host instant it is true for, and of its arrival, ns.
+        q : Quaternion
+            Unit quaternion; its sign does not matter.
+        synced : bool
+            Whether its clock has settled.
+        epoch : int
+            Epoch of its clock: samples of different epochs are never joined.
+        rate : Vector, optional
+            Angular rate at `t_ns` in the sensor's own frame, rad/s, where it was measured.
+        """
+        stream = self._streams[name]
+        if not self._active:
+            return stream.idle()
+        self._changed = True
+        if epoch != stream.epoch:  # its samples so far will be forgotten
+            self._served = None
+        passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
+        verdict = stream.push(
+            t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns, rate=rate
+        )
+        if self._dues:  # of the others nothing has changed
+            self._dues[name] = self._due_of(stream)
+        return verdict
+
+    def counts(self, name: str) -> dict[str, int]:
+        """Return ``received`` and what became of it: the verdicts and ``pending`` add up to it."""
+        return self._streams[name].counts()
+
+    # --- frames ------------------------------------------------------------------------------
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """Return when ``advance`` will emit a frame if no sample comes; None: none is owed yet."""
+        if self._changed:
+            self._deadline_ns = self._due() if self._active else None
+            self._changed = False
+        return self._deadline_ns
+
+    @property
+    def next_ns(self) -> int | None:
+        """Return the instant of the next frame, ns; None: none is owed yet."""
+        return None if self._next is None else self._next * self._period_ns
+
+    def advance(self, now_ns: int, *, complete_only: bool = False) -> list[AlignedFrame]:
+        """Return the frames due at `now_ns`, in order.
+
+        Parameters
+        ----------
+        now_ns : int
+            Host instant, ns.
+        complete_only : bool
+            Return no frame that still lacks a sample, even if its deadline has passed. For calls
+            between two reads: after a stall of the process the missing sample has usually
+            arrived and waits in the kernel, to be read next.
+        """
+        frames: list[AlignedFrame] = []
+        while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
+            if complete_only and self._lacks_sample():
+                break
+            self._changed = True
+            if self._served == self._next or not self._pass_over(now_ns):
+                frames.append(self._emit(due_ns))
+        return frames
+
+    def _lacks_sample(self) -> bool:
+        """Return whether a stream that is waited for has no sample at or after the next frame."""
+        t_k = (self._next or 0) * self._period_ns
+        return any(
+            stream.waited_for and stream.newest_ns < (t_k - stream.period_ns if self._fast else t_k)
+            for _, stream in self._items
+        )
+
+    def _pass_over(self, now_ns: int) -> bool:
+        """Go on to what a stream can serve or is not too old; False if the next frame is."""
+        until_ns = now_ns - OWED_NS
+        if self._serves_ns is not None:
+            until_ns = min(until_ns, self._serves_ns)
+        first, following = -(-until_ns // self._period_ns), self._next or 0
+        if first <= following:
+            return False
+        self.skipped_frames += first - following
+        self._next = first
+        return True
+
+    def _find_servers(self) -> None:
+        """Note whether a stream serves the next frame, else from when on one will."""
+        starts = self._starts()
+        self._serves_ns = min(starts, default=None)
+        if self._next is None and self._serves_ns is not None:
+            self._next = self._served = -(-self._serves_ns // self._period_ns)
+
+    def _starts(self) -> list[int]:
+        """Return from when on streams can serve; settle those that cannot."""
+        starts: list[int] = []
+        t_next, served = self.next_ns, False
+        for _, stream in self._items:
+            if served and stream.waited_for:
+                continue  # one is enough, and this one has not ended
+            start = stream.serves_from(t_next)
+            if start is None:
+                stream.settle()
+            else:
+                starts.append(start)
+                served = served or start == t_next
+        if served:
+            self._served = self._next
+        return starts
+
+    def _due(self) -> int | None:
+        """Return when the next frame is or was complete, or its deadline if it is not, ns."""
+        if self._served is None or self._served != self._next:
+            self._dues.clear()
+            self._find_servers()
+        t_k = self.next_ns
+        if t_k is None:
+            return None
+        if self._served != self._next:
+            return max([t_k, *[stream.given_up_ns(t_k) for _, stream in self._items]])
+        if not self._dues:  # else more samples change nothing but their own stream's
+            self._dues = {name: self._due_of(stream) for name, stream in self._items}
+        latest = max(self._dues.values())
+        return max(t_k, latest) if self._fast else latest
+
+    def _due_of(self, stream: Stream) -> int:
+        t_k = (self._next or 0) * self._period_ns
+        return stream.due(t_k - stream.period_ns if self._fast else t_k)
+
+    def _emit(self, due_ns: int) -> AlignedFrame:
+        number = self._next or 0
+        t_k = number * self._period_ns
+        self._next = number + 1
+        self._completed_ns = completed_ns = max(self._completed_ns, due_ns)
+        orientations: dict[str, Quaternion] = {}
+        extrapolated: list[str] = []
+        missing: list[str] = []
+        synced, forced = True, False
+        for name, stream in self._items:
+            q = stream.at(t_k)
+            if q is None:
+                missing.append(name)
+                continue
+            orientations[name] = q
+            synced = synced and stream.synced
+            if stream.extrapolated:
+                extrapolated.append(name)
+                forced = True
+        if not orientations:  # as before, while no stream has ended: a pause unsettles no clock
+            synced = self._synced and any(stream.waited_for for _, stream in self._items)
+        self._synced = synced
+        self.emitted_frames += 1
+        self.forced_frames += forced
+        return AlignedFrame(
+            t_k,
+            completed_ns,
+            orientations,
+            frozenset(extrapolated) if extrapolated else _NONE,
+            frozenset(missing) if missing else _NONE,
+            synced,
+        )
+
+    # --- changes of state --------------------------------------------------------------------
+
+    @property
+    def active(self) -> bool:
+        """Whether frames are wanted."""
+        return self._active
+
+    @active.setter
+    def active(self, wanted: bool) -> None:
+        if self._active and not wanted:
+            self.close()
+        self._active, self._changed, self._served = wanted, True, None
+
+    def lose(self, name: str) -> None:
+        """Take it that the stream has ended: do not wait for it until it returns."""
+        self._streams[name].lose()
+        self._changed, self._served = True, None
+
+    def reset(self, name: str) -> None:
+        """Forget the samples of a stream whose clock began anew."""
+        self._streams[name].reset()
+        self._changed, self._served = True, None
+
+    def close(self) -> None:
+        """Give every pending sample its verdict; the next sample begins anew."""
+        for _, stream in self._items:
+            stream.reset()
+        self._changed, self._served = True, None

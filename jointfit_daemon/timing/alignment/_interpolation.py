@@ -1,0 +1,157 @@
+r"""Orientation between, and shortly after, the samples of one stream.
+
+Law: pure, tuples of floats, a few microseconds a call; knows no stream, no frame, no clock.
+
+All of it happens in the tangent space of the newest sample *a* at or before the instant,
+:math:`r(t) = \log(q_a^* q(t))`, where the other samples are plain vectors: no interval is joined to
+the next by anything but a polynomial through them. Angular rates are those of the body, in its own
+frame: :math:`\dot q = q \otimes (0, \omega/2)`.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import TYPE_CHECKING, Protocol
+
+from jointfit_daemon.kinematics.rotation_scalar import turn_one, turned_one
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Quaternion, Vector
+
+_NS = 1e-9
+BEND = 0.5
+"""Share of the measured curvature that is extrapolated: see docs/timing.md."""
+_CONTRADICTS, _CONTRADICTS_RAD = 0.25, 0.02
+"""By how much a turn between two samples may differ from their rates: relative, and rad."""
+
+
+class Known(Protocol):
+    """A sample as far as this module looks at it."""
+
+    t_ns: int
+    q: Quaternion
+    rate: Vector | None
+    """Angular rate in the sensor's own frame at ``t_ns``, rad/s; None: not measured."""
+    turn: Vector | None
+    """From the sample before it, rad, kept here once it is worked out; None where that is not yet
+    so, and again when another sample comes between them."""
+
+
+def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
+    r"""Return the orientation at `t_ns`, between the neighbors `a` and `b`.
+
+    With rates at both ends a cubic (Hermite) in the tangent space of `a`; else with a sample
+    `before` them a parabola through all three,
+
+    .. math:: r(x) = r_b \frac{x (x + h_0)}{h_1 (h_0 + h_1)}
+              + r_0 \frac{x (x - h_1)}{h_0 (h_0 + h_1)}
+
+    with :math:`h_0, h_1` the intervals before and after `a`; else at constant rate (slerp). The
+    parabola's error is of third order in the interval, that of slerp of second.
+
+    Parameters
+    ----------
+    before, a, b : Known
+        Neighbors in order of time; `before` may be missing. Signs of quaternions do not matter.
+    t_ns : int
+        Instant in ``[a.t_ns, b.t_ns]``.
+    """
+    x, h = (t_ns - a.t_ns) * _NS, (b.t_ns - a.t_ns) * _NS
+    turn = _turn_to(b, a)
+    if a.rate is not None and b.rate is not None and _agree(a.rate, b.rate, turn, h):
+        r = _hermite(a.rate, b.rate, turn, x, h)
+    elif before is not None:
+        h0 = (a.t_ns - before.t_ns) * _NS
+        m, n = x * (x + h0) / (h * (h0 + h)), x * (h - x) / (h0 * (h0 + h))
+        r = _combine(m, turn, n, _turn_to(a, before))  # seen from `a`, `before` is at minus that
+    else:
+        share = x / h
+        r = (share * turn[0], share * turn[1], share * turn[2])
+    return turned_one(a.q, r)
+
+
+def beyond(
+    earlier: Known | None, before: Known, a: Known, t_ns: int, bend: float = BEND
+) -> Quaternion:
+    r"""Return the orientation at `t_ns`, after the last sample `a`.
+
+    It goes on at the last rate, which is measured or that of the last interval, and bends as the
+    rates did for as long as that interval lasted:
+
+    .. math:: r(x) = v x + \tfrac12 \beta\, a\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
+              \quad x_c = \min(x, h_0)
+
+    with the last interval's rate *v*, the second divided difference *a*, and :math:`\beta` = 1/2:
+    in full it would follow a faster motion, and scatter more (docs/timing.md has the figures).
+
+    Parameters
+    ----------
+    earlier, before, a : Known
+        The last samples in order of time; `earlier` may be missing.
+    t_ns : int
+        Instant at or after ``a.t_ns``.
+    bend : float
+        Share beta of the measured curvature, used where rates are not measured.
+    """
+    x, h0 = (t_ns - a.t_ns) * _NS, (a.t_ns - before.t_ns) * _NS
+    x_c = min(x, h0)
+    turn = _turn_to(a, before)
+    if a.rate is not None and before.rate is not None and _agree(before.rate, a.rate, turn, h0):
+        ahead = x_c * (x - 0.5 * x_c) / h0
+        r = _combine(x + ahead, a.rate, -ahead, before.rate)
+    else:
+        r = _combine(x / h0, turn, 0.0, turn)
+        if earlier is not None:
+            h1 = (before.t_ns - earlier.t_ns) * _NS
+            first = turn_one(a.q, earlier.q)
+            # in the tangent space of `a`: earlier at `first`, before at -turn, a at 0
+            weight = bend * (x_c * (x_c + h0) + (2.0 * x_c + h0) * (x - x_c)) / (h0 + h1)
+            bent = _combine(weight * (1.0 / h0 + 1.0 / h1), turn, weight / h1, first)
+            r = (r[0] + bent[0], r[1] + bent[1], r[2] + bent[2])
+    return turned_one(a.q, r)
+
+
+def _turn_to(sample: Known, before: Known) -> Vector:
+    """Return the turn from the sample before, which the next interval asks for, too."""
+    if sample.turn is None:
+        sample.turn = turn_one(before.q, sample.q)
+    return sample.turn
+
+
+def _combine(m: float, u: Vector, n: float, v: Vector) -> Vector:
+    return (m * u[0] + n * v[0], m * u[1] + n * v[1], m * u[2] + n * v[2])
+
+
+def _cross(u: Vector, v: Vector) -> Vector:
+    return (
+        u[1] * v[2] - u[2] * v[1],
+        u[2] * v[0] - u[0] * v[2],
+        u[0] * v[1] - u[1] * v[0],
+    )
+
+
+def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
+    """Tell whether rates explain the turn between them: other axes or units would not."""
+    miss = size = 0.0
+    for i in range(3):
+        miss += (0.5 * h * (start[i] + end[i]) - turn[i]) ** 2
+        size += turn[i] ** 2
+    return sqrt(miss) <= _CONTRADICTS_RAD + _CONTRADICTS * sqrt(size)
+
+
+def _hermite(start: Vector, end: Vector, turn: Vector, x: float, h: float) -> Vector:
+    """Return the cubic from 0 to `turn` that leaves and arrives with the given body rates.
+
+    At its end the tangent is the rate through the inverse right Jacobian of the turn,
+    ``w + r x w / 2 + r x (r x w) / 12``, to third order.
+    """
+    across = _cross(turn, end)
+    twice = _cross(turn, across)
+    arrive = tuple(end[i] + 0.5 * across[i] + twice[i] / 12.0 for i in range(3))
+    s = x / h
+    m0, m1, n1 = h * s * (1.0 - s) ** 2, h * s * s * (s - 1.0), s * s * (3.0 - 2.0 * s)
+    return (
+        m0 * start[0] + m1 * arrive[0] + n1 * turn[0],
+        m0 * start[1] + m1 * arrive[1] + n1 * turn[1],
+        m0 * start[2] + m1 * arrive[2] + n1 * turn[2],
+    )

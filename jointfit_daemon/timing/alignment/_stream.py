@@ -1,0 +1,306 @@
+"""One stream on its way into frames: its waiting samples, its habits, its verdicts.
+
+Law: pure, bounded; knows nothing of the other streams. A sample stays while a frame may still need
+it, at most three at or before the last frame (what an extrapolation needs), and gets its verdict
+when it leaves.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import StrEnum
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.timing.alignment import _interpolation
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Quaternion, Vector
+
+CAPACITY = 512
+"""Samples that may wait in one stream."""
+PATIENCE = 1.45
+"""Periods a sample is waited for beyond its usual delay: under 1.5 with the delay's own ripple."""
+REACH = 2.5
+"""Periods after the last sample that may be extrapolated over."""
+GAP = 4.0
+"""Periods between two samples that may be interpolated over."""
+CROWDED = 0.5
+"""Periods between two samples that tell no rate: while a clock settles, stamps may crowd."""
+LOST_PERIODS = 3
+LOST_LEAST_NS = 50_000_000
+FUTURE_NS = 100_000_000
+"""A stamp this far after its own arrival is no stamp."""
+PAST_NS = 10_000_000_000
+"""A stamp this far before its arrival is of no use to anyone live."""
+DELAY_MOST_NS = 250_000_000
+"""A stream that is always later than this does not hold up the others."""
+
+_EARLY = 20  # a twentieth of a period: a sample due just before t_k may as well come just after
+_DELAY_STEP = 128
+_DELAY_UP = 3  # three steps up for one down: settles where a quarter of the samples is later
+_BEHIND = 3  # samples at or before a frame that an extrapolation needs
+
+
+class StreamSpec(NamedTuple):
+    """What is known of a stream beforehand."""
+
+    period_ns: int
+    """Nominal time from sample to sample, ns."""
+
+
+class Verdict(StrEnum):
+    """What became of a sample."""
+
+    USED = "used"
+    """Took part in at least one emitted frame."""
+    DECIMATED = "decimated"
+    """Passed over: the stream is faster than the frames."""
+    LATE = "late"
+    """Came when the frames that needed it were out, and no later frame needed it."""
+    DUPLICATE = "duplicate"
+    """Has the time of a sample that is there already."""
+    DROPPED = "dropped"
+    """Given up: overflow, reset, close, or a stamp from the future."""
+    IDLE = "idle"
+    """Came while nobody wanted frames."""
+
+
+class _Sample:
+    __slots__ = ("arrival_ns", "late", "q", "rate", "synced", "t_ns", "turn", "used")
+
+    def __init__(
+        self, t_ns: int, arrival_ns: int, q: Quaternion, rate: Vector | None, synced: bool
+    ) -> None:
+        self.t_ns, self.arrival_ns, self.q, self.rate = t_ns, arrival_ns, q, rate
+        self.synced = synced
+        self.late = self.used = False
+        self.turn: Vector | None = None
+
+
+class Stream:
+    """Samples of one stream between their arrival and their verdict."""
+
+    __slots__ = (
+        "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_gap_ns",
+        "_lost_after_ns", "_patience_ns", "_reach_ns", "_received", "_samples",
+        "epoch", "extrapolated", "newest_arrival_ns", "newest_ns", "period_ns",
+        "synced", "waited_for",
+    )  # fmt: skip
+
+    def __init__(self, spec: StreamSpec) -> None:
+        period = self.period_ns = spec.period_ns
+        self._patience_ns = round(PATIENCE * period)
+        self._reach_ns = round(REACH * period)
+        self._gap_ns = round(GAP * period)
+        self._crowded_ns = round(CROWDED * period)
+        self._lost_after_ns = max(LOST_PERIODS * period, LOST_LEAST_NS)
+        self._delay_step = max(1, period // _DELAY_STEP)
+        self._delay_ns: int | None = None  # usual arrival minus stamp
+        self._samples: deque[_Sample] = deque()
+        self.epoch: int | None = None
+        """Of the clock behind the samples."""
+        self.waited_for = False
+        """Whether more is expected of it."""
+        self._received = 0
+        self._counts = dict.fromkeys(Verdict, 0)
+        self.newest_ns = self.newest_arrival_ns = 0
+        self.extrapolated = self.synced = False
+        """What the last ``at`` did, and whether the clock behind it had settled."""
+
+    # --- in ----------------------------------------------------------------------------------
+
+    def idle(self) -> Verdict:
+        """Count a sample nobody wants."""
+        self._received += 1
+        return self._count(Verdict.IDLE)
+
+    def push(
+        self,
+        t_ns: int,
+        arrival_ns: int,
+        q: Quaternion,
+        *,
+        synced: bool,
+        epoch: int,
+        passed_ns: int | None,
+        rate: Vector | None = None,
+    ) -> Verdict | None:
+        """Take a sample; `passed_ns` is the last frame that is out. Return an early verdict."""
+        self._received += 1
+        if t_ns > arrival_ns + FUTURE_NS:
+            return self._count(Verdict.DROPPED)
+        if t_ns < arrival_ns - PAST_NS:
+            return self._count(Verdict.LATE)
+        if epoch != self.epoch:
+            self.reset()
+            self.epoch = epoch
+        samples = self._samples
+        sample = _Sample(t_ns, arrival_ns, q, rate, synced)
+        sample.late = passed_ns is not None and t_ns <= passed_ns
+        if samples and t_ns <= samples[-1].t_ns:
+            return self._insert(sample)
+        delay_ns, usual_ns = arrival_ns - t_ns, self._delay_ns
+        if usual_ns is not None:
+            least, most = usual_ns - self._delay_step, usual_ns + _DELAY_UP * self._delay_step
+            delay_ns = least if delay_ns < least else min(delay_ns, most)
+        self._delay_ns = delay_ns
+        samples.append(sample)
+        self.newest_ns, self.waited_for = t_ns, True
+        if arrival_ns > self.newest_arrival_ns:  # noqa: PLR1730 - max() costs more
+            self.newest_arrival_ns = arrival_ns
+        if len(samples) > CAPACITY:
+            self._leave(samples.popleft(), Verdict.DROPPED)
+        return None
+
+    def _insert(self, sample: _Sample) -> Verdict | None:
+        """Put a reordered sample where it belongs, if it is still worth anything there."""
+        samples = self._samples
+        at = len(samples)
+        while at and samples[at - 1].t_ns > sample.t_ns:
+            at -= 1
+        if at and samples[at - 1].t_ns == sample.t_ns:
+            return self._count(Verdict.DUPLICATE)
+        if sample.late or at == 0 or len(samples) >= CAPACITY:
+            return self._count(Verdict.LATE)
+        samples[at].turn = None
+        samples.insert(at, sample)
+        return None
+
+    # --- out ---------------------------------------------------------------------------------
+
+    def serves_from(self, t_ns: int | None) -> int | None:
+        """Return the first instant at or after `t_ns` that this stream can serve; None if none."""
+        samples = self._samples
+        if not samples:
+            return None
+        if t_ns is None:
+            return samples[0].t_ns
+        before = None
+        for sample in samples:
+            if sample.t_ns >= t_ns:
+                close = before is not None and sample.t_ns - before.t_ns <= self._gap_ns
+                return t_ns if close else self._reached(before, t_ns) or sample.t_ns
+            before = sample
+        return self._reached(before, t_ns)
+
+    def _reached(self, before: _Sample | None, t_ns: int) -> int | None:
+        return t_ns if before is not None and t_ns - before.t_ns <= self._reach_ns else None
+
+    def due(self, t_ns: int) -> int:
+        """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
+        if not self.waited_for:
+            return 0
+        newest = self.newest_ns
+        if newest < t_ns:
+            period = self.period_ns
+            expected = newest - (newest + period // _EARLY - t_ns) // period * period
+            deadline = expected + min(self._delay_ns or 0, DELAY_MOST_NS) + self._patience_ns
+            return min(deadline, self.newest_arrival_ns + self._lost_after_ns)
+        for sample in self._samples:
+            if sample.t_ns >= t_ns:
+                return sample.arrival_ns
+        return 0
+
+    def given_up_ns(self, t_ns: int) -> int:
+        """Return until when a frame at `t_ns` that no stream can serve waits for this one, ns.
+
+        A stream that still sends is waited for until its usual delay is over, however long that
+        is, and until it counts as lost.
+        """
+        if self.newest_ns >= t_ns:
+            return t_ns
+        delay_ns = self._delay_ns or 0
+        usual_ns = t_ns + min(delay_ns, DELAY_MOST_NS) + self._patience_ns
+        if not self.waited_for:
+            return usual_ns
+        return max(usual_ns, min(t_ns + delay_ns, self.newest_arrival_ns) + self._lost_after_ns)
+
+    def at(self, t_ns: int) -> Quaternion | None:
+        """Return the orientation at `t_ns`, which grows from call to call; None: missing."""
+        self.extrapolated = False
+        samples = self._samples
+        after = len(samples)  # as a place: of the first sample after `t_ns`, one of the newest
+        while after and samples[after - 1].t_ns > t_ns:
+            after -= 1
+        if not after:
+            return None
+        while after > _BEHIND:
+            self._leave(samples.popleft(), Verdict.DECIMATED)
+            after -= 1
+        last = after - 1
+        a = samples[last]
+        if a.t_ns == t_ns:
+            a.used, self.synced = True, a.synced
+            return a.q
+        if after < len(samples):
+            b = samples[after]
+            if b.t_ns - a.t_ns <= self._gap_ns:
+                return self._between(self._before(last), a, b, t_ns)
+        if t_ns - a.t_ns > self._reach_ns:
+            return None
+        return self._beyond(last, t_ns)
+
+    def _before(self, at: int) -> _Sample | None:
+        """Return the sample before the one at that place, if the two tell a rate."""
+        if not at:
+            return None
+        before = self._samples[at - 1]
+        apart_ns = self._samples[at].t_ns - before.t_ns
+        return before if self._crowded_ns <= apart_ns <= self._gap_ns else None
+
+    def _between(self, before: _Sample | None, a: _Sample, b: _Sample, t_ns: int) -> Quaternion:
+        a.used = b.used = True
+        self.synced = a.synced and b.synced
+        if before is not None and before.synced is a.synced:
+            before.used = True
+        else:
+            before = None
+        return _interpolation.between(before, a, b, t_ns)
+
+    def _beyond(self, last: int, t_ns: int) -> Quaternion | None:
+        before = self._before(last)
+        if before is None:
+            return None
+        a, earlier = self._samples[last], self._before(last - 1)
+        a.used = before.used = self.extrapolated = True
+        self.synced = a.synced and before.synced
+        if earlier is not None and earlier.synced is before.synced:
+            earlier.used = True
+        else:
+            earlier = None
+        return _interpolation.beyond(earlier, before, a, t_ns)
+
+    # --- end ---------------------------------------------------------------------------------
+
+    def lose(self) -> None:
+        """Stop waiting for this stream until a sample comes."""
+        self.waited_for = False
+
+    def settle(self) -> None:
+        """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
+        if self._samples and not self.waited_for:
+            self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples; what no frame used is dropped."""
+        samples = self._samples
+        while samples:
+            self._leave(samples.popleft(), Verdict.DROPPED)
+        self.waited_for, self.epoch = False, None
+
+    def counts(self) -> dict[str, int]:
+        """Return samples received, by verdict, and still pending."""
+        verdicts = {verdict.value: count for verdict, count in self._counts.items()}
+        return {"received": self._received, **verdicts, "pending": len(self._samples)}
+
+    def _leave(self, sample: _Sample, otherwise: Verdict) -> None:
+        if sample.used:
+            self._count(Verdict.USED)
+        elif sample.late and otherwise is Verdict.DECIMATED:
+            self._count(Verdict.LATE)
+        else:
+            self._count(otherwise)
+
+    def _count(self, verdict: Verdict) -> Verdict:
+        self._counts[verdict] += 1
+        return verdict

@@ -1,0 +1,148 @@
+"""The line under the fastest samples: device clock to host clock without asking the device.
+
+Law: pure, integers in, constant memory, constant time a sample (a refit now and then).
+
+With device time u and arrival A the difference ``y = A - u = c + s u + D`` has a delay
+``D >= D_min`` of unknown shape. The line wanted passes below every point and as close as it can:
+``feasible`` tells its mean and covariance. It rests on the fastest samples, so jitter of any shape
+leaves it unbiased but for D_min, which nobody can see from one side.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf, sqrt
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.timing.clock._feasible_line import mean_feasible_line
+
+if TYPE_CHECKING:
+    from jointfit_daemon.timing.clock._feasible_line import Point
+
+BUCKET_NS = 250_000_000
+"""Of each bucket only the fastest sample is kept."""
+BUCKETS = 240
+"""One minute: long against jitter, short against the temperature of a crystal."""
+YOUNG_NS = 10_000_000_000
+"""Until this span every bucket is worth a refit; later one in four seconds is."""
+SETTLED_NS = 2_000_000_000
+SETTLED_POINTS = 10
+TRUSTED_NS = 500_000.0
+"""Standard deviation below which the line is taken for settled; scattered delays leave it above."""
+FLOOR_NS = 10_000.0
+"""No envelope is believed better than this."""
+CRYSTAL = 50e-6
+"""Prior standard deviation of the skew of a clock."""
+NOMINAL_RATE = 5000e-6
+"""Prior standard deviation of a sample rate against its nominal value."""
+
+_OLD_REFIT_BUCKETS = 16
+_FLOOR_VAR = FLOOR_NS**2
+_LINE_POINTS = 3  # two make a line, the third a doubt
+
+
+class Envelope:
+    """Streaming lower envelope of (u, y).
+
+    The slope stays near its prior as long as the points cannot tell: with a short span or a few
+    scattered ones it is near 0, later the prior no longer matters.
+
+    Parameters
+    ----------
+    skew_sd : float
+        Prior standard deviation of the slope, dimensionless; its mean is 0.
+    """
+
+    __slots__ = (
+        "_best", "_best_key", "_bucket_end", "_c", "_points", "_prior", "_prior_sd", "_ref",
+        "_sealed", "_span", "_variance", "_y0", "settled", "skew",
+    )  # fmt: skip
+
+    def __init__(self, skew_sd: float = CRYSTAL) -> None:
+        self.skew = 0.0
+        """Slope s, dimensionless: positive when the device clock runs slow."""
+        self.settled = False
+        """Whether the line rests on enough."""
+        self._prior, self._prior_sd = 0.0, skew_sd
+        self._points: deque[Point] = deque(maxlen=BUCKETS)
+        self._best: Point | None = None
+        self._best_key = inf
+        self._bucket_end = self._ref = self._y0 = self._sealed = self._span = 0
+        self._c = 0.0
+        self._variance = (inf, 0.0, skew_sd**2)
+
+    @property
+    def skew_sigma(self) -> float:
+        """Standard deviation of ``skew``."""
+        return sqrt(self._variance[2])
+
+    def residual(self, u: int, y: int) -> float:
+        """Return how far (u, y) lies above the line, ns; 0 before the first point."""
+        if self._best is None:
+            return 0.0
+        return y - self._y0 - self._c - self.skew * (u - self._ref)
+
+    def offset_ns(self, u: int) -> int:
+        """Return the height of the line at `u`, ns: host time minus device time, plus D_min."""
+        return self.at(u)[0]
+
+    def sigma_ns(self, u: int) -> float:
+        """Return the standard deviation of the line at `u`, ns; inf before the third bucket."""
+        return self.at(u)[1]
+
+    def at(self, u: int) -> tuple[int, float]:
+        """Return ``offset_ns`` and ``sigma_ns`` together, as every sample needs them."""
+        ahead = u - self._ref
+        height, both, slope = self._variance
+        spread = height + ahead * (2.0 * both + ahead * slope)
+        sigma = sqrt(_FLOOR_VAR + spread) if spread > 0.0 else FLOOR_NS
+        return self._y0 + round(self._c + self.skew * ahead), sigma
+
+    def feed(self, u: int, y: int) -> float:
+        """Take a point with increasing `u`; return how far above the line it was, ns.
+
+        A point below the line pulls it down at once: nothing arrives before it was sent.
+        """
+        if self._best is None:
+            self._y0, self._ref, self._bucket_end = y, u, u + BUCKET_NS
+            self._best, self._best_key = (u, 0), 0.0
+            return 0.0
+        y -= self._y0
+        key = y - self.skew * (u - self._ref)
+        residual = key - self._c
+        if u >= self._bucket_end:
+            self._seal(u, y)
+        elif key < self._best_key:
+            self._best, self._best_key = (u, y), key
+        if residual < 0.0:
+            self._c = min(self._c, y - self.skew * (u - self._ref))
+        return residual
+
+    def _seal(self, u: int, y: int) -> None:
+        points = self._points
+        if self._best is not None:
+            points.append(self._best)
+        oldest = u - BUCKETS * BUCKET_NS
+        while points and points[0][0] < oldest:
+            points.popleft()
+        self._span = u - points[0][0] if points else 0
+        enough = len(points) >= SETTLED_POINTS and self._span >= SETTLED_NS
+        self._sealed += 1
+        if not points:  # a silence of a whole window: the slope is still a good guess
+            self._prior, self._prior_sd = self.skew, CRYSTAL / 10
+            self._c, self._ref = float(y), u
+            self._variance = (inf, 0.0, self._prior_sd**2)
+        elif self._span < YOUNG_NS or not self.settled or self._sealed % _OLD_REFIT_BUCKETS == 0:
+            self._refit(u)
+        self.settled = enough and (self.settled or self.sigma_ns(u) <= TRUSTED_NS)
+        self._best, self._best_key = (u, y), y - self.skew * (u - self._ref)
+        self._bucket_end = u + BUCKET_NS
+
+    def _refit(self, u: int) -> None:
+        points = self._points
+        if len(points) < _LINE_POINTS:
+            self._c, self._ref = self._c + self.skew * (u - self._ref), u
+            return
+        line = mean_feasible_line(points, u, self._prior, self._prior_sd)
+        self._ref, self._c, self.skew = u, line.height, line.slope
+        self._variance = (line.height_var, line.both, line.slope_var)

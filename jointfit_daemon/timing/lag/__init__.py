@@ -1,0 +1,23 @@
+"""Lag of an IMU behind motion capture, estimated from the angular rates of both."""
+
+from jointfit_daemon.timing.lag._angular_rates import rates_from_gyro, rates_from_orientations
+from jointfit_daemon.timing.lag._estimate import (
+    LagEstimate,
+    LagSettings,
+    estimate_in_steps,
+    estimate_lag,
+    estimate_lag_of_rates,
+)
+from jointfit_daemon.timing.lag._tracker import LagTracker, TrackedLag
+
+__all__ = [
+    "LagEstimate",
+    "LagSettings",
+    "LagTracker",
+    "TrackedLag",
+    "estimate_in_steps",
+    "estimate_lag",
+    "estimate_lag_of_rates",
+    "rates_from_gyro",
+    "rates_from_orientations",
+]

@@ -1,0 +1,356 @@
+r"""Lag of an IMU behind motion capture, found from the motion itself.
+
+Law: pure, whole windows, numpy. No world frames, no heading, no gravity, no mount: this comes
+before all other fits. It says how sure it is, and refuses rather than guesses.
+
+Two bodies rigidly connected turn at the same rate up to a constant rotation and a gyro bias,
+
+.. math:: g(t + \tau) = R\,\omega(t) + b + n ,
+
+g and omega each in its own body frame. The lag tau is **IMU stamp minus mocap stamp of the same
+event**: positive when the IMU is later; subtract it from IMU stamps. It is what the clocks cannot
+see: unseen transport delay, filters inside both systems, exposure conventions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf, nan, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
+from jointfit_daemon.timing.lag._angular_rates import (
+    BRIDGE_S,
+    Interpolant,
+    low_pass,
+    rates_from_orientations,
+)
+from jointfit_daemon.timing.lag._fine_fit import LEAST_PAIRS, fit_lag
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.model import Quaternion, Vector
+    from jointfit_daemon.timing.lag._angular_rates import Floats, Rates
+    from jointfit_daemon.timing.lag._fine_fit import LagFit
+
+NO_OVERLAP = "the tracks do not overlap"
+STAY = "stay in view of the cameras"
+IRREGULAR = "move faster and irregularly, about several axes"
+_NYQUIST_SHARE = 0.4
+_LEAST_OVERLAP = 0.5
+_CANDIDATE = 0.5
+"""Share of the best correlation from which on a maximum deserves a fit of its own."""
+_CANDIDATES = 4
+_TIE = 1e-3
+"""Correlations of magnitudes that differ by less do not rank lags: periodic motion gives equal
+maxima, whose order is rounding. The fits on three axes decide between them."""
+_SAME_S = 0.01
+"""Fits that end this near to each other are one."""
+_RIVAL = 1.5
+"""A rival that leaves less than this times the residual variance cannot be told apart."""
+_AGREE = 0.005
+"""No two systems agree on a rate better than to this share of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagSettings:
+    """How to search, and the gates an estimate must pass."""
+
+    span_s: float = 0.15
+    """Largest lag searched for, s. 3 s at first contact if a clock is not mapped."""
+    step_s: float = 0.004
+    cutoff_hz: float = 10.0
+    """Low-pass on both rates; at most 0.4 of the lower sample rate."""
+    bridge_s: float = BRIDGE_S
+    min_rate: float = radians(30.0)
+    """RMS angular rate of the reference, rad/s."""
+    min_acceleration: float = radians(300.0)
+    """RMS angular acceleration of the reference, rad/s²."""
+    max_sigma_ns: float = 700_000.0
+    """Well above what ordinary motion gives: a gate near it would choose windows by their luck."""
+    min_r2: float = 0.98
+    """Right data on one rigid body reach 0.998; skin-mounted sensors deserve less."""
+    min_weight: float = 0.7
+    """Mean Huber weight: else the fit rests on a minority of the data."""
+    min_valid: float = 0.8
+    """Share of the window without gaps."""
+    max_bias: float = radians(10.0)
+    """Larger means wrong units or a wrong stream, rad/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagEstimate:
+    """A lag, how sure it is, and what else the fit found."""
+
+    lag_ns: float
+    """IMU stamp minus reference stamp of the same event, ns; NaN if there was nothing to fit."""
+    sigma_ns: float
+    """Standard deviation, honest for correlated residuals, ns."""
+    r2: float
+    """1 - sum |residual|² / sum |omega|²."""
+    refused: str | None
+    """Why not to use it; None if it may be used."""
+    q_imu_ref: Quaternion = IDENTITY_ONE
+    """Takes reference-body coordinates to IMU coordinates. About a single axis it is a guess."""
+    bias: Vector = (0.0, 0.0, 0.0)
+    """Of the IMU's rate, rad/s."""
+    residual_rms: float = nan
+    """Per axis, rad/s."""
+    rate_rms: float = nan
+    """Of the reference, rad/s."""
+    acceleration_rms: float = nan
+    """Of the reference, rad/s²."""
+    mean_weight: float = nan
+    valid_share: float = nan
+    pairs: int = 0
+    """Rates compared."""
+
+
+def estimate_lag(
+    imu_t_ns: NDArray[np.int64],
+    imu_q: Floats,
+    ref_t_ns: NDArray[np.int64],
+    ref_q: Floats,
+    settings: LagSettings | None = None,
+) -> LagEstimate:
+    """Estimate the lag between two tracks of orientations.
+
+    The lag of orientations is not the lag of the gyro behind them (an orientation filter leads its
+    gyro by half its internal period): it belongs to the quantity it was estimated from.
+
+    Parameters
+    ----------
+    imu_t_ns, ref_t_ns : ndarray, shape (n,), (m,)
+        Host instants, strictly increasing, ns.
+    imu_q, ref_q : ndarray, shape (n, 4), (m, 4)
+        q_world_body of either, each in its own world; rows with NaN are poses not seen.
+    settings : LagSettings, optional
+        Search and gates.
+
+    Returns
+    -------
+    LagEstimate
+        Refused, saying why, where the data cannot tell.
+    """
+    settings = settings or LagSettings()
+    if min(np.size(imu_t_ns), np.size(ref_t_ns)) == 0:
+        return LagEstimate(nan, inf, nan, "no data")
+    origin = int(ref_t_ns[0])
+
+    def rates(t_ns: NDArray[np.int64], q: Floats) -> Rates:
+        return rates_from_orientations(t_ns, q, origin, bridge_s=settings.bridge_s)
+
+    imu, ref = rates(imu_t_ns, imu_q), rates(ref_t_ns, ref_q)
+    estimate = estimate_lag_of_rates(imu, ref, settings)
+    if not estimate.r2 < settings.min_r2:
+        return estimate
+    turned = rates(ref_t_ns, rotation.conjugate(ref_q))
+    if estimate_lag_of_rates(imu, turned, settings).refused is not None:
+        return estimate
+    hint = f"{estimate.refused}; it fits with one side's quaternions conjugated"
+    return replace(estimate, refused=hint)
+
+
+def estimate_lag_of_rates(
+    imu: Rates, ref: Rates, settings: LagSettings | None = None
+) -> LagEstimate:
+    """Estimate the lag between two tracks of angular rates with a common origin.
+
+    See ``estimate_lag``.
+    """
+    work = estimate_in_steps(imu, ref, settings)
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            estimate: LagEstimate = done.value
+            return estimate
+
+
+def estimate_in_steps(
+    imu: Rates, ref: Rates, settings: LagSettings | None = None
+) -> Generator[None, None, LagEstimate]:
+    """Do ``estimate_lag_of_rates`` in steps of a few milliseconds, so that nothing need wait."""
+    settings = settings or LagSettings()
+    cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE / max(imu.period_s, ref.period_s))
+    valid = min(imu.valid_share, ref.valid_share)
+    imu = low_pass(imu, cutoff)
+    yield
+    ref = low_pass(ref, cutoff)
+    if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
+        refused = f"no gapless stretch of data: {STAY}"
+        return LagEstimate(nan, inf, nan, refused, valid_share=valid)
+    rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)
+    seen = LagEstimate(
+        nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
+    )
+    if rate < settings.min_rate or acceleration < settings.min_acceleration:
+        return replace(seen, refused=_too_little(rate, acceleration, settings))
+    yield
+    coarse, why = coarse_lags(imu, ref, settings)
+    if why is not None:
+        return replace(seen, refused=why)
+    fits: list[LagFit] = []
+    for start in coarse:
+        yield
+        found = yield from fit_lag(imu, ref, start)
+        fits += [] if found is None else [found]
+    if not fits:
+        return replace(seen, refused=NO_OVERLAP)
+    return _judged(seen, fits, settings)
+
+
+def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
+    """Return the best of the fits, and why not to use it."""
+    fit, rival = _best_and_rival(fits, seen)
+    estimate = replace(
+        seen,
+        lag_ns=1e9 * fit.tau_s,
+        sigma_ns=1e9 * fit.sigma_s,
+        r2=fit.r2,
+        q_imu_ref=as_quaternion(rotation.from_matrix(fit.rotation).tolist()),
+        bias=(float(fit.bias[0]), float(fit.bias[1]), float(fit.bias[2])),
+        residual_rms=fit.residual_rms,
+        mean_weight=fit.mean_weight,
+        pairs=fit.pairs,
+    )
+
+    refused = _gate(estimate, fit, settings)
+    if refused is None and rival is not None:
+        other = 1e3 * rival.tau_s
+        refused = f"the motion is periodic: a lag of {other:.0f} ms fits as well; {IRREGULAR}"
+    return replace(estimate, refused=refused)
+
+
+def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagFit | None]:
+    """Return the best fit, and another lag that fits nearly as well, or None.
+
+    Without a rival the least residual is best. With rivals the residuals do not decide: the
+    smallest lag is returned, and the rival nearest to it.
+    """
+    best = min(fits, key=lambda fit: fit.residual_rms)
+    limit = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2
+    alike = [best, *(fit for fit in fits if fit is not best and fit.residual_rms**2 < limit)]
+    if all(abs(fit.tau_s - best.tau_s) <= _SAME_S for fit in alike):
+        return best, None
+
+    # Whole milliseconds, because lags of equal size and opposite sign differ in their last bits.
+    nearest = min(alike, key=lambda fit: (round(1e3 * abs(fit.tau_s)), fit.tau_s < 0.0))
+    others = [fit for fit in alike if abs(fit.tau_s - nearest.tau_s) > _SAME_S / 2]
+    return nearest, min(
+        others, key=lambda fit: (round(1e3 * abs(fit.tau_s - nearest.tau_s)), fit.tau_s < 0.0)
+    )
+
+
+def _too_little(rate: float, acceleration: float, settings: LagSettings) -> str:
+    return (
+        f"too little motion: {np.degrees(rate):.1f} deg/s rms, {np.degrees(acceleration):.0f} "
+        f"deg/s² rms; at least {np.degrees(settings.min_rate):.0f} and "
+        f"{np.degrees(settings.min_acceleration):.0f} are needed: {IRREGULAR}"
+    )
+
+
+def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | None:
+    """Return the first gate the estimate fails, with the remedy, in words."""
+    share, bias = estimate.valid_share, float(np.degrees(np.linalg.norm(fit.bias)))
+    gates = (
+        (
+            share >= settings.min_valid,
+            f"too many gaps: {100 * share:.0f} % of the time is covered, at least "
+            f"{100 * settings.min_valid:.0f} % are needed: {STAY}",
+        ),
+        (fit.converged, f"the fit did not converge: {IRREGULAR}"),
+        (
+            estimate.r2 >= settings.min_r2,
+            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: not the same motion, or a wrong "
+            "convention; check that the sensor sits on this body, and that it sits firmly",
+        ),
+        (
+            estimate.mean_weight >= settings.min_weight,
+            "too many outliers: check for markers that swap or are hidden",
+        ),
+        (
+            bias <= float(np.degrees(settings.max_bias)),
+            f"rate bias too large, {bias:.1f} deg/s: check the unit of the rate",
+        ),
+        (
+            estimate.sigma_ns <= settings.max_sigma_ns,
+            f"too uncertain: {_ms(estimate.sigma_ns)} > {_ms(settings.max_sigma_ns)}: {IRREGULAR}",
+        ),
+        (
+            abs(fit.tau_s) <= settings.span_s,
+            f"{1e3 * fit.tau_s:.0f} ms is outside the searched span of {1e3 * settings.span_s:.0f} "
+            "ms: check that both clocks are mapped",
+        ),
+    )
+    return next((reason for passed, reason in gates if not passed), None)
+
+
+def _ms(value_ns: float) -> str:
+    return f"{value_ns * 1e-6:.2f} ms" if value_ns < inf else "all rests on one moment"
+
+
+def coarse_lags(
+    imu: Rates, ref: Rates, settings: LagSettings
+) -> tuple[tuple[float, ...], str | None]:
+    """Return lags, s, that correlate the magnitudes of both rates, best first, or why not.
+
+    The magnitude needs no rotation. The best correlation must be a maximum inside the search: one
+    at its border means that the lag lies outside. Maxima that differ by less than `_TIE` have no
+    order, so they are ranked by the size of the lag, and those at the border are fitted, too.
+    """
+    step, reach = settings.step_s, round(settings.span_s / settings.step_s)
+    scores = _correlations(imu, ref, step, reach)
+    best = float(scores.max())
+    if not np.isfinite(best):
+        return (), NO_OVERLAP
+
+    padded = np.concatenate(([-inf], scores, [-inf]))
+    peaks = np.flatnonzero((scores > padded[:-2]) & (scores >= padded[2:]))
+    inside = peaks[(peaks > 0) & (peaks < scores.size - 1)]
+    tied = peaks[scores[peaks] >= best - _TIE]
+    if not np.isin(tied, inside).any():
+        return (), (
+            f"no common motion within {settings.span_s:g} s: check that the sensor sits on this "
+            "body and that both clocks are mapped"
+        )
+
+    tied = tied[np.argsort(np.abs(tied - reach), kind="stable")]
+    lesser = np.setdiff1d(inside[scores[inside] >= _CANDIDATE * best], tied)
+    lesser = lesser[np.argsort(-scores[lesser], kind="stable")]
+    ranked = np.concatenate((tied, lesser))[:_CANDIDATES]
+    return tuple(((ranked - reach) * step).tolist()), None
+
+
+def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
+    """Return the normalized correlation of the magnitudes at ``(i - reach) * step``."""
+    grid = np.arange(ref.t_s[0], ref.t_s[-1], step)
+    wide = grid[0] + step * np.arange(-reach, grid.size + reach)
+    a, a_ok = _magnitude(ref, grid)
+    b, b_ok = _magnitude(imu, wide)
+    least = _LEAST_OVERLAP * a_ok.sum()
+    scores = np.full(2 * reach + 1, -inf)
+    for shift in range(scores.size):
+        both = a_ok & b_ok[shift : shift + grid.size]
+        if both.sum() > max(2.0, least):
+            x = a[both] - a[both].mean()
+            y = b[shift : shift + grid.size][both]
+            y = y - y.mean()
+            scores[shift] = (x @ y) / np.sqrt(max((x @ x) * (y @ y), 1e-300))
+    return scores
+
+
+def _magnitude(rates: Rates, t: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return |rate| at instants `t`, linear between samples, and where it is known."""
+    _, inside = Interpolant(rates).locate(t)
+    return np.interp(t, rates.t_s, np.linalg.norm(rates.w, axis=1)), inside
+
+
+def _rms(vectors: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

@@ -1,0 +1,212 @@
+"""The fine fit of the lag: rotation, bias and lag at once, on three axes.
+
+Law: pure; starts from a coarse lag; returns numbers, judges nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.timing.lag._angular_rates import KERNEL_HALF_S, Interpolant
+from jointfit_daemon.timing.lag._standard_deviation import RIDGE, Columns, lag_sigma
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+    from jointfit_daemon.timing.lag._angular_rates import Floats, Rates
+
+HUBERS = (1.5, 2.4, np.inf)
+"""Times sigma, on the norm of three, whose median is 1.538. Optics err in bursts, and then low is
+best; where errors grow with the motion instead, the largest come with what tells most."""
+CHOICES = 6
+"""Iterations that choose among them, by the least variance of the lag; then the choice stands."""
+MEDIAN_NORM = 1.538
+"""Median norm of a standard normal vector of three."""
+STEP_S = 0.020
+ITERATIONS = 30
+DONE_S = 1e-6
+"""A step this small, twice in a row, ends the search. The rotation is not asked: about a single
+axis of motion it may turn for ever without a word to the lag."""
+LEAST_PAIRS = 16
+
+_FIRST_HUBER = 2.4
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class LagFit:
+    """What the fit found, in the convention of ``lag``."""
+
+    tau_s: float
+    sigma_s: float
+    rotation: Floats
+    """R, reference-body to IMU coordinates, shape (3, 3)."""
+    bias: Floats
+    """rad/s, shape (3,)."""
+    r2: float
+    residual_rms: float
+    mean_weight: float
+    """Of the usual Huber weights, clipped at 2.4, whichever were used."""
+    pairs: int
+    converged: bool
+
+
+class _State(NamedTuple):
+    tau: float
+    rot: Floats
+    bias: Floats
+
+
+class _Linear(NamedTuple):
+    """Residuals r (n, 3), weights w (n,), and the Jacobian's columns."""
+
+    r: Floats
+    w: Floats
+    jac: Floats
+    """Of phi and b, shape (n, 3, 6)."""
+    jtau: Floats
+    """Of tau, shape (n, 3)."""
+    omega: Floats
+    t_s: Floats
+    give: Floats
+    """See ``Columns``."""
+
+
+def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, LagFit | None]:
+    r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
+
+    Gauss-Newton on all seven unknowns with Huber weights on |r|, clipped where the residuals
+    themselves say that it pays. The faster track is interpolated
+    at the instants of the slower one. The standard deviation is that of ``lag_sigma``.
+
+    Parameters
+    ----------
+    imu, ref : Rates
+        Filtered alike.
+    start_s : float
+        Coarse lag, s.
+
+    Yields
+    ------
+    None
+        After every iteration: about a millisecond of work.
+
+    Returns
+    -------
+    LagFit or None
+        None if too little overlaps.
+    """
+    swapped = imu.period_s > ref.period_s  # then omega is interpolated at the instants of g
+    fast, slow = (ref, imu) if swapped else (imu, ref)
+    cubic = Interpolant(fast)
+    state = _start(cubic, slow, -start_s if swapped else start_s)
+    if state is None:
+        return None
+    converged, before = False, float("inf")
+    clip: float | None = None
+    for iteration in range(ITERATIONS):
+        linear = _linearize(cubic, slow, state, clip)
+        if linear is None:
+            return None
+        if iteration < CHOICES:
+            clip = _best_clip(linear)
+        state, moved = _step(linear, state)
+        if max(moved, before) < DONE_S:
+            converged = True
+            break
+        before = moved
+        yield
+    linear = _linearize(cubic, slow, state, clip)
+    if linear is None:
+        return None
+    yield
+    rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
+    whole = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
+    norm = np.linalg.norm(linear.r, axis=1)
+    square = float(norm @ norm)
+    return LagFit(
+        tau_s=-state.tau if swapped else state.tau,
+        sigma_s=lag_sigma(
+            Columns(whole, linear.r, linear.w, linear.give), linear.t_s, 2.0 * KERNEL_HALF_S
+        ),
+        rotation=rot,
+        bias=bias,
+        r2=1.0 - square / max(float(np.sum(linear.omega**2)), _TINY),
+        residual_rms=float(np.sqrt(square / linear.r.size)),
+        mean_weight=float(_clipped(norm, _FIRST_HUBER * _scale(norm)).mean()),
+        pairs=len(linear.r),
+        converged=converged,
+    )
+
+
+def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
+    """Return R by SVD of the covariance, means removed, and b = 0."""
+    g, _, ok = cubic(slow.t_s + tau)
+    if ok.sum() < LEAST_PAIRS:
+        return None
+    g, omega = g[ok] - g[ok].mean(axis=0), slow.w[ok] - slow.w[ok].mean(axis=0)
+    u, _, vt = np.linalg.svd(g.T @ omega)
+    u[:, 2] *= np.sign(np.linalg.det(u @ vt))
+    return _State(tau, u @ vt, np.zeros(3))
+
+
+def _linearize(
+    cubic: Interpolant, slow: Rates, state: _State, clip: float | None
+) -> _Linear | None:
+    g, slope, ok = cubic(slow.t_s + state.tau)
+    if ok.sum() < LEAST_PAIRS:
+        return None
+    omega = slow.w[ok]
+    turned = omega @ state.rot.T
+    r = g[ok] - state.bias - turned
+    norm = np.linalg.norm(r, axis=1)
+    weight = _clipped(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
+    jac = np.concatenate(
+        (rotation.skew(turned), np.broadcast_to(-np.eye(3), (*weight.shape, 3, 3))), axis=2
+    )
+    give = (weight < 1.0).astype(np.float64)
+    return _Linear(r, weight, jac, slope[ok], omega, slow.t_s[ok], give)
+
+
+def _scale(norm: Floats) -> float:
+    """Return sigma per axis of residuals so long, robust."""
+    return max(float(np.median(norm)), _TINY) / MEDIAN_NORM
+
+
+def _clipped(norm: Floats, clip: float) -> Floats:
+    """Return Huber's weights."""
+    return np.minimum(1.0, clip / np.maximum(norm, _TINY))
+
+
+def _best_clip(linear: _Linear) -> float:
+    r"""Return the clip, rad/s, of the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
+
+    h is what a row may tell of the lag. Residuals are taken as they come, each for its own: that
+    they are correlated is the same for all clips.
+    """
+    norm, tells = np.linalg.norm(linear.r, axis=1), np.sum(linear.jtau**2, axis=1)
+
+    def variance(clip: float) -> float:
+        weight = _clipped(norm, clip)
+        curve = weight * np.where(weight < 1.0, 2.0 / 3.0, 1.0)
+        return float(tells @ (weight * norm) ** 2) / float(tells @ curve + _TINY) ** 2
+
+    return min((huber * _scale(norm) for huber in HUBERS), key=variance)
+
+
+def _step(linear: _Linear, state: _State) -> tuple[_State, float]:
+    """Return the next state and how far the lag moved, s."""
+    jac = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
+    weighted = jac * linear.w[:, None, None]
+    normal = np.einsum("nij,nik->jk", weighted, jac)
+    gradient = np.einsum("nij,ni->j", weighted, linear.r)
+    normal[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(normal[:3, :3]), _TINY)
+    normal[6, 6] += _TINY
+    move = -np.linalg.solve(normal, gradient)
+    tau = float(np.clip(move[6], -STEP_S, STEP_S))
+    rot = rotation.to_matrix(rotation.exp(move[:3])) @ state.rot
+    return _State(state.tau + tau, rot, state.bias + move[3:6]), abs(tau)

@@ -1,0 +1,184 @@
+"""Captures of every kind become chunks."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.files.captures import read_capture
+from jointfit_daemon.files.captures._candump import read_candump
+from jointfit_daemon.files.captures._capture import CaptureUnreadable
+from jointfit_daemon.files.captures._packet_capture import read_udp
+from jointfit_protocols.can_frame import host_count, unpack_frames
+from jointfit_protocols.candump import parse_candump
+from jointfit_protocols.corrupt import Corrupt
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def udp(payload: bytes, source: int = 1510, target: int = 40000) -> bytes:
+    return struct.pack(">HHHH", source, target, 8 + len(payload), 0) + payload
+
+
+def ip(body: bytes, number: int = 1, flags: int = 0) -> bytes:
+    head = struct.pack(
+        ">BBHHHBBH4s4s", 0x45, 0, 20 + len(body), number, flags, 64, 17, 0, b"aaaa", b"bbbb"
+    )
+    return head + body
+
+
+def ethernet(packet: bytes, vlan: bool = False) -> bytes:
+    return bytes(12) + (b"\x81\x00\x00\x05" if vlan else b"") + b"\x08\x00" + packet
+
+
+def pcap(frames: list[tuple[int, bytes]], order: str = "<", link: int = 1) -> bytes:
+    parts = [struct.pack(order + "IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)]
+    for t_us, frame in frames:
+        stamp = divmod(t_us, 10**6)
+        parts += [struct.pack(order + "IIII", *stamp, len(frame), len(frame)), frame]
+    return b"".join(parts)
+
+
+def block(kind: int, body: bytes, order: str) -> bytes:
+    body += bytes(-len(body) % 4)
+    size = struct.pack(order + "I", 12 + len(body))
+    return struct.pack(order + "I", kind) + size + body + size
+
+
+def pcapng(frames: list[tuple[int, bytes]], order: str, resolution: int) -> bytes:
+    section = struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1)
+    options = struct.pack(order + "HHB3xHHq", 9, 1, resolution, 14, 8, 5) + bytes(4)
+    parts = [block(0x0A0D0D0A, section, order)]
+    parts.append(block(1, struct.pack(order + "HHI", 1, 0, 0) + options, order))
+    for ticks, frame in frames:
+        head = struct.pack(order + "5I", 0, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
+        parts.append(block(6, head + frame, order))
+    parts.append(block(5, bytes(12), order))
+    return b"".join(parts)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("vlan", [False, True])
+def test_a_pcap_file_gives_its_udp_payloads(order: str, vlan: bool) -> None:
+    file = pcap([(1_500_000, ethernet(ip(udp(b"hello")), vlan))], order)
+    (packet,) = read_udp(file)
+    assert packet == (1_500_000_000, 1510, 40000, b"hello")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("resolution", "t_ns"), [(6, 7_000_000), (9, 7_000), (0x80 | 10, 6_835_937_500)]
+)
+def test_a_pcapng_file_keeps_the_time_of_its_interface(
+    order: str, resolution: int, t_ns: int
+) -> None:
+    file = pcapng([(7000, ethernet(ip(udp(b"x"))))], order, resolution)
+    (packet,) = read_udp(file)
+    assert packet.t_ns == 5 * 10**9 + t_ns
+
+
+def test_fragments_are_put_together_in_any_order() -> None:
+    whole = udp(bytes(range(256)) * 10)
+    cuts = [(0, 1480), (1480, 2000), (2000, len(whole))]
+    frames = [
+        (n, ethernet(ip(whole[a:b], 9, (0x2000 if b < len(whole) else 0) | a // 8)))
+        for n, (a, b) in enumerate(cuts)
+    ]
+    for order in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
+        (packet,) = read_udp(pcap([frames[i] for i in order]))
+        assert packet.payload == whole[8:]
+    assert not list(read_udp(pcap(frames[:2])))
+
+
+@given(st.binary(max_size=200), st.sampled_from([b"\x0a\x0d\x0d\x0a", b"\xd4\xc3\xb2\xa1"]))
+def test_any_bytes_end_quietly(data: bytes, magic: bytes) -> None:
+    list(read_udp(magic + data))
+
+
+@given(st.integers(0, 400))
+def test_a_file_that_a_crash_cut_off_gives_what_is_whole(cut: int) -> None:
+    frames = [(n, ethernet(ip(udp(bytes([n]))))) for n in range(3)]
+    for file in (pcap(frames), pcapng(frames, "<", 6)):
+        payloads = [packet.payload for packet in read_udp(file[: max(4, len(file) - cut)])]
+        assert payloads == [b"\0", b"\1", b"\2"][: len(payloads)]
+
+
+def test_the_real_capture_holds_550_datagrams(shared_data: Path) -> None:
+    path = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data" / "raw" / "traffic.pcapng"
+    chunks = list(read_capture(path, "datagram"))
+    assert len(chunks) == 550
+    assert sum(len(chunk.data) == 336 for chunk in chunks) == 518
+    assert [chunk.t_ns for chunk in chunks] == sorted(chunk.t_ns for chunk in chunks)
+    assert sum(1 for _ in read_capture(path, "datagram", port=1511)) == 518
+
+
+LOG = b"""# a comment
+(1436509052.249713) vcan0 044#2A366C2B
+(1436509052.449847) vcan0 0F6#R
+(1436509053.1) vcan0 19FF0021#7FFF00
+(1436509053.2) vcan0 7F1#
+
+(1436509053.3) vcan0 20000004#0001000000000000
+"""
+
+
+def test_candump_text_becomes_the_records_of_the_codec() -> None:
+    chunks = list(read_candump(LOG))
+    found = [frame for chunk in chunks for frame in unpack_frames(chunk.data)]
+    assert found == parse_candump(LOG)
+    assert [chunk.t_ns for chunk in chunks] == [frame.t_ns for frame in found]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"(1.5) can0 105##1AABB\n", b"garbage\n", b"(1.5) can0 999#00\n", b"(1.5) can0 105#0\n"],
+)
+def test_a_line_that_is_no_frame_is_counted_by_its_length(line: bytes) -> None:
+    (wanted,) = parse_candump(line)
+    assert isinstance(wanted, Corrupt)
+    (chunk,) = read_candump(line)
+    (note,) = unpack_frames(chunk.data)
+    assert not isinstance(note, Corrupt)
+    assert host_count(note) == wanted.discarded == len(line)
+
+
+@given(st.binary(max_size=100))
+def test_any_text_gives_records_the_codec_accepts(data: bytes) -> None:
+    for chunk in read_candump(data):
+        assert not any(isinstance(frame, Corrupt) for frame in unpack_frames(chunk.data))
+
+
+def test_raw_bytes_of_a_stream_come_in_pieces_with_time_going_on(tmp_path: Path) -> None:
+    (tmp_path / "raw.bin").write_bytes(bytes(10_000))
+    chunks = list(read_capture(tmp_path / "raw.bin", "stream"))
+    assert [len(chunk.data) for chunk in chunks] == [4096, 4096, 1808]
+    assert chunks[0].t_ns < chunks[1].t_ns < chunks[2].t_ns
+
+
+def test_raw_datagrams_are_walked_by_length_only_if_that_fits(tmp_path: Path) -> None:
+    two = b"\x0a\0\1\0a" + b"\x0a\0\2\0bc"
+    for data, pieces in ((two, [two[:5], two[5:]]), (two + b"x", [two + b"x"])):
+        (tmp_path / "raw.bin").write_bytes(data)
+        chunks = list(read_capture(tmp_path / "raw.bin", "datagram"))
+        assert [chunk.data for chunk in chunks] == pieces
+
+
+@pytest.mark.parametrize(
+    ("data", "wire", "found"),
+    [
+        (LOG, "stream", "candump text"),
+        (pcap([]), "can", "a network capture"),
+        (b"12345", "can", "neither"),
+    ],
+)
+def test_the_wrong_kind_of_file_is_refused_by_name(
+    tmp_path: Path, data: bytes, wire: str, found: str
+) -> None:
+    (tmp_path / "f").write_bytes(data)
+    with pytest.raises(CaptureUnreadable, match=found):
+        read_capture(tmp_path / "f", wire)  # type: ignore[arg-type]

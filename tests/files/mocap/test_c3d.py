@@ -1,0 +1,158 @@
+"""C3D and marker trials: what an independent reader says, what a written file holds, and faults."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.files.mocap import (
+    MarkerTrajectories,
+    UnknownMarker,
+    read_marker_trial,
+    write_trc,
+)
+from jointfit_daemon.files.mocap._c3d import PackageMissing, read_c3d
+from jointfit_daemon.files.text import Malformed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+pytest.importorskip("c3d", reason="c3d is not installed (pip install jointfitd[c3d])")
+ezc3d: Any = pytest.importorskip("ezc3d", reason="ezc3d is not installed")
+
+NAMES = ("Tom:LASI", "Tom:RASI", "Tom:LKNE")
+
+
+def write_c3d(path: Path, positions: NDArray[np.float64], **parameters: Any) -> None:
+    """Write positions (n, k, 3), NaN missing, with ezc3d."""
+    file = ezc3d.c3d()
+    points = file["parameters"]["POINT"]
+    points["RATE"]["value"] = [200.0]
+    points["LABELS"]["value"] = list(NAMES)
+    file.add_parameter("POINT", "UNITS", [parameters.pop("units", "mm")])
+    for key, value in parameters.items():
+        file.add_parameter("POINT", key, [value])
+    homogeneous = np.ones((4, positions.shape[1], len(positions)))
+    homogeneous[:3] = positions.transpose(2, 1, 0)
+    file["data"]["points"] = homogeneous
+    file.write(str(path))
+
+
+@pytest.fixture
+def positions() -> NDArray[np.float64]:
+    drawn = np.random.default_rng(1).uniform(-500.0, 500.0, (40, 3, 3))
+    drawn[5:9, 1] = np.nan
+    return drawn
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "missing"),
+    [("markers_analogs_first100", 1, 0), ("markers_gaps_frames119to218", 119, 139)],
+)
+def test_an_independent_reader_sees_the_same_points_and_gaps(
+    shared_data: Path, name: str, first: int, missing: int
+) -> None:
+    path = shared_data / "mocap" / "c3d_trc_pyomeca" / f"{name}.c3d"
+    trial = read_c3d(path)
+    judge = ezc3d.c3d(str(path))
+    expected = judge["data"]["points"][:3].transpose(2, 1, 0) / 1000.0
+    np.testing.assert_allclose(trial.positions, expected, rtol=1e-6, atol=1e-9)
+    assert np.isnan(trial.positions).all(axis=-1).sum() == missing
+    assert list(trial.names) == judge["parameters"]["POINT"]["LABELS"]["value"]
+    assert (trial.frames[0], trial.frames[-1], trial.rate_hz) == (first, first + 99, 100.0)
+    assert trial.t_s[0] == pytest.approx((first - 1) / 100.0)
+    assert trial.warnings == ()
+
+
+def test_gaps_are_where_the_recording_has_them(shared_data: Path) -> None:
+    path = shared_data / "mocap" / "c3d_trc_pyomeca" / "markers_gaps_frames119to218.c3d"
+    trial = read_marker_trial(path)
+    gap = np.flatnonzero(np.isnan(trial.points(["gauche_ext"])[:, 0, 0]))
+    assert gap.tolist() == list(range(88, 94))
+    assert (trial.up_axis, trial.up_said_by) == ("z", "file")
+
+
+@pytest.mark.parametrize(("units", "scale"), [("mm", 1e-3), ("m", 1.0), ("cm", 1e-2)])
+def test_what_is_written_is_read_in_metres(
+    tmp_path: Path, positions: NDArray[np.float64], units: str, scale: float
+) -> None:
+    write_c3d(tmp_path / "trial.c3d", positions, units=units)
+    trial = read_c3d(tmp_path / "trial.c3d")
+    np.testing.assert_allclose(trial.positions, positions * scale, rtol=1e-6, atol=1e-6)
+    assert trial.names == NAMES
+
+
+def test_z_is_up_whatever_the_screen_was(tmp_path: Path, positions: NDArray[np.float64]) -> None:
+    write_c3d(tmp_path / "trial.c3d", positions, X_SCREEN="+X", Y_SCREEN="+Y")
+    trial = read_marker_trial(tmp_path / "trial.c3d")
+    assert (trial.up_axis, trial.up_said_by) == ("y", "file")
+    up = trial.trajectories.positions[..., 2]
+    np.testing.assert_allclose(up, positions[..., 1] / 1000.0, rtol=1e-6, atol=1e-6)
+    asked = read_marker_trial(tmp_path / "trial.c3d", up_axis="x")
+    assert (asked.up_axis, asked.up_said_by) == ("x", "caller")
+
+
+def test_turning_to_z_up_keeps_the_hand(tmp_path: Path) -> None:
+    corner = np.array([[[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]]) * 1000.0
+    write_c3d(tmp_path / "trial.c3d", corner)
+    for axis in ("x", "y", "z"):
+        points = read_marker_trial(tmp_path / "trial.c3d", axis).trajectories.positions[0]
+        assert np.linalg.det(points - 1.0) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_marker_in_the_origin_of_a_trc_is_missing(tmp_path: Path) -> None:
+    points = np.ones((3, 1, 3))
+    points[1] = 0.0
+    frames = np.arange(1, 4)
+    write_trc(tmp_path / "a.trc", MarkerTrajectories(("M",), frames / 100, frames, points, 100.0))
+    found = read_marker_trial(tmp_path / "a.trc")
+    assert np.isnan(found.points(["M"])[:, 0, 0]).tolist() == [False, True, False]
+    assert (found.up_axis, found.up_said_by) == ("y", "custom of the format")
+
+
+def test_a_subjects_prefix_may_be_left_out_and_misspellings_are_met_halfway(
+    tmp_path: Path, positions: NDArray[np.float64]
+) -> None:
+    write_c3d(tmp_path / "trial.c3d", positions)
+    trial = read_marker_trial(tmp_path / "trial.c3d")
+    assert np.array_equal(trial.points(["LKNE"]), trial.points(["Tom:LKNE"]), equal_nan=True)
+    with pytest.raises(UnknownMarker, match=r"'LKNEE': did you mean 'LKNE.*'XX'; there are: Tom"):
+        trial.points(["LKNEE", "LASI", "XX"])
+
+
+def test_a_file_that_is_no_c3d_is_named(tmp_path: Path) -> None:
+    for name, data in (("a.c3d", b"hello"), ("b.c3d", bytes(2048)), ("c.c3d", b"")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(Malformed, match=name):
+            read_c3d(tmp_path / name)
+    with pytest.raises(Malformed, match=r"\.trc or \.c3d"):
+        read_marker_trial(tmp_path / "trial.csv")
+
+
+def test_a_broken_c3d_is_named_never_a_traceback(
+    tmp_path: Path, positions: NDArray[np.float64]
+) -> None:
+    write_c3d(tmp_path / "whole.c3d", positions)
+    whole = (tmp_path / "whole.c3d").read_bytes()
+    rng = np.random.default_rng(2)
+    for trial in range(100):
+        data = bytearray(whole[: int(rng.integers(1, len(whole)))] if trial % 2 else whole)
+        for at in rng.integers(0, len(data), 5):
+            data[at] = int(rng.integers(0, 256))
+        (tmp_path / "broken.c3d").write_bytes(bytes(data))
+        with suppress(Malformed):
+            read_c3d(tmp_path / "broken.c3d")
+
+
+def test_without_the_package_the_message_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "c3d", None)
+    with pytest.raises(PackageMissing, match=r"pip install 'jointfitd\[c3d\]'"):
+        read_c3d(tmp_path / "any.c3d")

@@ -1,0 +1,55 @@
+"""The last minute of delays against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_daemon.timing.clock._delay_statistics import HALF_NS, LastMinute, bin_of
+
+S = 1_000_000_000
+
+
+@given(st.lists(st.integers(1, 10**11), min_size=200, max_size=400))
+def test_percentiles_are_those_of_the_samples(delays: list[int]) -> None:
+    minute = LastMinute()
+    for k, delay in enumerate(delays):
+        minute.feed(k * 1000, delay)
+    found = minute.delays
+    assert found is not None
+    assert found.max_ns == max(delays)
+    for value, share in ((found.p50_ns, 0.5), (found.p99_ns, 0.99)):
+        low, high = np.quantile(delays, [share - 0.01, min(1.0, share + 0.01)])
+        assert 0.88 * low - 2048 <= value <= 1.13 * high + 2048
+
+
+@given(st.integers(-(10**9), 10**14), st.integers(0, 10**12))
+def test_bins_are_in_order(delay: int, more: int) -> None:
+    assert bin_of(delay) <= bin_of(delay + more)
+
+
+def test_what_is_older_than_a_minute_is_forgotten() -> None:
+    minute = LastMinute()
+    minute.feed(0, 10 * S)
+    for k in range(1, 75):
+        minute.feed(k * S, S // 1000)
+    found = minute.delays
+    assert found is not None
+    assert found.max_ns == S // 1000
+
+
+def test_after_a_long_silence_the_rate_is_that_of_what_came_since() -> None:
+    minute = LastMinute()
+    for start in (0, 3 * HALF_NS):
+        for k in range(101):
+            minute.feed(start + k * S // 100, 0)
+    assert minute.rate_hz == pytest.approx(100)
+
+
+def test_nothing_is_known_of_nothing() -> None:
+    minute = LastMinute()
+    assert minute.delays is None
+    minute.feed(5, 7)
+    assert minute.rate_hz is None
