@@ -11,19 +11,16 @@ from typing import TYPE_CHECKING, NamedTuple, cast, get_args
 import numpy as np
 
 from bench.baselines.linear_correction import fit_linear_correction
-from jointfit_daemon.calibration.joint_correlation import error_correlation
-from jointfit_daemon.calibration.redundancy import fit_segment
-from jointfit_daemon.calibration.segment_model import SegmentTraining
-from jointfit_daemon.calibration.trial import Method
-from jointfit_daemon.calibration.weighted_mean import fuse
+from jointfit_daemon.calibration.soft_tissue import SegmentTraining, error_correlation, fit_segment
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import Method, fuse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from bench.subjects.recorded_knee import KneeTrial
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.segment_model import SegmentModel
+    from jointfit_daemon.limb_model import SegmentModel
 
     Predict = Callable[[KneeTrial], tuple[Array, Array]]
 

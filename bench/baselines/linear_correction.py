@@ -17,14 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from typing_extensions import override  # typing has it from Python 3.12
 
-from jointfit_daemon.calibration.robust_ridge import fit_ridge
-from jointfit_daemon.calibration.segment_model import (
-    Prediction,
-    SegmentModel,
-    SegmentTraining,
-    widened,
-)
-from jointfit_daemon.calibration.weighted_mean import fuse, fuse_one, fusion_weights
+from jointfit_daemon.calibration.soft_tissue import fit_ridge, fusion_weights
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import (
     between_one,
@@ -32,6 +25,7 @@ from jointfit_daemon.kinematics.rotation_scalar import (
     log_one,
     multiply_one,
 )
+from jointfit_daemon.limb_model import Prediction, SegmentModel, fuse, fuse_one, widened
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -39,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.soft_tissue import SegmentTraining
     from jointfit_daemon.model import Quaternion
 
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from bench.framework.measurement import loop_s
 from bench.rigs.request_flood import SECONDS
 from bench.subjects.simulated_wearer import bench_rig, fitted
-from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon, simulator
@@ -30,7 +30,7 @@ from jointfit_daemon.tools.child_processes import daemon, simulator
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.tools.child_processes import Simulator
 
 SETTLE_S = 4.0

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, training_frames
-from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.outputs.mqtt import MqttClient
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.limb_model import Calibration, Method
     from jointfit_daemon.tools.child_processes import Simulator
 
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.subjects.simulated_wearer import NS, bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.refused import CalibrationRefused
+from jointfit_daemon.calibration import CalibrationRefused
+from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.kinematics import rotation
 from jointfit_simulators.cameras import Cameras
 from jointfit_simulators.orientation import Rotation, from_wxyz, to_wxyz
@@ -27,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion import LimbFuser, SensorNews
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
 
 BEGIN_S = 100.0

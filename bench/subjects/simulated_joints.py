@@ -12,8 +12,8 @@ import numpy as np
 
 from jointfit_daemon.calibration.center.movement import BodyPoses
 from jointfit_daemon.calibration.center.parent_noise import spatial_noise
-from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import rigid_fit
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
+from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTrack
+from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.config import parse_rig
 from jointfit_simulators.cameras import CameraFrames, Cameras
 from jointfit_simulators.placement import CLUSTERS
@@ -29,8 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Quaternion
 
 NS = 1_000_000_000

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from jointfit_daemon.calibration.trial import CalibrationSettings
+from jointfit_daemon.calibration import CalibrationSettings
 from jointfit_daemon.config import _bandwidth, _checks
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._rig import MOCAP, Rig, Source

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.calibration.trial import CalibrationSettings
+    from jointfit_daemon.calibration import CalibrationSettings
     from jointfit_daemon.config._tables import MqttSettings, RecordingSettings
     from jointfit_daemon.driver import Driver
     from jointfit_daemon.model import Chain

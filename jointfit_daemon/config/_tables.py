@@ -11,8 +11,8 @@ from typing import Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from jointfit_daemon.calibration.trial import Method  # noqa: TC001 - pydantic reads it at run time
 from jointfit_daemon.driver import Settings
+from jointfit_daemon.limb_model import Method  # noqa: TC001 - pydantic reads it at run time
 
 _PLAIN, _TLS = 1883, 8883  # IANA: mqtt, secure-mqtt
 

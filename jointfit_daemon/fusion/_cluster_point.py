@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.calibration.markers import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 from jointfit_daemon.kinematics.rotation_scalar import (
     as_quaternion,
     conjugate_one,
     multiply_one,
     rotate_one,
 )
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.markers import Cluster
+    from jointfit_daemon.limb_model import Cluster
     from jointfit_daemon.model import MocapFrame, MocapLayout, Vector
 
 

@@ -8,22 +8,21 @@ from __future__ import annotations
 from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.anatomy import flexion_sign
-from jointfit_daemon.calibration.model_fit import neighbor
 from jointfit_daemon.fusion._angle_rates import AngleRates
 from jointfit_daemon.fusion._forward_kinematics import Reach, joint_positions, read_angles
 from jointfit_daemon.fusion._heading_uncertainty import widened_joints, widened_segments
 from jointfit_daemon.fusion._segment_fuser import Fused, SegmentFuser
 from jointfit_daemon.fusion.faults import LinkWatch, SensorWatch
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
+from jointfit_daemon.limb_model import flexion_sign, neighbor
 from jointfit_daemon.model import JointState, LimbState, SegmentState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion._segment_fuser import Inputs
     from jointfit_daemon.fusion.faults import SensorNews
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
 _NOBODY: frozenset[str] = frozenset()

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.static_pose import live_cluster
 from jointfit_daemon.fusion._cluster_point import CarriedPoint
+from jointfit_daemon.limb_model import live_cluster
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.markers import Cluster
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration, Cluster
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Vector
 
 

@@ -12,16 +12,13 @@ from __future__ import annotations
 from math import radians, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.calibration.redundancy import Prediction
-from jointfit_daemon.calibration.result import alive_key
-from jointfit_daemon.calibration.static_pose import UNREFERENCED_SD
 from jointfit_daemon.kinematics.rotation_scalar import normalize_one, turn_one, turned_one
+from jointfit_daemon.limb_model import UNREFERENCED_SD, Prediction, alive_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from jointfit_daemon.calibration.result import SegmentCalibration
-    from jointfit_daemon.calibration.segment_model import SegmentModel
+    from jointfit_daemon.limb_model import SegmentCalibration, SegmentModel
     from jointfit_daemon.model import Quaternion, Vector
 
 FLOOR_SD = 0.0005

@@ -36,8 +36,8 @@ from jointfit_daemon.pipeline.online_learning import OnlineLearner, models_only
 from jointfit_daemon.pipeline.sources import LagWatch, SourceState, Stamped, SyncLines, known_lags
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner

@@ -12,7 +12,7 @@ from jointfit_daemon.fusion import OpticalOrigin
 from jointfit_daemon.model import ImuSample
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, Vector
     from jointfit_daemon.pipeline.calibration_session import CalibrationSession
     from jointfit_daemon.pipeline.online_learning import OnlineLearner

@@ -14,8 +14,8 @@ from jointfit_daemon.model import LimbState
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chunk
 
 # --- in ---------------------------------------------------------------------------------------

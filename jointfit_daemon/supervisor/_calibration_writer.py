@@ -17,8 +17,8 @@ from jointfit_daemon.supervisor._stored_calibrations import Found
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import Event
 
 

@@ -6,12 +6,12 @@ import dataclasses
 import datetime
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.calibration.store import CalibrationStore, CalibrationUnreadable
+from jointfit_daemon.calibration.record import CalibrationStore, CalibrationUnreadable
 from jointfit_daemon.supervisor.state_directory import state_directory
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
 
 
 class Found(NamedTuple):

@@ -33,7 +33,7 @@ def main() -> int:
     words = source.read(length)
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
-        from jointfit_daemon.calibration.jobs import run_job  # noqa: PLC0415 - its fault is an answer
+        from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - its fault is an answer
 
         kind, payload = pickle.loads(words)  # noqa: S301 - written by our parent
         answer: dict[str, object] = {"result": run_job(kind, payload)}

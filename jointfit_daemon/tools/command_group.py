@@ -84,7 +84,7 @@ def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
     """Judge by the classes of modules that are loaded: what is not loaded raised nothing."""
     for code, module, name in (
         (EXIT_MISUSE, "jointfit_daemon.config", "ConfigError"),
-        (EXIT_MISUSE, "jointfit_daemon.calibration.refused", "CalibrationRefused"),
+        (EXIT_MISUSE, "jointfit_daemon.calibration._errors", "CalibrationRefused"),
         (EXIT_MISUSE, "jointfit_daemon.files.mocap._c3d", "PackageMissing"),
         (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlotMissing"),
         (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriverError"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from jointfit_daemon.calibration.trial import (
+from jointfit_daemon.calibration import (
     CalibrationSettings,
     CalibrationTrial,
     OpticalTrack,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
+from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from tests.calibration.synthetic_limb import (
     CHAIN,
     SETTINGS,
@@ -14,7 +13,7 @@ from tests.calibration.synthetic_limb import (
 )
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain
     from tests.calibration.synthetic_limb import Subject
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.markers import MAX_FIT_RMS_M, Cluster, rigid_fit
 from jointfit_daemon.fusion._cluster_point import CarriedPoint
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, Cluster, rigid_fit
 from jointfit_daemon.model import MocapFrame, MocapLayout
 
 NAMES = ("a", "b", "c", "d", "e")

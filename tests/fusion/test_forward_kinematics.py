@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.redundancy import MeanModel
-from jointfit_daemon.calibration.result import SegmentCalibration, alive_key
 from jointfit_daemon.fusion._forward_kinematics import Reach, joint_positions, read_angles
 from jointfit_daemon.fusion._segment_fuser import Fused, SegmentFuser, mean_one
+from jointfit_daemon.limb_model import MeanModel, SegmentCalibration, alive_key
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion

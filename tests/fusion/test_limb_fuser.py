@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
+from jointfit_daemon.calibration.phases import fit_static
+from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.model import Chain, Quaternion
 from tests.calibration.synthetic_limb import (
@@ -31,7 +32,7 @@ from tests.fusion.calibrated_limb import calibrated
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
 
 STEP = 10_000_000

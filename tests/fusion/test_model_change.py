@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.model_fit import fit_models
+from jointfit_daemon.calibration.soft_tissue import fit_models
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, as_quaternion
-from tests.calibration.taught_limb import CHAIN, calibration, moving
+from tests.calibration.calibrated_subject import CHAIN, calibration, moving
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState, Quaternion
 
 MS = 1_000_000

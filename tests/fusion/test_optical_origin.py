@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.result import Calibration, JointCalibration
+from jointfit_daemon.calibration.phases import fit_calibration
 from jointfit_daemon.fusion import OpticalOrigin
+from jointfit_daemon.limb_model import Calibration, JointCalibration
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from tests.calibration.synthetic_limb import (
     CHAIN,

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import orjson
 
-from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
-from jointfit_daemon.calibration.store import CalibrationStore, CalibrationUnreadable
-from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration import CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration.phases import fit_static
+from jointfit_daemon.calibration.phases._static_pose import fit_static_only
+from jointfit_daemon.calibration.record import CalibrationStore, CalibrationUnreadable
 from jointfit_daemon.config import MqttSettings, load_rig, parse_rig
 from jointfit_daemon.config._fault_messages import ConfigError
 from jointfit_daemon.model import Chunk
@@ -53,7 +54,7 @@ from tests.pipeline.core_feed import (
 )
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import Event
 
 KEY = b"a key for requests, 32 bytes long"

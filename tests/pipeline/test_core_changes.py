@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 import pytest
 
-from jointfit_daemon.calibration.jobs import run_job
+from jointfit_daemon.calibration.phases import run_job
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import (
@@ -43,7 +43,7 @@ from tests.pipeline.core_feed import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import Event
 
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.outputs.mqtt import Incoming
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -22,7 +22,7 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.supervisor import _stored_calibrations
 from jointfit_daemon.supervisor._calibration_writer import CalibrationWriter
 from jointfit_daemon.supervisor.daemon import Daemon
-from tests.calibration.plain_calibration import plain_calibration
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from pathlib import Path

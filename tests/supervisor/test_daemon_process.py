@@ -18,13 +18,13 @@ import pytest
 
 from jointfit_daemon import __version__
 from jointfit_daemon.__main__ import main
-from jointfit_daemon.calibration.store import checksum
+from jointfit_daemon.calibration.record._store import checksum
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from jointfit_daemon.pipeline import replay_states
 from tests import fake_drivers
-from tests.calibration.plain_calibration import plain_calibration
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -27,7 +27,7 @@ from jointfit_daemon.pipeline.online_learning import _frame_collector
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_protocols.natnet_frame import Body, FrameOfData
 from jointfit_protocols.natnet_messages import encode as encode_natnet
-from tests.calibration.taught_limb import TWO_AND_TWO, calibration, moving
+from tests.calibration.calibrated_subject import TWO_AND_TWO, calibration, moving
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import BEGIN_NS, PERIOD_NS, SENSORS, Bench, chunk
 

@@ -14,7 +14,7 @@ import pytest
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.supervisor import _stored_calibrations
 from jointfit_daemon.supervisor.worker import HEADER
-from tests.calibration.plain_calibration import plain_calibration
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,7 +68,7 @@ async def test_a_worker_dies_with_its_parent(tmp_path: Path) -> None:
         "time.sleep(60)\n"
     )
     worker = (
-        "import time, jointfit_daemon.calibration.jobs as jobs\n"
+        "import time, jointfit_daemon.calibration.phases._job_runner as jobs\n"
         "jobs.run_job = lambda kind, payload: time.sleep(60)\n"
         "from jointfit_daemon.supervisor.worker import main\n"
         "main()\n"

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
-from jointfit_daemon.calibration.store import CalibrationStore
-from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration import CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration.phases import fit_static
+from jointfit_daemon.calibration.phases._static_pose import fit_static_only
+from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig
 from jointfit_daemon.outputs.mqtt import BrokerLostError, MqttClient
 from jointfit_daemon.tools.calibrate import CalibrationWatch

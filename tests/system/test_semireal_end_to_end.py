@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bench.rigs.recorded_trial import Played
-    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.limb_model import Method
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(150)]
 

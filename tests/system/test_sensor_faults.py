@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bench.subjects.simulated_wearer import bench_rig, fitted
-from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import load_rig
 from tests.system.station import Listener, Station, knee_angles, listening, sensors_in
 

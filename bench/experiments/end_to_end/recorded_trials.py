@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bench.rigs.recorded_trial import Played
-    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.limb_model import Method
 
 METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
 WALKERS: tuple[Method, ...] = ("patent12", "anchored")

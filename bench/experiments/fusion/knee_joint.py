@@ -13,12 +13,10 @@ from bench.baselines import fusion_methods
 from bench.experiments.fusion.knee_segments import Squats
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.recorded_knee import FOLDER, load
-from jointfit_daemon.calibration.kernel_expert import fit_expert
-from jointfit_daemon.calibration.kernel_model import BLOCKS
-from jointfit_daemon.calibration.segment_model import SegmentTraining
-from jointfit_daemon.calibration.weighted_mean import fuse
+from jointfit_daemon.calibration.soft_tissue import BLOCKS, SegmentTraining, fit_expert
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import joint_rotation
+from jointfit_daemon.limb_model import fuse
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,16 +12,16 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure, near
 from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, training_frames
-from jointfit_daemon.calibration.redundancy import SegmentModel, fit_segment
-from jointfit_daemon.calibration.weighted_mean import fuse
+from jointfit_daemon.calibration.soft_tissue import fit_segment
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import fuse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.trial import Method
+    from jointfit_daemon.limb_model import Method, SegmentModel
 
 NAMES = ("thigh", "shank", "flexion")
 THIGH, SHANK = (0, 1), (2, 3)

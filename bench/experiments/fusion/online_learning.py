@@ -17,16 +17,24 @@ import numpy as np
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.faulty_wearer import Worn, play
 from bench.subjects.simulated_wearer import NS, bench_rig
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.online_fit import Fresh, learn
-from jointfit_daemon.calibration.refused import CalibrationRefused
-from jointfit_daemon.calibration.result import Calibration
-from jointfit_daemon.calibration.sampling import sensor_at
-from jointfit_daemon.calibration.static_pose import fit_static, with_new_static
-from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
+from jointfit_daemon.calibration import (
+    CalibrationRefused,
+    CalibrationTrial,
+    Fresh,
+    OpticalTrack,
+    SensorTrack,
+)
+from jointfit_daemon.calibration.phases import (
+    fit_calibration,
+    fit_plate_alignment,
+    fit_static,
+    learn,
+    with_new_static,
+)
+from jointfit_daemon.calibration.registration import sensor_at
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import Calibration
 from jointfit_simulators.cameras import Cameras
 from jointfit_simulators.orientation import to_wxyz
 from jointfit_simulators.programme import Step

@@ -16,11 +16,13 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.refused import CalibrationRefused
-from jointfit_daemon.calibration.static_pose import StaticPose, fit_static
-from jointfit_daemon.calibration.trial import CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration import CalibrationRefused, CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration.phases import (
+    StaticPose,
+    fit_calibration,
+    fit_plate_alignment,
+    fit_static,
+)
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
 from jointfit_simulators.cameras import Cameras
@@ -35,9 +37,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.calibration.trial import Method
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration, Method
     from jointfit_daemon.model import LimbState, Quaternion
 
 SEEDS = tuple(range(1, 9))

@@ -19,10 +19,9 @@ from bench.experiments.fusion.simulated_leg import take_pose, wear_live
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.recorded_knee import Judge, KneeTrial
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.markers import track_clusters
-from jointfit_daemon.calibration.sampling import sensor_at
+from jointfit_daemon.calibration.anatomy import track_clusters
+from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
+from jointfit_daemon.calibration.registration import sensor_at
 from jointfit_daemon.fusion import HEADING_SD
 from jointfit_daemon.kinematics import rotation
 

@@ -15,9 +15,8 @@ import numpy as np
 from bench.experiments.fusion.simulated_leg import SEEDS, SEGMENTS, errors_of, take_pose, wear_live
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.fit import fit_calibration
-from jointfit_daemon.calibration.markers import track_cluster
+from jointfit_daemon.calibration.anatomy import track_cluster
+from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
@@ -25,11 +24,10 @@ if TYPE_CHECKING:
 
     from bench.experiments.fusion.simulated_leg import Live
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.alignment_phase import PlateAlignment
-    from jointfit_daemon.calibration.result import Calibration
-    from jointfit_daemon.calibration.static_pose import StaticPose
-    from jointfit_daemon.calibration.trial import CalibrationTrial
+    from jointfit_daemon.calibration import CalibrationTrial
+    from jointfit_daemon.calibration.phases import PlateAlignment, StaticPose
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
 
 KNOCKED = {"thigh": "T2", "shank": "C2"}
 KNOCKED_M = 0.015

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
-from jointfit_daemon.calibration.mount import fit_observable_alignment, fit_sensor_alignment
-from jointfit_daemon.calibration.static import robust_mean
-from jointfit_daemon.calibration.stillness import still_from_rates
+from jointfit_daemon.calibration.registration import (
+    fit_observable_alignment,
+    fit_sensor_alignment,
+    robust_mean,
+    still_from_rates,
+)
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from bench.framework.experiment import Experiment, Figure
 from bench.subjects import faulty_wearer, recorded_knee
 from bench.subjects.faulty_wearer import SEGMENTS
 from bench.subjects.simulated_wearer import bench_rig
-from jointfit_daemon.calibration.offline import OfflineTrial, fit_offline
+from jointfit_daemon.calibration.phases import OfflineTrial, fit_offline
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chain
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion import SensorNews
+    from jointfit_daemon.limb_model import Calibration
 
 SEEDS = (1, 2, 5, 6, 7, 8)
 RATE_HZ = 50.0

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from bench.subjects.faulty_wearer import Worn
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
 
 PEOPLE = (*SEEDS, 11, 12, 13, 14)

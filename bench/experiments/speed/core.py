@@ -26,7 +26,7 @@ from jointfit_simulators.wearer import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chunk, Quaternion
     from jointfit_daemon.pipeline.events import Event
 

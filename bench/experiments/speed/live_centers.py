@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from bench.framework.measurement import Bench, Row, per_item
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.movement_guide import MovementGuide
+from jointfit_daemon.calibration.guidance import MovementGuide
 from jointfit_daemon.model import MocapFrame, MocapLayout
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from bench.framework.measurement import Bench, Row
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
-from jointfit_daemon.calibration.jobs import run_job
+from jointfit_daemon.calibration.phases import fit_plate_alignment, run_job
 
 DAEMON = (
     "import jointfit_daemon.__main__, jointfit_daemon.config, jointfit_daemon.supervisor.daemon"

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration.alignment_phase import fit_plate_alignment
+from jointfit_daemon.calibration.phases import fit_plate_alignment
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,8 +8,8 @@ import numpy as np
 
 from bench.experiments.timing.lag import made_up
 from bench.framework.experiment import Experiment, Figure
-from jointfit_daemon.calibration.result import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
+from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.model import Chain, ClockEcho, MocapFrame, MocapLayout, TickClock
 from jointfit_daemon.pipeline.sources import LagWatch
 from jointfit_daemon.timing.clock import DeviceClock

@@ -17,19 +17,19 @@ from itertools import combinations
 from math import cos, degrees, hypot, radians, sin, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.calibration.sensor_links import axis_heading_one, up_one
 from jointfit_daemon.fusion.faults._fault_reports import drift_told, pair_told, turn_told
 from jointfit_daemon.fusion.faults._heading_drift import HeadingDrift
 from jointfit_daemon.fusion.faults._joint_heading import JointWatch
 from jointfit_daemon.fusion.faults._magnetic_disturbance import Look, SuddenTurns
 from jointfit_daemon.fusion.faults._slip import PairWatch, together, untrained
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
+from jointfit_daemon.limb_model import axis_heading_one, up_one
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.fusion.faults._sensor_monitor import SensorNews
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
     Inputs = dict[str, Quaternion]

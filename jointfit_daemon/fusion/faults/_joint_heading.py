@@ -15,7 +15,7 @@ from jointfit_daemon.fusion.faults._slip import LEAST_LIMIT, SMOOTH_S, USUAL, La
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.sensor_links import SensorLink
+    from jointfit_daemon.limb_model import SensorLink
 
 HINGE_SPREAD = radians(6.0)
 """A joint whose flexion axes turn against each other by more than this, posture aside, is no hinge:

@@ -10,8 +10,8 @@ from collections import deque
 from math import exp, hypot, radians, sqrt
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.sensor_links import SensorLink
 from jointfit_daemon.kinematics.rotation_scalar import exp_one, turn_one
+from jointfit_daemon.limb_model import SensorLink
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

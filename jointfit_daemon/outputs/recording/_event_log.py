@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon import __version__
-from jointfit_daemon.calibration.result import Calibration
 from jointfit_daemon.config import parse_rig
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chunk, JointState, LimbState, SegmentState
 from jointfit_daemon.pipeline.events import (
     CalibrationStored,

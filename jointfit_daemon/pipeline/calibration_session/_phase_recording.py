@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.movement_guide import first_of
+from jointfit_daemon.calibration.guidance import first_of
 from jointfit_daemon.pipeline.calibration_session._stillness_gate import SILENT_NS, StillnessGate
 from jointfit_daemon.pipeline.calibration_session._trial_recorder import TrialRecorder
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.movement_guide import MovementGuide, MovementLook
-    from jointfit_daemon.calibration.trial import CalibrationTrial
+    from jointfit_daemon.calibration import CalibrationTrial
+    from jointfit_daemon.calibration.guidance import MovementGuide, MovementLook
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
 _NS = 1_000_000_000

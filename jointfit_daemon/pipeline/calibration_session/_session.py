@@ -14,9 +14,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from jointfit_daemon.calibration.alignment_phase import PLATE
-from jointfit_daemon.calibration.movement_guide import MovementGuide
-from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration import PLATE
+from jointfit_daemon.calibration.guidance import MovementGuide
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.pipeline.calibration_session._phase_recording import TEXTS, Phase
 from jointfit_daemon.pipeline.calibration_session._trial_recorder import LONGEST_S
 from jointfit_daemon.pipeline.events import (
@@ -33,8 +33,7 @@ from jointfit_daemon.pipeline.online_learning import Learned
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from jointfit_daemon.calibration.online_fit import Fresh
-    from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
+    from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, Fresh
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
     from jointfit_daemon.pipeline.sources import LagWatch

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.stillness import StillnessMonitor
+from jointfit_daemon.calibration.registration import StillnessMonitor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

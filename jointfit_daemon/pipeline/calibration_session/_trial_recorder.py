@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.trial import CalibrationTrial, OpticalTrack, SensorTrack
+from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTrack
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, Quaternion

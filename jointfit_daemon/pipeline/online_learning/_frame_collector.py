@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.calibration.online_fit import Fresh
+from jointfit_daemon.calibration import Fresh
 from jointfit_daemon.kinematics.rotation_scalar import interpolate_one, multiply_one
 from jointfit_daemon.pipeline.online_learning._learning_state import LearningWatch, hidden
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Quaternion
     from jointfit_daemon.pipeline.events import Notice
     from jointfit_daemon.timing.alignment import AlignedFrame

@@ -9,14 +9,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.pipeline.events import FitJob, Notice
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.calibration.online_fit import Fresh
-    from jointfit_daemon.calibration.trial import CalibrationSettings
+    from jointfit_daemon.calibration import CalibrationSettings, Fresh
     from jointfit_daemon.model import Chain
     from jointfit_daemon.pipeline.events import JobFinished
     from jointfit_daemon.pipeline.online_learning._frame_collector import OnlineLearner

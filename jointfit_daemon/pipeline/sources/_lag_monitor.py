@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.calibration.markers import rigid_fit
-from jointfit_daemon.calibration.static_pose import live_cluster
 from jointfit_daemon.driver import ImuSettings
+from jointfit_daemon.limb_model import live_cluster, rigid_fit
 from jointfit_daemon.pipeline.events import Notice
 from jointfit_daemon.timing.lag import (
     LagEstimate,
@@ -29,9 +28,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.calibration.markers import Cluster
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration, Cluster
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.timing.lag import TrackedLag
 

@@ -12,18 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.calibration.anatomy import moving_template
 from jointfit_daemon.calibration.center.estimate import METHODS, estimate_center
 from jointfit_daemon.calibration.center.movement import BodyPoses, Movement
 from jointfit_daemon.calibration.center.planar_reduction import plane_of
-from jointfit_daemon.calibration.markers import (
-    MAX_FIT_RMS_M,
-    MIN_MARKERS,
-    is_line,
-    moving_template,
-    steady_fit,
-    visible,
-)
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line, steady_fit, visible
 from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.calibration.store import CalibrationStore
+from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.calibrate import CalibrationWatch, RequestRefused
 from jointfit_daemon.tools.child_processes import finished_within

@@ -15,7 +15,7 @@ from jointfit_daemon.nearest_name import unknown_name
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.offline import OfflineTrial
+    from jointfit_daemon.calibration.phases import OfflineTrial
     from jointfit_daemon.tools.fuse._trial import Limb
 
 UNTAUGHT = ("mean", "single")
@@ -81,14 +81,14 @@ def evaluate(
     ] = None,
 ) -> None:
     """Judge every method where it was not fitted: leave one trial out."""
-    from jointfit_daemon.calibration import offline
+    from jointfit_daemon.calibration.phases import evaluate
     from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_plot
 
     check_plot(plot)
     limb, read, mounts, doubts = _inputs(trials, segment, joints, static, markers=markers, up=up)
     _refuse_unmoved(limb, read)
-    found = offline.evaluate(limb.chain, read, mounts, holdout=holdout)
+    found = evaluate(limb.chain, read, mounts, holdout=holdout)
     _warn(doubts)
     if json:
         _echo_json(_report.judgement_json(found) | {"notes": doubts})
@@ -120,7 +120,7 @@ def fit(
     from datetime import UTC, datetime
 
     from jointfit_daemon import __version__
-    from jointfit_daemon.calibration import offline
+    from jointfit_daemon.calibration.phases import fit_offline, mounts_of
     from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_output
 
@@ -130,8 +130,8 @@ def fit(
     if chosen not in UNTAUGHT:
         _refuse_unmoved(limb, read)
     if mounts is None:
-        mounts = {s: mean.q for s, mean in offline.mounts_of(limb.chain, read).items()}
-    calibration = offline.fit_offline(
+        mounts = {s: mean.q for s, mean in mounts_of(limb.chain, read).items()}
+    calibration = fit_offline(
         limb.chain,
         read,
         mounts,
@@ -195,7 +195,7 @@ def _inputs(
     up: str,
 ) -> tuple[Limb, list[OfflineTrial], dict[str, Any] | None, list[str]]:
     """Return limb, trials, mounts (None: to be learned) and what to doubt."""
-    from jointfit_daemon.calibration.offline_checks import doubts
+    from jointfit_daemon.calibration.phases import doubts
     from jointfit_daemon.tools.fuse import _trial
 
     limb = _trial.read_limb(segments, joints, markers or (), _axis(up))
@@ -225,7 +225,7 @@ def _axis(up: str) -> Any:
 
 
 def _method(name: str) -> Any:
-    from jointfit_daemon.calibration.model_fit import METHODS
+    from jointfit_daemon.calibration.soft_tissue import METHODS
 
     if name in METHODS:
         return name
@@ -233,9 +233,9 @@ def _method(name: str) -> Any:
 
 
 def _read_model(path: Path) -> Any:
-    from jointfit_daemon.calibration.result import Calibration, UnknownSchema
-    from jointfit_daemon.calibration.store import MOST_BYTES
+    from jointfit_daemon.calibration.record import MOST_BYTES
     from jointfit_daemon.files.text import read_json
+    from jointfit_daemon.limb_model import Calibration, UnknownSchema
 
     said = read_json(path, MOST_BYTES)
     try:
@@ -257,7 +257,7 @@ def _echo_json(said: dict[str, Any]) -> None:
 
 
 def _refuse_unmoved(limb: Limb, trials: Sequence[OfflineTrial]) -> None:
-    from jointfit_daemon.calibration.offline_checks import unmoved
+    from jointfit_daemon.calibration.phases import unmoved
 
     if why := unmoved(limb.chain, trials):
         raise ValueError(why)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.markers import visible
 from jointfit_daemon.files.orientations import (
     OrientationTable,
     OrientationTrial,
@@ -22,6 +21,7 @@ from jointfit_daemon.files.orientations import (
     write_sto,
 )
 from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.limb_model import visible
 from jointfit_daemon.model import Chain
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.result import Calibration
     from jointfit_daemon.files.mocap import Axis
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.tools.fuse._tables import Table
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from jointfit_daemon.calibration.offline import Judged, Judgement
+    from jointfit_daemon.calibration.phases import Judged, Judgement
 
 ROW_INCHES = 3.2
 

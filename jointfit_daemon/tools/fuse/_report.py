@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from jointfit_daemon.calibration.offline import Judged, Judgement
-    from jointfit_daemon.calibration.result import Calibration
+    from jointfit_daemon.calibration.phases import Judged, Judgement
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.tools.fuse._output import FusedTrial
 
 BASELINE = "mean"

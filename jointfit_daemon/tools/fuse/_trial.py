@@ -10,19 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.markers import (
-    MIN_MARKERS,
-    static_cluster,
-    track_cluster,
-    visible,
-)
-from jointfit_daemon.calibration.offline import OfflineTrial, mounts_of
-from jointfit_daemon.calibration.sampling import orientations_at
-from jointfit_daemon.calibration.static import robust_mean
-from jointfit_daemon.calibration.trial import CalibrationSettings, OpticalTrack
+from jointfit_daemon.calibration import CalibrationSettings, OpticalTrack
+from jointfit_daemon.calibration.anatomy import static_cluster, track_cluster
+from jointfit_daemon.calibration.phases import OfflineTrial, mounts_of
+from jointfit_daemon.calibration.registration import orientations_at, robust_mean
 from jointfit_daemon.files.mocap import read_marker_trial
 from jointfit_daemon.files.orientations import quaternions_z_up
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MIN_MARKERS, visible
 from jointfit_daemon.model import Chain
 from jointfit_daemon.nearest_name import unknown_name
 from jointfit_daemon.tools.fuse._tables import (
@@ -42,9 +37,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.markers import Cluster
-    from jointfit_daemon.calibration.static import RobustMean
+    from jointfit_daemon.calibration.registration import RobustMean
     from jointfit_daemon.files.mocap import Axis
+    from jointfit_daemon.limb_model import Cluster
 
 
 MARKER_FILES = (".trc", ".c3d")

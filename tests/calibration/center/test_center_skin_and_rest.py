@@ -16,8 +16,8 @@ from jointfit_daemon.calibration.center.parent_noise import turn_noise
 from jointfit_daemon.calibration.center.running_sphere import fit_running
 from jointfit_daemon.calibration.center.sphere import fit_sphere
 from jointfit_daemon.calibration.center.sphere_directions import Limits, of_posture, within95
-from jointfit_daemon.calibration.markers import rigid_fit
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import rigid_fit
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array

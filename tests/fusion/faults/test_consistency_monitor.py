@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.result import Calibration
-from jointfit_daemon.calibration.static_pose import fit_static, fit_static_only
+from jointfit_daemon.calibration.phases import fit_static
+from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import Calibration
 from tests.calibration.synthetic_limb import (
     CHAIN,
     SETTINGS,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.result import Calibration
-from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
+from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (

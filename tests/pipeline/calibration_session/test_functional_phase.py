@@ -30,7 +30,7 @@ from tests.calibration.synthetic_limb import (
 )
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.trial import CalibrationSettings, CalibrationTrial
+    from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.model import Quaternion
     from jointfit_daemon.pipeline.events import Output
 

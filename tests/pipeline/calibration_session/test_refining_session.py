@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from jointfit_daemon.calibration.jobs import run_job
-from jointfit_daemon.calibration.static_pose import fit_static
+from jointfit_daemon.calibration.phases import fit_static, run_job
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.trial import CalibrationSettings
+from jointfit_daemon.calibration import CalibrationSettings
 from jointfit_daemon.kinematics.rotation_scalar import angle_between_one
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
@@ -25,7 +25,7 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_daemon.pipeline.online_learning import OnlineLearner, _frame_collector, models_only
 from jointfit_daemon.timing.alignment import AlignedFrame
-from tests.calibration.taught_limb import CHAIN, calibration, fresh, moving
+from tests.calibration.calibrated_subject import CHAIN, calibration, fresh, moving
 
 MS, S = 1_000_000, 1_000_000_000
 SENSORS = ("S1", "S2", "S3")

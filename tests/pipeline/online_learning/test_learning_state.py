@@ -13,7 +13,7 @@ from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.online_learning import Learned, OnlineLearner, models_only
 from jointfit_daemon.pipeline.online_learning._learning_state import TOLD_NS, LearningWatch, hidden
 from jointfit_daemon.timing.alignment import AlignedFrame
-from tests.calibration.taught_limb import CHAIN, calibration
+from tests.calibration.calibrated_subject import CHAIN, calibration
 
 MS, S = 1_000_000, 1_000_000_000
 SENSORS = ("S1", "S2", "S3")

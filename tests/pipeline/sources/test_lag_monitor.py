@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.result import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
+from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.sources import LagWatch
 from jointfit_daemon.pipeline.sources._lag_monitor import KnownLag

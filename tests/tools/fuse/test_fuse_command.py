@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.model_fit import METHODS
-from jointfit_daemon.calibration.result import Calibration
+from jointfit_daemon.calibration.soft_tissue import METHODS
 from jointfit_daemon.files.orientations import (
     OrientationTable,
     OrientationTrial,
@@ -26,6 +25,7 @@ from jointfit_daemon.files.orientations import (
     write_orientations_sto,
 )
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import Calibration
 from tests.tools.fuse.fuse_files import (
     LIMB,
     MARKER_OPTIONS,

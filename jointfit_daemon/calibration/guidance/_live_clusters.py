@@ -1,0 +1,197 @@
+"""Where the body parts are, one camera frame at a time: all of them in one small rigid fit.
+
+Law: a frame costs the same whether it is the first or the millionth. A part whose markers do not
+fit the static pose is not seen in that frame, and what was wrong is counted under its name.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.model import MocapFrame, MocapLayout
+
+Mask = NDArray[np.bool_]
+
+_PATTERNS = 4096
+"""Ways of being hidden that are remembered; a bound, not a need."""
+
+
+class PartFigures(NamedTuple):
+    """How well one body part was seen so far."""
+
+    seen: float
+    """Share of the frames in which it had a pose."""
+    misfits: float
+    """Share of the frames in which its markers were seen, but not where they belong."""
+    suspect: str | None
+    """The marker that was out of place most often in those."""
+    absent: tuple[str, ...]
+    """Markers (or the body) that no frame so far has had by that name."""
+
+
+class LiveParts:
+    """Poses of body parts against the static pose, frame by frame.
+
+    Parameters
+    ----------
+    clusters : mapping of str to Cluster
+        The body parts as they stood, by name. A rigid body counts with its four virtual points.
+    """
+
+    def __init__(self, clusters: Mapping[str, Cluster]) -> None:
+        self.names = tuple(clusters)
+        self._clusters = tuple(clusters.values())
+        sizes = [len(cluster.template) for cluster in self._clusters]
+        shape = (len(sizes), max(sizes, default=0))
+        self.sizes = tuple(sizes)
+        self._template = np.zeros((*shape, 3))
+        self._wanted = np.zeros(shape, dtype=np.bool_)
+        for i, cluster in enumerate(self._clusters):
+            self._template[i, : sizes[i]] = cluster.template
+            self._wanted[i, : sizes[i]] = True
+        self.origins = np.array([c.origin for c in self._clusters]).reshape(-1, 3)
+        self._bodies = [i for i, c in enumerate(self._clusters) if c.body is not None]
+        self._frames = 0
+        self._good = np.zeros(shape[0], dtype=np.int64)
+        self._bad = np.zeros(shape[0], dtype=np.int64)
+        self._blamed = np.zeros(shape, dtype=np.int64)
+        self._known = np.zeros(shape, dtype=np.bool_)
+        self._usable: dict[bytes, Mask] = {}
+        self._layout: MocapLayout | None = None
+        self._columns = np.zeros(shape, dtype=np.intp)
+        self._missing = ~self._wanted
+        self._body_columns: dict[int, int] = {}
+        self.points = np.full((*shape, 3), np.nan)
+        """Markers as seen in the last frame, optical world, m, shape (parts, k, 3); NaN where not,
+        and where a part's markers do not fit it."""
+        self.R = np.tile(np.eye(3), (shape[0], 1, 1))
+        """R_now_static of the last frame, shape (parts, 3, 3); true only where `placed`."""
+        self.p = np.zeros((shape[0], 3))
+        """Where each origin was, m, shape (parts, 3)."""
+        self.placed = np.zeros(shape[0], dtype=np.bool_)
+        """Which parts have a pose in the last frame, shape (parts,)."""
+
+    def feed(self, frame: MocapFrame) -> None:
+        r"""Place every body part in one frame.
+
+        .. math:: \min_{R,t} \sum_k |R a_k + t - y_k|^2
+
+        over the markers seen (Kabsch 1976), all parts at once.
+        """
+        if frame.layout is not self._layout and frame.layout != self._layout:
+            self._read(frame.layout)
+        self._frames += 1
+        y = np.full_like(self.points, np.nan)
+        if len(frame.markers):
+            y = frame.markers[self._columns]
+        y[self._missing] = np.nan
+        for i in self._bodies:
+            y[i, : self.sizes[i]] = self._virtual(i, frame)
+        seen: Mask = np.asarray(np.isfinite(y).all(axis=2))
+        ok = self._enough(seen)
+        self.points = y
+        gap = self._fit(np.where(seen[..., None], y, 0.0), np.asarray(seen, dtype=np.float64))
+        count = np.maximum(seen.sum(axis=1), 1)
+        wrong = ok & (gap.sum(axis=1) / count > MAX_FIT_RMS_M**2)
+        self.placed = ok & ~wrong
+        self._good += self.placed
+        for i in np.flatnonzero(wrong).tolist():
+            self._bad[i] += 1
+            self._blamed[i, _out_of_place(self._template[i], y[i], seen[i])] += 1
+            y[i] = np.nan
+
+    def _read(self, layout: MocapLayout) -> None:
+        """Find the columns of a new layout; what it lacks is not seen."""
+        self._layout = layout
+        markers = {name: i for i, name in enumerate(layout.markers)}
+        bodies = {name: i for i, name in enumerate(layout.bodies)}
+        self._columns[:], self._missing[:] = 0, True
+        self._body_columns = {}
+        for i, cluster in enumerate(self._clusters):
+            if cluster.body is not None and cluster.body in bodies:
+                self._body_columns[i] = bodies[cluster.body]
+                self._known[i] = True
+            for k, name in enumerate(cluster.markers):
+                if name in markers:
+                    self._columns[i, k], self._missing[i, k] = markers[name], False
+                    self._known[i, k] = True
+
+    def _virtual(self, i: int, frame: MocapFrame) -> Array:
+        """Return where the virtual points of a rigid body are; NaN while it is not seen."""
+        column = self._body_columns.get(i)
+        if column is None:
+            return np.full((self.sizes[i], 3), np.nan)
+        q_body = np.asarray(frame.body_orientations[column], dtype=np.float64)
+        q = rotation.multiply(q_body, rotation.conjugate(self._clusters[i].q_body))
+        norm = float(np.sqrt(q @ q))
+        if not norm > 0.0:  # NaN too
+            return np.full((self.sizes[i], 3), np.nan)
+        R = rotation.to_matrix(q / norm)
+        return np.asarray(self._clusters[i].template @ R.T + frame.body_positions[column])
+
+    def _enough(self, seen: Mask) -> Mask:
+        """Tell which parts show three markers or more that are not on a line."""
+        key = seen.tobytes()
+        known = self._usable.get(key)
+        if known is None:
+            if len(self._usable) >= _PATTERNS:
+                self._usable.clear()
+            known = np.array(
+                [
+                    np.count_nonzero(row) >= MIN_MARKERS and not is_line(self._template[i][row])
+                    for i, row in enumerate(seen)
+                ],
+                dtype=np.bool_,
+            )
+            self._usable[key] = known
+        return known
+
+    def _fit(self, y: Array, w: Array) -> Array:
+        """Fit all parts; return the squared gap of every marker, m², shape (parts, k)."""
+        total = np.maximum(w.sum(axis=1), 1.0)[:, None, None]
+        weight = w[:, None, :]
+        a_mean, y_mean = weight @ self._template / total, weight @ y / total
+        a = (self._template - a_mean) * w[..., None]
+        U, _, Vt = np.linalg.svd(np.swapaxes(a, 1, 2) @ y)
+        mirrored = np.linalg.det(U @ Vt) < 0.0
+        Vt[mirrored, 2] *= -1.0
+        R = np.swapaxes(U @ Vt, 1, 2)
+        t = y_mean - a_mean @ np.swapaxes(R, 1, 2)
+        gap = self._template @ np.swapaxes(R, 1, 2) + t - y
+        self.R, self.p = R, t[:, 0]
+        return np.asarray((gap * gap).sum(axis=2) * w)
+
+    def figures(self) -> dict[str, PartFigures]:
+        """Return how well each body part was seen so far."""
+        frames = max(self._frames, 1)
+        told = {}
+        for i, (name, cluster) in enumerate(zip(self.names, self._clusters, strict=True)):
+            labels = cluster.markers or (cluster.body or name,) * self.sizes[i]
+            worst = labels[int(self._blamed[i, : self.sizes[i]].argmax())]
+            unknown = ~self._known[i] & (self._frames > 0)
+            absent = tuple(dict.fromkeys(label for k, label in enumerate(labels) if unknown[k]))
+            told[name] = PartFigures(
+                float(self._good[i]) / frames,
+                float(self._bad[i]) / frames,
+                worst if self._bad[i] else None,
+                absent,
+            )
+        return told
+
+
+def _out_of_place(template: Array, y: Array, seen: Mask) -> int:
+    """Return the marker whose distances to the others changed most: a rigid fit would share it."""
+    known = np.where(seen[:, None], y, 0.0)
+    now, then = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, template))
+    return int((np.abs(now - then) * np.outer(seen, seen)).sum(axis=1).argmax())

@@ -1,0 +1,357 @@
+"""The functional phase: from a static pose and a movement to a whole calibration.
+
+Law: pure; the optical system is the reference and is itself made of skin markers, so figures are
+distances from that reference, not from bones. Everything refused is refused at once, with remedies.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.calibration._errors import CalibrationRefused
+from jointfit_daemon.calibration.anatomy import (
+    SKIN_SD_M,
+    Anatomy,
+    ClusterTrack,
+    JointFound,
+    find_anatomy,
+    track_clusters,
+)
+from jointfit_daemon.calibration.phases._acceptance import better
+from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
+from jointfit_daemon.calibration.phases._static_pose import (
+    StaticPose,
+    fit_static,
+    sensor_calibration,
+)
+from jointfit_daemon.calibration.phases._training_set import MIN_FRAMES, limb_training
+from jointfit_daemon.calibration.record import trials_digest
+from jointfit_daemon.calibration.registration import (
+    NO_LAG,
+    SKIN,
+    ChosenLag,
+    fit_sensor_alignment,
+    known_lag,
+    seen_lags,
+    segment_lags,
+    sensor_lags,
+)
+from jointfit_daemon.calibration.soft_tissue import (
+    LimbTraining,
+    error_correlations,
+    evenly,
+    fit_links,
+    fit_models,
+    judge,
+    pack,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import (
+    Calibration,
+    JointCalibration,
+    SegmentCalibration,
+    SensorCalibration,
+    stored_cluster,
+    vector,
+    visible,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration._trial import CalibrationSettings, CalibrationTrial
+    from jointfit_daemon.calibration.phases._plate_alignment import PlateAlignment
+    from jointfit_daemon.limb_model import SegmentModel
+    from jointfit_daemon.model import Chain, Quaternion
+    from jointfit_daemon.timing.lag import LagEstimate
+
+__all__ = ["better", "fit_calibration"]
+
+
+MIN_SEEN = 0.5
+PLATE_SD_NS = 500_000.0
+"""Of a lag from the align phase that came without its standard deviation."""
+STORED_SD_NS = 3e6
+"""Of a lag of the calibration in force: it may have been found on skin."""
+MISALIGNED = np.deg2rad(25.0)
+"""A heading that differs by more is no matter of skin; below, skin may be all of it."""
+MEANING = (
+    "RMS distance from the optical reference on the last part of the trial, after a fit to the"
+    " first part; the stored models were then fitted to all of it"
+)
+
+
+def fit_calibration(
+    static: StaticPose | CalibrationTrial,
+    functional: CalibrationTrial,
+    alignment: PlateAlignment | None,
+    settings: CalibrationSettings,
+    chain: Chain,
+    *,
+    previous: Calibration | None = None,
+    software: str = "",
+    created_utc: str = "",
+    lag_ns: Mapping[str, int] | None = None,
+    tracked: Mapping[str, tuple[float, float]] | None = None,
+) -> Calibration:
+    """Calibrate a limb.
+
+    Parameters
+    ----------
+    static : StaticPose or CalibrationTrial
+        The static pose, or the trial to take it from.
+    functional : CalibrationTrial
+        The movement, with the optical system; sensor stamps not yet corrected for lag.
+    alignment : PlateAlignment or None
+        None: all sensor worlds are taken for the optical one, and ``headings_from_static`` says so.
+    previous : Calibration, optional
+        Gives lags where this movement shows none.
+    lag_ns : mapping, optional
+        Lags known beforehand; the others are estimated.
+    tracked : mapping, optional
+        Lag and sigma, ns, that earlier movement showed: used where this one shows none.
+
+    Raises
+    ------
+    CalibrationRefused
+        No optical system or markers, too little seen or moved, sensors missing.
+    """
+    pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
+    refined, tracks = _refined(_tracks(pose, functional, chain), pose, functional, settings)
+    anatomy = find_anatomy(chain, tracks)
+    lags = _lags(chain, functional, tracks, lag_ns or {})
+    used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}), lag_ns or {})
+    used_ns = {name: item.lag_ns for name, item in used.items()}
+    sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
+    training, raw, taught_notes = limb_training(chain, functional, tracks, anatomy, sensors)
+    models = fit_models(chain, training, settings.method)
+    headings = _heading_notes(chain, raw, training) if alignment is None else []
+    notes = (*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *taught_notes, *headings)
+    return Calibration(
+        method=settings.method,
+        joints=chain.joints,
+        segments=chain.segments,
+        chain_sensors=chain.sensors,
+        sensor=sensors,
+        segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
+        joint={name: _joint(found) for name, found in anatomy.joints.items()},
+        clusters={name: stored_cluster(cluster) for name, cluster in refined.clusters.items()},
+        flags=(*anatomy.flags, *(["headings_from_static"] if alignment is None else [])),
+        notes=notes,
+        quality={
+            "static": pose.quality,
+            "alignment": None if alignment is None else alignment.quality,
+            "lag": {n: _lag_figures(lags.get(n), used.get(n, NO_LAG)) for n in sensors},
+            **({} if refined.figures is None else {"markers": refined.figures}),
+            "anatomy": _anatomy_figures(anatomy),
+            "holdout": _holdout(chain, training, settings),
+        },
+        digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
+        software=software,
+        created_utc=created_utc,
+        links=fit_links(chain, training.sensors, anatomy.q_static),
+        correlations=error_correlations(chain, training, settings.method),
+        memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
+    )
+
+
+def _holdout(chain: Chain, training: LimbTraining, settings: CalibrationSettings) -> dict[str, Any]:
+    figures = judge(chain, training, settings.holdout_share)
+    return {"method": settings.method, **figures, "meaning": MEANING}
+
+
+def _tracks(
+    pose: StaticPose, functional: CalibrationTrial, chain: Chain
+) -> dict[str, ClusterTrack]:
+    """Follow all body parts; refuse what makes a reference impossible."""
+    if functional.optical is None or len(functional.optical.t_ns) < MIN_FRAMES:
+        raise CalibrationRefused("functional: needs the optical system; check that it streams")
+    reasons = [
+        f"{segment}: no markers in the static pose; name them under markers.{segment} "
+        "and repeat the static pose in view of the cameras"
+        for segment in chain.segments
+        if segment not in pose.clusters
+    ]
+    tracks = track_clusters(functional.optical, pose.clusters)
+    for segment in chain.segments:
+        share = float(visible(tracks[segment].q).mean()) if segment in tracks else 1.0
+        if share < MIN_SEEN:
+            reasons.append(
+                f"{segment}: three markers were seen together in {100 * share:.0f} % of the trial; "
+                "at least 50 % are needed: add a marker or stay in view"
+            )
+    reasons += [
+        f"{sensor}: no data while moving; switch it on and repeat"
+        for group in chain.sensors
+        for sensor in group
+        if sensor not in functional.sensors
+    ]
+    if reasons:
+        raise CalibrationRefused(*reasons)
+    return tracks
+
+
+def _refined(
+    tracks: dict[str, ClusterTrack],
+    pose: StaticPose,
+    functional: CalibrationTrial,
+    settings: CalibrationSettings,
+) -> tuple[RefinedClusters, dict[str, ClusterTrack]]:
+    """Refine the markers if that is wanted, and follow the body parts by them."""
+    if not settings.refine_markers or functional.optical is None:
+        return RefinedClusters(pose.clusters, None), tracks
+    refined = refine_clusters(pose.clusters, tracks, settings.holdout_share)
+    if refined.figures is None:
+        return refined, tracks
+    return refined, track_clusters(functional.optical, refined.clusters)
+
+
+def _lags(
+    chain: Chain,
+    functional: CalibrationTrial,
+    tracks: Mapping[str, ClusterTrack],
+    known: Mapping[str, int],
+) -> dict[str, LagEstimate]:
+    out: dict[str, LagEstimate] = {}
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        track = tracks[segment]
+        unknown = {s: functional.sensors[s] for s in group if s not in known}
+        out |= sensor_lags(track.t_ns, track.q, unknown, SKIN)
+    return out
+
+
+def _chosen_lags(
+    chain: Chain,
+    moving: Mapping[str, LagEstimate],
+    alignment: PlateAlignment | None,
+    earlier: Mapping[str, ChosenLag],
+    known: Mapping[str, int],
+) -> dict[str, ChosenLag]:
+    """Return what is known, else the lag of this movement and the plate together, else earlier."""
+    lags = dict(earlier)
+    plate = {} if alignment is None else alignment.sensors
+    prior = {
+        name: (
+            item.lag_ns,
+            item.lag_sigma_ns or (STORED_SD_NS if item.kind == "stored" else PLATE_SD_NS),
+        )
+        for name, item in plate.items()
+        if item.lag_ns is not None
+    }
+    for group in chain.sensors:
+        lags |= segment_lags(
+            {name: moving[name] for name in group if name in moving},
+            {name: prior[name] for name in group if name in prior},
+        )
+    return lags | {name: known_lag(lag) for name, lag in known.items()}
+
+
+def _earlier(
+    previous: Calibration | None, tracked: Mapping[str, tuple[float, float]]
+) -> dict[str, ChosenLag]:
+    """Return what was known before: as stored, or as seen since where that is surer."""
+    stored = {} if previous is None else previous.lag_ns
+    seen = seen_lags(tracked)
+    kept = {
+        name: ChosenLag(lag, STORED_SD_NS, "stored")
+        for name, lag in stored.items()
+        if name not in seen or (seen[name].sigma_ns or 0.0) >= STORED_SD_NS
+    }
+    return seen | kept
+
+
+def _lag_notes(lags: Mapping[str, LagEstimate], used_ns: Mapping[str, int]) -> list[str]:
+    return [
+        f"{name}: no lag from this movement ({lag.refused}); "
+        f"{used_ns.get(name, 0) / 1e6:.1f} ms used"
+        for name, lag in lags.items()
+        if lag.refused is not None
+    ]
+
+
+def _sensors(
+    chain: Chain,
+    pose: StaticPose,
+    alignment: PlateAlignment | None,
+    anatomy: Anatomy,
+    lag_ns: Mapping[str, int],
+) -> dict[str, SensorCalibration]:
+    out = {}
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        q_static = as_quaternion(anatomy.q_static[segment])
+        for s in group:
+            world: Quaternion = (1.0, 0.0, 0.0, 0.0) if alignment is None else alignment.world(s)
+            out[s] = sensor_calibration(pose.sensors[s], world, q_static, lag_ns.get(s, 0))
+    return out
+
+
+def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTraining) -> list[str]:
+    """Say which worlds seem turned. No alignment: skin motion is part of the figure."""
+    notes = []
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        for s in group:
+            found = fit_sensor_alignment("heading", raw[s], training.reference[segment])
+            turn = float(rotation.heading_of(found.q_world))
+            if abs(turn) > MISALIGNED:
+                notes.append(
+                    f"{s}: its world seems turned by about {np.rad2deg(turn):.0f} deg against the "
+                    "optical one; run the align phase"
+                )
+    return notes
+
+
+def _segment(name: str, anatomy: Anatomy, models: Mapping[str, SegmentModel]) -> SegmentCalibration:
+    q_static = as_quaternion(anatomy.q_static[name])
+    return SegmentCalibration(q_static, *anatomy.lengths[name], models)
+
+
+def _joint(found: JointFound | None) -> JointCalibration:
+    if found is None:
+        return JointCalibration(None, None, "unknown")
+    sd = float(np.sqrt(np.trace(found.covariance) / 3.0 + SKIN_SD_M**2))
+    residual = None if found.fit is None else found.fit.residual_rms
+    return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
+
+
+def _lag_figures(moving: LagEstimate | None, used: ChosenLag) -> dict[str, Any]:
+    """Return the lag in use, and beside it what this movement alone said."""
+    figures: dict[str, Any] = {"source": used.source}
+    if used.source != "none":
+        figures["lag_ns"] = used.lag_ns
+    if used.sigma_ns is not None:
+        figures["sigma_ns"] = round(used.sigma_ns)
+    if moving is not None and moving.refused is not None:
+        return figures | {"refused": moving.refused}
+    if moving is not None:
+        said = {"lag_ns": round(moving.lag_ns), "sigma_ns": round(moving.sigma_ns), "r2": moving.r2}
+        figures["movement"] = said
+    return figures
+
+
+def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:
+    return {
+        "joints": {
+            name: {
+                "source": "unknown" if found is None else found.told,
+                "sd_m": _joint(found).sd,
+                "residual_rms_m": _joint(found).residual_rms,
+                "gap_rms_m": None if found is None else found.gap_rms,
+                "arc_rad": None if found is None or found.fit is None else found.fit.arc,
+                "unseen_directions": 0
+                if found is None or found.fit is None
+                else len(found.fit.unseen),
+            }
+            for name, found in anatomy.joints.items()
+        },
+        "lengths_m": {name: length for name, (length, _) in anatomy.lengths.items()},
+        "length_sd_m": {name: sd for name, (_, sd) in anatomy.lengths.items()},
+        "length_sources": dict(anatomy.length_sources),
+        "flexion_axes": {
+            name: {"rms_rad": axis.rms, "off_plane_rad": axis.off}
+            for name, axis in anatomy.axes.items()
+        },
+    }

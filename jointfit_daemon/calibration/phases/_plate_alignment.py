@@ -1,0 +1,236 @@
+"""The align phase: all sensors on one plate that the cameras see, turned by hand.
+
+Law: each sensor's world gets its rotation to the optical world from here or from nowhere; skin
+motion never decides it. What the movement did not show is refused with the reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.calibration._errors import CalibrationRefused, unknown_name
+from jointfit_daemon.calibration._trial import PLATE
+from jointfit_daemon.calibration.anatomy import columns, moving_template
+from jointfit_daemon.calibration.registration import (
+    fit_observable_alignment,
+    sensor_at,
+    sensor_lags,
+    usable_ns,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import rigid_fit, visible
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.calibration._trial import (
+        CalibrationSettings,
+        CalibrationTrial,
+        OpticalTrack,
+        SensorTrack,
+    )
+    from jointfit_daemon.model import Quaternion
+
+MIN_FRAMES = 200
+MAX_RMS = np.deg2rad(6.0)
+"""A worse fit has a loose sensor, a swapped marker or a sensor that is not on the plate."""
+MAX_FRAMES = 3000
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedSensor:
+    """One sensor's world in the optical one."""
+
+    q_optical_world: Quaternion
+    kind: str
+    """``full`` | ``heading`` (both verticals taken for true)."""
+    kappa: float
+    """1: world and mount could not be told apart."""
+    error: float
+    """Standard error of the weakest direction, rad."""
+    rms: float
+    """RMS angle between plate and model, rad."""
+    lag_ns: int | None = None
+    """Sensor stamp minus optical stamp of the same event; None where the turning showed none."""
+    lag_sigma_ns: float | None = None
+    """Standard deviation; None where it was given without one."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlateAlignment:
+    """Every sensor's world in the optical one."""
+
+    sensors: Mapping[str, AlignedSensor]
+    notes: tuple[str, ...] = field(default=())
+
+    def world(self, sensor: str) -> Quaternion:
+        """Return q_optical_world of a sensor.
+
+        Raises
+        ------
+        CalibrationRefused
+            The sensor was not on the plate.
+        """
+        if sensor not in self.sensors:
+            raise CalibrationRefused(
+                f"{sensor}: not in the align phase; repeat it with all sensors on the plate"
+            )
+        return self.sensors[sensor].q_optical_world
+
+    @property
+    def quality(self) -> dict[str, Any]:
+        """Figures of every sensor, angles in rad."""
+        return {
+            name: {
+                "kind": item.kind,
+                "kappa": item.kappa,
+                "error_rad": item.error,
+                "rms_rad": item.rms,
+                "lag_ns": item.lag_ns,
+                "lag_sigma_ns": item.lag_sigma_ns,
+            }
+            for name, item in self.sensors.items()
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        return {
+            "sensors": {
+                name: {"q_optical_world": list(item.q_optical_world), **self.quality[name]}
+                for name, item in self.sensors.items()
+            },
+            "notes": list(self.notes),
+        }
+
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> PlateAlignment:
+        """Return the alignment of a JSON form."""
+        return PlateAlignment(
+            {
+                name: AlignedSensor(
+                    as_quaternion(item["q_optical_world"]),
+                    item["kind"],
+                    item["kappa"],
+                    item["error_rad"],
+                    item["rms_rad"],
+                    item["lag_ns"],
+                    item.get("lag_sigma_ns"),
+                )
+                for name, item in data["sensors"].items()
+            },
+            tuple(data["notes"]),
+        )
+
+
+def fit_plate_alignment(
+    trial: CalibrationTrial,
+    settings: CalibrationSettings,
+    *,
+    lag_ns: Mapping[str, int] | None = None,
+) -> PlateAlignment:
+    """Align every sensor of the trial with the optical world.
+
+    Parameters
+    ----------
+    trial : CalibrationTrial
+        The plate being turned; every sensor in it is taken to be on the plate.
+    settings : CalibrationSettings
+        `plate` names the rigid body, or ``markers["plate"]`` the markers.
+    lag_ns : mapping, optional
+        Sensor stamp minus optical stamp of the same event, where known; the others are estimated,
+        and taken for 0 where that is refused.
+
+    Raises
+    ------
+    CalibrationRefused
+        No plate, hardly seen, or a sensor whose movement or fit does not suffice; all at once.
+    """
+    if trial.optical is None or not trial.sensors:
+        raise CalibrationRefused(
+            "align: needs the optical system and at least one sensor streaming"
+        )
+    t_ns, q_plate = plate_track(trial.optical, settings)
+    unknown = {n: track for n, track in trial.sensors.items() if n not in (lag_ns or {})}
+    turning = sensor_lags(t_ns, q_plate, unknown)
+    lags = {**usable_ns(turning), **(lag_ns or {})}
+    reasons: list[str] = []
+    found: dict[str, AlignedSensor] = {}
+    for name, track in trial.sensors.items():
+        try:
+            aligned = _align_one(name, track, (t_ns, q_plate), lags.get(name))
+            sigma = turning[name].sigma_ns if name in turning and name in lags else None
+            found[name] = replace(aligned, lag_sigma_ns=sigma)
+        except CalibrationRefused as refusal:
+            reasons += refusal.reasons
+    if reasons:
+        raise CalibrationRefused(*reasons)
+    notes = [
+        f"{name}: heading only; turn the plate about more axes to align the vertical, too"
+        for name, item in found.items()
+        if item.kind == "heading"
+    ]
+    return PlateAlignment(found, tuple(notes))
+
+
+def plate_track(
+    optical: OpticalTrack, settings: CalibrationSettings
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps and q_optical_plate, at most `MAX_FRAMES` of them with NaN where unseen.
+
+    Raises
+    ------
+    CalibrationRefused
+        rig.toml names no plate, or the stream does not have it or hardly shows it.
+    """
+    if settings.plate is not None:
+        if settings.plate not in optical.bodies:
+            name = unknown_name("rigid body", settings.plate, optical.bodies)
+            raise CalibrationRefused(f"plate: {name}")
+        column = optical.bodies.index(settings.plate)
+        q = rotation.normalize(optical.body_orientations[:, column])
+    elif PLATE in settings.markers:
+        positions = optical.positions[:, columns(optical, PLATE, settings)]
+        q = rigid_fit(moving_template(positions), positions)[0]
+    else:
+        raise CalibrationRefused(
+            "align: no plate; name its rigid body (plate = …) or its markers (markers.plate = […])"
+        )
+    if (seen := int(np.count_nonzero(visible(q)))) < MIN_FRAMES:
+        raise CalibrationRefused(
+            f"plate: seen in {seen} frames, at least {MIN_FRAMES} are needed; keep it in view"
+        )
+    return optical.t_ns, q
+
+
+def _align_one(
+    name: str,
+    track: SensorTrack,
+    plate: tuple[NDArray[np.int64], NDArray[np.float64]],
+    lag_ns: int | None,
+) -> AlignedSensor:
+    t_ns, q_plate = plate
+    q_sensor = sensor_at(track, t_ns, lag_ns or 0)
+    both = np.flatnonzero(visible(q_sensor) & visible(q_plate))
+    if both.size < MIN_FRAMES:
+        raise CalibrationRefused(
+            f"{name}: {both.size} frames together with the plate, at least {MIN_FRAMES} are needed;"
+            " check that the sensor streams and the plate is in view"
+        )
+    every = both[:: -(-both.size // MAX_FRAMES)]
+    fit = fit_observable_alignment(q_sensor[every], q_plate[every])
+    if fit.kind == "mount":
+        raise CalibrationRefused(f"{name}: {'; '.join(fit.refused)}")
+    if fit.residual_scale > MAX_RMS:
+        raise CalibrationRefused(
+            f"{name}: off the plate by {np.rad2deg(fit.residual_scale):.1f} deg; fix the sensor to"
+            " the plate and check that all its markers belong to it"
+        )
+    return AlignedSensor(
+        as_quaternion(fit.q_world), fit.kind, fit.kappa, fit.weak_error, fit.residual_rms, lag_ns
+    )

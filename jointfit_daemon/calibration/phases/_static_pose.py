@@ -1,0 +1,240 @@
+"""The static pose: how sensors and markers stood while the wearer stood still.
+
+Law: a pose is judged as a whole; every reason to repeat it is said at once, each with its remedy.
+Without cameras the pose defines its own world, in which all segments are upright and face +y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.calibration._errors import CalibrationRefused
+from jointfit_daemon.calibration.anatomy import marked_parts, static_cluster
+from jointfit_daemon.calibration.record import trials_digest
+from jointfit_daemon.calibration.registration import (
+    RobustMean,
+    StaticLimits,
+    robust_mean,
+    static_problems,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import (
+    UNREFERENCED_SD,
+    Calibration,
+    JointCalibration,
+    MeanModel,
+    SegmentCalibration,
+    SegmentModel,
+    SensorCalibration,
+    alive_key,
+    rigid_fit,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.calibration._trial import CalibrationSettings, CalibrationTrial
+    from jointfit_daemon.calibration.phases._plate_alignment import PlateAlignment
+    from jointfit_daemon.limb_model import Cluster, StoredCluster
+    from jointfit_daemon.model import Chain, Quaternion
+
+MAX_TEMPLATE_RMS_M = 0.02
+"""Markers that fit their old places worse than this were moved since."""
+_NS = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class StaticPose:
+    """Means over one stretch of standing still."""
+
+    sensors: Mapping[str, RobustMean]
+    """q_world_sensor per sensor, in its own world."""
+    still_s: float
+    clusters: Mapping[str, Cluster] = field(default_factory=dict)
+    """Body parts the cameras saw; empty without cameras."""
+    digest: str = ""
+
+    @property
+    def quality(self) -> dict[str, Any]:
+        """Figures for people: seconds, spread of every sensor in rad, parts seen."""
+        return {
+            "still_s": self.still_s,
+            "spread_rad": {name: mean.spread for name, mean in self.sensors.items()},
+            "body_parts": sorted(self.clusters),
+        }
+
+
+def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Chain) -> StaticPose:
+    """Take the static pose from a trial in which the wearer stood still throughout.
+
+    Raises
+    ------
+    CalibrationRefused
+        A sensor is silent or spreads by more than 1°, the pose is too short, markers are unknown,
+        hidden or on a line; all reasons at once.
+    """
+    wanted = [sensor for group in chain.sensors for sensor in group]
+    reasons = [
+        f"{sensor}: no data while standing still; switch it on, or take it out of rig.toml"
+        for sensor in wanted
+        if sensor not in trial.sensors or len(trial.sensors[sensor].t_ns) < 2
+    ]
+    heard = [s for s in wanted if s in trial.sensors and len(trial.sensors[s].t_ns) >= 2]
+    means = {s: robust_mean(trial.sensors[s].q_world_sensor) for s in heard}
+    spans = [_span_s(trial.sensors[s].t_ns) for s in heard]
+    still_s = min(spans, default=0.0)
+    # A rig may ask for a shorter pose than the usual three seconds. A tenth less is enough: the
+    # samples of a pose span less than the pose, by their period and the way they come.
+    limits = StaticLimits(still_s=0.9 * min(StaticLimits().still_s, settings.static_s))
+    if heard:
+        reasons += static_problems(means, still_s, limits)
+    clusters: dict[str, Cluster] = {}
+    if trial.optical is not None and len(trial.optical.t_ns) > 0:
+        for name in marked_parts(settings, chain):
+            try:
+                clusters[name] = static_cluster(trial.optical, name, settings)
+            except CalibrationRefused as refusal:
+                reasons += refusal.reasons
+    if reasons:
+        raise CalibrationRefused(*reasons)
+    return StaticPose(means, still_s, clusters, trials_digest(trial))
+
+
+def _span_s(t_ns: NDArray[np.int64]) -> float:
+    return float(t_ns[-1] - t_ns[0]) / _NS
+
+
+def sensor_calibration(
+    mean: RobustMean, q_optical_world: Quaternion, q_static: Quaternion, lag_ns: int = 0
+) -> SensorCalibration:
+    """Return a sensor's bias, (q_optical_world q_world_sensor)* q_optical_segment, static pose."""
+    q_optical_sensor = rotation.multiply(q_optical_world, mean.q)
+    bias = rotation.multiply(rotation.conjugate(q_optical_sensor), q_static)
+    return SensorCalibration(q_optical_world, as_quaternion(bias), lag_ns, mean.spread)
+
+
+def fit_static_only(
+    pose: StaticPose,
+    alignment: PlateAlignment | None,
+    chain: Chain,
+    *,
+    software: str = "",
+    created_utc: str = "",
+) -> Calibration:
+    """Calibrate without cameras: all segments upright in the pose, plain mean of the sensors.
+
+    Without an alignment every sensor's world is taken for the static world (the patent's reading:
+    one common world); with arbitrary headings only the inclination is right then, and
+    ``headings_from_static`` says so.
+    """
+    upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    flags = ["facing_unknown"] if alignment is not None else ["headings_from_static"]
+    worlds = {
+        name: upright if alignment is None else alignment.world(name) for name in pose.sensors
+    }
+    return Calibration(
+        method="mean",
+        joints=chain.joints,
+        segments=chain.segments,
+        chain_sensors=chain.sensors,
+        sensor={
+            name: sensor_calibration(mean, worlds[name], upright)
+            for name, mean in pose.sensors.items()
+        },
+        segment={
+            name: SegmentCalibration(
+                upright,
+                chain.lengths[i] if i < len(chain.lengths) else None,
+                0.01 if i < len(chain.lengths) and chain.lengths[i] is not None else None,
+                models=_plain_means(chain.sensors[i]),
+            )
+            for i, name in enumerate(chain.segments)
+        },
+        joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
+        flags=tuple(flags),
+        notes=("no cameras: angles count from the static pose, the deviation given is a guess",),
+        quality={"static": pose.quality, "functional": None},
+        digest=pose.digest,
+        software=software,
+        created_utc=created_utc,
+    )
+
+
+def _plain_means(sensors: tuple[str, ...]) -> dict[str, SegmentModel]:
+    """Return equal-weight means of all sensors and of each alone."""
+    sets = {sensors, *((sensor,) for sensor in sensors)}
+    return {
+        alive_key(alive, None): MeanModel((1.0 / len(alive),) * len(alive), UNREFERENCED_SD)
+        for alive in sorted(sets)
+    }
+
+
+def with_new_static(
+    calibration: Calibration, pose: StaticPose, alignment: PlateAlignment | None = None
+) -> Calibration:
+    """Return the calibration after sensors were put on anew: only the biases change.
+
+    Where cameras see a segment's markers in their old places on the body, they say how it stands
+    now; else it is taken to stand as in the old pose, facing the same way (`same_pose_assumed`).
+
+    Parameters
+    ----------
+    alignment : PlateAlignment, optional
+        Newer than the calibration: gives the worlds, and the lags it has found.
+
+    Raises
+    ------
+    CalibrationRefused
+        The pose or the alignment lacks a calibrated sensor, or markers were moved.
+    """
+    if missing := [name for name in calibration.sensor if name not in pose.sensors]:
+        raise CalibrationRefused(
+            *(f"{name}: not in the new static pose; switch it on" for name in missing)
+        )
+    q_now: dict[str, Quaternion] = {}
+    assumed = False
+    for name, segment in calibration.segment.items():
+        turned = _turned(calibration.clusters.get(name), pose.clusters.get(name))
+        assumed |= turned is None and bool(calibration.clusters)
+        q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
+        q_now[name] = as_quaternion(q)
+    owner = {
+        s: n
+        for n, g in zip(calibration.segments, calibration.chain_sensors, strict=True)
+        for s in g
+    }
+    sensors = {}
+    for name, old in calibration.sensor.items():
+        world, lag_ns = old.q_optical_world, old.lag_ns
+        if alignment is not None:
+            world, found_ns = alignment.world(name), alignment.sensors[name].lag_ns
+            lag_ns = lag_ns if found_ns is None else found_ns
+        sensors[name] = sensor_calibration(pose.sensors[name], world, q_now[owner[name]], lag_ns)
+    flags = [flag for flag in calibration.flags if flag != "same_pose_assumed"]
+    flags += ["same_pose_assumed"] if assumed else []
+    quality = {**calibration.quality, "static": pose.quality}
+    if alignment is not None:
+        quality["alignment"] = alignment.quality
+    return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)
+
+
+def _turned(old: StoredCluster | None, new: Cluster | None) -> NDArray[np.float64] | None:
+    """Return how a body part stands now as seen from its old static pose; None if not seen."""
+    if old is None or new is None or old.markers != new.markers or old.body != new.body:
+        return None
+    if old.body is not None:
+        return rotation.multiply(new.q_body, rotation.conjugate(old.q_body))
+    q, _, rms = rigid_fit(np.array(old.template), (new.template + new.origin)[None])
+    if rms[0] > MAX_TEMPLATE_RMS_M:
+        raise CalibrationRefused(
+            f"markers of {new.name}: {1000 * rms[0]:.0f} mm from their old places on the body; "
+            "calibrate again with a functional trial"
+        )
+    turned: NDArray[np.float64] = q[0]
+    return turned

@@ -1,0 +1,10 @@
+"""Stored calibrations: the versioned store, the check of their content and the digest of trials."""
+
+from jointfit_daemon.calibration.record._store import (
+    MOST_BYTES,
+    CalibrationStore,
+    CalibrationUnreadable,
+)
+from jointfit_daemon.calibration.record._trial_digest import trials_digest
+
+__all__ = ["MOST_BYTES", "CalibrationStore", "CalibrationUnreadable", "trials_digest"]

@@ -1,0 +1,227 @@
+"""Calibrations on disk: numbered versions, written whole or not at all, with a checksum.
+
+Invariant: a version, once written, is never changed; a reader sees a complete file or none. Text
+is written aside, flushed to the medium, then linked under its number, which fails if that number
+exists; the directory is flushed last. A stop at any moment leaves the previous version in force.
+
+A file is ``{"sha256": …, "calibration": {…}}``; the checksum is that of the calibration as JSON
+with sorted keys and without blanks. A file whose content cannot be used is renamed to ``….bad``,
+which keeps its number taken, and never deleted.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.calibration.record._content_check import content_faults
+from jointfit_daemon.files.text import Malformed, parse_json, plain_fault, read_bounded
+from jointfit_daemon.limb_model import Calibration, UnknownSchema
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+MOST_BYTES = 64 * 1024 * 1024
+"""Size of the largest file that is read; a calibration of four sensors has about 1 MB."""
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP)
+_NUMBERED = re.compile(r"(\d{4,9})\.json")
+_TAKEN = re.compile(r"(\d{4,9})\.json(\.bad\d*)?")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+class CalibrationUnreadable(Exception):  # noqa: N818 - named for what happened
+    """A stored file is damaged or of another program; the message names the file and the remedy."""
+
+
+class _DamagedError(CalibrationUnreadable):
+    """Its content can never be used by this program."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A calibration as found."""
+
+    calibration: Calibration
+    version: int
+    notes: tuple[str, ...] = ()
+    """Newer versions that could not be read, one sentence each."""
+
+
+class CalibrationStore:
+    """The versions of one name under one directory: ``DIRECTORY/NAME/0001.json`` and on.
+
+    Parameters
+    ----------
+    directory : Path
+        Usually ``$STATE_DIRECTORY/calibrations``; made when first written to.
+    name : str
+        Of the wearer or session: letters, digits, ``. _ -``, starting with a letter or digit.
+
+    Raises
+    ------
+    ValueError
+        The name would leave the directory or needs other characters.
+    """
+
+    def __init__(self, directory: Path, name: str) -> None:
+        if not _NAME.fullmatch(name):
+            raise ValueError(
+                f"calibration store {name!r}: use letters, digits, '.', '_' and '-', "
+                "and start with a letter or digit"
+            )
+        self._directory = directory / name
+
+    def versions(self) -> list[int]:
+        """Return the numbers of all versions, oldest first."""
+        if not self._directory.is_dir():
+            return []
+        found = (_NUMBERED.fullmatch(path.name) for path in self._directory.iterdir())
+        return sorted(int(match[1]) for match in found if match)
+
+    def path(self, version: int) -> Path:
+        """Return where a version lies, whether it exists or not."""
+        return self._directory / f"{version:04d}.json"
+
+    def save(self, calibration: Calibration) -> int:
+        """Write a new version and return its number; durable when this returns.
+
+        Raises
+        ------
+        OSError
+            The medium is full, read-only or gone; nothing was changed then.
+        """
+        self._directory.mkdir(parents=True, exist_ok=True)
+        content = calibration.to_dict()
+        table = {"sha256": checksum(content), "calibration": content}
+        text = json.dumps(table, allow_nan=False, indent=1) + "\n"
+        aside = self._directory / f".writing-{os.getpid()}"
+        try:
+            with aside.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            version = self._link(aside)
+        finally:
+            aside.unlink(missing_ok=True)
+        self._flush_directory()
+        return version
+
+    def _link(self, aside: Path) -> int:
+        """Give the file the next free number. A hard link, unlike a rename, never replaces."""
+        names = (_TAKEN.fullmatch(path.name) for path in self._directory.iterdir())
+        version = max((int(match[1]) for match in names if match), default=0) + 1
+        while True:
+            try:
+                os.link(aside, self.path(version))
+            except FileExistsError:  # another process was first: its version stays
+                version += 1
+            except OSError as error:
+                if error.errno not in _NO_LINKS:
+                    raise
+                aside.rename(self.path(version))  # FAT and the like: atomic, one writer trusted
+                return version
+            else:
+                return version
+
+    def _flush_directory(self) -> None:
+        descriptor = os.open(self._directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def load(self, version: int) -> Calibration:
+        """Return one version.
+
+        Raises
+        ------
+        CalibrationUnreadable
+            No such version, or the file is damaged.
+        """
+        path = self.path(version)
+        if not path.exists():
+            known = ", ".join(map(str, self.versions())) or "none"
+            raise CalibrationUnreadable(f"{path}: no such version; stored: {known}")
+        try:
+            data = read_bounded(path, MOST_BYTES)
+        except Malformed as error:
+            raise CalibrationUnreadable(str(error)) from error
+        try:
+            return _calibration_of(data)
+        except (UnknownSchema, ValueError, RecursionError) as error:
+            raise _DamagedError(
+                f"{path}: cannot be used ({str(error) or type(error).__name__:.300}); "
+                "restore the file from a backup or calibrate again"
+            ) from error
+
+    def latest(self) -> Stored | None:
+        """Return the newest usable version, with a note for every newer one that is not.
+
+        Files whose content cannot be used are renamed.
+
+        Raises
+        ------
+        CalibrationUnreadable
+            There are versions and none can be read.
+        """
+        notes: list[str] = []
+        for version in reversed(self.versions()):
+            try:
+                return Stored(self.load(version), version, tuple(notes))
+            except _DamagedError as error:
+                notes.append(f"{error}; {self._set_aside(version)}; the version before is used")
+            except CalibrationUnreadable as error:
+                notes.append(f"{error}; the version before is used")
+        if notes:
+            raise CalibrationUnreadable("; ".join(notes))
+        return None
+
+    def _set_aside(self, version: int) -> str:
+        """Rename a damaged version, so that it is reported once; return what was done."""
+        path = self.path(version)
+        for count in range(1, 100):
+            aside = path.with_name(f"{path.name}.bad{count if count > 1 else ''}")
+            if not aside.exists():
+                try:
+                    path.rename(aside)
+                except OSError as error:
+                    return f"it cannot be renamed: {error.strerror}"
+                return f"set aside as {aside.name}"
+        return "it stays: too many files of this name are set aside"
+
+
+def checksum(content: Mapping[str, object]) -> str:
+    """Return the SHA-256, in hex, of the JSON form of a calibration, whatever its layout."""
+    text = json.dumps(content, allow_nan=False, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _calibration_of(data: bytes) -> Calibration:
+    """Return the calibration in a file.
+
+    Raises
+    ------
+    ValueError, RecursionError
+        It cannot be used; `UnknownSchema` among them.
+    """
+    table = parse_json(data.decode("utf-8-sig"))
+    if not isinstance(table, dict):
+        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - of a file
+    content: object = table if "schema" in table else table.get("calibration")
+    if not isinstance(content, dict):
+        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - as above
+    # A bare calibration was written before there were checksums.
+    if content is not table and table.get("sha256") != checksum(content):
+        raise ValueError("the checksum differs: it was damaged, or edited by hand")
+    if fault := plain_fault(content):
+        raise ValueError(fault)
+    calibration = Calibration.from_dict(content)
+    if faults := content_faults(calibration):
+        raise ValueError("; ".join(faults))
+    return calibration

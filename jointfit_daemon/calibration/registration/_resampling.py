@@ -1,0 +1,59 @@
+"""Orientation tracks at other instants. Law: never across a gap; NaN says that nothing is known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import visible
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration._trial import SensorTrack
+
+
+MAX_GAP_SAMPLES = 3.5
+"""Widest gap bridged, in median sample periods: three missing samples are not bridged."""
+
+
+def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64]) -> Array:
+    """Interpolate orientations along the shortest rotation, q_i exp(a log(q_i* q_i+1)).
+
+    Parameters
+    ----------
+    t_ns : ndarray, shape (n,)
+        Strictly increasing.
+    q : ndarray, shape (n, 4)
+        Unit; rows of NaN are left out as if never sampled.
+    at_ns : ndarray, shape (m,)
+        Where to.
+
+    Returns
+    -------
+    ndarray, shape (m, 4)
+        NaN outside the track and inside gaps.
+    """
+    good = visible(q)
+    t, q = t_ns[good], q[good]
+    if len(t) < 2:
+        return np.full((len(at_ns), 4), np.nan)
+    widest = MAX_GAP_SAMPLES * float(np.median(np.diff(t_ns)))
+    i = np.clip(np.searchsorted(t, at_ns, side="right") - 1, 0, len(t) - 2)
+    width = (t[i + 1] - t[i]).astype(np.float64)
+    share = (at_ns - t[i]) / width
+    out = rotation.interpolate(q[i], q[i + 1], share)
+    out[(share < 0.0) | (share > 1.0) | ((width > widest) & (share > 0.0) & (share < 1.0))] = np.nan
+    return out
+
+
+def sensor_at(track: SensorTrack, at_ns: NDArray[np.int64], lag_ns: int = 0) -> Array:
+    """Return a sensor's orientations at instants of the optical clock.
+
+    `lag_ns` is the sensor's stamp minus the optical stamp of the same event, so the sensor is read
+    at ``at_ns + lag_ns``.
+    """
+    return orientations_at(track.t_ns, track.q_world_sensor, at_ns + lag_ns)

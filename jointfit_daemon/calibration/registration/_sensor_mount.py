@@ -1,0 +1,204 @@
+r"""How a sensor's world and housing sit against the optical world and the body it is on.
+
+.. math:: q_{ref,i} = q_W \otimes q_{s,i} \otimes q_B
+
+Law: pure, linear algebra of 4x4 matrices; the solver says what the movement could not show and
+refuses to answer it. The full and the heading-only problem are for sensors on a rigid plate:
+skin-mounted sensors move with the tissue, the fit takes that for a turn of the world, and is tens
+of degrees wrong once the subject faces another way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from jointfit_daemon.calibration._robust_weights import (
+    MAX_PASSES,
+    SETTLED,
+    effective_count,
+    huber_weights,
+    robust_scale,
+)
+from jointfit_daemon.calibration.registration._static_mean import robust_mean
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+
+Kind = Literal["full", "heading", "mount"]
+
+_SAME = 1e-9  # singular values closer than this, relatively, are equal
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentLimits:
+    """When a turn between the worlds is believed."""
+
+    kappa_full: float = 0.95
+    kappa_heading: float = 0.98
+    weak_error: float = np.deg2rad(1.0)
+    """Largest standard error of the full problem's weakest direction, rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorAlignment:
+    """What was found, how well, and what was refused."""
+
+    kind: Kind
+    q_world: Array
+    """q_optical_sensorworld, shape (4,); the identity for kind ``mount``."""
+    q_mount: Array
+    """q_sensor_body, shape (4,)."""
+    kappa: float
+    """Second singular value over the first: 1 where world and mount cannot be told apart; 0 for
+    kind ``mount``, which has nothing to tell apart."""
+    weak_error: float
+    """Standard error of the weakest direction, rad; inf where it is unobservable."""
+    residual_rms: float
+    """RMS angle between model and reference, rad, all frames."""
+    residual_scale: float
+    """Robust scale of the same angles, rad: outliers do not enter."""
+    effective_count: float
+    """Independent looks the frames are worth."""
+    refused: tuple[str, ...] = ()
+    """Why each richer kind was not accepted."""
+
+
+def fit_observable_alignment(
+    q_world_sensor: ArrayLike, q_optical_body: ArrayLike, limits: AlignmentLimits | None = None
+) -> SensorAlignment:
+    """Return the richest alignment the movement supports: full, else heading, else mount only.
+
+    Parameters
+    ----------
+    q_world_sensor : array_like, shape (n, 4)
+        Sensor orientations in the sensor's own world.
+    q_optical_body : array_like, shape (n, 4)
+        The body the sensor is fixed to, at the same instants; rows with NaN in either are left out.
+
+    Raises
+    ------
+    ValueError
+        Fewer than four frames have both.
+    """
+    limits = limits or AlignmentLimits()
+    refused: list[str] = []
+    full = fit_sensor_alignment("full", q_world_sensor, q_optical_body)
+    if full.kappa <= limits.kappa_full and full.weak_error <= limits.weak_error:
+        return full
+    refused.append(
+        f"full world alignment: kappa {full.kappa:.3f} (at most {limits.kappa_full}), error of the "
+        f"weakest direction {np.rad2deg(full.weak_error):.2f} deg: turn about two or more axes"
+    )
+    heading = fit_sensor_alignment("heading", q_world_sensor, q_optical_body)
+    if heading.kappa <= limits.kappa_heading:
+        return _with_refused(heading, refused)
+    refused.append(
+        f"heading alignment: kappa {heading.kappa:.3f} (at most {limits.kappa_heading}): turn "
+        "about a horizontal axis, too"
+    )
+    return _with_refused(fit_sensor_alignment("mount", q_world_sensor, q_optical_body), refused)
+
+
+def fit_sensor_alignment(
+    kind: Kind, q_world_sensor: ArrayLike, q_optical_body: ArrayLike
+) -> SensorAlignment:
+    r"""Fit one kind of alignment by robust least squares, without judging it.
+
+    With :math:`b = q_B` and :math:`v = q_W^*` the model reads :math:`L(q_s) b = \pm R(q_{ref}) v`;
+    the summed squared difference over unit b, v is smallest at the first singular vectors of
+    :math:`M = \sum w_i s_i L(q_{s,i})^T R(q_{ref,i})`. Signs s and Huber weights w are iterated.
+    For ``heading`` only the columns w and z of M are kept; for ``mount`` q_W = 1 and q_B is a
+    robust mean. Source: the quaternion form of AX = YB, Zhuang, Roth and Sudhakar 1994.
+
+    Raises
+    ------
+    ValueError
+        Fewer than four frames have both orientations.
+    """
+    q_s = rotation.normalize(q_world_sensor)
+    q_ref = rotation.normalize(q_optical_body)
+    both = np.isfinite(q_s).all(axis=1) & np.isfinite(q_ref).all(axis=1)
+    if np.count_nonzero(both) < 4:
+        raise ValueError("an alignment needs at least four frames with both orientations")
+    q_s, q_ref = q_s[both], q_ref[both]
+    if kind == "mount":
+        q_mount = robust_mean(rotation.multiply(rotation.conjugate(q_s), q_ref)).q
+        return _judged(kind, (q_s, q_ref), rotation.IDENTITY, q_mount, 0.0)
+    T = np.swapaxes(rotation.left_matrix(q_s), -1, -2) @ rotation.right_matrix(q_ref)
+    starts = _starts(q_s, q_ref, T)
+    return min(
+        (_solve(kind, q_s, q_ref, T[:, :, _columns(kind)], signs) for signs in starts),
+        key=lambda found: found.residual_scale,
+    )
+
+
+def _starts(q_s: Array, q_ref: Array, T: Array) -> tuple[Array, Array]:
+    """Return two guesses of the signs: both streams continuous, and blind to time.
+
+    Outliers break continuity; the second guess takes the signs that make the T_i most alike.
+    """
+    steady = np.where(np.sum(rotation.continuous(q_s) * q_s, axis=1) < 0.0, -1.0, 1.0)
+    steady *= np.where(np.sum(rotation.continuous(q_ref) * q_ref, axis=1) < 0.0, -1.0, 1.0)
+    flat = T.reshape(len(T), 16)
+    alike = np.linalg.eigh(flat.T @ flat)[1][:, -1]
+    return steady, np.where(flat @ alike < 0.0, -1.0, 1.0)
+
+
+def _solve(kind: Kind, q_s: Array, q_ref: Array, T: Array, signs: Array) -> SensorAlignment:
+    weights = np.ones(len(T))
+    q_world, b, kappa = _decompose(kind, T, signs)
+    for _ in range(MAX_PASSES):
+        angles = rotation.angle_between(_model(q_world, q_s, b), q_ref)
+        before = weights * signs
+        signs = np.where(T @ rotation.conjugate(q_world)[_columns(kind)] @ b < 0.0, -1.0, 1.0)
+        weights = huber_weights(angles, robust_scale(angles))
+        q_world, b, kappa = _decompose(kind, T, weights * signs)
+        if float(np.max(np.abs(weights * signs - before))) < SETTLED:
+            break
+    return _judged(kind, (q_s, q_ref), q_world, b, kappa)
+
+
+def _decompose(kind: Kind, T: Array, signed_weights: Array) -> tuple[Array, Array, float]:
+    """Return q_W, q_B and kappa from the first singular vectors of the weighted sum of T_i."""
+    U, S, Vt = np.linalg.svd(np.einsum("i,ijk->jk", signed_weights, T))
+    v = np.zeros(4)
+    v[_columns(kind)] = Vt[0]
+    return rotation.conjugate(v), U[:, 0], float(S[1] / S[0])
+
+
+def _columns(kind: Kind) -> list[int]:
+    """Return which components of v are free: a turn about the vertical has no x and no y."""
+    return [0, 3] if kind == "heading" else [0, 1, 2, 3]
+
+
+def _model(q_world: Array, q_s: Array, q_mount: Array) -> Array:
+    return rotation.multiply(q_world, rotation.multiply(q_s, q_mount))
+
+
+def _judged(
+    kind: Kind, streams: tuple[Array, Array], q_world: Array, q_mount: Array, kappa: float
+) -> SensorAlignment:
+    q_s, q_ref = streams
+    model = _model(q_world, q_s, q_mount)
+    residuals = rotation.log(rotation.multiply(rotation.conjugate(model), q_ref))
+    angles = np.linalg.norm(residuals, axis=1)
+    rms, scale = float(np.sqrt(np.mean(angles**2))), robust_scale(angles)
+    # the weights hold outliers down, so they must not swell the claimed error either
+    weights = huber_weights(angles, scale)
+    weighted_rms = float(np.sqrt(np.sum(weights**2 * angles**2) / np.sum(weights)))
+    count = effective_count(residuals * weights[:, None])
+    apart = count * (1.0 - kappa)
+    weak = weighted_rms / np.sqrt(apart) if kappa < 1.0 - _SAME else np.inf
+    q_world = rotation.align_hemisphere(q_world, rotation.IDENTITY)
+    q_mount = rotation.align_hemisphere(q_mount, rotation.IDENTITY)
+    return SensorAlignment(kind, q_world, q_mount, kappa, float(weak), rms, scale, count)
+
+
+def _with_refused(found: SensorAlignment, refused: list[str]) -> SensorAlignment:
+    return replace(found, refused=tuple(refused))

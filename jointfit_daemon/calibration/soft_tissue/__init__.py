@@ -1,0 +1,47 @@
+"""Fits of the segment models that correct soft-tissue artefacts."""
+
+from jointfit_daemon.calibration.soft_tissue._error_correlation import (
+    error_correlation,
+    error_correlations,
+)
+from jointfit_daemon.calibration.soft_tissue._kernel_expert_fit import fit_expert
+from jointfit_daemon.calibration.soft_tissue._kernel_fit import BLOCKS
+from jointfit_daemon.calibration.soft_tissue._limb_fit import (
+    METHODS,
+    LimbTraining,
+    all_alive,
+    fit_models,
+    flexion,
+    judge,
+    mean_of,
+)
+from jointfit_daemon.calibration.soft_tissue._mean_fit import fusion_weights
+from jointfit_daemon.calibration.soft_tissue._robust_ridge import fit_ridge
+from jointfit_daemon.calibration.soft_tissue._segment_fit import fit_segment
+from jointfit_daemon.calibration.soft_tissue._segment_training import FEWEST_FRAMES, SegmentTraining
+from jointfit_daemon.calibration.soft_tissue._sensor_link_fit import fit_links
+from jointfit_daemon.calibration.soft_tissue._training_memory import evenly, joined, pack, unpack
+
+__all__ = [
+    "BLOCKS",
+    "FEWEST_FRAMES",
+    "METHODS",
+    "LimbTraining",
+    "SegmentTraining",
+    "all_alive",
+    "error_correlation",
+    "error_correlations",
+    "evenly",
+    "fit_expert",
+    "fit_links",
+    "fit_models",
+    "fit_ridge",
+    "fit_segment",
+    "flexion",
+    "fusion_weights",
+    "joined",
+    "judge",
+    "mean_of",
+    "pack",
+    "unpack",
+]

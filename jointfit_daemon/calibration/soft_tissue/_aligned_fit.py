@@ -1,0 +1,49 @@
+"""Fit of the aligned mean: world and mount of each sensor, and its weight."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.calibration.registration import fit_sensor_alignment
+from jointfit_daemon.calibration.soft_tissue._mean_fit import fusion_weights
+from jointfit_daemon.calibration.soft_tissue._segment_training import (
+    SegmentTraining,
+    cross_validated_sd,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import AlignedModel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.arrays import Array
+
+
+def fit_aligned(training: SegmentTraining) -> AlignedModel:
+    """Return the mean of aligned sensors, each weighted by what it errs then.
+
+    Robot-world and hand-eye calibration with true verticals, see `fit_sensor_alignment`, sensor by
+    sensor, then the eigenvector mean of Markley et al. 2007.
+    """
+
+    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
+        model = _aligned(part, 0.0)
+        return lambda test: model.predict(test.sensors)
+
+    return _aligned(training, cross_validated_sd(training, fit))
+
+
+def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:
+    found = [fit_sensor_alignment("heading", q, training.q_reference) for q in training.sensors]
+    turned = [
+        rotation.multiply(rotation.multiply(one.q_world, q), one.q_mount)
+        for one, q in zip(found, training.sensors, strict=True)
+    ]
+    return AlignedModel(
+        tuple(as_quaternion(one.q_world.tolist()) for one in found),
+        tuple(as_quaternion(one.q_mount.tolist()) for one in found),
+        tuple(fusion_weights(turned, training.q_reference).tolist()),
+        sd,
+        training.movements,
+    )

@@ -1,0 +1,80 @@
+"""Fit of the kernel model: experts, trend and claimed variance from held-out groups."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.soft_tissue._kernel_expert_fit import fit_expert
+from jointfit_daemon.calibration.soft_tissue._kernel_trend_fit import fit_trend, unseen_trend
+from jointfit_daemon.calibration.soft_tissue._leverage_variance_fit import measure_spread
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import (
+    KernelModel,
+    equal_weights,
+    fuse,
+    mix_corrections,
+    model_inputs,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.soft_tissue._segment_training import SegmentTraining
+
+
+BLOCKS = 3
+"""Of a single trial: few and long ones, so that each holds movement the others do not."""
+
+
+def fit_kernel(training: SegmentTraining) -> KernelModel:
+    """Return the model alone, see `learn_kernel`."""
+    return learn_kernel(training)[0]
+
+
+def learn_kernel(training: SegmentTraining) -> tuple[KernelModel, Array]:
+    """Fit both experts; all that is chosen, and the claimed variance, come from held-out groups.
+
+    Groups are blocks in time and, where several trials train, whole trials as well.
+
+    Returns
+    -------
+    model : KernelModel
+    residuals : ndarray, shape (w n, 3)
+        What is left over of every frame when its group is left out, rad in the axes of the segment;
+        one way of leaving out after the other.
+
+    Raises
+    ------
+    ValueError
+        There is no neighbouring segment to look at.
+    """
+    if training.q_other is None:
+        raise ValueError("the anchored model needs a sensor of the neighbouring segment")
+    count = len(training.sensors)
+    mean = fuse(training.sensors, equal_weights(count))
+    rho = rotation.log(rotation.multiply(rotation.conjugate(mean), training.q_reference))
+    u = model_inputs(training.sensors, mean, training.q_other)
+    ways = [list(training.folds(BLOCKS))]
+    if training.movements > 1:
+        ways.append([training.trials == label for label in np.unique(training.trials)])
+    plain = fit_expert(u, rho, count, ways, tilted=False)
+    tilted = fit_expert(u, rho, count, ways, tilted=True)
+    lines = [unseen_trend(u, rho, groups) for groups in ways]
+    unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
+    residuals = [rho - mix_corrections(*each) for each in unseen]
+    distances = [np.maximum(a_ratio, b_ratio) for _, _, a_ratio, _, b_ratio in unseen]
+    model = KernelModel(
+        sensors=count,
+        plain=plain.expert,
+        tilted=tilted.expert,
+        trend=fit_trend(u, rho),
+        spread=measure_spread(distances, residuals),
+        residual_sd=_sd(residuals[-1]),
+        mean_sd=_sd(rho),
+    )
+    return model, np.concatenate(residuals)
+
+
+def _sd(residuals: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)) / 3.0))

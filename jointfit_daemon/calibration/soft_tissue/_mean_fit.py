@@ -1,0 +1,80 @@
+"""Fits of the weighted mean: equal weights, the best single sensor, weights by error."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.soft_tissue._segment_training import (
+    SegmentTraining,
+    cross_validated_sd,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MeanModel, fuse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from jointfit_daemon.arrays import Array
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.arrays import Array
+
+
+_SMALLEST_VARIANCE = 1e-12  # rad^2; a sensor that is its own reference still gets a finite weight
+
+
+def fusion_weights(sensors: Sequence[Array], q_reference: Array) -> Array:
+    """Return weights 1 / mean(e^2), normalised to sum 1, e the angle to the reference.
+
+    Parameters
+    ----------
+    sensors : sequence of ndarray, shape (n, 4)
+        Bone-aligned orientations, one array a sensor.
+    q_reference : ndarray, shape (n, 4)
+
+    Returns
+    -------
+    ndarray, shape (len(sensors),)
+    """
+    variances = [np.mean(rotation.angle_between(q, q_reference) ** 2) for q in sensors]
+    weights = 1.0 / np.maximum(np.array(variances), _SMALLEST_VARIANCE)
+    normalized: Array = weights / weights.sum()
+    return normalized
+
+
+def plain_mean(training: SegmentTraining) -> MeanModel:
+    """Return the mean with equal weights: the baseline that learns nothing but its own error."""
+    weights = (1.0 / len(training.sensors),) * len(training.sensors)
+    said = fuse(training.sensors, weights)
+    angles = rotation.angle_between(said, training.q_reference)
+    return MeanModel(weights, float(np.sqrt(np.mean(angles**2) / 3.0)))
+
+
+def best_single(training: SegmentTraining) -> MeanModel:
+    """Return the sensor that is nearest to the reference in training, alone: weight 1, others 0."""
+
+    def best(part: SegmentTraining) -> int:
+        errors = [rotation.angle_between(q, part.q_reference) for q in part.sensors]
+        return int(np.argmin([np.mean(error**2) for error in errors]))
+
+    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
+        chosen = best(part)
+        return lambda test: test.sensors[chosen]
+
+    chosen = best(training)
+    weights = tuple(float(k == chosen) for k in range(len(training.sensors)))
+    return MeanModel(weights, cross_validated_sd(training, fit))
+
+
+def fit_mean(training: SegmentTraining) -> MeanModel:
+    """Return the mean weighted by each sensor's own error against the reference."""
+
+    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
+        weights = tuple(fusion_weights(part.sensors, part.q_reference).tolist())
+        return lambda test: fuse(test.sensors, weights)
+
+    weights = tuple(fusion_weights(training.sensors, training.q_reference).tolist())
+    return MeanModel(weights, cross_validated_sd(training, fit))

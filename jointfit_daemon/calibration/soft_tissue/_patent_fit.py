@@ -1,0 +1,64 @@
+"""Fits of both readings of the patent regression."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.soft_tissue._segment_training import (
+    SegmentTraining,
+    cross_validated_sd,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import PatentModel, Reading
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.arrays import Array
+
+
+def fit_patent(reading: Reading, training: SegmentTraining) -> PatentModel:
+    """Return the regression of `reading`, judged on hold-out blocks.
+
+    Least squares by orthogonal decomposition: the normal equations would square condition numbers
+    that are near a thousand already.
+    """
+
+    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
+        model = _regressed(reading, part, 0.0)
+        return lambda test: model.predict(test.sensors)
+
+    return _regressed(reading, training, cross_validated_sd(training, fit))
+
+
+def _regressed(reading: Reading, training: SegmentTraining, sd: float) -> PatentModel:
+    q_sign = training.q_reference[0]
+    inputs = [rotation.align_hemisphere(q, q_sign) for q in training.sensors]
+    target = rotation.align_hemisphere(training.q_reference, q_sign)
+    table = (_separate if reading == "patent12" else _shared)(inputs, target)
+    rows = tuple(tuple(row) for row in table.tolist())
+    return PatentModel(reading, rows, as_quaternion(q_sign.tolist()), sd, training.movements)
+
+
+def _separate(inputs: list[Array], target: Array) -> Array:
+    """Fit each component alone: four systems of len(inputs) + 1 parameters."""
+    rows = []
+    for k in range(4):
+        A = np.column_stack([*(q[:, k] for q in inputs), np.ones(len(target))])
+        rows.append(np.linalg.lstsq(A, target[:, k])[0])
+    return np.array(rows)
+
+
+def _shared(inputs: list[Array], target: Array) -> Array:
+    """Fit one system of all components: one coefficient a sensor, one intercept a component."""
+    n, count = len(target), len(inputs)
+    A = np.zeros((4 * n, count + 4))
+    for m, q in enumerate(inputs):
+        A[:, m] = q.T.reshape(-1)
+    for k in range(4):
+        A[k * n : (k + 1) * n, count + k] = 1.0
+    solved = np.linalg.lstsq(A, target.T.reshape(-1))[0]
+    return np.column_stack([np.tile(solved[:count], (4, 1)), solved[count:]])

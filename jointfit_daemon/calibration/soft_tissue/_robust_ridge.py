@@ -1,0 +1,60 @@
+r"""Ridge regression through the origin with Huber weights, its penalty chosen by held-out blocks.
+
+.. math:: H = \sum_i w_i g_i g_i^T + \lambda n I, \qquad C = H^{-1} \sum_i w_i g_i \rho_i^T
+
+Law: regressors are scaled but never centred; centring would be an intercept by another name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration._robust_weights import huber_weights, robust_scale
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
+PASSES = 5
+_SMALLEST_SCALE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Ridge:
+    """A fit, in units of the regressors as given."""
+
+    coefficients: Array
+    """Shape (p, k): k targets per unit of regressor."""
+    leverage: Array
+    """Shape (p, p): ``phi @ leverage @ phi`` is n g^T H^-1 g, how far phi lies outside the hull."""
+    scales: Array
+    """RMS of each regressor in training, shape (p,): g = phi / scales."""
+
+    def leverages(self, phi: Array) -> Array:
+        """Return the leverage of each row, shape (n,)."""
+        found: Array = np.einsum("ij,jk,ik->i", phi, self.leverage, phi)
+        return found
+
+
+def fit_ridge(
+    phi: Array, rho: Array, penalty: float, smallest_scale: float = _SMALLEST_SCALE
+) -> Ridge:
+    """Fit rho (n, k) on phi (n, p); five passes of Huber weights on the residual length.
+
+    `smallest_scale` is added to the RMS of each regressor: what hardly moved is not blown up.
+    """
+    n, p = phi.shape
+    scales = np.sqrt(np.mean(phi**2, axis=0)) + smallest_scale
+    g = phi / scales
+    weights = np.ones(n)
+    H, C = np.eye(p), np.zeros((p, rho.shape[1]))
+    for _ in range(PASSES):
+        weighted = g * weights[:, None]
+        H = weighted.T @ g + penalty * n * np.eye(p)
+        C = np.linalg.solve(H, weighted.T @ rho)
+        sizes = np.linalg.norm(rho - g @ C, axis=1)
+        weights = huber_weights(sizes, robust_scale(sizes))
+    inverse = n * np.linalg.inv(H) / np.outer(scales, scales)
+    return Ridge(C / scales[:, None], 0.5 * (inverse + inverse.T), scales)

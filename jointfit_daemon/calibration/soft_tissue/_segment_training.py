@@ -1,0 +1,110 @@
+"""Training frames of one segment: bone-aligned sensors with their optical reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+
+
+FEWEST_FRAMES = 30
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentTraining:
+    """Frames of one segment with their optical reference; only finite ones, in order of time."""
+
+    sensors: tuple[Array, ...]
+    """Bone-aligned, one array a sensor, shape (n, 4)."""
+    q_other: Array | None
+    """The neighbouring segment as one of its sensors says it, shape (n, 4)."""
+    q_reference: Array
+    """q_world_segment by optics, shape (n, 4)."""
+    trials: NDArray[np.int64]
+    """Which trial, that is kind of movement, each frame belongs to, shape (n,)."""
+
+    @staticmethod
+    def of(
+        sensors: Sequence[ArrayLike],
+        q_other: ArrayLike | None,
+        q_reference: ArrayLike,
+        trials: ArrayLike | None = None,
+    ) -> SegmentTraining:
+        """Return the frames of which everything is known.
+
+        Raises
+        ------
+        ValueError
+            There is no sensor, or fewer than 30 frames are complete: too few to judge any fit.
+        """
+        if not sensors:
+            raise ValueError("a segment model needs at least one sensor")
+        columns = [*sensors, q_reference] if q_other is None else [*sensors, q_reference, q_other]
+        stacked = np.stack([np.asarray(column, dtype=np.float64) for column in columns])
+        complete = np.all(np.isfinite(stacked), axis=(0, 2))
+        found = int(np.count_nonzero(complete))
+        if found < FEWEST_FRAMES:
+            raise ValueError(f"{found} complete frames; at least {FEWEST_FRAMES} are needed")
+        q = rotation.normalize(stacked[:, complete])
+        count = len(sensors)
+        labels = np.zeros(len(complete), dtype=np.int64)
+        if trials is not None:
+            labels = np.asarray(trials, dtype=np.int64)
+        other = None if q_other is None else q[count + 1]
+        return SegmentTraining(tuple(q[:count]), other, q[count], labels[complete])
+
+    def __len__(self) -> int:
+        return len(self.q_reference)
+
+    def part(self, chosen: NDArray[np.bool_]) -> SegmentTraining:
+        """Return the chosen frames."""
+        other = None if self.q_other is None else self.q_other[chosen]
+        sensors = tuple(q[chosen] for q in self.sensors)
+        return SegmentTraining(sensors, other, self.q_reference[chosen], self.trials[chosen])
+
+    @property
+    def movements(self) -> int:
+        """Kinds of movement: trials."""
+        return len(np.unique(self.trials))
+
+    def folds(self, of_one: int = 5) -> Iterator[NDArray[np.bool_]]:
+        """Yield masks of hold-out blocks, contiguous in time.
+
+        `of_one` blocks of a single trial, three of each of several. Never random frames:
+        neighbouring frames are nearly copies, and would tell the fit what it is judged on.
+        """
+        labels = np.unique(self.trials)
+        blocks = of_one if len(labels) == 1 else 3
+        for label in labels:
+            for block in np.array_split(np.flatnonzero(self.trials == label), blocks):
+                held = np.zeros(len(self), dtype=bool)
+                held[block] = True
+                yield held
+
+
+def cross_validated_sd(
+    training: SegmentTraining, fit: Callable[[SegmentTraining], Callable[[SegmentTraining], Array]]
+) -> float:
+    """Return the RMS error per axis, rad, over all hold-out blocks of `training`.
+
+    Parameters
+    ----------
+    fit : callable
+        Takes training frames, returns what takes frames and gives their orientations (n, 4).
+    """
+    squares = []
+    for held in training.folds():
+        test = training.part(held)
+        said = fit(training.part(~held))(test)
+        squares.append(rotation.angle_between(said, test.q_reference) ** 2)
+    return float(np.sqrt(np.mean(np.concatenate(squares)) / 3.0))

@@ -1,0 +1,141 @@
+"""Fit of the links between the sensors of a limb."""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+from math import radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import (
+    LEAST_LEVEL,
+    Kind,
+    SensorLink,
+    level_axis,
+    posture_one,
+    up_one,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Chain
+
+
+RIDGE = 1e-3
+
+BLOCKS = 5
+
+FEWEST_FRAMES = 100
+
+LEAST_SPREAD = radians(0.3)
+
+
+def fit_links(
+    chain: Chain, sensors: Mapping[str, Array], q_static: Mapping[str, ArrayLike]
+) -> tuple[SensorLink, ...]:
+    """Learn all links of a limb from a movement.
+
+    Parameters
+    ----------
+    chain : Chain
+        Who sits where.
+    sensors : mapping of str to ndarray, shape (n, 4)
+        q_optical_segment as each sensor says it through its mount, at common instants in order
+        of time; frames with NaN are left out.
+    q_static : mapping
+        q_optical_segment in the static pose, by segment.
+
+    Returns
+    -------
+    tuple of SensorLink
+        Empty where there are fewer than 100 complete frames.
+    """
+    links = []
+    for i, group in enumerate(chain.sensors):
+        near = _near(chain, i)
+        links += [_fit("pair", (a, b), near, sensors) for a, b in combinations(group, 2)]
+        if i + 1 < len(chain.sensors):
+            q_a, q_b = (q_static[chain.segments[k]] for k in (i, i + 1))
+            standing = float(_axis_headings(np.array([q_a]), np.array([q_b]))[0])
+            links += [
+                _fit("joint", (a, b), (b,), sensors, standing)
+                for a, b in product(group, chain.sensors[i + 1])
+            ]
+    return tuple(link for link in links if link is not None)
+
+
+def _near(chain: Chain, i: int) -> tuple[str, ...]:
+    """Return the sensors of the next segment, the last looks back, a lone one at itself."""
+    if len(chain.sensors) == 1:
+        return chain.sensors[0]
+    return chain.sensors[i + 1 if i + 1 < len(chain.sensors) else i - 1]
+
+
+def _fit(
+    kind: Kind,
+    ends: tuple[str, str],
+    near: tuple[str, ...],
+    sensors: Mapping[str, Array],
+    standing: float = 0.0,
+) -> SensorLink | None:
+    a, b = ends
+    q_a, q_b, q_near = sensors[a], sensors[b], sensors[near[0]]
+    if kind == "pair":
+        wanted = rotation.log(rotation.multiply(rotation.conjugate(q_a), q_b))
+    else:
+        wanted = _wrapped(_axis_headings(q_a, q_b) - standing)[:, None]
+    shown = _postures(q_a, q_near)
+    known = np.isfinite(wanted).all(axis=1) & np.isfinite(shown).all(axis=1)
+    shown, wanted = shown[known], wanted[known]
+    if len(shown) < FEWEST_FRAMES:
+        return None
+    left = []
+    for held in np.array_split(np.arange(len(shown)), BLOCKS):
+        rest = np.ones(len(shown), dtype=bool)
+        rest[held] = False
+        left.append(wanted[held] - shown[held] @ _ridge(shown[rest], wanted[rest]))
+    spread = float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+    return SensorLink(
+        a=a,
+        b=b,
+        kind=kind,
+        near=near,
+        weights=tuple(tuple(row) for row in _ridge(shown, wanted).T.tolist()),
+        low=tuple(shown.min(axis=0).tolist()),
+        high=tuple(shown.max(axis=0).tolist()),
+        spread=float(max(spread, LEAST_SPREAD)),
+        total=float(np.sqrt(np.mean(wanted**2))),
+    )
+
+
+def _ridge(shown: Array, wanted: Array) -> Array:
+    """Return the weights, shape (10, components), without intercept: upright is upright."""
+    scale = np.sqrt(np.mean(shown**2, axis=0)) + 1e-6
+    g = shown / scale
+    H = g.T @ g + RIDGE * len(g) * np.eye(g.shape[1])
+    found: Array = np.linalg.solve(H, g.T @ wanted) / scale[:, None]
+    return found
+
+
+def _postures(q_a: Array, q_near: Array) -> Array:
+    u, v = (np.stack(up_one(tuple(q.T)), axis=0) for q in (q_a, q_near))
+    return np.stack(posture_one(tuple(u), tuple(v)), axis=1)
+
+
+def _axis_headings(q_a: Array, q_b: Array) -> Array:
+    ax, ay = level_axis(tuple(q_a.T))
+    bx, by = level_axis(tuple(q_b.T))
+    steep = (ax**2 + ay**2 < LEAST_LEVEL) | (bx**2 + by**2 < LEAST_LEVEL)
+    found: Array = np.where(steep, np.nan, np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
+    return found
+
+
+def _wrapped(angle: Array) -> Array:
+    wrapped: Array = np.arctan2(np.sin(angle), np.cos(angle))
+    return wrapped

@@ -1,0 +1,110 @@
+"""The frames a calibration was taught with, in few bytes: what later learning must not forget.
+
+Law: a bounded number of frames, postures evenly, of each posture the newest. Text in, text out, so
+that the JSON form stays exact; a component is kept to 1/32767, an orientation to 0.003°.
+"""
+
+from __future__ import annotations
+
+from base64 import b64decode, b64encode
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.soft_tissue._limb_fit import LimbTraining
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import fuse
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.model import Chain
+
+
+MOST = 800
+"""Frames kept: the models have some hundred unknowns, and each frame costs 50 bytes."""
+CELL = 0.25
+"""Width of a posture, rad."""
+MOVEMENTS = 3
+"""Kinds of movement told apart; the oldest ones are taken together."""
+_ONE = 32767
+
+
+def pack(chain: Chain, training: LimbTraining) -> str:
+    """Return frames as text; in order of time, with the kind of movement of each."""
+    columns = [training.sensors[s] for group in chain.sensors for s in group]
+    columns += [training.reference[name] for name in chain.segments]
+    counts = np.round(np.concatenate(columns, axis=1) * _ONE)
+    labels = _labels(training)[:, None].astype(np.float64)
+    table = np.concatenate([counts, labels], axis=1).astype("<i2")
+    return b64encode(table.tobytes()).decode("ascii")
+
+
+def unpack(chain: Chain, text: str) -> LimbTraining | None:
+    """Return the frames of a text; None where there are none, or they are of another chain."""
+    sensors = [s for group in chain.sensors for s in group]
+    width = 4 * (len(sensors) + len(chain.segments)) + 1
+    table = np.frombuffer(b64decode(text), dtype="<i2")
+    if table.size == 0 or table.size % width:
+        return None
+    rows = table.reshape(-1, width).astype(np.float64)
+    columns = [rotation.normalize(rows[:, i : i + 4]) for i in range(0, width - 1, 4)]
+    count = len(sensors)
+    return LimbTraining(
+        dict(zip(sensors, columns[:count], strict=True)),
+        dict(zip(chain.segments, columns[count:], strict=True)),
+        rows[:, -1].astype(np.int64),
+    )
+
+
+def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
+    """Return both, in this order, the new one as another kind of movement."""
+    before = _labels(old)
+    labels = np.concatenate([before, np.full(len(new), before.max(initial=-1) + 1)])
+    labels = np.maximum(labels - max(int(labels.max()) - MOVEMENTS + 1, 0), 0)
+    return LimbTraining(
+        {name: np.concatenate([q, new.sensors[name]]) for name, q in old.sensors.items()},
+        {name: np.concatenate([q, new.reference[name]]) for name, q in old.reference.items()},
+        labels,
+    )
+
+
+def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraining:
+    """Return at most `most` frames: every posture's newest, then every posture's second, and so on.
+
+    So a posture seen once stays, and of one seen often the old frames give way to new ones.
+    """
+    if len(training) <= most:
+        return training
+    cells = postures(chain, training)
+    _, which = np.unique(cells, axis=0, return_inverse=True)
+    which = np.ravel(which)
+    newest = np.arange(len(which))[::-1]
+    by_cell = newest[np.argsort(which[newest], kind="stable")]
+    edges = np.flatnonzero(np.diff(which[by_cell], prepend=-1))
+    starts = np.repeat(edges, np.diff(np.append(edges, len(by_cell))))
+    turn = np.empty(len(which), dtype=np.int64)
+    turn[by_cell] = np.arange(len(by_cell)) - starts
+    order = np.lexsort((-np.arange(len(which)), turn))
+    return training.rows(np.sort(order[:most]))
+
+
+def postures(chain: Chain, training: LimbTraining) -> NDArray[np.int64]:
+    """Return the posture of every frame: where gravity is, and each joint, in cells."""
+    means = [
+        fuse([training.sensors[s] for s in group], (1.0 / len(group),) * len(group))
+        for group in chain.sensors
+    ]
+    seen = [rotation.rotate(rotation.conjugate(means[0]), np.array([0.0, 0.0, 1.0]))]
+    seen += [
+        rotation.log(rotation.multiply(rotation.conjugate(above), below))
+        for above, below in pairwise(means)
+    ]
+    return np.round(np.concatenate(seen, axis=1) / CELL).astype(np.int64)
+
+
+def _labels(training: LimbTraining) -> NDArray[np.int64]:
+    if training.trials is None:
+        return np.zeros(len(training), dtype=np.int64)
+    return training.trials

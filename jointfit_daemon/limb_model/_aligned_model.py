@@ -1,0 +1,91 @@
+r"""The mean of sensors whose worlds and mounts were first fitted to the reference: a baseline.
+
+.. math:: \hat q = \operatorname{mean}_\omega \left( q_{W,m} \otimes q_m \otimes q_{B,m} \right)
+
+Law: learns constants only, a turn about the vertical and a mount of each sensor, and its weight;
+nothing of posture. On skin the turn absorbs what moves with flexion, so it holds for the heading it
+was trained at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from typing_extensions import override  # typing has it from Python 3.12
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion, multiply_one
+from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel, widened
+from jointfit_daemon.limb_model._weighted_mean import fuse, fuse_one
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Quaternion
+
+
+@dataclass(frozen=True)
+class AlignedModel(SegmentModel):
+    """Weighted mean of sensors that are turned by constants on both sides."""
+
+    kind: ClassVar[str] = "aligned"
+
+    worlds: tuple[Quaternion, ...]
+    """q_optical_world of each sensor beyond its calibration: turns about the vertical."""
+    mounts: tuple[Quaternion, ...]
+    """q_segment_bone of each sensor beyond its static mount."""
+    weights: tuple[float, ...]
+    """One a sensor, sum 1."""
+    residual_sd: float
+    movements: int
+    """Kinds of movement in training."""
+
+    @override
+    def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
+        """Return the weighted mean, shape (n, 4); see `SegmentModel.predict`."""
+        turned = [
+            rotation.multiply(rotation.multiply(world, np.asarray(q, dtype=np.float64)), mount)
+            for world, q, mount in zip(self.worlds, sensors, self.mounts, strict=True)
+        ]
+        return fuse(turned, self.weights)
+
+    @override
+    def predict_one(
+        self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
+    ) -> Prediction:
+        """Return the weighted mean of one frame."""
+        turned = [
+            multiply_one(multiply_one(world, q), mount)
+            for world, q, mount in zip(self.worlds, sensors, self.mounts, strict=True)
+        ]
+        sd = widened(self.residual_sd, self.movements)
+        return Prediction(fuse_one(turned, self.weights), sd, False)
+
+    @override
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        return {
+            "kind": self.kind,
+            "worlds": [list(q) for q in self.worlds],
+            "mounts": [list(q) for q in self.mounts],
+            "weights": list(self.weights),
+            "residual_sd": self.residual_sd,
+            "movements": self.movements,
+        }
+
+    @classmethod
+    @override
+    def read(cls, data: Mapping[str, Any]) -> AlignedModel:
+        """Return the model of its JSON form."""
+        return cls(
+            tuple(as_quaternion(q) for q in data["worlds"]),
+            tuple(as_quaternion(q) for q in data["mounts"]),
+            tuple(data["weights"]),
+            data["residual_sd"],
+            data["movements"],
+        )

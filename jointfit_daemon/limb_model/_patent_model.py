@@ -1,0 +1,109 @@
+r"""The patent's multiple linear regression of quaternion components, in both of its readings.
+
+.. math:: \hat Y_k = \sum_m a_{k m} X_{m,k} + c_k, \qquad k = w, x, y, z
+
+Law: kept as a named baseline. ``patent12`` fits every component alone (12 parameters for two
+sensors), ``patent6`` shares the sensors' coefficients between components (6). Neither turns with
+the subject: the intercept ties the fit to the heading it was trained at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from typing_extensions import override  # typing has it from Python 3.12
+
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel, widened
+from jointfit_daemon.limb_model._weighted_mean import equal_weights, fuse, fuse_one
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Quaternion
+
+Reading = Literal["patent12", "patent6"]
+
+SHORTEST = 0.5
+"""A regression output shorter than this is no rotation; the mean of the sensors stands in."""
+
+
+@dataclass(frozen=True)
+class PatentModel(SegmentModel):
+    """Linear regression on quaternion components, normalised."""
+
+    kind: ClassVar[str] = "patent"
+
+    reading: Reading
+    coefficients: tuple[tuple[float, ...], ...]
+    """Four rows w, x, y, z; one column a sensor and the intercept last."""
+    q_sign: Quaternion
+    """The first reference of training: signs are such that products with it are not negative."""
+    residual_sd: float
+    movements: int
+    """Kinds of movement in training."""
+
+    @override
+    def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
+        """Return the regression, shape (n, 4); see `SegmentModel.predict`."""
+        inputs = [rotation.align_hemisphere(q, self.q_sign) for q in sensors]
+        table = np.array(self.coefficients)
+        said: Array = table[:, -1] + sum(a * q for a, q in zip(table.T, inputs, strict=False))
+        short = np.linalg.norm(said, axis=1) < SHORTEST
+        said = rotation.normalize(said)
+        said[short] = fuse([q[short] for q in inputs], equal_weights(len(inputs)))
+        return said
+
+    @override
+    def predict_one(
+        self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
+    ) -> Prediction:
+        """Return the regression of one frame; the mean, flagged, where it gave no rotation."""
+        sd = widened(self.residual_sd, self.movements)
+        inputs = [_same_side(q, self.q_sign) for q in sensors]
+        said = [
+            row[-1] + sum([a * q[k] for a, q in zip(row, inputs, strict=False)])
+            for k, row in enumerate(self.coefficients)
+        ]
+        length = sqrt(sum([c * c for c in said]))
+        if length < SHORTEST:
+            return Prediction(fuse_one(inputs, equal_weights(len(inputs))), sd, True)
+        w, x, y, z = said
+        return Prediction((w / length, x / length, y / length, z / length), sd, False)
+
+    @override
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        return {
+            "kind": self.kind,
+            "reading": self.reading,
+            "coefficients": [list(row) for row in self.coefficients],
+            "q_sign": list(self.q_sign),
+            "residual_sd": self.residual_sd,
+            "movements": self.movements,
+        }
+
+    @classmethod
+    @override
+    def read(cls, data: Mapping[str, Any]) -> PatentModel:
+        """Return the model of its JSON form."""
+        return cls(
+            data["reading"],
+            tuple(tuple(row) for row in data["coefficients"]),
+            as_quaternion(data["q_sign"]),
+            data["residual_sd"],
+            data["movements"],
+        )
+
+
+def _same_side(q: Quaternion, ref: Quaternion) -> Quaternion:
+    if q[0] * ref[0] + q[1] * ref[1] + q[2] * ref[2] + q[3] * ref[3] < 0.0:
+        return (-q[0], -q[1], -q[2], -q[3])
+    return q

@@ -1,0 +1,151 @@
+"""The worker's jobs: what a session hands over, and what it gets back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration.phases import PlateAlignment, fit_static, run_job
+from jointfit_daemon.calibration.phases._plate_alignment import AlignedSensor
+from jointfit_daemon.calibration.phases._static_pose import fit_static_only
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import Calibration
+from jointfit_daemon.model import Chain
+
+SENSORS = ("S1", "S2", "S3", "S4")
+CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (SENSORS[:2], SENSORS[2:]))
+SETTINGS = CalibrationSettings(rigid_bodies={"thigh": "Thigh", "shank": "Shank"})
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+RNG = np.random.default_rng(7)
+
+
+def about_z(angle: float) -> np.ndarray:
+    return rotation.exp(np.array([0.0, 0.0, angle]))
+
+
+def mounts() -> dict[str, np.ndarray]:
+    """Return q_sensor_segment of every sensor, as it was put on."""
+    return {name: rotation.exp(RNG.normal(size=3)) for name in SENSORS}
+
+
+def worlds(angles: dict[str, float]) -> PlateAlignment:
+    """Return an alignment in which every world is turned by its angle about the vertical."""
+    return PlateAlignment(
+        {
+            name: AlignedSensor(as_quaternion(about_z(angle)), "full", 0.1, 0.01, 0.01, 4_000_000)
+            for name, angle in angles.items()
+        }
+    )
+
+
+def standing(alignment: PlateAlignment, worn: dict[str, np.ndarray]) -> CalibrationTrial:
+    """Return five seconds of all segments upright, as the sensors see it."""
+    t_ns = np.arange(500, dtype=np.int64) * 10_000_000
+    tracks = {}
+    for name, mount in worn.items():
+        q = said(alignment, worn, name, UPRIGHT)
+        assert mount.shape == (4,)
+        tracks[name] = SensorTrack(t_ns, np.tile(q, (len(t_ns), 1)))
+    return CalibrationTrial(tracks, None)
+
+
+def said(
+    alignment: PlateAlignment, worn: dict[str, np.ndarray], name: str, q: np.ndarray
+) -> np.ndarray:
+    """Return what a sensor says of a segment at `q`: its world's inverse, then its mount's."""
+    seen = rotation.multiply(rotation.conjugate(np.array(alignment.world(name))), q)
+    return np.asarray(rotation.multiply(seen, rotation.conjugate(worn[name])))
+
+
+def static_job(
+    trial: CalibrationTrial, previous: Calibration, alignment: PlateAlignment | None
+) -> Any:
+    stored = None if alignment is None else alignment.to_dict()
+    payload = {
+        "chain": CHAIN, "settings": SETTINGS, "static": trial, "alignment": stored,
+        "previous": previous.to_dict(),
+    }  # fmt: skip
+    return Calibration.from_dict(run_job("static", payload)["calibration"])
+
+
+def test_a_new_alignment_counts_when_sensors_are_put_on_anew() -> None:
+    """All sensors were switched off and on: their headings are others, and the plate says which."""
+    before, worn = worlds(dict.fromkeys(SENSORS, 0.3)), mounts()
+    pose = fit_static(standing(before, worn), SETTINGS, CHAIN)
+    previous = fit_static_only(pose, before, CHAIN)
+    now, worn = worlds({"S1": 2.0, "S2": -1.0, "S3": 0.5, "S4": 3.0}), mounts()
+    found = static_job(standing(now, worn), previous, now)
+    bent = rotation.exp(np.array([0.7, 0.4, 0.2]))
+    for name, item in found.sensor.items():
+        q = rotation.multiply(
+            rotation.multiply(np.array(item.q_optical_world), said(now, worn, name, bent)),
+            np.array(item.q_sensor_segment),
+        )
+        assert rotation.angle_between(q, bent) == pytest.approx(0.0, abs=1e-6), name
+        assert item.lag_ns == 4_000_000
+
+
+def test_without_a_new_alignment_the_worlds_stay() -> None:
+    before, worn = worlds(dict.fromkeys(SENSORS, 0.3)), mounts()
+    pose = fit_static(standing(before, worn), SETTINGS, CHAIN)
+    previous = fit_static_only(pose, before, CHAIN)
+    found = static_job(standing(before, mounts()), previous, None)
+    assert {item.q_optical_world for item in found.sensor.values()} == {
+        item.q_optical_world for item in previous.sensor.values()
+    }
+
+
+def test_models_of_unaligned_worlds_are_not_moved_to_aligned_ones() -> None:
+    before, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
+    pose = fit_static(standing(before, worn), SETTINGS, CHAIN)
+    previous = fit_static_only(pose, None, CHAIN)
+    assert "headings_from_static" in previous.flags
+    found = static_job(standing(before, worn), previous, worlds(dict.fromkeys(SENSORS, 1.0)))
+    assert found.sensor["S1"].q_optical_world == previous.sensor["S1"].q_optical_world
+
+
+def test_a_sensor_that_is_silent_on_the_plate_is_named_at_once() -> None:
+    trial = standing(worlds(dict.fromkeys(SENSORS, 0.0)), mounts())
+    heard = {name: track for name, track in trial.sensors.items() if name != "S3"}
+    payload = {"chain": CHAIN, "settings": SETTINGS, "trial": CalibrationTrial(heard, None)}
+    assert "S3" in run_job("align", payload)["refused"]
+
+
+def test_a_sensor_that_alone_was_moved_is_told_when_a_new_pose_is_taken() -> None:
+    room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
+    before = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), room, CHAIN)
+    moved = {**worn, "S4": rotation.multiply(worn["S4"], rotation.exp(np.array([0.2, 0.0, 0.0])))}
+    notes: list[str] = []
+    for trial, expected in ((standing(room, worn), []), (standing(room, moved), ["shank"])):
+        payload = {
+            "chain": CHAIN, "settings": SETTINGS, "static": trial, "alignment": None,
+            "previous": before.to_dict(),
+        }  # fmt: skip
+        notes = run_job("static", payload)["notes"]
+        assert [note.partition(":")[0] for note in notes] == expected
+    assert "S3 and S4 differ by 11.5 deg" in notes[0]
+
+
+def test_a_movement_is_given_the_lags_of_the_calibration_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
+    before = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), None, CHAIN)
+    given: dict[str, Any] = {}
+
+    def fit(*_: object, **options: object) -> Calibration:
+        given.update(options)
+        return before
+
+    monkeypatch.setattr("jointfit_daemon.calibration.phases._job_runner.fit_calibration", fit)
+    trial = standing(room, worn)
+    payload = {
+        "chain": CHAIN, "settings": SETTINGS, "static": trial, "functional": trial,
+        "alignment": None, "previous": before.to_dict(),
+    }  # fmt: skip
+    run_job("functional", payload)
+    assert given["previous"] == before

@@ -1,0 +1,146 @@
+"""Learning on: better models or none; what is wrong or no better is never taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.calibration import CalibrationRefused, CalibrationSettings, Fresh
+from jointfit_daemon.calibration.phases import learn, run_job
+from jointfit_daemon.calibration.record._content_check import content_faults
+from jointfit_daemon.calibration.soft_tissue import evenly, joined, pack, unpack
+from jointfit_daemon.calibration.soft_tissue._training_memory import MOST, postures
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import Calibration
+from tests.calibration.calibrated_subject import CHAIN, calibration, fresh, moving
+
+
+@pytest.fixture(scope="module")
+def learned() -> dict[str, Any]:
+    payload = {
+        "chain": CHAIN,
+        "settings": CalibrationSettings(),
+        "previous": calibration().to_dict(),
+        "fresh": fresh(moving(600, 1.2, 1)),
+    }
+    return run_job("online", payload)
+
+
+def error(one: Calibration, bend: float) -> float:
+    """Return the RMS error of the thigh on a movement that no fit has seen, rad."""
+    new = moving(150, bend, 9)
+    model = one.segment["thigh"].models["S1+S2|S3"]
+    said = model.predict([new.sensors["S1"], new.sensors["S2"]], new.sensors["S3"])
+    off = rotation.angle_between(said, new.reference["thigh"])
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def test_far_bends_are_learned_and_small_ones_are_not_forgotten(learned: dict[str, Any]) -> None:
+    after = Calibration.from_dict(learned["calibration"])
+    assert error(after, 1.2) < 0.6 * error(calibration(), 1.2)
+    assert error(after, 0.5) < error(calibration(), 0.5) + np.deg2rad(0.3)
+
+
+def test_only_models_memory_and_figures_change(learned: dict[str, Any]) -> None:
+    before, after = calibration(), Calibration.from_dict(learned["calibration"])
+    assert content_faults(after) == []
+    blank: dict[str, Any] = {"segment": {}, "quality": {}, "memory": "", "correlations": {}}
+    assert replace(before, **blank) == replace(after, **blank)
+    assert {n: s.length for n, s in before.segment.items()} == {
+        n: s.length for n, s in after.segment.items()
+    }
+    online = after.quality["online"]
+    assert online["rounds"] == 1
+    assert online["taught"] == "d"
+    assert online["judged"] == 180
+    assert all(online["after_rad"][k] <= was for k, was in online["before_rad"].items())
+
+
+def test_more_of_what_is_known_teaches_nothing(learned: dict[str, Any]) -> None:
+    after = Calibration.from_dict(learned["calibration"])
+    result = learn(after, fresh(moving(400, 0.5, 3)), CHAIN)
+    assert "calibration" not in result
+    assert "newest frames" in result["kept"]
+
+
+def spoilt(kind: str) -> Fresh:
+    good = fresh(moving(400, 1.2, 1))
+    thigh = good.markers["thigh"].copy()
+    if kind == "two names swapped":
+        thigh[:, [0, 1]] = thigh[:, [1, 0]]
+    elif kind == "a marker knocked off":
+        thigh[:, 2] += np.array([0.0, 0.06, 0.0])
+    elif kind == "cluster turned":
+        q = moving(400, 1.2, 1).reference["thigh"]
+        tilted = rotation.multiply(q, rotation.exp(np.array([0.2, 0.0, 0.0])))
+        thigh = rotation.rotate(tilted[:, None], np.array(calibration().clusters["thigh"].template))
+    else:
+        return replace(good, markers={"thigh": good.markers["shank"], "shank": thigh})
+    return replace(good, markers={**good.markers, "thigh": thigh})
+
+
+@pytest.mark.parametrize(
+    "kind", ["two names swapped", "a marker knocked off", "cluster turned", "segments swapped"]
+)
+def test_nothing_is_learned_from_wrong_cameras(kind: str) -> None:
+    with pytest.raises(CalibrationRefused, match="marker"):
+        learn(calibration(), spoilt(kind), CHAIN)
+
+
+def test_a_calibration_without_memory_is_refused_with_a_remedy() -> None:
+    with pytest.raises(CalibrationRefused, match="functional phase once more"):
+        learn(replace(calibration(), memory=""), fresh(moving(400, 1.2)), CHAIN)
+
+
+def test_few_frames_are_refused() -> None:
+    with pytest.raises(CalibrationRefused, match="200 are needed"):
+        learn(calibration(), fresh(moving(100, 1.2)), CHAIN)
+
+
+# --- memory -----------------------------------------------------------------------------------
+
+
+def test_memory_keeps_orientations_to_a_hundredth_of_a_degree() -> None:
+    taught = joined(moving(50, 0.5), moving(40, 1.0))
+    again = unpack(CHAIN, pack(CHAIN, taught))
+    assert again is not None
+    for name, q in {**taught.sensors, **taught.reference}.items():
+        found = {**again.sensors, **again.reference}[name]
+        assert np.max(rotation.angle_between(q, found)) < np.deg2rad(0.01)
+    assert again.trials is not None
+    assert again.trials.tolist() == [0] * 50 + [1] * 40
+
+
+def test_memory_of_another_chain_is_none() -> None:
+    other = replace(CHAIN, sensors=(("S1",), ("S3",)))
+    assert unpack(other, pack(CHAIN, moving(7, 0.5))) is None
+    assert unpack(CHAIN, "") is None
+
+
+def test_memory_is_bounded_and_keeps_what_is_rare() -> None:
+    rare, common = moving(20, 2.0), moving(5000, 0.3)
+    kept = evenly(CHAIN, joined(rare, common))
+    assert len(kept) == MOST
+    assert kept.trials is not None
+    assert np.count_nonzero(kept.trials == 0) >= 15
+
+
+def test_of_one_posture_the_newest_frames_stay() -> None:
+    long = moving(1000, 0.0)
+    assert len(np.unique(postures(CHAIN, long), axis=0)) < 10
+    both = joined(long, long)
+    kept = evenly(CHAIN, both, 500)
+    assert kept.trials is not None
+    assert np.mean(kept.trials == 1) > 0.95
+
+
+def test_only_three_kinds_of_movement_are_told_apart() -> None:
+    taught = moving(10, 0.5)
+    for _ in range(4):
+        taught = joined(taught, moving(10, 0.5))
+    assert taught.trials is not None
+    assert sorted(set(taught.trials.tolist())) == [0, 1, 2]
+    assert taught.trials.tolist() == sorted(taught.trials.tolist())

@@ -1,0 +1,87 @@
+"""Which lag a calibration uses: of the plate and the movement, each as far as it is sure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from bench.subjects.recorded_knee import load
+from jointfit_daemon.calibration.registration import SKIN, ChosenLag, seen_lags, segment_lags
+from jointfit_daemon.calibration.registration._lags import FLESH_SD_NS, MARKERS_SD_NS
+from jointfit_daemon.timing.lag import LagEstimate, estimate_lag
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MS = 1e6
+
+
+def said(lag_ms: float, sigma_ms: float, refused: str | None = None) -> LagEstimate:
+    return LagEstimate(lag_ms * MS, sigma_ms * MS, 0.9, refused)
+
+
+def test_a_plate_beats_skin_and_both_are_surer_than_either() -> None:
+    chosen = segment_lags({"S1": said(9.0, 1.0)}, {"S1": (round(5 * MS), 0.2 * MS)})["S1"]
+    assert chosen.source == "plate and movement"
+    assert chosen.lag_ns == pytest.approx(5.0 * MS, abs=0.05 * MS)
+    assert chosen.sigma_ns is not None
+    assert chosen.sigma_ns < 0.2 * MS
+
+
+def test_flesh_keeps_a_lag_on_skin_from_looking_sure() -> None:
+    chosen = segment_lags({"S1": said(9.0, 0.05)}, {})["S1"]
+    assert chosen.source == "movement"
+    assert chosen.lag_ns == 9 * MS
+    assert chosen.sigma_ns == pytest.approx(np.hypot(FLESH_SD_NS, MARKERS_SD_NS), rel=0.01)
+    assert seen_lags({"S1": (9 * MS, 0.05 * MS)})["S1"].sigma_ns == pytest.approx(
+        chosen.sigma_ns, rel=0.01
+    )
+
+
+def test_a_lag_smaller_than_its_deviation_is_noise_and_not_used() -> None:
+    """The recorded squats as bytes: 3.6 ± 4.7 ms for one of a pair, nothing for the other."""
+    assert segment_lags({"S1": said(3.6, 4.7)}, {}) == {}
+    assert set(segment_lags({"S1": said(3.6, 4.7), "S2": said(15.0, 1.0)}, {})) == {"S2"}
+    with_plate = segment_lags({"S1": said(0.5, 4.7)}, {"S1": (100_000, 0.2 * MS)})
+    assert with_plate["S1"].source == "plate and movement"
+
+
+def test_a_sensor_known_from_the_plate_tells_the_markers_flesh_to_its_neighbor() -> None:
+    moving = {"S1": said(9.0, 0.5), "S2": said(14.0, 0.5)}
+    alone = segment_lags(moving, {})["S2"]
+    taught = segment_lags(moving, {"S1": (round(5 * MS), 0.1 * MS)})["S2"]
+    assert alone.lag_ns == 14 * MS
+    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 showed 4 ms of flesh, most of it shared
+    assert taught.sigma_ns is not None
+    assert alone.sigma_ns is not None
+    assert taught.sigma_ns < alone.sigma_ns
+
+
+def test_what_refuses_is_left_to_the_plate_and_a_changed_clock_to_the_movement() -> None:
+    plate = {"S1": (round(5 * MS), 0.1 * MS), "S2": (round(5 * MS), 0.1 * MS)}
+    chosen = segment_lags({"S1": said(9.0, 1.0, "no"), "S2": said(40.0, 1.0)}, plate)
+    assert chosen["S1"] == ChosenLag(round(5 * MS), 0.1 * MS, "plate")
+    assert chosen["S2"].source == "movement"
+    assert chosen["S2"].lag_ns == 40 * MS
+    assert segment_lags({"S1": said(9.0, 1.0, "no")}, {}) == {}
+
+
+@pytest.mark.parametrize("name", ["squats1", "DJ1"])
+def test_lags_on_real_skin_are_within_what_they_claim(name: str, shared_data: Path) -> None:
+    """Truth is the lag put in; flesh moves what is found by milliseconds."""
+    trial = load(shared_data, name)
+    period = 20_000_000 if name == "squats1" else 10_000_000
+    t_ns = np.arange(len(trial)) * period
+    off = []
+    for first, bone in ((0, trial.thigh), (2, trial.shank)):
+        moving = {
+            f"S{k + 1}": estimate_lag(t_ns + 7_000_000, trial.sensors[k], t_ns, bone, SKIN)
+            for k in (first, first + 1)
+        }
+        for chosen in segment_lags(moving, {}).values():
+            assert chosen.sigma_ns is not None
+            off.append(abs(chosen.lag_ns - 7_000_000) / chosen.sigma_ns)
+    assert off
+    assert max(off) < 3.0

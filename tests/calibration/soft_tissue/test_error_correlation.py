@@ -1,0 +1,116 @@
+"""Errors of two segments that look at one joint, and what they make of its deviation."""
+
+from __future__ import annotations
+
+from math import hypot, sqrt
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.calibration.soft_tissue import (
+    LimbTraining,
+    SegmentTraining,
+    all_alive,
+    error_correlation,
+    error_correlations,
+)
+from jointfit_daemon.fusion._forward_kinematics import read_angles
+from jointfit_daemon.fusion._segment_fuser import Fused
+from jointfit_daemon.kinematics import rotation as rot
+from jointfit_daemon.limb_model import Calibration, UnknownSchema
+from jointfit_daemon.model import Chain
+from tests.calibration.calibrated_subject import calibration
+
+N = 600
+CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1", "S2"), ("S3", "S4")))
+
+
+def limb(alike: float, seed: int = 1) -> LimbTraining:
+    """Squats; about x all sensors err by slow noise no posture tells, of the correlation given."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 60.0, N)
+    bend = np.column_stack([0.6 - 0.6 * np.cos(t), 0.05 * np.sin(0.7 * t), 0.05 * np.sin(t)])
+    thigh, shank = rot.exp(0.5 * bend), rot.exp(-0.5 * bend)
+    one, other = np.repeat(rng.normal(0.0, 0.03, (2, N // 3)), 3, axis=1)
+    errors = {"thigh": one, "shank": alike * one + sqrt(1.0 - alike**2) * other}
+    said = {}
+    for names, segment, bone in zip(CHAIN.sensors, CHAIN.segments, (thigh, shank), strict=True):
+        off = np.zeros((N, 3))
+        off[:, 0] = errors[segment]
+        for name in names:
+            noise = rng.normal(0.0, 0.002, (N, 3))
+            said[name] = rot.multiply(bone, rot.exp(off + noise))
+    return LimbTraining(said, {"thigh": thigh, "shank": shank})
+
+
+@pytest.mark.parametrize("alike", [-0.8, 0.0, 0.8])
+def test_what_is_found_on_held_out_frames_holds_on_later_ones(alike: float) -> None:
+    training, later = limb(alike), limb(alike, seed=2)
+    found = error_correlations(CHAIN, training, "anchored")
+    assert found.keys() == {"knee"}
+    left = []
+    for i, segment in enumerate(CHAIN.segments):
+        said = all_alive(CHAIN, i, "anchored", training, later)
+        left.append(rot.log(rot.multiply(rot.conjugate(said), later.reference[segment]))[:, 0])
+    actual = np.corrcoef(np.stack(left))
+    assert abs(found["knee"] - float(np.asarray(actual)[0, 1])) < 0.15
+
+
+def test_errors_that_are_the_same_are_not_quite_believed() -> None:
+    training = limb(0.0)
+    a, b = training.sensors["S1"], training.sensors["S2"]
+    same = SegmentTraining.of([a, b], training.sensors["S3"], training.reference["thigh"])
+    assert error_correlation(same, same) == 0.9
+
+
+def test_a_joint_that_was_hardly_seen_whole_has_none() -> None:
+    training = limb(0.5)
+    hidden = training.reference["shank"].copy()
+    hidden[29:] = np.nan
+    partly = LimbTraining(training.sensors, {**training.reference, "shank": hidden})
+    assert error_correlations(CHAIN, partly, "anchored") == {}
+    assert error_correlations(CHAIN, training, "mean") == {}
+
+
+def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
+    above = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
+    below = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S3",), (), 0.04)
+
+    def sd(alike: float) -> float:
+        state = read_angles(above, below, sign=-1.0, left=False, alike=alike)
+        assert state is not None
+        assert state.flexion_sd is not None
+        return state.flexion_sd
+
+    assert sd(0.0) == pytest.approx(hypot(0.03, 0.04))
+    assert sd(-0.5) == pytest.approx(sqrt(0.0025 + 0.0012))
+    assert sd(0.5) == pytest.approx(sqrt(0.0025 - 0.0012))
+
+
+def test_what_no_model_says_is_independent_however_alike_the_models_err() -> None:
+    """Held orientations, plain means and doubts of a watch come from elsewhere than the models."""
+    above = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
+    below = Fused((1.0, 0.0, 0.0, 0.0), 0.4, (), ("held:shank",))
+
+    def sd(one: Fused, other: Fused) -> float:
+        state = read_angles(one, other, sign=-1.0, left=False, alike=0.9)
+        assert state is not None
+        assert state.flexion_sd is not None
+        return state.flexion_sd
+
+    assert sd(above, below) == pytest.approx(hypot(0.03, 0.4))
+    assert sd(below, below) == pytest.approx(hypot(0.4, 0.4))
+    doubted = above._replace(doubt=0.2)
+    models = 2.0 * 0.03**2 * (1.0 - 0.9)
+    assert sd(doubted, doubted) == pytest.approx(sqrt(models + 2.0 * 0.2**2))
+
+
+@pytest.mark.parametrize("rho", [1.0, -1.5, float("nan")])
+def test_a_stored_correlation_that_cannot_be_is_no_calibration(rho: float) -> None:
+    """It would make a variance of flexion negative, in the middle of a frame."""
+    data = calibration().to_dict()
+    assert Calibration.from_dict({**data, "correlations": {"knee": -0.3}}).correlations == {
+        "knee": -0.3
+    }
+    with pytest.raises(UnknownSchema, match="correlation"):
+        Calibration.from_dict({**data, "correlations": {"knee": rho}})
