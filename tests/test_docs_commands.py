@@ -100,6 +100,7 @@ def point_clients_at(broker: Broker, home: Path) -> None:
         (home / ".config" / program).write_text(options, encoding="utf-8")
 
 
+@pytest.mark.experiment
 @pytest.mark.system
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(

@@ -47,6 +47,7 @@ def test_codecs_keep_their_floors_and_slcan_is_several_times_cheaper_than_python
 
 
 @pytest.mark.alone
+@pytest.mark.experiment
 @pytest.mark.timeout(60)
 def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
     rows = measured(tmp_path, "fusion|core", 55.0)

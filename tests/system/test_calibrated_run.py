@@ -1,0 +1,191 @@
+"""A live run through calibration, reconnection and reload: its payloads, its log, its replay.
+
+The run is made once: it takes most of a minute. Its claims are tested one by one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
+from jointfit_daemon.pipeline import replay_states
+from jointfit_daemon.pipeline.events import Configured, JobFinished, SourceClosed, SourceOpened
+from tests.broker_fixture import chosen_broker
+from tests.system.station import SENSORS, Listener, Station, hang_up, running, stopped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jointfit_daemon.tools.child_processes import Child, Simulator
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+SETTLE_S = 1.7
+"""A motion blends into the next for 1.5 s."""
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "mqtt.md"
+TOPICS = ("pose/ui", "joint/+", "calibration/progress", "bridge/log", "device/+/info")
+"""Topics that the listener of a station does not subscribe to."""
+NAMES = {
+    *SENSORS, *(f"{a}{mark}{b}" for a in SENSORS for b in SENSORS for mark in "~+"),
+    "mocap", "hip", "knee", "ankle", "thigh", "shank", "pelvis", "foot",
+}  # fmt: skip
+"""Keys that are names of this rig."""
+FREE = re.compile(r"device/\w+/info|bridge/log")
+"""Topics whose keys are the device's own, or that are not published in every run."""
+
+
+@dataclass(frozen=True)
+class CalibratedRun:
+    """The run once its daemon has stopped."""
+
+    log: str
+    recording: Path
+    keys: dict[str, set[str]]
+    """Keys of all payloads, by topic."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> CalibratedRun:
+    chosen = chosen_broker()
+    if (reason := chosen.missing()) is not None:
+        pytest.skip(reason)
+    folder = tmp_path_factory.mktemp("calibrated-run")
+    broker = chosen(folder)
+    broker.start()
+    try:
+        return asyncio.run(calibrated_run(folder, broker.port))
+    finally:
+        broker.stop()
+
+
+async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
+    station = Station(folder, port, more_toml="[recording]\n")
+    found: dict[str, set[str]] = {}
+    take = Listener._take
+
+    def note(self: Listener, topic: str, payload: Any) -> None:
+        found.setdefault(topic, set()).update(keys(payload))
+        take(self, topic, payload)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Listener, "_take", note)
+        async with running(station) as (simulator, daemon, listener):
+            assert listener.client is not None
+            await listener.client.subscribe(*TOPICS)
+            answer = await listener.client.request("calibrate", {"phase": "abort"})
+            found["bridge/response/calibrate"] = set(keys(answer))
+
+            await calibrate(simulator, listener)
+            assert listener.latest["calibration"]["phase"] == "calibrated"
+            await listener.until(lambda: listener.latest["calibration"]["version"], 30)
+            await listener.more_poses(120)
+
+            await reconnect(simulator, listener, "S1")
+            await reload(station, daemon, listener)
+            assert listener.latest["bridge/health"]["recording"]["failure"] is None
+            code, _ = await stopped(daemon)
+            assert code == 0, station.log
+
+    (recording,) = (folder / "state" / "recordings").iterdir()
+    return CalibratedRun(station.log, recording, found)
+
+
+async def calibrate(simulator: Simulator, listener: Listener) -> None:
+    for motion, phase, seconds in (
+        ("plate", "align", 8.0), ("stand", "static", 3.0), ("functional", "functional", 12.0),
+    ):  # fmt: skip
+        await simulator.say(f"play {motion}")
+        await asyncio.sleep(SETTLE_S)
+        await listener.phase(phase, seconds)
+
+
+async def reconnect(simulator: Simulator, listener: Listener, name: str) -> None:
+    await simulator.say(f"unplug {name}")
+    await listener.until(lambda: name not in listener.online)
+    await asyncio.sleep(0.5)
+    await simulator.say(f"plug {name}")
+    await listener.connected({name})
+    await listener.more_poses(30)
+
+
+async def reload(station: Station, daemon: Child, listener: Listener) -> None:
+    station.write_rig(
+        ("output_rate_hz = 100", "output_rate_hz = 80"),
+        ('id = "S3"\n', 'id = "S3"\nsilence_s = 0.8\n'),
+    )
+    hang_up(daemon)
+    await listener.until(lambda: listener.said("demo", "configuration reloaded"))
+    await listener.connected({*SENSORS, "mocap"})
+    await listener.more_poses(80)
+
+
+def keys(value: Any) -> Iterator[str]:
+    """Yield all keys in a payload but names of devices, segments, joints and markers."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if key not in NAMES and not re.fullmatch(r"[A-Z]+[a-z_]*\d*", key):
+                yield key
+            yield from keys(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from keys(inner)
+
+
+def documented_words() -> set[str]:
+    """Return all words in code spans and code blocks of the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    spans = re.findall(r"```.*?```|`[^`\n]+`", text, re.DOTALL)
+    return set(re.findall(r"\w+", " ".join(spans)))
+
+
+def keys_of_examples() -> set[str]:
+    """Return the keys in the page's examples of payloads."""
+    text = PAGE.read_text(encoding="utf-8")
+    examples = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    return set(re.findall(r'"(\w+)":', " ".join(examples))) - NAMES
+
+
+def test_every_key_on_the_wire_is_documented_and_every_documented_key_is_published(
+    run: CalibratedRun,
+) -> None:
+    documented = documented_words()
+    unknown = {
+        topic: missing
+        for topic, used in run.keys.items()
+        if not FREE.fullmatch(topic) and (missing := used - documented)
+    }
+    assert unknown == {}
+    assert {topic for topic, used in run.keys.items() if "v" not in used} == set()
+
+    used = set().union(*run.keys.values())
+    assert keys_of_examples() - used == set()
+
+
+def test_the_log_has_one_line_for_each_phase_and_none_of_the_worker(run: CalibratedRun) -> None:
+    for line in (
+        "calibration align: ", "calibration aligned: ", "calibration posed: ",
+        "calibration calibrated: calibrated", "stored as version 1 (version 1 in ",
+    ):  # fmt: skip
+        assert run.log.count(line) == 1, (line, run.log)
+    assert "the worker said" not in run.log  # fits print nothing
+
+
+def test_the_event_log_replays_to_the_published_limb_states_byte_for_byte(
+    run: CalibratedRun,
+) -> None:
+    events = list(read_events(run.recording))
+    assert len([e for e in events if isinstance(e, Configured)]) == 2
+    assert len([e for e in events if isinstance(e, JobFinished)]) == 3
+    opened = [e.source for e in events if isinstance(e, SourceOpened)]
+    assert (opened.count("S1"), opened.count("S2"), opened.count("S3")) == (2, 1, 2)
+    assert {e.reason for e in events if isinstance(e, SourceClosed)} == {"lost", "removed"}
+
+    live = list(read_states(run.recording))
+    assert len(live) > 2000
+    assert [encode_state(state) for state in replay_states(events)] == live
