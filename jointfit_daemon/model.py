@@ -32,7 +32,7 @@ class Chunk:
     """Bytes as they arrived at the host.
 
     ``t_ns`` is the arrival stamp. A stream chunk is any cut of the byte stream; a datagram chunk
-    is one datagram; a CAN chunk is a run of records (``jointfit_protocols.can_frame``).
+    is one datagram; a CAN chunk is a run of records (``jointfit_protocols.can._frame``).
     """
 
     t_ns: int

@@ -21,7 +21,6 @@ PACKAGES = (
 SHIPPED = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 TOOLING = [path for room in ("bench", ".ci") for path in sorted((ROOT / room).rglob("*.py"))]
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
-DRIVERS = ROOT / "drivers" / "jointfit_drivers"
 MOST_LINES = 400
 MOST_LINES_OF_A_FUNCTION = 50
 VAGUE = {"util", "utils", "misc", "common", "helper", "helpers", "manager", "base"}
@@ -96,33 +95,26 @@ def test_no_name_says_nothing() -> None:
     assert vague == []
 
 
-def imported_drivers(path: Path) -> set[str]:
-    """Return the modules of jointfit_drivers that a module of it imports."""
+def imported_modules(path: Path) -> set[str]:
+    """Return the dotted names of modules, and of names in modules, that a file imports."""
     found: set[str] = set()
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        else:
-            continue
-        found |= {name.split(".")[1] for name in names if name.startswith("jointfit_drivers.")}
-    return {name for name in found if (DRIVERS / f"{name}.py").exists()}
+            found |= {alias.name for alias in node.names}
+    return found
 
 
-def test_a_driver_uses_its_own_helpers_and_the_shared_ports_only() -> None:
-    families = set(project()["entry-points"]["jointfit.drivers"])
-
-    def family(module: str) -> str | None:
-        """Return the driver that a module belongs to: its name, or its name and more."""
-        head = module.partition("_")[0]
-        return head if head in families else None
-
+@pytest.mark.parametrize("family", ["jointfit_drivers", "jointfit_protocols"])
+def test_private_modules_are_imported_within_their_package_only(family: str) -> None:
+    """`jointfit_drivers.xbus._decoder` is for `jointfit_drivers/xbus` alone."""
     crossing = [
-        f"{path.stem} imports {other}"
-        for path in sorted(DRIVERS.glob("*.py"))
-        for other in sorted(imported_drivers(path))
-        if family(other) not in {None, family(path.stem)}
+        f"{name_of(path)} imports {name}"
+        for path in SHIPPED + TOOLING
+        for name in sorted(imported_modules(path))
+        if name.startswith(f"{family}.") and "._" in name
+        if f"{name.partition('._')[0].replace('.', '/')}/" not in name_of(path)
     ]
     assert crossing == []
 

@@ -13,10 +13,10 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from jointfit_drivers.natnet_socket import StampedSocket
+from jointfit_drivers.ports.udp_socket import StampedSocket
 
 if TYPE_CHECKING:
-    from jointfit_drivers.natnet_socket import Arrival
+    from jointfit_drivers.ports.udp_socket import Arrival
 
 _STAMP = struct.Struct("<q")
 _SENDER = """

@@ -9,9 +9,10 @@ import math
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Chunk
-from jointfit_protocols import mtdata2, slcan, xbus, xcdi
-from jointfit_protocols.can_frame import CanFrame, pack_frames
-from jointfit_protocols.natnet_messages import ServerInfo, encode
+from jointfit_protocols import xbus, xcdi
+from jointfit_protocols.can import CanFrame, pack_frames, slcan
+from jointfit_protocols.natnet import ServerInfo, encode
+from jointfit_protocols.xbus import mtdata2
 from jointfit_simulators.natnet_stage import Stage, StagedBody, Stamps, model_definition
 from jointfit_simulators.placement import CLUSTERS
 

@@ -11,8 +11,9 @@ import numpy as np
 from bench.subjects import device_bytes
 from jointfit_daemon.driver import find_driver
 from jointfit_daemon.model import Chunk, ImuSample
-from jointfit_protocols import mtdata2, xbus
-from jointfit_protocols.mtdata2 import Item
+from jointfit_protocols import xbus
+from jointfit_protocols.xbus import mtdata2
+from jointfit_protocols.xbus.mtdata2 import Item
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,9 +14,10 @@ from bench.subjects.simulated_wearer import bench_rig
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
-from jointfit_protocols import mtdata2, xbus, xcdi
-from jointfit_protocols.can_frame import CanFrame, pack_frames
-from jointfit_protocols.natnet_messages import EchoRequest, EchoResponse, ServerInfo, encode
+from jointfit_protocols import xbus, xcdi
+from jointfit_protocols.can import CanFrame, pack_frames
+from jointfit_protocols.natnet import EchoRequest, EchoResponse, ServerInfo, encode
+from jointfit_protocols.xbus import mtdata2
 from jointfit_simulators.cameras import CameraFrames, Cameras
 from jointfit_simulators.clocks import Ticker
 from jointfit_simulators.natnet_stage import Stage, StagedBody, Stamps, model_definition

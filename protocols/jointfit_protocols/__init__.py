@@ -1,1 +1,1 @@
-"""Wire formats, sans-IO: the same codec serves driver and simulator."""
+"""Wire formats without I/O: the same codecs serve drivers and simulators, one package a family."""

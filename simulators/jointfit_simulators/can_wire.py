@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import can
 
-from jointfit_protocols.slcan import (
+from jointfit_protocols.can.slcan import (
     BITRATES,
     DONE,
     REFUSED,
-    SlcanDecoder,
+    SlcanCodec,
     SlcanLine,
     encode_frame,
 )
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from jointfit_protocols.can_frame import CanFrame
+    from jointfit_protocols.can import CanFrame
     from jointfit_simulators.imu_device import WireNoise
 
 _NS_PER_MS = 1_000_000
@@ -82,7 +82,7 @@ class SlcanAdapter:
     ) -> None:
         self._line = PtyLine(link)
         self._noise, self._bus_bitrate, self._mute = wire_noise, bus_bitrate, mute
-        self._decoder = SlcanDecoder(115_200, "adapter")
+        self._decoder = SlcanCodec(115_200, "adapter")
         self._serving = asyncio.Lock()
         self._open = self._stamping = False
         self.bitrate: int | None = None

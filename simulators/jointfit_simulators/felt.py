@@ -14,7 +14,7 @@ from __future__ import annotations
 from math import atan2, cos, radians, sin, sqrt
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.mtdata2 import Item
+from jointfit_protocols.xbus.mtdata2 import Item
 
 if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion

@@ -10,9 +10,9 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.mtdata2 import Item
-from jointfit_protocols.xbus_messages import SyncSetting
-from jointfit_protocols.xbus_sync import IN1, Polarity, SyncFunction
+from jointfit_protocols.xbus.configuration import SyncSetting
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_protocols.xbus.sync_lines import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.can_wire import CanWire, PythonCanWire, SlcanAdapter
 from jointfit_simulators.clocks import NS

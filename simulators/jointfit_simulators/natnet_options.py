@@ -10,7 +10,7 @@ from jointfit_simulators.imu_device import WireNoise, clean_wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_protocols.natnet_frame import Version
+    from jointfit_protocols.natnet import Version
     from jointfit_simulators.natnet_stage import Axis, Hiding, StagedBody
 
 

@@ -11,25 +11,25 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_protocols.natnet_connect import Connect
-from jointfit_protocols.natnet_frame import FrameOfData
-from jointfit_protocols.natnet_messages import (
+from jointfit_protocols.natnet import (
     Bare,
+    Connect,
     Discovery,
     EchoRequest,
     EchoResponse,
+    FrameOfData,
     MessageId,
+    ModelDefinition,
     ServerInfo,
     decode,
     encode,
 )
-from jointfit_protocols.natnet_model import ModelDefinition
 from jointfit_simulators.natnet_port import NatNetPort
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from jointfit_protocols.natnet_frame import Version
+    from jointfit_protocols.natnet import Version
     from jointfit_simulators.natnet_port import Address
 
 _NS = 10**9

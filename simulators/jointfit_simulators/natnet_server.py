@@ -14,17 +14,14 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.natnet_connect import Connect
-from jointfit_protocols.natnet_frame import (
+from jointfit_protocols.natnet import (
     FRAME_BITSTREAM_CHANGED,
     FRAME_EDIT_MODE,
     FRAME_MODEL_CHANGED,
-    SIZED,
-    Version,
-)
-from jointfit_protocols.natnet_messages import (
     HEADER,
+    SIZED,
     Bare,
+    Connect,
     Discovery,
     EchoRequest,
     EchoResponse,
@@ -33,6 +30,7 @@ from jointfit_protocols.natnet_messages import (
     Request,
     Response,
     ServerInfo,
+    Version,
     decode,
     encode,
 )
@@ -41,7 +39,7 @@ from jointfit_simulators.natnet_port import NatNetPort
 from jointfit_simulators.natnet_stage import Stage, Stamps, model_definition
 
 if TYPE_CHECKING:
-    from jointfit_protocols.natnet_frame import FrameOfData
+    from jointfit_protocols.natnet import FrameOfData
     from jointfit_simulators.natnet_port import Address
     from jointfit_simulators.natnet_stage import Bodies, Markers, StagedBody
 

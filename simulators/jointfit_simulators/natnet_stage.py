@@ -12,22 +12,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from jointfit_protocols.natnet_frame import (
+from jointfit_protocols.natnet import (
     BODY_TRACKED,
     MARKER_HAS_MODEL,
     MARKER_OCCLUDED,
     MARKER_POINT_CLOUD_SOLVED,
+    NAMES_FROM,
     Body,
+    BodyDescription,
     FrameOfData,
     Marker,
     MarkerSet,
-    Version,
-)
-from jointfit_protocols.natnet_model import (
-    NAMES_FROM,
-    BodyDescription,
     MarkerSetDescription,
     ModelDefinition,
+    Version,
 )
 
 Vector = tuple[float, float, float]

@@ -9,19 +9,20 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
-from jointfit_protocols import mtdata2, xbus
-from jointfit_protocols.mtdata2 import Item
-from jointfit_protocols.natnet_messages import ServerInfo
-from jointfit_protocols.natnet_messages import encode as encode_natnet
+from jointfit_protocols import xbus
+from jointfit_protocols.natnet import ServerInfo
+from jointfit_protocols.natnet import encode as encode_natnet
 from jointfit_protocols.orientation import native_of
-from jointfit_protocols.xbus_messages import TICK_NS
+from jointfit_protocols.xbus import mtdata2
+from jointfit_protocols.xbus.configuration import TICK_NS
+from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_simulators.natnet_stage import Stage, StagedBody, Stamps, model_definition
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from jointfit_protocols.can_frame import CanFrame
-    from jointfit_protocols.mtdata2 import Value
+    from jointfit_protocols.can import CanFrame
+    from jointfit_protocols.xbus.mtdata2 import Value
     from jointfit_simulators.imu_device import Quaternion
     from jointfit_simulators.natnet_stage import Bodies, Markers
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_protocols.can_frame import CanFrame
+    from jointfit_protocols.can import CanFrame
     from jointfit_simulators.imu_device import Quaternion
     from jointfit_simulators.natnet_stage import Pose, Vector
 

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from math import ceil
 from typing import TYPE_CHECKING
 
-from jointfit_protocols import mtdata2
-from jointfit_protocols import xbus_messages as setup
-from jointfit_protocols.mtdata2 import Item
 from jointfit_protocols.orientation import native_of
-from jointfit_protocols.xbus import MASTER, MessageId, XbusDecoder, XbusMessage, encode
-from jointfit_protocols.xbus_sync import IN1
+from jointfit_protocols.xbus import MASTER, MessageId, XbusCodec, XbusMessage, encode, mtdata2
+from jointfit_protocols.xbus import configuration as setup
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_protocols.xbus.sync_lines import IN1
 from jointfit_simulators.felt import Felt
 from jointfit_simulators.imu_device import clean_wire
 from jointfit_simulators.pty_line import PtyLine
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from jointfit_protocols.mtdata2 import Trigger, Value
+    from jointfit_protocols.xbus.mtdata2 import Trigger, Value
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 WAKE_UP_S = 0.5
@@ -106,7 +105,7 @@ class XbusDevice:
         self._noise = wire_noise
         self._sync = SyncLines(options.sync)
         self._felt = Felt()
-        self._decoder = XbusDecoder()
+        self._decoder = XbusCodec()
         self._outputs = tuple(setup.Output(*output) for output in options.outputs)
         self._alignment = dict.fromkeys((0, 1), options.alignment)
         self._modulus = setup.fine_time_modulus(options.product_code) or setup.WRAP_32_BIT

@@ -10,9 +10,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_protocols.mtdata2 import Item, decode_item, split
-from jointfit_protocols.xbus import XbusDecoder, XbusMessage, encode
-from jointfit_protocols.xbus_messages import TICK_NS
+from jointfit_protocols.xbus import XbusCodec, XbusMessage, encode
+from jointfit_protocols.xbus.configuration import TICK_NS
+from jointfit_protocols.xbus.mtdata2 import Item, decode_item, split
 from jointfit_simulators.xbus_device import XbusDevice
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class XbusReplay(XbusDevice):
 def _timed(capture: bytes) -> list[_Recorded]:
     found: list[_Recorded] = []
     first = newest = None
-    for message in XbusDecoder().feed(capture):
+    for message in XbusCodec().feed(capture):
         if not isinstance(message, XbusMessage):
             continue
         items = dict(split(message.data) or [])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from jointfit_protocols import xbus_messages as setup
-from jointfit_protocols.mtdata2 import Item, Trigger
-from jointfit_protocols.xbus_sync import IN1, IN2, SyncFunction
+from jointfit_protocols.xbus import configuration as setup
+from jointfit_protocols.xbus.mtdata2 import Item, Trigger
+from jointfit_protocols.xbus.sync_lines import IN1, IN2, SyncFunction
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

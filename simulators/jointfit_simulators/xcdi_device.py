@@ -10,10 +10,11 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.can_frame import STANDARD_MAX, CanFrame, frame_bits
+from jointfit_protocols.can import STANDARD_MAX, CanFrame, frame_bits
 from jointfit_protocols.xcdi import (
     COUNTER_MODULUS,
     OVERFLOW,
+    TICK_NS,
     TICKS_MODULUS,
     DataId,
     XcdiIds,
@@ -21,7 +22,6 @@ from jointfit_protocols.xcdi import (
     layout,
     quaternion_counts,
 )
-from jointfit_protocols.xcdi_unit import TICK_NS
 
 if TYPE_CHECKING:
     import random

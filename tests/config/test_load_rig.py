@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.config import ConfigError, MqttSettings, load_rig, parse_rig, rig_schema
 from jointfit_daemon.driver import _SLCAN_BITRATES, CanBusSettings
-from jointfit_drivers.python_can_bus import PythonCanBus
-from jointfit_drivers.slcan_bus import SlcanBus
-from jointfit_protocols.slcan import BITRATES, bitrate_code
+from jointfit_drivers.ports._python_can_bus import PythonCanBus
+from jointfit_drivers.ports._slcan_bus import SlcanBus
+from jointfit_protocols.can.slcan import BITRATES, bitrate_code
 from jointfit_simulators.rig_file import RigOptions
 
 PROJECT = Path(__file__).resolve().parents[2]

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 from bench.rigs.loopback import delays_ns
 from jointfit_daemon.model import Chunk, ImuSample
-from jointfit_drivers.wall_clock import WallClock
-from jointfit_drivers.xbus_events import XbusEvents
-from jointfit_protocols import mtdata2
-from jointfit_protocols.can_frame import CanFrame, frame_bits
-from jointfit_protocols.mtdata2 import Item
-from jointfit_protocols.slcan import SlcanDecoder, encode_frame
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_drivers.ports._wall_clock import WallClock
+from jointfit_drivers.xbus import XbusDecoder
+from jointfit_protocols.can import CanFrame, frame_bits
+from jointfit_protocols.can.slcan import SlcanCodec, encode_frame
+from jointfit_protocols.xbus import MessageId, encode, mtdata2
+from jointfit_protocols.xbus.mtdata2 import Item
 
 S = 1_000_000_000
 HOUR = 3600 * S
@@ -145,7 +144,7 @@ def read_in(pieces: list[int], wire: bytes, begin_ns: int) -> list[Chunk]:
 
 
 def stamps_of(chunks: list[Chunk]) -> list[int]:
-    events = XbusEvents(BAUD, 100.0)
+    events = XbusDecoder(BAUD, 100.0)
     found = [item for chunk in chunks for item in events.feed(chunk)]
     return [item.arrival_ns for item in found if isinstance(item, ImuSample)]
 
@@ -170,7 +169,7 @@ def test_no_way_to_cut_the_bytes_moves_a_stamp(pieces: list[int]) -> None:
 
 def test_on_usb_bytes_take_no_time() -> None:
     frames = xbus_wire(5)
-    events = XbusEvents(None, 100.0)
+    events = XbusDecoder(None, 100.0)
     found = events.feed(Chunk(EPOCH, b"".join(frames)))
     assert [i.arrival_ns for i in found if isinstance(i, ImuSample)] == [EPOCH] * 5
 
@@ -183,7 +182,7 @@ GROUP = [
 
 
 def test_frames_of_one_read_from_usb_lie_one_behind_the_other_on_the_bus() -> None:
-    decoder = SlcanDecoder(None, bitrate=250_000)
+    decoder = SlcanCodec(None, bitrate=250_000)
     wire = b"".join(encode_frame(frame) for frame in GROUP)
     found = [i for i in decoder.feed(wire, EPOCH) if isinstance(i, CanFrame)]
     bits = [frame_bits(len(frame.data), extended=False) for frame in GROUP]
@@ -196,8 +195,8 @@ def test_frames_of_one_read_from_usb_lie_one_behind_the_other_on_the_bus() -> No
 def test_a_usb_adapter_at_a_made_up_speed_is_not_believed_to_be_slow() -> None:
     """At 115 200 baud, as configured, the group below would have taken 4 ms."""
     wire = b"".join(encode_frame(frame) for frame in GROUP)
-    slow = SlcanDecoder(BAUD).feed(wire, EPOCH)[0]
-    usb = SlcanDecoder(None).feed(wire, EPOCH)[0]
+    slow = SlcanCodec(BAUD).feed(wire, EPOCH)[0]
+    usb = SlcanCodec(None).feed(wire, EPOCH)[0]
     assert isinstance(slow, CanFrame)
     assert isinstance(usb, CanFrame)
     assert EPOCH - slow.t_ns > 3_900_000
@@ -207,7 +206,7 @@ def test_a_usb_adapter_at_a_made_up_speed_is_not_believed_to_be_slow() -> None:
 @given(st.lists(st.integers(1, 40), max_size=40))
 def test_the_speed_of_the_bus_changes_stamps_only_within_a_read(pieces: list[int]) -> None:
     wire = b"".join(encode_frame(frame) for frame in GROUP * 5)
-    decoder, at, before = SlcanDecoder(None), 0, EPOCH
+    decoder, at, before = SlcanCodec(None), 0, EPOCH
     for k, size in enumerate([*pieces, len(wire)]):
         now = EPOCH + (k + 1) * 10_000_000
         for frame in decoder.feed(wire[at : at + size], now):

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk, ImuSample, TickClock
 from jointfit_daemon.timing.clock import DeviceClock
-from jointfit_drivers.xbus_events import XbusEvents
-from jointfit_drivers.xbus_raw import XbusRaw
-from jointfit_drivers.xcdi_events import XcdiEvents
-from jointfit_protocols.can_frame import CanFrame, pack_frames
-from jointfit_protocols.mtdata2 import Item, encode_items
-from jointfit_protocols.slcan import SlcanDecoder
+from jointfit_drivers.xbus import XbusDecoder
+from jointfit_drivers.xbus._raw_orientation import XbusRaw
+from jointfit_drivers.xcdi import XcdiDecoder
+from jointfit_protocols.can import CanFrame, pack_frames
+from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import XcdiIds
 
 if TYPE_CHECKING:
@@ -68,13 +68,13 @@ def stamped(wires: list[bytes], steps: list[int]) -> list[Chunk]:
 
 @given(st.lists(xbus_messages() | st.binary(max_size=80), max_size=MOST_MESSAGES), arrivals)
 def test_xbus(wires: list[bytes], steps: list[int]) -> None:
-    through_clock(XbusEvents(115_200, 100.0), stamped(wires, steps))
+    through_clock(XbusDecoder(115_200, 100.0), stamped(wires, steps))
 
 
 @given(st.lists(xbus_messages(), max_size=MOST_MESSAGES), arrivals)
 def test_xbus_with_raw_readings(wires: list[bytes], steps: list[int]) -> None:
     raw = XbusRaw(100.0, magnetometer=False)
-    through_clock(XbusEvents(None, 100.0, None, raw), stamped(wires, steps))
+    through_clock(XbusDecoder(None, 100.0, None, raw), stamped(wires, steps))
 
 
 frames = st.builds(
@@ -88,12 +88,12 @@ frames = st.builds(
 @given(st.lists(frames, max_size=3 * MOST_MESSAGES))
 def test_xcdi(wire: list[CanFrame]) -> None:
     chunks = [Chunk(frame.t_ns, pack_frames([frame])) for frame in wire]
-    through_clock(XcdiEvents(XcdiIds(), "auto", "big"), chunks)
+    through_clock(XcdiDecoder(XcdiIds(), "auto", "big"), chunks)
 
 
 @given(st.lists(st.binary(max_size=60) | st.from_regex(rb"[tTrR][0-9A-F]{1,27}\r"), max_size=60))
 def test_slcan(wires: list[bytes]) -> None:
-    decoder, xcdi = SlcanDecoder(115_200), XcdiEvents(XcdiIds(), "auto", "big")
+    decoder, xcdi = SlcanCodec(115_200), XcdiDecoder(XcdiIds(), "auto", "big")
     for number, data in enumerate(wires):
         found = decoder.feed(data, number * PERIOD_NS)
         xcdi.feed(Chunk(0, pack_frames(item for item in found if isinstance(item, CanFrame))))

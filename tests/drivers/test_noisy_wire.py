@@ -9,12 +9,12 @@ import pytest
 
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
 from jointfit_daemon.timing.clock import DeviceClock
-from jointfit_drivers.xbus_events import XbusEvents
-from jointfit_drivers.xcdi_events import XcdiEvents
-from jointfit_protocols.can_frame import CanFrame, pack_frames
-from jointfit_protocols.mtdata2 import Item, encode_items
-from jointfit_protocols.slcan import SlcanDecoder, encode_frame
+from jointfit_drivers.xbus import XbusDecoder
+from jointfit_drivers.xcdi import XcdiDecoder
+from jointfit_protocols.can import CanFrame, pack_frames
+from jointfit_protocols.can.slcan import SlcanCodec, encode_frame
 from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, XcdiIds, quaternion_counts
 from jointfit_protocols.xcdi import encode as xcdi_encode
 from jointfit_simulators.contract_scene import orientation
@@ -108,13 +108,13 @@ def lines(chance: random.Random, number: int, share: float) -> bytes:
 
 
 def xcdi_outcome(seed: int, share: float) -> Outcome:
-    slcan, chance = SlcanDecoder(None), random.Random(seed)
+    slcan, chance = SlcanCodec(None), random.Random(seed)
     chunks = []
     for number in range(MESSAGES):
         t_ns = (number + 1) * PERIOD_NS
         found = slcan.feed(lines(chance, number, share), t_ns)
         chunks.append(pack_frames(item for item in found if isinstance(item, CanFrame)))
-    return outcome(XcdiEvents(XcdiIds(), "100us", "big"), chunks)
+    return outcome(XcdiDecoder(XcdiIds(), "100us", "big"), chunks)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.1])
@@ -138,7 +138,7 @@ def test_a_line_without_checksum_makes_no_restart_and_few_losses(seed: int, shar
 def test_xbus_reports_no_more_lost_than_were_sent_and_no_restart(
     damage: Callable[[random.Random, int], bytes], seed: int
 ) -> None:
-    found = outcome(XbusEvents(None, RATE_HZ), wires(damage, seed))
+    found = outcome(XbusDecoder(None, RATE_HZ), wires(damage, seed))
     assert found.restarts == 0, found
     assert found.received + found.lost <= MESSAGES, found
     assert found.lost <= MESSAGES - found.received, found

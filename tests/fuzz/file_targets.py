@@ -23,7 +23,7 @@ from jointfit_daemon.files.orientations import (
     read_orientations_sto,
     read_sto,
 )
-from jointfit_protocols.candump import parse_candump
+from jointfit_protocols.can._candump import parse_candump
 from jointfit_simulators.c3d_file import c3d_bytes
 from jointfit_simulators.sample_data import write_sample
 from tests.fuzz.broker_targets import folder

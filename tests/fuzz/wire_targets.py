@@ -15,17 +15,18 @@ from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
 from jointfit_daemon.pipeline.sources import SourceState
-from jointfit_drivers.natnet_answers import OpenQuestions
-from jointfit_protocols.can_frame import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
+from jointfit_drivers.natnet._open_requests import OpenQuestions
+from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
+from jointfit_protocols.can.slcan import SlcanCodec
+from jointfit_protocols.can.slcan import encode_frame as encode_slcan
 from jointfit_protocols.corrupt import Corrupt
-from jointfit_protocols.natnet_frame_encode import encode_frame
-from jointfit_protocols.natnet_messages import HEADER, Bare, MessageId, decode
-from jointfit_protocols.natnet_messages import encode as encode_natnet
-from jointfit_protocols.slcan import SlcanDecoder
-from jointfit_protocols.slcan import encode_frame as encode_slcan
-from jointfit_protocols.xbus import MAX_DATA, XbusDecoder, XbusMessage
+from jointfit_protocols.natnet import HEADER, Bare, MessageId, decode
+from jointfit_protocols.natnet import encode as encode_natnet
+from jointfit_protocols.natnet._frame_encode import encode_frame
+from jointfit_protocols.xbus import XbusCodec, XbusMessage
 from jointfit_protocols.xbus import encode as encode_xbus
-from tests.drivers.natnet_feeder import INFO, MODEL, frame, marker
+from jointfit_protocols.xbus._framing import MAX_DATA
+from tests.drivers.natnet.feeder import INFO, MODEL, frame, marker
 from tests.fuzz.target import Target, UnaccountedError
 from tests.pipeline.core_feed import (
     BEGIN_NS,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.pipeline.events import Event
-    from jointfit_protocols.natnet_messages import Message
+    from jointfit_protocols.natnet import Message
 
 VERSIONS = ((3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
 ANSWERS = (0x01, 0x0D, 0x13, 0x1D, 0x2D, 0x3E, 0x42, 0x43, 0xC1, 0xED)
@@ -124,7 +125,7 @@ def feed_source(source: str, chunks: Iterable[bytes]) -> None:
 
 def run_xbus_bytes(data: bytes) -> None:
     """Decode serial bytes in pieces; every byte belongs to a message or is counted."""
-    decoder, found = XbusDecoder(), []
+    decoder, found = XbusCodec(), []
     for piece in cut(data):
         found += decoder.feed(piece)
     found += decoder.flush()
@@ -167,7 +168,7 @@ def seeds_xbus_records() -> list[bytes]:
 
 def run_slcan(data: bytes) -> None:
     """Decode the bytes of an SLCAN adapter in pieces, then its frames through the core."""
-    decoder = SlcanDecoder(115_200)
+    decoder = SlcanCodec(115_200)
     frames: list[CanFrame] = []
     for number, piece in enumerate(cut(data)):
         found = decoder.feed(piece, BEGIN_NS + number * _MS)

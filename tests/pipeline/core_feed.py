@@ -10,14 +10,12 @@ from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, LimbState
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened, Tick
-from jointfit_protocols.can_frame import CanFrame, pack_frames
-from jointfit_protocols.mtdata2 import Item, encode_items
-from jointfit_protocols.natnet_frame import FrameOfData
-from jointfit_protocols.natnet_messages import ServerInfo
-from jointfit_protocols.natnet_messages import encode as encode_natnet
-from jointfit_protocols.natnet_model import BodyDescription, ModelDefinition
+from jointfit_protocols.can import CanFrame, pack_frames
+from jointfit_protocols.natnet import BodyDescription, FrameOfData, ModelDefinition, ServerInfo
+from jointfit_protocols.natnet import encode as encode_natnet
 from jointfit_protocols.xbus import MessageId
 from jointfit_protocols.xbus import encode as encode_xbus
+from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, quaternion_counts
 from jointfit_protocols.xcdi import encode as encode_xcdi
 

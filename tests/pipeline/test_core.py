@@ -16,7 +16,7 @@ from jointfit_daemon.outputs.recording import encode_state
 from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened, Tick
-from jointfit_protocols.can_frame import RECORD_BYTES
+from jointfit_protocols.can import RECORD_BYTES
 from tests.pipeline.core_feed import (
     MS,
     PERIOD_NS,

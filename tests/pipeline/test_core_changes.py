@@ -23,8 +23,7 @@ from jointfit_daemon.pipeline.events import (
     SourceClosed,
     SourceOpened,
 )
-from jointfit_protocols.natnet_frame import FrameOfData
-from jointfit_protocols.natnet_messages import encode
+from jointfit_protocols.natnet import FrameOfData, encode
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import (
     BEGIN_NS,

@@ -15,10 +15,10 @@ from typing_extensions import override
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Notice, SourceClosed, SourceOpened
-from jointfit_protocols.can_frame import CanFrame, pack_frames
-from jointfit_protocols.mtdata2 import Item, encode_items
+from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.xbus import MessageId
 from jointfit_protocols.xbus import encode as encode_xbus
+from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, quaternion_counts
 from jointfit_protocols.xcdi import encode as encode_xcdi
 from tests.pipeline.core_feed import (

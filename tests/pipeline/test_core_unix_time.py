@@ -22,10 +22,8 @@ from jointfit_daemon.pipeline.events import (
     SourceOpened,
     UnixOffset,
 )
-from jointfit_protocols.natnet_frame import FrameOfData
-from jointfit_protocols.natnet_messages import ServerInfo
-from jointfit_protocols.natnet_messages import encode as encode_natnet
-from jointfit_protocols.natnet_model import ModelDefinition
+from jointfit_protocols.natnet import FrameOfData, ModelDefinition, ServerInfo
+from jointfit_protocols.natnet import encode as encode_natnet
 from tests.pipeline.core_feed import BEGIN_NS, MS, PERIOD_NS, SENSORS, Bench, chunk, table
 
 if TYPE_CHECKING:

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any
 import natnet  # type: ignore[import-untyped]
 import pytest
 
-from jointfit_protocols.natnet_connect import Connect
-from jointfit_protocols.natnet_frame import FrameOfData
-from jointfit_protocols.natnet_messages import (
+from jointfit_protocols.natnet import (
     Bare,
+    Connect,
     Discovery,
     EchoRequest,
     EchoResponse,
+    FrameOfData,
     Message,
     MessageId,
+    ModelDefinition,
     Request,
     Response,
     ServerInfo,
     decode,
     encode,
 )
-from jointfit_protocols.natnet_model import ModelDefinition
 from jointfit_simulators.natnet_options import NatNetServerOptions
 from jointfit_simulators.natnet_server import NatNetServer
 from jointfit_simulators.natnet_stage import StagedBody

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_protocols import xbus_messages as setup
-from jointfit_protocols.mtdata2 import Item, decode_item, split
-from jointfit_protocols.xbus import MessageId, XbusDecoder, XbusMessage, encode
+from jointfit_protocols.xbus import MessageId, XbusCodec, XbusMessage, encode
+from jointfit_protocols.xbus import configuration as setup
+from jointfit_protocols.xbus.mtdata2 import Item, decode_item, split
 from jointfit_simulators.xbus_device import WAKE_UP_S, XbusDevice, XbusDeviceOptions
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Host:
     def __init__(self, link: Path, **options: Any) -> None:
         self.device = XbusDevice(link, options=XbusDeviceOptions(**options))
         self._fd = os.open(link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        self._decoder = XbusDecoder()
+        self._decoder = XbusCodec()
 
     def close(self) -> None:
         os.close(self._fd)

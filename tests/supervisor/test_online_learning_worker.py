@@ -25,8 +25,8 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_daemon.pipeline.online_learning import _frame_collector
 from jointfit_daemon.supervisor._fit_runner import FitRunner
-from jointfit_protocols.natnet_frame import Body, FrameOfData
-from jointfit_protocols.natnet_messages import encode as encode_natnet
+from jointfit_protocols.natnet import Body, FrameOfData
+from jointfit_protocols.natnet import encode as encode_natnet
 from tests.calibration.calibrated_subject import TWO_AND_TWO, calibration, moving
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import BEGIN_NS, PERIOD_NS, SENSORS, Bench, chunk

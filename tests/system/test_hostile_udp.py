@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from jointfit_daemon.tools.child_processes import daemon
-from jointfit_protocols.natnet_messages import (
+from jointfit_protocols.natnet import (
     EchoResponse,
+    MarkerSetDescription,
     MessageId,
+    ModelDefinition,
     Response,
     ServerInfo,
     encode,
 )
-from jointfit_protocols.natnet_model import MarkerSetDescription, ModelDefinition
 from jointfit_simulators.natnet_options import NatNetServerOptions
 from jointfit_simulators.natnet_server import NatNetServer
 from jointfit_simulators.natnet_stage import StagedBody
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from jointfit_protocols.natnet_messages import Message
+    from jointfit_protocols.natnet import Message
     from tests.broker_fixture import Broker
 
 pytestmark = pytest.mark.system

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_protocols.xbus import XbusDecoder, XbusMessage, encode
+from jointfit_protocols.xbus import XbusCodec, XbusMessage, encode
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from jointfit_protocols.can_frame import CanFrame
+    from jointfit_protocols.can import CanFrame
 
 run = CliRunner().invoke
 FIRST = [0.0038471566513180733, -0.003237534314393997, -0.764083743095398, 0.6450973749160767]
@@ -57,7 +57,7 @@ def test_the_xsens_captures_hold_a_hundred_messages_each(
 
 def frame_at(wire: bytes, number: int) -> int:
     """Return where frame `number` (from 0) begins."""
-    frames = [event for event in XbusDecoder().feed(wire) if isinstance(event, XbusMessage)]
+    frames = [event for event in XbusCodec().feed(wire) if isinstance(event, XbusMessage)]
     return sum(len(encode(m.mid, m.data, m.bid)) for m in frames[:number])
 
 

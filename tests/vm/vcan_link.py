@@ -14,7 +14,7 @@ import pytest
 from jointfit_daemon.driver import CanBusSettings
 from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_drivers.xcdi import XcdiImu, XcdiSettings
-from jointfit_protocols.can_frame import CanFrame, unpack_frames
+from jointfit_protocols.can import CanFrame, unpack_frames
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -18,7 +18,8 @@ from bench.framework.measurement import Bench, Row, per_item, repeats
 from bench.subjects import device_bytes
 from jointfit_daemon.driver import CanBusSettings, find_driver
 from jointfit_daemon.model import Chunk, ImuSample, MocapFrame
-from jointfit_protocols import natnet_frame, slcan, xbus, xcdi
+from jointfit_protocols import natnet, xbus, xcdi
+from jointfit_protocols.can import slcan
 from jointfit_simulators.placement import CLUSTERS
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def xbus_rows(quick: bool) -> list[Row]:
     settings = driver.Settings(id="S1", segment="thigh", driver="xbus", port="p", rate_hz=400)
 
     def codec() -> Callable[[], object]:
-        decoder = xbus.XbusDecoder()
+        decoder = xbus.XbusCodec()
         return lambda: [decoder.feed(data) for data in messages]
 
     whole = _decoding(lambda: driver(settings).decoder(), chunks, ImuSample)
@@ -85,7 +86,7 @@ def xcdi_rows(quick: bool) -> list[Row]:
     chunks = device_bytes.xcdi_chunks(ORIENTATIONS, PERIOD_NS, IDS)
 
     def codec() -> Callable[[], object]:
-        decoder = slcan.SlcanDecoder(3_000_000)
+        decoder = slcan.SlcanCodec(3_000_000)
         return lambda: [decoder.feed(data, k * PERIOD_NS) for k, data in enumerate(lines)]
 
     whole = _decoding(lambda: driver(settings).decoder(), chunks, ImuSample)
@@ -107,12 +108,10 @@ def natnet_rows(quick: bool) -> list[Row]:
     )
 
     def codec() -> Callable[[], object]:
-        return lambda: [
-            natnet_frame.decode_frame(data, device_bytes.BITSTREAM) for data in datagrams
-        ]
+        return lambda: [natnet.decode_frame(data, device_bytes.BITSTREAM) for data in datagrams]
 
-    whole_frame = natnet_frame.decode_frame(datagrams[0], device_bytes.BITSTREAM)
-    assert isinstance(whole_frame, natnet_frame.FrameOfData), whole_frame
+    whole_frame = natnet.decode_frame(datagrams[0], device_bytes.BITSTREAM)
+    assert isinstance(whole_frame, natnet.FrameOfData), whole_frame
 
     opening = tuple(Chunk(0, data) for data in device_bytes.natnet_opening())
     chunks = [Chunk(k * 8_333_333, data) for k, data in enumerate(datagrams, 1)]
@@ -155,7 +154,7 @@ class Line:
 
 
 def _ours(line: Line) -> Callable[[], int]:
-    decoder = slcan.SlcanDecoder(115_200)
+    decoder = slcan.SlcanCodec(115_200)
 
     def drain() -> int:
         return len(decoder.feed(os.read(line.near, 65536), 0))

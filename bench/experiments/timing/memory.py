@@ -25,9 +25,14 @@ from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, LimbState
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
-from jointfit_protocols.natnet_frame import FrameOfData
-from jointfit_protocols.natnet_messages import EchoRequest, EchoResponse, ServerInfo, encode
-from jointfit_protocols.natnet_model import ModelDefinition
+from jointfit_protocols.natnet import (
+    EchoRequest,
+    EchoResponse,
+    FrameOfData,
+    ModelDefinition,
+    ServerInfo,
+    encode,
+)
 from jointfit_simulators.clocks import DeviceClock
 from jointfit_simulators.wearer import SENSORS
 

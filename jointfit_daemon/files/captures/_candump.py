@@ -2,7 +2,7 @@
 
     (1436509052.249713) can0 105#2A366C2B       eight digits of identifier: a 29-bit one; #R: remote
 
-A record is what `jointfit_protocols.can_frame` defines (24 bytes: i64 time in ns, u32 identifier,
+A record is what `jointfit_protocols.can._frame` defines (24 bytes: i64 time in ns, u32 identifier,
 u8 flags, u8 size, two zeros, eight data bytes). It is packed here once more because the daemon
 knows no wire format; a test holds the two together. A line that is no classic CAN frame becomes
 that format's note of bytes lost, so that whoever decodes the chunks counts it.

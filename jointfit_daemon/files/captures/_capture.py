@@ -5,10 +5,10 @@ The kind of file is seen from its first bytes, never from its name:
 | file | wire | chunks |
 |---|---|---|
 | pcapng, pcap | datagram | one a UDP datagram, both directions, at the packet's own time |
-| ``candump -L`` text | can | one a line, a record of `jointfit_protocols.can_frame` |
+| ``candump -L`` text | can | one a line, a record of `jointfit_protocols.can._frame` |
 | raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
-| raw bytes | can | records of `jointfit_protocols.can_frame` back to back |
+| raw bytes | can | records of `jointfit_protocols.can._frame` back to back |
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.captures._capture import CaptureUnreadable
 from jointfit_daemon.files.captures._packet_capture import read_udp
-from jointfit_protocols.can_frame import host_count, unpack_frames
-from jointfit_protocols.candump import parse_candump
+from jointfit_protocols.can import host_count, unpack_frames
+from jointfit_protocols.can._candump import parse_candump
 from jointfit_protocols.corrupt import Corrupt
 
 if TYPE_CHECKING:

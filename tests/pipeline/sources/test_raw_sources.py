@@ -10,8 +10,8 @@ from jointfit_daemon.config import headings, parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, Notice, SourceOpened
-from jointfit_protocols.mtdata2 import Item, encode_items
 from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from tests.pipeline import core_feed
 
 pytest.importorskip("vqf")

@@ -9,7 +9,7 @@ from jointfit_daemon.config import load_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.sources import SourceState, Stamped
 from jointfit_protocols import xcdi
-from jointfit_protocols.can_frame import CanFrame, pack_frames
+from jointfit_protocols.can import CanFrame, pack_frames
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Source

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, ImuSettings
 from jointfit_daemon.model import Corrupt, ImuSample
-from jointfit_drivers.byte_stream import SerialPort
+from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_protocols.orientation import OrientationGate, canonical
 from pydantic import Field, field_validator
 

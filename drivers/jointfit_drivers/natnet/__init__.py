@@ -1,0 +1,7 @@
+"""Driver for OptiTrack NatNet motion capture over UDP."""
+
+from jointfit_drivers.natnet._decoder import NatNetDecoder
+from jointfit_drivers.natnet._driver import NatNetMocap
+from jointfit_drivers.natnet._settings import NatNetSettings
+
+__all__ = ["NatNetDecoder", "NatNetMocap", "NatNetSettings"]

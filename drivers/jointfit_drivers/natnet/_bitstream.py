@@ -1,0 +1,69 @@
+"""Bitstream version of one NatNet server, changed only by a datagram that proves the new one.
+
+Invariant: pure. An announced version is a candidate. It is adopted when a frame or a model cannot
+be decoded with the version in use and decodes exactly with the candidate. A forged announcement
+alone therefore changes nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.natnet import decode, is_versioned, supported
+
+if TYPE_CHECKING:
+    from jointfit_protocols.natnet import Message, Version
+
+UNKNOWN: Version = (0, 0)
+
+
+class Bitstream:
+    """Decodes datagrams with the version in use and tracks changes of it.
+
+    Parameters
+    ----------
+    wanted : tuple of int, optional
+        Version that rig.toml asks the server for; always a candidate.
+    """
+
+    def __init__(self, wanted: Version | None = None) -> None:
+        self.version = UNKNOWN
+        self._wanted = wanted
+        self._announced: Version | None = None
+        self._confirmed: Version | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether the server has named its version."""
+        return self.version != UNKNOWN
+
+    def announce(self, version: Version) -> None:
+        """Take the version of a SERVERINFO: the first one is used, later ones are candidates."""
+        self._announced = version
+        if not self.known or not supported(self.version):
+            self.version = version
+
+    def confirm(self, version: Version) -> None:
+        """Take the version of a RESPONSE as a candidate."""
+        self._confirmed = version
+
+    def restart(self, version: Version) -> None:
+        """Use the version of another server at the same address."""
+        self.version = self._announced = version
+        self._confirmed = None
+
+    def decode(self, datagram: bytes) -> Message | Corrupt:
+        """Return the message in `datagram`; adopt a candidate that alone can decode it."""
+        message = decode(datagram, self.version)
+        if not isinstance(message, Corrupt) or not self.known or not is_versioned(datagram):
+            return message
+
+        for candidate in dict.fromkeys((self._announced, self._confirmed, self._wanted)):
+            if candidate is None or candidate == self.version:
+                continue
+            found = decode(datagram, candidate)
+            if not isinstance(found, Corrupt):
+                self.version = candidate
+                return found
+        return message

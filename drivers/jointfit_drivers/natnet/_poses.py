@@ -1,0 +1,208 @@
+"""One NatNet frame in columns: SI, world Z up, NaN for what was not seen. Law: pure.
+
+"Not seen" is the wire's, never a guess of ours: a body whose bit 0 is clear repeats its last good
+pose; a labeled marker is missing, or occluded with a plausible filled position; a position in a
+marker set is (0, 0, 0). A usable marker is not occluded **and** point-cloud solved.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_drivers.natnet._binding import body_key
+from jointfit_protocols.natnet import BODY_TRACKED, MARKER_OCCLUDED, MARKER_POINT_CLOUD_SOLVED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.model import Quaternion, Vector
+    from jointfit_drivers.natnet._binding import Binding, Key
+    from jointfit_protocols.natnet import Body, FrameOfData, Marker
+
+_HALF = math.sqrt(0.5)
+_NOWHERE: Vector = (math.nan, math.nan, math.nan)
+_UNTURNED: Quaternion = (math.nan, math.nan, math.nan, math.nan)
+_NORM_TOLERANCE = 1e-3
+_FARTHEST_M = 10_000.0
+"""Coordinates beyond this, m, were measured by no camera; NaN compares as beyond."""
+_JUDGED = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
+
+
+class Columns(NamedTuple):
+    """The arrays of one `MocapFrame`, and what had to be left out of them."""
+
+    markers: NDArray[np.float64]
+    body_positions: NDArray[np.float64]
+    body_orientations: NDArray[np.float64]
+    suspicious: int
+    """Bodies refused because their rotation was none, or their numbers were not finite."""
+    unknown: tuple[int, ...]
+    """Ids that the model does not explain."""
+
+
+class Poses:
+    """Turns frames of one server into columns.
+
+    Parameters
+    ----------
+    up_axis : {"x", "y", "z"}
+        The stream's up axis. The **world** is turned, p' = R p and q' = q_R q; the axes of a body
+        stay as the vendor defined them.
+    """
+
+    def __init__(self, up_axis: str) -> None:
+        self._place, self._turn = _WORLDS[up_axis]
+
+    def columns(self, frame: FrameOfData, binding: Binding) -> Columns:
+        """Return `frame` in the columns of `binding`."""
+        unknown: list[int] = []
+        markers = self._markers(frame, binding, unknown)
+        bodies, suspicious = self._bodies(frame, binding, unknown)
+        places = [bodies.get(key, _ABSENT) for key in binding.bodies]
+        return Columns(
+            _array([markers.get(key, _NOWHERE) for key in binding.markers], 3),
+            _array([place for place, _ in places], 3),
+            _array([turn for _, turn in places], 4),
+            suspicious,
+            tuple(unknown),
+        )
+
+    def _markers(
+        self, frame: FrameOfData, binding: Binding, unknown: list[int]
+    ) -> dict[Key, Vector]:
+        seen = self._labeled(frame.markers, binding.known, unknown)
+        if frame.assets:
+            self._asset_markers(frame, seen)
+        if binding.loose_sets:
+            self._set_markers(frame, binding.loose_sets, seen)
+        return seen
+
+    def _labeled(
+        self, markers: tuple[Marker, ...], known: frozenset[Key], unknown: list[int]
+    ) -> dict[Key, Vector]:
+        seen: dict[Key, Vector] = {}
+        twice: set[int] = set()
+        place = self._place
+        for number, x, y, z, _, params, _ in markers:
+            if number not in known:
+                if number >> 16:  # model 0: seen by the cameras, claimed by no model
+                    unknown.append(number)
+            elif params & _JUDGED == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
+                if number in seen:
+                    twice.add(number)
+                seen[number] = place(x, y, z)
+        for number in twice:
+            del seen[number]
+        return seen
+
+    def _asset_markers(self, frame: FrameOfData, seen: dict[Key, Vector]) -> None:
+        for asset in frame.assets:
+            for marker in asset.markers:
+                if _usable(marker):
+                    key = body_key(asset.id, marker.id)
+                    seen.setdefault(key, self._place(marker.x, marker.y, marker.z))
+
+    def _set_markers(
+        self, frame: FrameOfData, loose: frozenset[str], seen: dict[Key, Vector]
+    ) -> None:
+        for marker_set in frame.marker_sets:
+            if marker_set.name in loose:
+                for i, (x, y, z) in enumerate(marker_set.positions):
+                    if (x or y or z) and _near(x, y, z):
+                        seen[marker_set.name, i] = self._place(x, y, z)
+
+    def _bodies(
+        self, frame: FrameOfData, binding: Binding, unknown: list[int]
+    ) -> tuple[dict[Key, tuple[Vector, Quaternion]], int]:
+        seen: dict[Key, tuple[Vector, Quaternion]] = {}
+        met: set[int] = set()
+        suspicious = 0
+        for key, body in _all_bodies(frame):
+            if key not in binding.known:
+                unknown.append(key)
+            elif key in met:
+                seen.pop(key, None)  # two bodies with one id: which is which cannot be known
+            elif body.params & BODY_TRACKED:
+                pose = self._pose(body)
+                if pose is None:
+                    suspicious += 1
+                else:
+                    seen[key] = pose
+            met.add(key)
+        return seen, suspicious
+
+    def _pose(self, body: Body) -> tuple[Vector, Quaternion] | None:
+        _, x, y, z, qx, qy, qz, qw, _, _ = body
+        norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+        if not (abs(norm - 1.0) <= _NORM_TOLERANCE and _near(x, y, z)):
+            return None
+        turned = self._turn(qw / norm, qx / norm, qy / norm, qz / norm)
+        return self._place(x, y, z), turned
+
+
+_ABSENT = (_NOWHERE, _UNTURNED)
+
+
+def _usable(marker: Marker) -> bool:
+    solved = marker.params & _JUDGED == MARKER_POINT_CLOUD_SOLVED
+    return solved and _near(marker.x, marker.y, marker.z)
+
+
+def _near(x: float, y: float, z: float) -> bool:
+    """Return whether a position is finite and where cameras can be."""
+    return abs(x) <= _FARTHEST_M and abs(y) <= _FARTHEST_M and abs(z) <= _FARTHEST_M
+
+
+def _all_bodies(frame: FrameOfData) -> Iterable[tuple[int, Body]]:
+    found = [(body.id, body) for body in frame.bodies]
+    for skeleton in frame.skeletons:
+        found += [(body_key(skeleton.id, bone.id), bone) for bone in skeleton.bones]
+    for asset in frame.assets:
+        found += [(body_key(asset.id, body.id), body) for body in asset.bodies]
+    return found
+
+
+def _array(rows: list[Vector] | list[Quaternion], width: int) -> NDArray[np.float64]:
+    return np.array(rows, dtype=np.float64).reshape(len(rows), width)
+
+
+# --- worlds -----------------------------------------------------------------------------------
+
+
+def _place_x(x: float, y: float, z: float) -> Vector:
+    return -z, y, x
+
+
+def _place_y(x: float, y: float, z: float) -> Vector:
+    return x, -z, y
+
+
+def _place_z(x: float, y: float, z: float) -> Vector:
+    return x, y, z
+
+
+def _turn_x(w: float, x: float, y: float, z: float) -> Quaternion:
+    return _HALF * (w + y), _HALF * (x - z), _HALF * (y - w), _HALF * (z + x)
+
+
+def _turn_y(w: float, x: float, y: float, z: float) -> Quaternion:
+    return _HALF * (w - x), _HALF * (x + w), _HALF * (y - z), _HALF * (z + y)
+
+
+def _turn_z(w: float, x: float, y: float, z: float) -> Quaternion:
+    return w, x, y, z
+
+
+_WORLDS: dict[
+    str,
+    tuple[
+        Callable[[float, float, float], Vector], Callable[[float, float, float, float], Quaternion]
+    ],
+] = {"x": (_place_x, _turn_x), "y": (_place_y, _turn_y), "z": (_place_z, _turn_z)}
+"""For each up axis the rotation of the world that makes z up: -90 deg about y for x, +90 deg about
+x for y; on positions, and from the left on quaternions."""

@@ -1,0 +1,197 @@
+"""UDP sockets that know when a datagram arrived. Law: the one place of this driver that does I/O.
+
+The kernel stamps datagrams on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; ``wall_clock`` takes the
+stamp to CLOCK_MONOTONIC. `asyncio`'s datagram endpoint hides ancillary data, so the sockets are our
+own.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import fcntl
+import socket
+import struct
+import time
+from typing import NamedTuple
+
+from jointfit_drivers.ports._wall_clock import WallClock
+
+MAX_DATAGRAM = 65_507
+DRAIN = 64
+"""Datagrams taken at one wake-up; the rest waits for the next, so that others get their turn."""
+RECEIVE_BUFFER = 1 << 20
+"""Asked for, bytes: half a second of large frames while the host is busy."""
+
+_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)  # x86-64 and ARM alike
+_IP_RECVERR = 11  # an ICMP refusal becomes an error of this socket, connected or not
+_IP_MULTICAST_ALL = 49  # 0: only groups that this socket joined
+_SIOCGIFADDR = 0x8915
+_ATTACH_FILTER = getattr(socket, "SO_ATTACH_FILTER", 26)
+_INSTRUCTION = struct.Struct("@HBBI")
+_PROGRAM = struct.Struct("@HL")
+_LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # classic BPF
+_SOURCE_ADDRESS = 0xFFF00000 + 12  # SKF_NET_OFF: offset from the IPv4 header
+_WHOLE_PACKET = 0xFFFFFFFF
+_STAMP = struct.Struct("@ll")
+_ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
+
+
+class Arrival(NamedTuple):
+    """One datagram."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC when it reached the kernel."""
+    data: bytes
+    host: str
+    """Address it came from."""
+    port: int
+    """Port it came from."""
+
+
+class StampedSocket:
+    """A non-blocking UDP socket whose datagrams carry their arrival.
+
+    Parameters
+    ----------
+    address, port
+        Where it is bound.
+    sender : str
+        Numeric address; the kernel drops datagrams from any other one, so that a flood of them
+        costs the daemon no time.
+    shared : bool
+        Other programs of this host may be bound to the same address and port.
+    """
+
+    def __init__(self, address: str, port: int, *, sender: str, shared: bool = False) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
+            if shared:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._filter(sender)
+            self._socket.bind((address, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self._wall = WallClock()
+
+    def _filter(self, sender: str) -> None:
+        """Have the kernel drop what `sender` did not send; whoever reads checks once more."""
+        (address,) = struct.unpack("!I", socket.inet_aton(sender))
+        program = array.array(
+            "B",
+            _INSTRUCTION.pack(_LOAD_WORD, 0, 0, _SOURCE_ADDRESS)
+            + _INSTRUCTION.pack(_JUMP_IF_EQUAL, 0, 1, address)
+            + _INSTRUCTION.pack(_RETURN, 0, 0, _WHOLE_PACKET)
+            + _INSTRUCTION.pack(_RETURN, 0, 0, 0),
+        )
+        start, size = program.buffer_info()
+        described = _PROGRAM.pack(size // _INSTRUCTION.size, start)
+        with contextlib.suppress(OSError):  # a kernel without socket filters
+            self._socket.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, described)
+
+    @classmethod
+    def in_group(cls, group: str, port: int, local: str, *, sender: str) -> StampedSocket:
+        """Open a socket that receives one multicast group on the network card of `local`.
+
+        It is bound to the group itself, so that other groups on the same port stay out.
+        """
+        opened = cls(group, port, sender=sender, shared=True)
+        try:
+            opened._socket.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+            member = socket.inet_aton(group) + socket.inet_aton(local)
+            opened._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except OSError:
+            opened.close()
+            raise
+        return opened
+
+    def fileno(self) -> int:
+        """Return the descriptor, for ``loop.add_reader``."""
+        return self._socket.fileno()
+
+    @property
+    def port(self) -> int:
+        """Port it is bound to."""
+        return int(self._socket.getsockname()[1])
+
+    def close(self) -> None:
+        """Close; the group is left with it."""
+        self._socket.close()
+
+    def send(self, data: bytes, address: tuple[str, int]) -> None:
+        """Send one datagram. A full queue of the network card loses it, as the network may."""
+        try:
+            self._socket.sendto(data, address)
+        except BlockingIOError:
+            return
+
+    def receive(self) -> list[Arrival]:
+        """Return what is there, at most `DRAIN` datagrams.
+
+        Raises
+        ------
+        OSError
+            Above all ConnectionRefusedError: nobody listens where we sent to.
+        """
+        self._wall.pair()
+        found: list[Arrival] = []
+        for _ in range(DRAIN):
+            try:
+                data, ancillary, _, address = self._socket.recvmsg(MAX_DATAGRAM, _ANCILLARY)
+            except BlockingIOError:
+                break
+            except OSError:
+                self._drop_errors()
+                if found:  # a refusal beside datagrams that arrive is forged or stale
+                    break
+                raise
+            now_ns = time.monotonic_ns()
+            found.append(Arrival(self._arrival(ancillary, now_ns), data, *address))
+        if not found:
+            self._drop_errors()  # woken by a refusal that sending has reported already
+        return found
+
+    def _drop_errors(self) -> None:
+        """Empty the error queue of the socket; until then it counts as readable."""
+        with contextlib.suppress(OSError):
+            while True:
+                self._socket.recvmsg(1, 0, socket.MSG_ERRQUEUE)
+
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int) -> int:
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == _TIMESTAMPNS and len(value) == _STAMP.size:
+                seconds, ns = _STAMP.unpack(value)
+                return self._wall.monotonic(seconds * 10**9 + ns, now_ns)
+        self._wall.soft += 1
+        return now_ns
+
+
+def local_address(server: str, interface: str | None) -> str:
+    """Return the IPv4 address of the network card to use.
+
+    Parameters
+    ----------
+    server : str
+        Numeric address of the server.
+    interface : str, optional
+        Address or name of the card; None: the card that leads to the server.
+
+    Raises
+    ------
+    OSError
+        No such card, or no way to the server.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        if interface is None:
+            probe.connect((server, 9))  # sends nothing: asks the routing table
+            return str(probe.getsockname()[0])
+        try:
+            return socket.inet_ntoa(socket.inet_aton(interface))
+        except OSError:
+            name = struct.pack("256s", interface.encode()[:15])
+            return socket.inet_ntoa(fcntl.ioctl(probe, _SIOCGIFADDR, name)[20:24])

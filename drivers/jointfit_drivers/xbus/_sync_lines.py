@@ -1,0 +1,126 @@
+"""Sync lines of an Xbus device: what rig.toml asks, as what the device stores.
+
+Law: pure; settings in, entries and words out. Order does not matter to a device, so it does not
+matter here either.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, Self
+
+from pydantic import Field, model_validator
+
+from jointfit_daemon.driver import Settings
+from jointfit_protocols.xbus.configuration import SyncSetting
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_protocols.xbus.sync_lines import (
+    Polarity,
+    SyncFunction,
+    function_name,
+    line_code,
+    line_name,
+    polarity_name,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+_MOST = 0xFFFF
+_UNITS_PER_MS = 10  # pulse width and delay are in 100 us
+TRIGGERS = {"in1": Item.TRIGGER_IN1, "in2": Item.TRIGGER_IN2}
+"""Item that tells of edges on a line."""
+
+Function = Literal[
+    "trigger_indication",
+    "interval_transition_measurement",
+    "send_latest",
+    "clock_bias_estimation",
+    "start_sampling",
+    "gnss_1pps",
+]
+
+
+class XbusSyncSettings(Settings):
+    """One line of one device."""
+
+    function: Function = Field(
+        description="`trigger_indication` (edges are told), `clock_bias_estimation` (edges every "
+        "`period_ms` discipline its clock), `start_sampling`, `send_latest`, `gnss_1pps`; on an "
+        "output `interval_transition_measurement` (a pulse a sample)"
+    )
+    line: Literal["clock_in", "in1", "in2", "out1"] = Field(description="which of its lines")
+    polarity: Literal["rising", "falling", "both"] = Field("rising", description="which edge")
+    once: bool = Field(False, description="only the first time")
+    skip_first: int = Field(0, ge=0, le=_MOST, description="edges ignored at first")
+    skip_factor: int = Field(0, ge=0, le=_MOST, description="edges ignored between two that count")
+    pulse_width_ms: float = Field(
+        0.0, ge=0, le=6553.5, description="of the pulses of an output, ms, in steps of 0.1"
+    )
+    delay_ms: float = Field(
+        0.0, ge=0, le=6553.5, description="from edge to action, ms, in steps of 0.1"
+    )
+    period_ms: int = Field(
+        0, ge=0, le=_MOST, description="of the reference of `clock_bias_estimation`, ms"
+    )
+    wire: int = Field(
+        0, ge=0, description="which wire of the rig: devices on one wire say the same number"
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        """Refuse what no device can do."""
+        out = self.function == "interval_transition_measurement"
+        if out != (self.line == "out1"):
+            kind = "an output (out1)" if out else "an input (clock_in, in1, in2)"
+            raise ValueError(f"{self.function} is a function of {kind}, found {self.line}")
+        if (self.function == "clock_bias_estimation") != (self.period_ms > 0):
+            raise ValueError("period_ms belongs to clock_bias_estimation, which needs it")
+        if self.function == "trigger_indication" and self.line not in TRIGGERS:
+            raise ValueError(f"trigger_indication: in1 or in2, found {self.line}")
+        return self
+
+
+def wanted(settings: Iterable[XbusSyncSettings], product_code: str) -> tuple[SyncSetting, ...]:
+    """Return the entries that `settings` mean to a device of this product code."""
+    return tuple(
+        SyncSetting(
+            SyncFunction[one.function.upper()],
+            line_code(one.line, product_code),
+            Polarity[one.polarity.upper()],
+            int(one.once),
+            one.skip_first,
+            one.skip_factor,
+            round(one.pulse_width_ms * _UNITS_PER_MS),
+            one.period_ms or round(one.delay_ms * _UNITS_PER_MS),
+        )
+        for one in settings
+    )
+
+
+def differences(found: Sequence[SyncSetting], asked: Sequence[SyncSetting]) -> list[str]:
+    """Return in words what the stored entries lack and what they have too much."""
+    lacks = [f"it does not have {describe(one)}" for one in asked if one not in found]
+    return lacks + [f"it has {describe(one)}" for one in found if one not in asked]
+
+
+def describe(one: SyncSetting) -> str:
+    """Return an entry in words."""
+    words = [function_name(one.function), "on", line_name(one.line), polarity_name(one.polarity)]
+    more = {
+        "once": one.once,
+        "skip_first": one.skip_first,
+        "skip_factor": one.skip_factor,
+        "pulse_width_ms": one.pulse_width / _UNITS_PER_MS,
+    }
+    clocked = one.function == SyncFunction.CLOCK_BIAS_ESTIMATION
+    more |= {"period_ms": one.delay} if clocked else {"delay_ms": one.delay / _UNITS_PER_MS}
+    return " ".join([*words, *(f"{name} {value:g}" for name, value in more.items() if value)])
+
+
+def wires(settings: Iterable[XbusSyncSettings]) -> dict[int, int]:
+    """Return the wire of the rig for every item that tells of edges."""
+    return {
+        int(TRIGGERS[one.line]): one.wire
+        for one in settings
+        if one.function == "trigger_indication"
+    }

@@ -1,0 +1,274 @@
+"""The pure half of the XCDI driver: records of CAN frames in, samples in SI out.
+
+Law: a function of the chunks fed; no clock, no bus. A sample is stamped with the first frame of its
+group, for arbitration delays the later ones by whatever else is on the bus. Every record of 24
+bytes is a message, a frame of somebody else's, a note of the host, or discarded.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
+from jointfit_drivers.xcdi._continuity import Continuity
+from jointfit_protocols.can import (
+    HOST_CORRUPT,
+    HOST_DROPPED,
+    RECORD_BYTES,
+    CanFrame,
+    describe_error,
+    host_count,
+    unpack_frames,
+)
+from jointfit_protocols.orientation import OrientationGate
+from jointfit_protocols.xcdi import (
+    OVERFLOW,
+    QUATERNION_SCALE,
+    TICK_NS,
+    TICKS_MODULUS,
+    TickUnit,
+    XcdiCodec,
+    XcdiError,
+    XcdiGroup,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_protocols.orientation import Quaternion
+    from jointfit_protocols.xcdi import ByteOrder, XcdiIds
+
+_UNDECIDED = 100  # groups after which an undecided unit is worth a warning
+_TIMELESS = 20  # quaternions without any SampleTime that are worth one
+_REPEAT_NS = 1_000_000_000  # the same error is told once a second at most
+
+
+class XcdiDecoder:
+    """Decoder of one XCDI sensor.
+
+    Parameters
+    ----------
+    ids
+        Its identifiers.
+    unit
+        ``100us`` or ``1us``, or ``auto``: decided from what arrives.
+    byte_order
+        Of the payloads.
+    """
+
+    def __init__(self, ids: XcdiIds, unit: str, byte_order: ByteOrder) -> None:
+        self._xcdi = XcdiCodec(ids, byte_order)
+        self._continuity = Continuity()
+        self._held: XcdiGroup | None = None
+        self._gate = OrientationGate()
+        self._unit = TickUnit()
+        self._configured = TICK_NS.get(unit)
+        self._tick_clock = (
+            None if self._configured is None else TickClock(self._configured, TICKS_MODULUS)
+        )
+        self._measured = self._has_time = self._has_counter = False
+        self._incomplete = self._timed = self._told_at_ns = 0
+        self._refused = 0
+        self._discarded = 0
+        self._said: set[str] = set()
+        self._error_text = ""
+
+    @property
+    def tick_clock(self) -> TickClock | None:
+        """Unit of SampleTime; None until it is decided."""
+        return self._tick_clock
+
+    @property
+    def messages(self) -> int:
+        """Well-formed frames of this sensor so far."""
+        return self._xcdi.messages - self._refused
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes of records that are no frame or make no sense, and of lost adapter lines."""
+        return self._discarded
+
+    @property
+    def incomplete(self) -> int:
+        """Groups that never got their quaternion."""
+        return self._xcdi.incomplete
+
+    @property
+    def ungrouped(self) -> int:
+        """Quaternions that came without device time."""
+        return self._xcdi.ungrouped
+
+    @property
+    def foreign(self) -> int:
+        """Frames that are not this sensor's."""
+        return self._xcdi.foreign
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return what `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        for item in unpack_frames(chunk.data):
+            if not isinstance(item, CanFrame):
+                out.append(self._lose(item.discarded, item.reason))
+            elif item.error:
+                out += self._note(item)
+            else:
+                message = self._xcdi.feed(item)
+                if message is None:
+                    continue
+                if isinstance(message, XcdiGroup):
+                    self._group(message, out)
+                elif isinstance(message, XcdiError):
+                    out += self._reported(message)
+                else:
+                    out.append(self._lose(RECORD_BYTES, message.reason))
+        return out
+
+    def flush(self) -> list[Decoded]:
+        """Give up waiting for the rest of a group, and for what would confirm one."""
+        self._xcdi.flush()
+        out: list[Decoded] = []
+        self._drop_held(out)
+        return out
+
+    def _group(self, group: XcdiGroup, out: list[Decoded]) -> None:
+        """Append the sample of `group`, after what its counter and time show."""
+        ticks, counter = group.ticks, group.counter
+        self._has_time = self._has_time or ticks is not None
+        self._has_counter = self._has_counter or counter is not None
+        torn = ticks is None and (self._has_time or (counter is None and self._has_counter))
+        broken = torn or self._xcdi.incomplete != self._incomplete
+        self._incomplete = self._xcdi.incomplete
+        step = self._continuity.group(ticks, counter, broken=broken)
+        held = self._held
+        if held is not None and not step.confirmed:
+            self._drop_held(out)
+        if step.shared:
+            self._refuse("two sensors share these identifiers", out)
+            out += self._once("warning", "shared", _SHARED)
+            return
+        self._said.discard("shared")
+        self._held = group if step.held else None
+        if step.held:
+            return
+        first = held if held is not None and step.confirmed else group
+        if step.restarted:
+            self._gate.forget()
+            self._unit.restart()
+            out.append(DeviceEvent("restart", f"its clock began anew at {first.ticks} ticks"))
+        if first is not group:
+            self._sample(first, out)
+        if step.lost:
+            out.append(DeviceEvent("gap", f"{step.lost} groups lost", {"lost": step.lost}))
+        self._sample(group, out)
+
+    def _drop_held(self, out: list[Decoded]) -> None:
+        """Discard a group that nothing confirmed."""
+        held, self._held = self._held, None
+        if held is not None:
+            self._gate.admit(_native(held))  # a wrong byte order makes time and counter leap, too
+            self._judge_norm(out)
+            self._refuse("counter and time contradict the others", out)
+
+    def _sample(self, group: XcdiGroup, out: list[Decoded]) -> None:
+        """Append the sample of a group that belongs to the stream."""
+        ticks = group.ticks
+        native = _native(group)
+        q = self._gate.admit(native)
+        if q is None:
+            self._refuse("quaternion norm is not 1", out)
+            self._judge_norm(out)
+            return
+        if ticks is None:
+            self._timeless(out)
+        elif not self._measured:
+            self._measure(ticks, group.t_ns, out)
+        out.append(ImuSample(group.t_ns, q, native, ticks, group.counter, group.status))
+
+    def _measure(self, ticks: int, t_ns: int, out: list[Decoded]) -> None:
+        """Decide the unit of SampleTime, or check the one that was configured."""
+        self._timed += 1
+        tick_ns = self._unit.feed(ticks, t_ns)
+        rate = self._unit.ticks_per_s
+        if tick_ns is None:
+            if self._timed == _UNDECIDED and rate is not None:
+                known = "10 000 or 1 000 000: set `sample_time_unit`"
+                text = f"SampleTime counts {rate:.4g} ticks a second, expected {known}"
+                out += self._once("warning", "unit", text)
+            return
+        self._measured = True
+        name = next(key for key, value in TICK_NS.items() if value == tick_ns)
+        if self._configured not in {None, tick_ns}:
+            text = f"SampleTime counts {rate:.4g} ticks a second: set `sample_time_unit` = {name!r}"
+            out += self._once("warning", "unit", text)
+            return
+        self._tick_clock = TickClock(tick_ns, TICKS_MODULUS)
+        data = {"sample_time_unit": name, "ticks_per_s": rate}
+        out.append(DeviceEvent("info", f"SampleTime counts in {name}", data))
+
+    def _timeless(self, out: list[Decoded]) -> None:
+        if self._xcdi.ungrouped == _TIMELESS and not self._timed:
+            text = (
+                f"{_TIMELESS} quaternions, and no SampleTime: samples are stamped on arrival; set "
+                "`ids.sample_time`, or switch the output on (over UART, Xsens MT Manager)"
+            )
+            out += self._once("warning", "timeless", text)
+
+    def _judge_norm(self, out: list[Decoded]) -> None:
+        norm = self._gate.misconfigured_norm
+        if norm is not None:
+            text = f"median quaternion norm is {norm:.4g}, expected 1: change `byte_order`"
+            out += self._once("warning", "norm", text, {"median_norm": norm})
+
+    def _note(self, frame: CanFrame) -> list[Decoded]:
+        """Return what the controller, its driver or the host has to say."""
+        if frame.can_id == HOST_CORRUPT:
+            return [self._lose(host_count(frame), "no SLCAN line")]
+        if frame.can_id == HOST_DROPPED:
+            lost = host_count(frame)
+            text = f"this host was too slow: the kernel dropped {lost} CAN frames"
+            return [DeviceEvent("warning", text, {"dropped_frames": lost})]
+        text, serious = describe_error(frame)
+        return self._limited("error" if serious else "warning", text, frame.t_ns)
+
+    def _reported(self, error: XcdiError) -> list[Decoded]:
+        known = (
+            "its output buffer overflowed, frames are lost: lower its rate or raise the bit rate"
+        )
+        text = known if error.code == OVERFLOW else f"it reports error {error.code}"
+        return self._limited("error", text, error.t_ns)
+
+    def _limited(self, kind: str, text: str, t_ns: int) -> list[Decoded]:
+        """Return the event unless the same was told within a second: a bad bus makes thousands."""
+        if text == self._error_text and 0 <= t_ns - self._told_at_ns < _REPEAT_NS:
+            return []
+        self._error_text, self._told_at_ns = text, t_ns
+        return [DeviceEvent(kind, text)]
+
+    def _once(
+        self, kind: str, topic: str, text: str, data: dict[str, object] | None = None
+    ) -> list[Decoded]:
+        if topic in self._said:
+            return []
+        self._said.add(topic)
+        return [DeviceEvent(kind, text, data or {})]
+
+    def _refuse(self, reason: str, out: list[Decoded]) -> None:
+        """Discard the quaternion frame that was just decoded."""
+        self._refused += 1
+        out.append(self._lose(RECORD_BYTES, reason))
+
+    def _lose(self, count: int, reason: str) -> Corrupt:
+        self._discarded += count
+        return Corrupt(count, reason)
+
+
+def _native(group: XcdiGroup) -> Quaternion:
+    a, b, c, d = group.quaternion
+    s = QUATERNION_SCALE
+    return (a * s, b * s, c * s, d * s)
+
+
+_SHARED = (
+    "counters and times contradict each other: two sensors send with the same CAN identifiers, so "
+    "none of their samples is used: give each a block of its own (over UART, Xsens MT Manager) and "
+    "set `ids`"
+)

@@ -1,0 +1,206 @@
+"""Xsens MTi-600, Sirius and Avior on CAN ("XCDI").
+
+Law: this driver only listens. The device is configured over its UART, once (CAN is off by factory
+default); over CAN nothing can be asked or set, so what is wrong is reported with what to change.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
+from jointfit_drivers.ports.can_bus import shared_bus, unknown_kind
+from jointfit_drivers.xcdi._decoder import XcdiDecoder
+from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, unpack_frames
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.orientation import OrientationGate
+from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_daemon.model import Chunk
+
+log = logging.getLogger(__name__)
+
+_LONGEST_SILENCE_S = 30.0  # a sensor that is away stays on the bus's list, and is heard at once
+_SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
+_RAW_FRAMES = 20  # logged at debug level, so that a first real device can be judged from its log
+
+
+class XcdiIdSettings(Settings):
+    """CAN identifiers of one sensor; give each sensor on a bus a block of its own."""
+
+    sample_time: int = Field(DataId.SAMPLE_TIME, ge=0, le=EXTENDED_MAX, description="SampleTime")
+    group_counter: int = Field(
+        DataId.GROUP_COUNTER, ge=0, le=EXTENDED_MAX, description="GroupCounter"
+    )
+    quaternion: int = Field(DataId.QUATERNION, ge=0, le=EXTENDED_MAX, description="Quaternion")
+    status_word: int | None = Field(
+        None,
+        ge=0,
+        le=EXTENDED_MAX,
+        description="StatusWord; default: 0x11, moved like the three above if they move together",
+    )
+    error: int | None = Field(
+        None,
+        ge=0,
+        le=EXTENDED_MAX,
+        description="Error; default: 0x01, moved like the three above if they move together",
+    )
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        """Refuse identifiers that cannot be told apart or would tear groups apart."""
+        ids = self.resolved()
+        given = [number for number in ids[:5] if number is not None]
+        if len(set(given)) < len(given):
+            raise ValueError("each identifier once: found one twice")
+        if not self.sample_time < self.group_counter < self.quaternion:
+            raise ValueError(
+                "sample_time < group_counter < quaternion: the lowest identifier leaves first, and "
+                "the quaternion must complete its group"
+            )
+        return self
+
+    def resolved(self, *, extended: bool = False) -> XcdiIds:
+        """Return all identifiers, those left out derived from a block if there is one."""
+        base = self.quaternion - DataId.QUATERNION
+        block = base >= 0 and (
+            self.sample_time - DataId.SAMPLE_TIME
+            == self.group_counter - DataId.GROUP_COUNTER
+            == base
+        )
+
+        def default(data_id: DataId) -> int | None:
+            return base + data_id if block else None
+
+        return XcdiIds(
+            sample_time=self.sample_time,
+            group_counter=self.group_counter,
+            quaternion=self.quaternion,
+            status_word=default(DataId.STATUS_WORD)
+            if self.status_word is None
+            else self.status_word,
+            error=default(DataId.ERROR) if self.error is None else self.error,
+            extended=extended,
+        )
+
+
+class XcdiSettings(ImuSettings):
+    """One Xsens / Movella IMU on a CAN bus."""
+
+    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
+    ids: XcdiIdSettings = Field(
+        default_factory=XcdiIdSettings,
+        description="its identifiers; required in effect when two sensors share a bus",
+    )
+    extended_ids: bool = Field(
+        False, description="29-bit identifiers even where the numbers would fit 11 bits"
+    )
+    sample_time_unit: Literal["auto", "100us", "1us"] = Field(
+        "auto", description="unit of SampleTime; auto decides from ten groups or more"
+    )
+    byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
+
+    @model_validator(mode="after")
+    def _fits_its_identifiers(self) -> Self:
+        """Refuse 11-bit identifiers that no frame can carry."""
+        for name, number in self.ids:
+            if number is not None and number > STANDARD_MAX and not self.extended_ids:
+                raise ValueError(
+                    f"ids.{name} = 0x{number:X} is above 0x{STANDARD_MAX:X}, the greatest 11-bit "
+                    "identifier: correct it, or set extended_ids = true if the sensor sends 29-bit "
+                    "identifiers"
+                )
+        return self
+
+    @field_validator("can")
+    @classmethod
+    def _bus_of_a_known_kind(cls, can: CanBusSettings) -> CanBusSettings:
+        if (fault := unknown_kind(can.interface)) is not None:
+            raise ValueError(fault)
+        return can
+
+    @property
+    @override
+    def can_frames(self) -> tuple[tuple[int, bool], ...]:
+        ids = self.ids.resolved(extended=self.extended_ids)
+        return tuple(
+            (_SAMPLE_BYTES[data_id], extended)
+            for (_, extended), data_id in ids.by_id().items()
+            if data_id in _SAMPLE_BYTES
+        )
+
+
+class XcdiImu:
+    """Xsens IMU on a CAN bus: orientation, device time and counter, as three frames a sample."""
+
+    Settings: ClassVar[type[XcdiSettings]] = XcdiSettings
+    wire: ClassVar[Wire] = "can"
+
+    def __init__(self, settings: XcdiSettings) -> None:
+        self._settings = settings
+        self._ids = settings.ids.resolved(extended=settings.extended_ids)
+        self._silent_s = settings.silence_s  # listening on costs nothing; opening the bus anew does
+
+    def decoder(self) -> XcdiDecoder:
+        """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
+        settings = self._settings
+        return XcdiDecoder(self._ids, settings.sample_time_unit, settings.byte_order)
+
+    async def run(self, emit: Emit) -> None:
+        """Read the bus until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            Bus absent or down, adapter unplugged, or this sensor silent for `silence_s`.
+        DeviceMisconfiguredError
+            No such bus here, or another sensor of the rig claims the same identifiers.
+        """
+        settings, by_id = self._settings, self._ids.by_id()
+        ids = {key: data_id.name.lower() for key, data_id in by_id.items()}
+        (needed,) = (key for key, data_id in by_id.items() if data_id is DataId.QUATERNION)
+
+        def emit_sample(chunk: Chunk) -> None:
+            self._silent_s = settings.silence_s
+            emit(chunk)
+
+        silence_s = self._silent_s
+        self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
+        async with shared_bus(settings.can) as bus:
+            await bus.pump(
+                settings.id,
+                ids,
+                self._logged(emit_sample),
+                silence_s,
+                needed=needed,
+                resembles=self._resembles,
+            )
+
+    def _resembles(self, data: bytes) -> bool:
+        """Whether `data` could be a quaternion: four integers of norm 1."""
+        counts = decode(DataId.QUATERNION, data, self._settings.byte_order)
+        if isinstance(counts, Corrupt):
+            return False
+        w, x, y, z = (count * QUATERNION_SCALE for count in counts)
+        return OrientationGate().admit((w, x, y, z)) is not None
+
+    def _logged(self, emit: Emit) -> Emit:
+        """Return `emit`, with the first frames written to the log at debug level."""
+        if not log.isEnabledFor(logging.DEBUG):
+            return emit
+        left = _RAW_FRAMES
+
+        def emit_and_log(chunk: Chunk) -> None:
+            nonlocal left
+            for frame in unpack_frames(chunk.data)[:left]:
+                left -= 1
+                log.debug("%s: %s", self._settings.id, frame)
+            emit(chunk)
+
+        return emit_and_log

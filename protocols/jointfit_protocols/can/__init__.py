@@ -1,0 +1,35 @@
+"""CAN frames: records, error frames, candump logs and the SLCAN adapter protocol."""
+
+from jointfit_protocols.can._candump import parse_candump
+from jointfit_protocols.can._error_frame import describe_error
+from jointfit_protocols.can._frame import (
+    EXTENDED_MAX,
+    HOST_CORRUPT,
+    HOST_DROPPED,
+    RECORD_BYTES,
+    STANDARD_MAX,
+    CanFrame,
+    frame_bits,
+    host_corrupt,
+    host_count,
+    host_dropped,
+    pack_frames,
+    unpack_frames,
+)
+
+__all__ = [
+    "EXTENDED_MAX",
+    "HOST_CORRUPT",
+    "HOST_DROPPED",
+    "RECORD_BYTES",
+    "STANDARD_MAX",
+    "CanFrame",
+    "describe_error",
+    "frame_bits",
+    "host_corrupt",
+    "host_count",
+    "host_dropped",
+    "pack_frames",
+    "parse_candump",
+    "unpack_frames",
+]

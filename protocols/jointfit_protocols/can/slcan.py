@@ -1,0 +1,213 @@
+r"""SLCAN (Lawicel): CAN frames as lines of ASCII over a serial port, decode and encode, both roles.
+
+Law: bytes in, frames and lines out; no port, no clock. Stamps are computed from the arrival that
+the caller gives. On a real line a frame is back-dated by the characters that came with and after
+it. On USB characters take no time, whatever the port's speed says; what came in one read is
+back-dated by its time on the bus, for frames there follow each other.
+
+    t iii l dd...    11-bit frame, l bytes     T iiiiiiii l dd...   29-bit frame
+    r iii l          11-bit remote request     R iiiiiiii l         29-bit remote request
+
+Every line ends in CR (LF is ignored); a frame may be followed by four digits of adapter time, ms
+modulo 60 000, which is a clock of its own and is dropped. The adapter answers a command with CR
+(done) or BELL (refused); the host's commands are ``Sn`` (bit rate), ``O``, ``C``, ``V``, ``N``,
+``Z`` and others.
+Source: Lawicel CAN232 manual, version 3.
+"""
+
+from __future__ import annotations
+
+from binascii import unhexlify
+from typing import Literal, NamedTuple
+
+from jointfit_protocols.can._frame import EXTENDED_MAX, STANDARD_MAX, CanFrame, frame_bits
+from jointfit_protocols.corrupt import Corrupt
+
+Role = Literal["host", "adapter"]
+"""Who decodes: the host reads answers, the adapter reads commands; frames go both ways."""
+
+BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+"""bit/s of the commands S0 to S8."""
+
+DONE, REFUSED = b"\r", b"\a"
+_CR, _BELL = 0x0D, 0x07
+_LONGEST = 64  # characters of a line; some adapters have long version strings
+_WINDOW = 32  # characters at the end of a broken line that may hold a frame: the longest has 30
+_BITS_A_CHARACTER = 10  # 8N1
+
+# Letters of lines that are not frames, with the lengths of argument they may have.
+_ANSWERS: dict[int, range] = {
+    ord("V"): range(1, 41),
+    ord("v"): range(1, 41),
+    ord("N"): range(1, 41),
+    ord("F"): range(2, 3),
+    ord("z"): range(1),
+    ord("Z"): range(1),
+}
+_COMMANDS: dict[int, range] = {
+    **dict.fromkeys(b"OLlCVvNFAPX", range(2)),
+    **dict.fromkeys(b"SZUQW", range(1, 3)),
+    ord("s"): range(4, 7),
+    ord("m"): range(8, 9),
+    ord("M"): range(8, 9),
+}
+
+
+class SlcanLine(NamedTuple):
+    """A line that is no frame: an answer or a command."""
+
+    letter: str
+    """Its first letter; ``""`` for a bare CR (done), ``"\\a"`` for BELL (refused)."""
+    argument: str = ""
+
+
+def bitrate_code(bitrate: int) -> int | None:
+    """Return n of the command ``Sn`` for `bitrate` in bit/s, or None where there is none."""
+    return BITRATES.index(bitrate) if bitrate in BITRATES else None
+
+
+def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
+    """Return `frame` as a line, with `time_ms` modulo 60 000 as its adapter time if given."""
+    letter = ("rR" if frame.remote else "tT")[frame.extended]
+    head = f"{letter}{frame.can_id:0{8 if frame.extended else 3}X}{len(frame.data)}"
+    body = "" if frame.remote else frame.data.hex().upper()
+    stamp = "" if time_ms is None else f"{time_ms % 60_000:04X}"
+    return f"{head}{body}{stamp}\r".encode()
+
+
+def _frame(line: bytes, t_ns: int) -> CanFrame | None:
+    """Return the frame that the whole of `line` (without CR) is, or None."""
+    letter = line[0]
+    extended = letter in b"TR"
+    try:
+        # One conversion for all digits: it is strict (no signs, spaces or underscores).
+        raw = unhexlify(b"0" + line[1:] if extended else line[1:])
+    except ValueError:
+        return None
+    head = 5 if extended else 2
+    if len(raw) < head:
+        return None
+    number = int.from_bytes(raw[:head], "big")
+    can_id, size = number >> 4, number & 0xF
+    remote = letter in b"rR"
+    end = head if remote else head + size
+    if size > 8 or len(raw) not in {end, end + 2}:  # noqa: PLR2004 - classic CAN
+        return None
+    if can_id > (EXTENDED_MAX if extended else STANDARD_MAX):
+        return None
+    return CanFrame(t_ns, can_id, raw[head:end], extended, error=False, remote=remote)
+
+
+class SlcanCodec:
+    """Bytes in pieces of any size in, frames and lines out; never raises.
+
+    Parameters
+    ----------
+    baud
+        Speed of the serial line, bit/s: one character lasts 10/baud seconds. None: USB.
+    role
+        ``host`` (reads an adapter) or ``adapter`` (reads a host).
+    bitrate
+        Speed of the bus, bit/s.
+    """
+
+    def __init__(
+        self, baud: int | None, role: Role = "host", *, bitrate: int = BITRATES[-1]
+    ) -> None:
+        self._character_ns = 0.0 if baud is None else _BITS_A_CHARACTER * 1_000_000_000 / baud
+        self._bit_ns = 1_000_000_000 / bitrate
+        self._lines = _ANSWERS if role == "host" else _COMMANDS
+        self._pending = b""  # at most one line, _LONGEST bytes
+        self._endless = False  # the pending line has lost its beginning
+        self._previous_ns: int | None = None
+        self.frames = 0
+        self.discarded_bytes = 0
+
+    def feed(self, data: bytes, t_ns: int) -> list[CanFrame | SlcanLine | Corrupt]:
+        """Return what `data` completed, in wire order.
+
+        A frame's ``t_ns`` is the start of its line: `t_ns`, the arrival of `data`, minus the
+        characters from the line's start on (on USB: minus the frames from it on, as the bus
+        carried them); but for a line that lies in `data` whole never before the previous call's,
+        whatever the configured speed.
+        """
+        found: list[CanFrame | SlcanLine | Corrupt] = []
+        *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
+        before = len(self._pending)  # bytes that came with earlier calls
+        # from a line's start to the end of `data`
+        after_ns = (before + len(data)) * self._character_ns or sum(map(self._on_bus_ns, lines))
+        for line in lines:
+            floor = self._previous_ns if before <= 0 else None
+            start = t_ns - round(after_ns)
+            self._line(line, start if floor is None or start > floor else floor, found)
+            after_ns -= (len(line) + 1) * self._character_ns or self._on_bus_ns(line)
+            before -= len(line) + 1
+        self._pending = self._bounded(rest, found)
+        self._previous_ns = t_ns
+        return found
+
+    def flush(self) -> list[Corrupt]:
+        """Give up on an unfinished line."""
+        rest, self._pending, self._endless = self._pending, b"", False
+        return [self._corrupt(len(rest), "unfinished line")] if rest else []
+
+    def _on_bus_ns(self, line: bytes) -> float:
+        """Return how long what `line` tells of was on the bus; 0 for what is no frame."""
+        if not line or line[0] not in b"tTrR":
+            return 0.0
+        extended = line[0] in b"TR"
+        digit = line[9:10] if extended else line[4:5]
+        size = int(digit) if digit.isdigit() and line[0] in b"tT" else 0
+        return frame_bits(min(size, 8), extended) * self._bit_ns
+
+    def _bounded(self, rest: bytes, found: list[CanFrame | SlcanLine | Corrupt]) -> bytes:
+        """Return the unfinished line; one that is longer than any line loses all but its end."""
+        rest = self._bells(rest, found)
+        if len(rest) <= _LONGEST:
+            return rest
+        self._endless = True
+        found.append(self._corrupt(len(rest) - _WINDOW, "line without end"))
+        return rest[-_WINDOW:]  # a frame may have begun in it
+
+    def _bells(self, line: bytes, found: list[CanFrame | SlcanLine | Corrupt]) -> bytes:
+        """Return what follows the last BELL of `line`: BELL is an answer without CR."""
+        while _BELL in line:
+            junk, line = line.split(REFUSED, 1)
+            if junk:
+                found.append(self._corrupt(len(junk), "cut line"))
+            found.append(SlcanLine("\a"))
+            self._endless = False
+        return line
+
+    def _line(self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | Corrupt]) -> None:
+        """Append what `line` (without CR) is."""
+        if line and line[0] in b"tTrR":
+            frame = _frame(line, t_ns)
+            if frame is not None:
+                self.frames += 1
+                self._endless = False
+                found.append(frame)
+                return
+        line = self._bells(line, found)
+        endless, self._endless = self._endless, False
+        if not line:
+            found.append(SlcanLine(""))
+        elif not endless and line.isascii() and len(line) - 1 in self._lines.get(line[0], ()):
+            found.append(SlcanLine(chr(line[0]), line[1:].decode()))
+        else:
+            self._rescue(line, t_ns, found)
+
+    def _rescue(self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | Corrupt]) -> None:
+        """Append the frame that ends the broken `line`, if one does: noise may have come before."""
+        for at in range(max(0, len(line) - _WINDOW), len(line)):
+            if line[at] in b"tTrR":
+                frame = _frame(line[at:], t_ns + round(at * self._character_ns))
+                if frame is not None:
+                    self.frames += 1
+                    found += [self._corrupt(at, "no SLCAN line"), frame]
+                    return
+        found.append(self._corrupt(len(line) + 1, "no SLCAN line"))
+
+    def _corrupt(self, count: int, reason: str) -> Corrupt:
+        self.discarded_bytes += count
+        return Corrupt(count, reason)

@@ -1,0 +1,278 @@
+"""NatNet FRAMEOFDATA, bitstreams 3.0 to 4.x. Law: bytes in, values as sent out; no unit, no name.
+
+    number | marker sets | other markers | bodies | skeletons | assets | labeled | plates | devices
+    timecode | sub-frame | timestamp | exposure | received | transmit | [precision] | params | 0
+
+Little-endian, packed. Each section begins with ``i32 n`` and, from 4.1, ``i32 bytes`` of its items;
+assets exist from 4.1 on. Positions are metres in the server's world, quaternions x, y, z, w.
+Bitstreams 2.x are refused by name: they carry no exposure stamp and their servers answer no echo.
+
+Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.natnet._cursor import BREAKS, XYZ, Cursor, Malformed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Version = tuple[int, int]
+"""Bitstream in use: major and minor."""
+
+Position = tuple[float, float, float]
+
+OLDEST: Version = (3, 0)
+SIZED: Version = (4, 1)
+"""From this bitstream on, sections carry their size in bytes."""
+
+BODY_TRACKED = 0x01
+MARKER_OCCLUDED = 0x01
+MARKER_POINT_CLOUD_SOLVED = 0x02
+MARKER_MODEL_FILLED = 0x04
+MARKER_HAS_MODEL = 0x08
+MARKER_UNLABELED = 0x10
+FRAME_RECORDING = 0x01
+FRAME_MODEL_CHANGED = 0x02
+FRAME_EDIT_MODE = 0x04
+FRAME_BITSTREAM_CHANGED = 0x08
+
+BODY_LAYOUT = struct.Struct("<i3f4ffh")
+MARKER_LAYOUT = struct.Struct("<i3ffhf")
+FLOAT_LAYOUT = struct.Struct("<f")
+TWO_LAYOUT = struct.Struct("<ii")
+STAMPS_LAYOUT = struct.Struct("<IIdQQQ")
+PRECISION_LAYOUT = struct.Struct("<II")
+END_LAYOUT = struct.Struct("<hi")
+_SHORT_TAIL = END_LAYOUT.size
+_LONG_TAIL = PRECISION_LAYOUT.size + END_LAYOUT.size
+
+
+class Body(NamedTuple):
+    """Pose of one rigid body or bone (38 bytes); a bone's id is ``skeleton << 16 | bone``."""
+
+    id: int
+    x: float
+    y: float
+    z: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+    error: float
+    """Mean marker error, m. No measure of validity: three markers always fit."""
+    params: int
+    """Bit 0 tracked; clear means that the last good pose is repeated."""
+
+
+class Marker(NamedTuple):
+    """One labeled marker (26 bytes); id is ``model << 16 | member``, model 0 if it has none."""
+
+    id: int
+    x: float
+    y: float
+    z: float
+    size: float
+    params: int
+    """``MARKER_`` bits; usable if not occluded and point-cloud solved."""
+    residual: float
+    """Metres a ray."""
+
+
+class MarkerSet(NamedTuple):
+    """Positions of one marker set, in the order of its description; (0, 0, 0) is "not seen"."""
+
+    name: str
+    positions: tuple[Position, ...]
+
+
+class Skeleton(NamedTuple):
+    """One skeleton and its bones."""
+
+    id: int
+    bones: tuple[Body, ...]
+
+
+class Asset(NamedTuple):
+    """One trained marker set (from 4.1)."""
+
+    id: int
+    bodies: tuple[Body, ...]
+    markers: tuple[Marker, ...]
+
+
+class Analog(NamedTuple):
+    """Samples of one force plate or analog device, a tuple for each channel."""
+
+    id: int
+    channels: tuple[tuple[float, ...], ...]
+
+
+class FrameOfData(NamedTuple):
+    """One camera frame as sent."""
+
+    number: int
+    timestamp: float
+    """Frame number times nominal period, s: a counter, never a clock."""
+    exposure: int
+    """Center of the camera exposure, server ticks; 0 from USB cameras."""
+    received: int
+    transmit: int
+    params: int = 0
+    bodies: tuple[Body, ...] = ()
+    markers: tuple[Marker, ...] = ()
+    marker_sets: tuple[MarkerSet, ...] = ()
+    other_markers: tuple[Position, ...] = ()
+    skeletons: tuple[Skeleton, ...] = ()
+    assets: tuple[Asset, ...] = ()
+    force_plates: tuple[Analog, ...] = ()
+    devices: tuple[Analog, ...] = ()
+    timecode: int = 0
+    subframe: int = 0
+    precision: tuple[int, int] | None = None
+    """Seconds and fraction of an external clock; None where the bitstream has no such field."""
+    skipped: tuple[str, ...] = ()
+    """Sections passed over by their size because their content was not understood."""
+
+
+def supported(version: Version) -> bool:
+    """Tell whether frames of this bitstream can be decoded: 3.0 and newer, by section size."""
+    return version >= OLDEST
+
+
+def decode_frame(datagram: bytes, version: Version) -> FrameOfData | Corrupt:
+    """Return the frame in a whole FRAMEOFDATA datagram (header included); never raises.
+
+    A parse is accepted only if it ends exactly at the end of the datagram, end tag included. The
+    precision timestamp is taken to be present if the length says so, whatever the version.
+    """
+    if not supported(version):
+        return Corrupt(
+            len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
+        )
+    try:
+        return _read_frame(Cursor(datagram, 4), version >= SIZED)
+    except BREAKS as problem:
+        return Corrupt(len(datagram), f"frame: {problem}")
+
+
+# --- reading ----------------------------------------------------------------------------------
+
+
+def _read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
+    number = cursor.integer()
+    skipped: list[str] = []
+    sections = {
+        name: _read_section(cursor, name, smallest, read, skipped if sized else None)
+        for name, smallest, read in (_SECTIONS_SIZED if sized else _SECTIONS)
+    }
+    tail = STAMPS_LAYOUT.size + _LONG_TAIL
+    while sized and cursor.left > tail:  # a section that a newer bitstream put behind ours
+        _, size = cursor.unpack(TWO_LAYOUT)
+        cursor.window(size, _nothing)
+        skipped.append("unknown")
+    timecode, subframe, timestamp, exposure, received, transmit = cursor.unpack(STAMPS_LAYOUT)
+    precision = cursor.unpack(PRECISION_LAYOUT) if cursor.left == _LONG_TAIL else None
+    if cursor.left != _SHORT_TAIL:
+        raise Malformed(f"{cursor.left - _SHORT_TAIL:+d} bytes where the end should be")
+    params, end = cursor.unpack(END_LAYOUT)
+    if end:
+        raise Malformed("no end tag")
+    return FrameOfData(
+        number, timestamp, exposure, received, transmit, params,
+        timecode=timecode, subframe=subframe, precision=precision, skipped=tuple(skipped),
+        **sections,
+    )  # fmt: skip
+
+
+def _read_section(
+    cursor: Cursor,
+    name: str,
+    smallest: int,
+    read: Callable[[Cursor, int], tuple[Any, ...]],
+    skipped: list[str] | None,
+) -> tuple[Any, ...]:
+    """Read one section; with sizes (`skipped` given), pass over one that does not fit its size."""
+    n = cursor.integer()
+    if skipped is None:
+        cursor.check(n, smallest)
+        return read(cursor, n) if n else ()
+    size = cursor.integer()
+    if n == 0 and size == 0:
+        return ()
+
+    def items() -> tuple[Any, ...]:
+        cursor.check(n, smallest)
+        return read(cursor, n)
+
+    found: tuple[Any, ...] | None = cursor.window(size, items)
+    if found is None:
+        skipped.append(name)
+        return ()
+    return found
+
+
+def _nothing() -> None:
+    """Read nothing of a section nobody here knows."""
+
+
+def _read_sets(cursor: Cursor, n: int) -> tuple[MarkerSet, ...]:
+    return tuple(
+        MarkerSet(cursor.text(), tuple(cursor.records(XYZ, cursor.integer()))) for _ in range(n)
+    )
+
+
+def _read_positions(cursor: Cursor, n: int) -> tuple[Any, ...]:
+    return tuple(cursor.records(XYZ, n))
+
+
+def _read_bodies(cursor: Cursor, n: int) -> tuple[Body, ...]:
+    return tuple(map(Body._make, cursor.records(BODY_LAYOUT, n)))
+
+
+def _read_markers(cursor: Cursor, n: int) -> tuple[Marker, ...]:
+    return tuple(map(Marker._make, cursor.records(MARKER_LAYOUT, n)))
+
+
+def _read_skeletons(cursor: Cursor, n: int) -> tuple[Skeleton, ...]:
+    return tuple(
+        Skeleton(cursor.integer(), _read_bodies(cursor, cursor.integer())) for _ in range(n)
+    )
+
+
+def _read_assets(cursor: Cursor, n: int) -> tuple[Asset, ...]:
+    return tuple(
+        Asset(
+            cursor.integer(),
+            _read_bodies(cursor, cursor.integer()),
+            _read_markers(cursor, cursor.integer()),
+        )
+        for _ in range(n)
+    )
+
+
+def _read_analog(cursor: Cursor, n: int) -> tuple[Analog, ...]:
+    return tuple(
+        Analog(cursor.integer(), tuple(_read_channel(cursor) for _ in range(cursor.count(4))))
+        for _ in range(n)
+    )
+
+
+def _read_channel(cursor: Cursor) -> tuple[float, ...]:
+    return tuple(value for (value,) in cursor.records(FLOAT_LAYOUT, cursor.integer()))
+
+
+_SECTIONS: tuple[tuple[str, int, Callable[[Cursor, int], tuple[Any, ...]]], ...] = (
+    ("marker_sets", 5, _read_sets),
+    ("other_markers", XYZ.size, _read_positions),
+    ("bodies", BODY_LAYOUT.size, _read_bodies),
+    ("skeletons", 8, _read_skeletons),
+    ("markers", MARKER_LAYOUT.size, _read_markers),
+    ("force_plates", 8, _read_analog),
+    ("devices", 8, _read_analog),
+)
+_SECTIONS_SIZED = (*_SECTIONS[:4], ("assets", 12, _read_assets), *_SECTIONS[4:])

@@ -1,0 +1,289 @@
+"""NatNet messages on UDP: who is there, what do you serve, what time is it. Law: sans-IO.
+
+    | u16 id | u16 payload length | payload |      little-endian; length = the datagram's - 4
+
+`decode` takes a datagram of either direction: a capture holds both, and a simulator reads what a
+driver writes. Frames and model definitions are laid out in `natnet_frame` and `natnet_model`.
+
+Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h; a capture of Motive 2.1.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.natnet._connect import Connect, decode_connect, encode_connect
+from jointfit_protocols.natnet._cursor import fixed_text, put_fixed_text
+from jointfit_protocols.natnet._frame import FrameOfData, Version, decode_frame
+from jointfit_protocols.natnet._frame_encode import encode_frame
+from jointfit_protocols.natnet._model import ModelDefinition, decode_model
+from jointfit_protocols.natnet._model_encode import encode_model
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MAX_DATAGRAM = 65_507
+COMMAND_PORT = 1510
+DATA_PORT = 1511
+GROUP = "239.255.42.99"
+
+Version4 = tuple[int, int, int, int]
+
+HEADER = struct.Struct("<HH")
+_STAMP = struct.Struct("<Q")
+_ECHO = struct.Struct("<QQ")
+_INFO = struct.Struct("<256s4B4B")
+_INFO_TAIL = struct.Struct("<QHB4B")
+
+
+class MessageId(IntEnum):
+    """First field of the header."""
+
+    CONNECT = 0
+    SERVERINFO = 1
+    REQUEST = 2
+    RESPONSE = 3
+    REQUEST_MODELDEF = 4
+    MODELDEF = 5
+    REQUEST_FRAMEOFDATA = 6
+    FRAMEOFDATA = 7
+    MESSAGESTRING = 8
+    DISCONNECT = 9
+    KEEPALIVE = 10
+    DISCONNECTBYTIMEOUT = 11
+    ECHOREQUEST = 12
+    ECHORESPONSE = 13
+    DISCOVERY = 14
+    UNRECOGNIZED_REQUEST = 100
+
+
+class ServerInfo(NamedTuple):
+    """The answer to CONNECT and DISCOVERY."""
+
+    application: str
+    application_version: Version4
+    natnet_version: Version4
+    """The bitstream in use is its first two numbers unless changed."""
+    clock_hz: int | None
+    """Ticks per second of the stamps in the frames; None from a 2.x server."""
+    data_port: int = DATA_PORT
+    multicast: bool = False
+    group: str = GROUP
+
+    @property
+    def bitstream(self) -> Version:
+        """The bitstream this server starts with."""
+        return self.natnet_version[:2]
+
+
+class Discovery(NamedTuple):
+    """CONNECT to whom it may concern (broadcast); every server answers."""
+
+    connect: Connect
+
+
+class Request(NamedTuple):
+    """A command in words: ``FrameRate``, ``Bitstream,4.1`` and so on."""
+
+    command: str
+
+
+class Response(NamedTuple):
+    """The answer to a `Request`: int32, float32 or a string; only who asked knows which."""
+
+    data: bytes
+
+    @property
+    def text(self) -> str:
+        """The answer read as a string."""
+        return fixed_text(self.data)
+
+
+class MessageString(NamedTuple):
+    """Text for a person."""
+
+    text: str
+
+
+class EchoRequest(NamedTuple):
+    """A stamp of the client's choosing."""
+
+    stamp: int
+
+
+class EchoResponse(NamedTuple):
+    """The client's stamp returned, and the server's ticks when it was."""
+
+    stamp: int
+    ticks: int
+
+
+class Bare(NamedTuple):
+    """A message that says everything by its id; whatever follows the header has no meaning."""
+
+    id: MessageId
+
+
+Message = (
+    Connect
+    | Discovery
+    | ServerInfo
+    | Request
+    | Response
+    | ModelDefinition
+    | FrameOfData
+    | MessageString
+    | EchoRequest
+    | EchoResponse
+    | Bare
+)
+
+
+def decode(datagram: bytes, version: Version) -> Message | Corrupt:
+    """Return the message in `datagram`, frames and models read as bitstream `version`.
+
+    Never raises: whatever is not a message, whole and exact, is `Corrupt` as a whole.
+    """
+    if len(datagram) < HEADER.size:
+        return Corrupt(len(datagram), "shorter than a header")
+    number, size = HEADER.unpack_from(datagram)
+    if size != len(datagram) - HEADER.size:
+        return Corrupt(len(datagram), "the length in the header is not the datagram's")
+    by_version = _VERSIONED.get(number)
+    if by_version is not None:
+        return by_version(datagram, version)
+    return _decode_plain(datagram, number)
+
+
+def _decode_plain(datagram: bytes, number: int) -> Message | Corrupt:
+    """Read a message that is the same in every bitstream."""
+    read = _READERS.get(number)
+    if read is None:
+        return Corrupt(len(datagram), f"no message has id {number}")
+    found = read(datagram[HEADER.size :])
+    if found is None:
+        return Corrupt(len(datagram), f"{MessageId(number).name} of {len(datagram)} bytes")
+    return found
+
+
+def is_versioned(datagram: bytes) -> bool:
+    """Tell whether `datagram` is, by its header, a message whose layout needs the bitstream."""
+    if len(datagram) < HEADER.size:
+        return False
+    number, size = HEADER.unpack_from(datagram)
+    return number in _VERSIONED and size == len(datagram) - HEADER.size
+
+
+def encode(message: Message, version: Version = (3, 0)) -> bytes:
+    """Return `message` as one datagram; frames and models are written in bitstream `version`.
+
+    Raises
+    ------
+    ValueError
+        The message does not exist in that bitstream, or exceeds one datagram.
+    """
+    number, payload = _payload(message, version)
+    if len(payload) + HEADER.size > MAX_DATAGRAM:
+        raise ValueError(f"{len(payload)} bytes exceed one datagram")
+    return HEADER.pack(number, len(payload)) + payload
+
+
+# --- reading ----------------------------------------------------------------------------------
+
+
+def _read_info(data: bytes) -> ServerInfo | None:
+    if len(data) not in (_INFO.size, _INFO.size + _INFO_TAIL.size):
+        return None
+    name, a, b, c, d, e, f, g, h = _INFO.unpack_from(data)
+    info = ServerInfo(fixed_text(name), (a, b, c, d), (e, f, g, h), None)
+    if len(data) == _INFO.size:
+        return info
+    hz, port, multicast, *group = _INFO_TAIL.unpack_from(data, _INFO.size)
+    address = ".".join(map(str, group))
+    return info._replace(clock_hz=hz, data_port=port, multicast=bool(multicast), group=address)
+
+
+def _read_discovery(data: bytes) -> Discovery | None:
+    connect = decode_connect(data)
+    return None if connect is None else Discovery(connect)
+
+
+def _read_stamp(data: bytes) -> EchoRequest | None:
+    return EchoRequest(*_STAMP.unpack(data)) if len(data) == _STAMP.size else None
+
+
+def _read_echo(data: bytes) -> EchoResponse | None:
+    return EchoResponse(*_ECHO.unpack(data)) if len(data) == _ECHO.size else None
+
+
+def _bare(number: MessageId) -> Callable[[bytes], Bare]:
+    bare = Bare(number)
+    return lambda _: bare
+
+
+_BARE = (
+    MessageId.REQUEST_MODELDEF,
+    MessageId.REQUEST_FRAMEOFDATA,
+    MessageId.DISCONNECT,
+    MessageId.KEEPALIVE,
+    MessageId.DISCONNECTBYTIMEOUT,
+    MessageId.UNRECOGNIZED_REQUEST,
+)
+
+_VERSIONED: dict[int, Callable[[bytes, Version], FrameOfData | ModelDefinition | Corrupt]] = {
+    MessageId.FRAMEOFDATA: decode_frame,
+    MessageId.MODELDEF: decode_model,
+}
+
+_READERS: dict[int, Callable[[bytes], Message | None]] = {
+    MessageId.CONNECT: decode_connect,
+    MessageId.DISCOVERY: _read_discovery,
+    MessageId.SERVERINFO: _read_info,
+    MessageId.REQUEST: lambda data: Request(fixed_text(data)),
+    MessageId.RESPONSE: Response,
+    MessageId.MESSAGESTRING: lambda data: MessageString(fixed_text(data)),
+    MessageId.ECHOREQUEST: _read_stamp,
+    MessageId.ECHORESPONSE: _read_echo,
+    **{number: _bare(number) for number in _BARE},
+}
+
+
+# --- writing ----------------------------------------------------------------------------------
+
+
+def _payload(message: Message, version: Version) -> tuple[MessageId, bytes]:  # noqa: C901, PLR0911 - one case a message
+    match message:
+        case FrameOfData():
+            return MessageId.FRAMEOFDATA, encode_frame(message, version)
+        case ModelDefinition():
+            return MessageId.MODELDEF, encode_model(message, version)
+        case ServerInfo():
+            return MessageId.SERVERINFO, _put_info(message)
+        case Connect():
+            return MessageId.CONNECT, encode_connect(message)
+        case Discovery():
+            return MessageId.DISCOVERY, encode_connect(message.connect)
+        case Request():
+            return MessageId.REQUEST, message.command.encode() + b"\0"
+        case Response():
+            return MessageId.RESPONSE, message.data
+        case MessageString():
+            return MessageId.MESSAGESTRING, message.text.encode() + b"\0"
+        case EchoRequest():
+            return MessageId.ECHOREQUEST, _STAMP.pack(message.stamp)
+        case EchoResponse():
+            return MessageId.ECHORESPONSE, _ECHO.pack(*message)
+        case Bare():
+            return message.id, b""
+
+
+def _put_info(info: ServerInfo) -> bytes:
+    name = put_fixed_text(info.application, 256)
+    head = _INFO.pack(name, *info.application_version, *info.natnet_version)
+    if info.clock_hz is None:
+        return head
+    group = (int(part) for part in info.group.split("."))
+    return head + _INFO_TAIL.pack(info.clock_hz, info.data_port, info.multicast, *group)

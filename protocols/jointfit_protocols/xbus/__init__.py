@@ -1,0 +1,25 @@
+"""Xsens Xbus over UART or USB: framing, device configuration and MTData2 items."""
+
+from jointfit_protocols.xbus._framing import (
+    MASTER,
+    MAX_DATA,
+    MAX_MESSAGE,
+    PREAMBLE,
+    MessageId,
+    XbusCodec,
+    XbusMessage,
+    encode,
+)
+from jointfit_protocols.xbus._mtdata2_layout import Layout
+
+__all__ = [
+    "MASTER",
+    "MAX_DATA",
+    "MAX_MESSAGE",
+    "PREAMBLE",
+    "Layout",
+    "MessageId",
+    "XbusCodec",
+    "XbusMessage",
+    "encode",
+]

@@ -1,0 +1,96 @@
+"""MTData2 messages whose items follow each other as in an earlier one: read in one step.
+
+Law: says what ``split`` and ``decode_item`` say, or nothing. A device repeats the items it was
+configured to send, so the heads of one message tell where everything is in the next; a message
+with any other head is none of this layout.
+"""
+
+from __future__ import annotations
+
+import struct
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.xbus.mtdata2 import Item, Precision, reals_in
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Sequence
+
+    from jointfit_protocols.xbus.mtdata2 import Value
+
+_COUNTS = {1: "B", 2: "H", 4: "I"}
+_COUNTED = {
+    Item.PACKET_COUNTER,
+    Item.SAMPLE_TIME_FINE,
+    Item.SAMPLE_TIME_COARSE,
+    Item.STATUS_BYTE,
+    Item.STATUS_WORD,
+}
+_HEAD = 2  # values: identifier and size
+
+
+class Layout:
+    """Places of the wanted items in a message.
+
+    Parameters
+    ----------
+    items : sequence of (int, bytes)
+        What ``split`` found in a message whose wanted items ``decode_item`` could read.
+    wanted : container of int
+        Identifiers to read, precision and world bits zero.
+    """
+
+    __slots__ = ("_heads", "_many", "_one", "_read_heads", "_struct", "world_id")
+
+    def __init__(self, items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> None:
+        written, heads, places = ">", list[int](), list[int]()
+        self._one: list[tuple[int, int]] = []
+        self._many: list[tuple[int, slice]] = []
+        self.world_id = 0
+        """Identifier of the last quaternion, which names its world."""
+        at = 0
+        for data_id, raw in items:
+            kind = data_id & 0xFFF0
+            heads += (data_id, len(raw))
+            places += (at, at + 1)
+            at += _HEAD
+            count, form = _form(data_id, raw) if kind in wanted else (1, f"{len(raw)}s")
+            if kind in wanted and count == 1:
+                self._one.append((kind, at))
+            elif kind in wanted:
+                self._many.append((kind, slice(at, at + count)))
+            written += f"HB{form}"
+            at += count
+            self.world_id = data_id if kind == Item.QUATERNION else self.world_id
+        self._struct = struct.Struct(written)
+        self._heads, self._read_heads = tuple(heads), itemgetter(*places)
+
+    @staticmethod
+    def of(items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> Layout | None:
+        """Return the layout of such a message; None where an item takes more than one step."""
+        plain = all(
+            data_id & 0xFFF0 not in wanted or _form(data_id, raw)[0] for data_id, raw in items
+        )
+        return Layout(items, wanted) if items and plain else None
+
+    def read(self, data: bytes) -> dict[int, Value] | None:
+        """Return the wanted items by identifier; None for a message of another layout."""
+        if len(data) != self._struct.size:
+            return None
+        found = self._struct.unpack(data)
+        if self._read_heads(found) != self._heads:
+            return None
+        values: dict[int, Value] = {kind: found[at] for kind, at in self._one}
+        for kind, places in self._many:
+            values[kind] = found[places]
+        return values
+
+
+def _form(data_id: int, raw: bytes) -> tuple[int, str]:
+    """Return how many values an item holds and how they are written; 0 where that is not plain."""
+    if data_id in _COUNTED:
+        return 1, _COUNTS[len(raw)]
+    count = reals_in(data_id)
+    if count is None or data_id & 0x3 != Precision.FLOAT32:
+        return 0, ""
+    return count, f"{count}f"

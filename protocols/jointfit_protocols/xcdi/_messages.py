@@ -1,0 +1,254 @@
+"""Xsens XCDI: the CAN messages of MTi-600, Sirius and Avior, decode and encode.
+
+Law: frames in, counts out; no bus, no clock, no unit beyond the table. Every quantity is a frame
+of its own, and one sensor's frames of one instant form a group:
+
+    SampleTime  GroupCounter  ...  Quaternion        lowest identifier first
+    U4 ticks    U2            ...  4 x I2 / 32767, w x y z, sensor to world, ENU
+
+Frames of other sensors interleave freely, so groups are assembled per sensor. Identifiers are
+configuration: by default the data identifier itself, but any 11- or 29-bit value can be set.
+Source: Xsens MT1604P rev. A (2019) and the vendor's CAN pages; byte order from third-party
+decoders. The unit of SampleTime is disputed (100 us or 1 us): see ``xcdi_unit``.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import Literal, NamedTuple
+
+from jointfit_protocols.can import STANDARD_MAX, CanFrame
+from jointfit_protocols.corrupt import Corrupt
+
+ByteOrder = Literal["big", "little"]
+
+TICKS_MODULUS = 2**32
+"""SampleTime wraps here."""
+COUNTER_MODULUS = 2**16
+"""GroupCounter wraps here."""
+QUATERNION_SCALE = 1 / 32767
+"""0x8000 is -1.00003: normalise, do not refuse."""
+OVERFLOW = 1
+"""Error code: the output buffer overflowed, at least one frame is lost."""
+
+
+class DataId(IntEnum):
+    """What a frame carries; also its identifier unless configured otherwise."""
+
+    ERROR = 0x01
+    SAMPLE_TIME = 0x05
+    GROUP_COUNTER = 0x06
+    UTC = 0x07
+    STATUS_WORD = 0x11
+    QUATERNION = 0x21
+    EULER = 0x22
+    RATE_OF_TURN = 0x32
+    ACCELERATION = 0x34
+    FREE_ACCELERATION = 0x35
+
+
+class Layout(NamedTuple):
+    """How a message is laid out."""
+
+    fields: str
+    """``struct`` codes, without byte order."""
+    scale: float
+    """SI (or degrees, for EULER) per count."""
+    unit: str
+
+
+_LAYOUTS: dict[DataId, Layout] = {
+    DataId.ERROR: Layout("B", 1, ""),
+    DataId.SAMPLE_TIME: Layout("I", 1, "ticks"),
+    DataId.GROUP_COUNTER: Layout("H", 1, ""),
+    DataId.UTC: Layout("6BH", 1, "year - 2000, month, day, hour, minute, second, 100 us"),
+    DataId.STATUS_WORD: Layout("I", 1, "bits"),
+    DataId.QUATERNION: Layout("4h", QUATERNION_SCALE, ""),
+    DataId.EULER: Layout("3h", 1 / 128, "deg"),
+    DataId.RATE_OF_TURN: Layout("3h", 1 / 512, "rad/s"),
+    DataId.ACCELERATION: Layout("3h", 1 / 256, "m/s^2"),
+    DataId.FREE_ACCELERATION: Layout("3h", 1 / 256, "m/s^2"),
+}
+_STRUCTS: dict[ByteOrder, dict[DataId, struct.Struct]] = {
+    "big": {key: struct.Struct(">" + layout.fields) for key, layout in _LAYOUTS.items()},
+    "little": {key: struct.Struct("<" + layout.fields) for key, layout in _LAYOUTS.items()},
+}
+
+
+def layout(data_id: DataId) -> Layout:
+    """Return how the message `data_id` is laid out."""
+    return _LAYOUTS[data_id]
+
+
+def decode(
+    data_id: DataId, data: bytes, byte_order: ByteOrder = "big"
+) -> tuple[int, ...] | Corrupt:
+    """Return the counts in the data field of a message, in wire order; never raises."""
+    message = _STRUCTS[byte_order][data_id]
+    if len(data) != message.size:
+        return Corrupt(
+            len(data), f"{data_id.name}: {len(data)} data bytes instead of {message.size}"
+        )
+    return message.unpack(data)
+
+
+def encode(data_id: DataId, counts: tuple[int, ...], byte_order: ByteOrder = "big") -> bytes:
+    """Return the data field of a message.
+
+    Raises
+    ------
+    struct.error
+        A count that does not fit its field, or a wrong number of counts.
+    """
+    return _STRUCTS[byte_order][data_id].pack(*counts)
+
+
+def quaternion_counts(q: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
+    """Return unit quaternion `q` (w, x, y, z) as the device sends it: rounded to 1/32767."""
+    w, x, y, z = (max(-32768, min(32767, round(part * 32767))) for part in q)
+    return w, x, y, z
+
+
+class XcdiIds(NamedTuple):
+    """Identifiers of one sensor; None: not listened to."""
+
+    sample_time: int | None = int(DataId.SAMPLE_TIME)
+    group_counter: int | None = int(DataId.GROUP_COUNTER)
+    quaternion: int = int(DataId.QUATERNION)
+    status_word: int | None = int(DataId.STATUS_WORD)
+    error: int | None = int(DataId.ERROR)
+    extended: bool = False
+    """29-bit identifiers even where the numbers would fit 11 bits."""
+
+    def by_id(self) -> dict[tuple[int, bool], DataId]:
+        """Return what each (identifier, is 29-bit) carries."""
+        named = {
+            DataId.SAMPLE_TIME: self.sample_time,
+            DataId.GROUP_COUNTER: self.group_counter,
+            DataId.QUATERNION: self.quaternion,
+            DataId.STATUS_WORD: self.status_word,
+            DataId.ERROR: self.error,
+        }
+        return {
+            (number, self.extended or number > STANDARD_MAX): data_id
+            for data_id, number in named.items()
+            if number is not None
+        }
+
+
+def id_block(base: int, *, extended: bool = False) -> XcdiIds:
+    """Return identifiers of a sensor whose every data identifier is moved up by `base`."""
+    return XcdiIds(
+        sample_time=base + DataId.SAMPLE_TIME,
+        group_counter=base + DataId.GROUP_COUNTER,
+        quaternion=base + DataId.QUATERNION,
+        status_word=base + DataId.STATUS_WORD,
+        error=base + DataId.ERROR,
+        extended=extended,
+    )
+
+
+class XcdiGroup(NamedTuple):
+    """One orientation with what came with it, as sent."""
+
+    t_ns: int
+    """Stamp of the group's first frame; of the Quaternion itself where SampleTime is missing."""
+    ticks: int | None
+    """SampleTime; None: the Quaternion came without an open group."""
+    counter: int | None
+    status: int | None
+    quaternion: tuple[int, int, int, int]
+    """Counts of 1/32767, w x y z."""
+
+
+class XcdiError(NamedTuple):
+    """The device reported an error."""
+
+    t_ns: int
+    code: int
+    """1: its output buffer overflowed, at least one frame is lost."""
+
+
+XcdiMessage = XcdiGroup | XcdiError | Corrupt
+
+
+_QUATERNION, _SAMPLE_TIME = DataId.QUATERNION, DataId.SAMPLE_TIME
+_GROUP_COUNTER, _ERROR = DataId.GROUP_COUNTER, DataId.ERROR
+
+
+class XcdiCodec:
+    """Frames of one sensor in, groups out; never raises.
+
+    SampleTime opens a group and Quaternion completes it. A second SampleTime, or a second counter,
+    before the Quaternion counts one incomplete group. A Quaternion without an open group keeps its
+    counter but has no device time. Frames of other identifiers are ignored and counted.
+
+    Parameters
+    ----------
+    ids
+        Identifiers of the sensor.
+    byte_order
+        ``big`` unless a device proves otherwise.
+    """
+
+    def __init__(self, ids: XcdiIds, byte_order: ByteOrder = "big") -> None:
+        self._by_id = ids.by_id()
+        self._messages = _STRUCTS[byte_order]
+        self._start_ns = 0
+        self._ticks: int | None = None  # of the open group
+        self._counter: int | None = None
+        self._status: int | None = None
+        self.messages = 0
+        """Well-formed frames of this sensor."""
+        self.incomplete = 0
+        """Groups that never got their Quaternion."""
+        self.ungrouped = 0
+        """Quaternions without an open group: their SampleTime was lost, or is not sent."""
+        self.foreign = 0
+        """Frames that are not this sensor's."""
+
+    def feed(self, frame: CanFrame) -> XcdiMessage | None:
+        """Return what `frame` completed, or None."""
+        t_ns, can_id, data, extended, error, remote = frame
+        data_id = self._by_id.get((can_id, extended))
+        if data_id is None or error or remote:
+            self.foreign += 1
+            return None
+        message = self._messages[data_id]
+        if len(data) != message.size:
+            size = f"{len(data)} data bytes instead of {message.size}"
+            return Corrupt(len(data), f"{data_id.name}: {size}")
+        self.messages += 1
+        counts = message.unpack(data)
+        if data_id is _QUATERNION:
+            return self._complete(t_ns, counts)
+        if data_id is _SAMPLE_TIME:
+            self._open(t_ns, counts[0])
+        elif data_id is _GROUP_COUNTER:
+            if self._counter is not None:
+                self._open(t_ns, None)  # its SampleTime was lost
+            self._counter = counts[0]
+        elif data_id is _ERROR:
+            return XcdiError(t_ns, counts[0])
+        else:
+            self._status = counts[0]
+        return None
+
+    def flush(self) -> None:
+        """Give up on an open group: nothing more will come."""
+        self._open(0, None)
+
+    def _open(self, t_ns: int, ticks: int | None) -> None:
+        if self._ticks is not None or self._counter is not None:
+            self.incomplete += 1
+        self._start_ns, self._ticks = t_ns, ticks
+        self._counter = self._status = None
+
+    def _complete(self, t_ns: int, quaternion: tuple[int, int, int, int]) -> XcdiGroup:
+        ticks, counter, status = self._ticks, self._counter, self._status
+        self._ticks = self._counter = self._status = None
+        if ticks is None:
+            self.ungrouped += 1
+            return XcdiGroup(t_ns, None, counter, status, quaternion)
+        return XcdiGroup(self._start_ns, ticks, counter, status, quaternion)

@@ -1,0 +1,288 @@
+"""The reading half of the NatNet driver against servers in every mood, and against a recording."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import socket
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from typing_extensions import override
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.files.captures import read_capture
+from jointfit_daemon.model import ClockEcho, MocapFrame
+from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _session
+from jointfit_drivers.ports.udp_socket import StampedSocket, local_address
+from jointfit_protocols.natnet import MessageId, ServerInfo, encode
+from jointfit_simulators.contract_scene import Listener
+from jointfit_simulators.natnet_options import NatNetServerOptions
+from jointfit_simulators.natnet_replay import NatNetReplay
+from jointfit_simulators.natnet_server import NatNetServer
+from jointfit_simulators.natnet_stage import StagedBody
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+THIGH = StagedBody("Thigh", ("T1", "T2", "T3"), 1)
+SHANK = StagedBody("Shank", ("S1",), 2)
+POSE = ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+SCENE: tuple[dict[str, Any], dict[str, Any]] = ({"T1": (1.0, 2.0, 3.0)}, {"Thigh": POSE})
+
+
+@contextlib.asynccontextmanager
+async def at_work(
+    server: Any, **settings: Any
+) -> AsyncIterator[tuple[Listener, asyncio.Task[None]]]:
+    """Serve and drive; yields what is heard and the driver's task."""
+    table = {"driver": "natnet", "server": "127.0.0.1", "command_port": server.command_port}
+    driver = NatNetMocap(NatNetSettings.model_validate(table | settings))
+    heard = Listener(driver, MocapFrame)
+    tasks = [asyncio.create_task(server.run()), asyncio.create_task(driver.run(heard.emit))]
+    try:
+        yield heard, tasks[1]
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        server.unplug()
+
+
+async def until(
+    condition: Callable[[], object], server: NatNetServer | None, within_s: float = 5
+) -> None:
+    """Push frames until `condition`."""
+    async with asyncio.timeout(within_s):
+        while not condition():
+            if server is not None:
+                server.push(time.monotonic_ns(), *SCENE)
+            await asyncio.sleep(0.005)
+
+
+def serve(**options: Any) -> NatNetServer:
+    return NatNetServer(NatNetServerOptions(bodies=(THIGH,), **options))
+
+
+async def test_the_real_capture_plays_through_socket_and_driver_frame_by_frame(
+    shared_data: Path,
+) -> None:
+    path = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data" / "raw" / "traffic.pcapng"
+    recorded = [(chunk.t_ns, chunk.data) for chunk in read_capture(path, "datagram")]
+    server = NatNetReplay(recorded)
+    async with at_work(server, up_axis="z") as (heard, _):
+        await until(lambda: len(heard.measurements) >= 518, None, within_s=20)
+        await asyncio.sleep(0.05)
+    got = heard.measurements
+    assert server.sent == server.frames == len(got) == 518
+    assert [frame.number for frame in got] == list(range(162734, 163252))
+    frames = [data for _, data in recorded if data[:1] == bytes([MessageId.FRAMEOFDATA])]
+    assert [chunk.data for chunk in heard.chunks if len(chunk.data) == 336] == frames
+    mean = np.mean([frame.body_positions[0] for frame in got], axis=0)
+    assert mean == pytest.approx([0.1744416, 1.4471301, -0.7343158], abs=2e-6)
+    span_s = (got[-1].arrival_ns - got[0].arrival_ns) / 1e9
+    assert span_s == pytest.approx(517 * 0.0083343, rel=0.1)
+    assert (heard.decoder.discarded_bytes, heard.decoder.unpublished) == (0, 0)  # type: ignore[attr-defined]
+
+
+async def test_ten_echoes_come_first_and_hold_the_servers_clock() -> None:
+    server = serve(clock_hz=3_312_787, device_ns=lambda ns: ns + 10**12)
+    async with at_work(server) as (heard, _):
+        await until(lambda: heard.measurements, server)
+    echoes = [event for event in heard.events if isinstance(event, ClockEcho)]
+    assert len(echoes) >= 10
+    for echo in echoes:
+        shown_ns = echo.ticks * 10**9 // 3_312_787 - 10**12
+        assert echo.sent_ns - 1000 <= shown_ns <= echo.received_ns + 1000
+    best = min(echo.received_ns - echo.sent_ns for echo in echoes)
+    assert best < 50_000_000
+    assert all(a.sent_ns < b.sent_ns for a, b in itertools.pairwise(echoes))
+
+
+async def test_arrival_is_stamped_by_the_kernel_before_the_daemon_wakes() -> None:
+    server = serve()
+    async with at_work(server) as (heard, _):
+        await until(lambda: heard.measurements, server)
+        await heard.settle()
+        count, before = len(heard.measurements), time.monotonic_ns()
+        server.push(time.monotonic_ns(), *SCENE)
+        after = time.monotonic_ns()
+        time.sleep(0.05)  # noqa: ASYNC251 - the loop is to be late
+        await until(lambda: len(heard.measurements) > count, None)
+    assert before - 1_000_000 <= heard.measurements[count].arrival_ns <= after + 5_000_000
+
+
+async def test_a_model_changed_while_running_is_asked_for_and_adopted() -> None:
+    server = serve()
+    async with at_work(server) as (heard, _):
+        await until(lambda: heard.measurements, server)
+        server.set_bodies((THIGH, SHANK))
+        await until(lambda: heard.measurements[-1].layout.bodies == ("Thigh", "Shank"), server)
+
+
+async def test_a_model_changed_unannounced_is_noticed_by_its_unknown_id() -> None:
+    server = serve()
+    async with at_work(server) as (heard, _):
+        await until(lambda: heard.measurements, server)
+        server.set_bodies((THIGH, SHANK))
+        server._model_changed = 0
+        await until(lambda: heard.measurements[-1].layout.bodies == ("Thigh", "Shank"), server)
+
+
+@pytest.mark.parametrize("announced", [True, False])
+async def test_a_bitstream_changed_while_running_is_followed(announced: bool) -> None:
+    server = serve(bitstream=(4, 0))
+    async with at_work(server) as (heard, _):
+        await until(lambda: heard.measurements, server)
+        server.set_bitstream((4, 1))
+        if not announced:
+            for client in server.clients:
+                client.changed = 0
+        count = len(heard.measurements) + 100
+        await until(lambda: len(heard.measurements) > count, server)
+    assert heard.decoder.discarded_bytes > 0
+
+
+async def test_a_unicast_4_x_server_is_asked_for_the_bitstream_wanted() -> None:
+    server = serve(bitstream=(4, 0))
+    async with at_work(server, bitstream="4.1") as (heard, _):
+        await until(lambda: heard.measurements, server)
+        assert server.clients[0].version == (4, 1)
+
+
+async def test_keepalives_keep_a_unicast_client() -> None:
+    server = serve(keepalive_s=1.4)
+    async with at_work(server) as (heard, task):
+        await until(lambda: heard.measurements, server)
+        began = time.monotonic()
+        await until(lambda: time.monotonic() > began + 2, server)
+        assert len(server.clients) == 1
+        assert not task.done()
+
+
+async def test_a_server_that_is_left_is_told_so() -> None:
+    server = serve()
+    async with at_work(server) as (heard, task):
+        await until(lambda: heard.measurements, server)
+        task.cancel()
+        await asyncio.wait([task])
+        await until(lambda: not server.clients, None)
+
+
+async def test_a_port_where_nobody_listens_is_lost_at_once_and_named() -> None:
+    server = serve()
+    server.unplug()
+    driver = NatNetMocap(
+        NatNetSettings(driver="natnet", server="127.0.0.1", command_port=server.command_port)
+    )
+    async with asyncio.timeout(1):
+        with pytest.raises(
+            DeviceLostError, match=f"127.0.0.1:{server.command_port}: nothing listens"
+        ):
+            await driver.run(lambda _: None)
+
+
+async def test_a_host_that_does_not_exist_is_lost_and_named() -> None:
+    driver = NatNetMocap(NatNetSettings(driver="natnet", server="no-such-host.invalid"))
+    with pytest.raises(DeviceLostError, match=r"no-such-host\.invalid"):
+        await driver.run(lambda _: None)
+
+
+async def test_a_network_card_that_does_not_exist_is_a_wrong_setting() -> None:
+    driver = NatNetMocap(NatNetSettings(driver="natnet", server="127.0.0.1", interface="eth77"))
+    with pytest.raises(DeviceMisconfiguredError, match="eth77"):
+        await driver.run(lambda _: None)
+
+
+class Claimant(NatNetServer):
+    """Says of itself what it is told."""
+
+    claims: ServerInfo
+
+    @override
+    def _put_info(self, address: tuple[str, int], _: tuple[int, int]) -> None:
+        self._port.send(encode(self.claims), address)
+
+
+@pytest.mark.parametrize(
+    ("claims", "settings", "words"),
+    [
+        (
+            ServerInfo("Motive", (1, 9, 0, 0), (2, 9, 0, 0), None),
+            {},
+            "speaks NatNet 2.9; 3.0 or newer",
+        ),
+        (ServerInfo("Motive", (5, 0, 0, 0), (5, 0, 0, 0), 10**7), {}, "bitstream = '4.1'"),
+        (ServerInfo("Fake", (3, 0, 0, 0), (4, 0, 0, 0), 0), {}, "no clock frequency"),
+        (
+            ServerInfo("Motive", (3, 0, 0, 0), (4, 0, 0, 0), 10**7, multicast=True),
+            {"bitstream": "4.1"},
+            "switch Motive to unicast",
+        ),
+        (
+            ServerInfo("M", (3, 0, 0, 0), (3, 0, 0, 0), 10**7, multicast=True, group="10.0.0.1"),
+            {},
+            "no multicast address",
+        ),
+    ],
+)
+async def test_a_server_that_can_never_work_is_refused_with_a_remedy(
+    claims: ServerInfo, settings: dict[str, Any], words: str
+) -> None:
+    server = Claimant()
+    server.claims = claims
+    async with at_work(server, **settings) as (_, task):
+        await asyncio.wait([task], timeout=2)
+        error = task.exception()
+    assert isinstance(error, DeviceMisconfiguredError)
+    assert words in str(error)
+
+
+async def test_silence_names_the_transport_where_it_contradicts_the_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(_session, "FIRST_ECHOES", 1)
+    server = serve(transport="multicast")
+    async with at_work(server, transport="unicast", silence_s=0.2) as (_, task):
+        await asyncio.wait([task], timeout=3)
+        error = task.exception()
+    assert isinstance(error, DeviceLostError)
+    assert "announces multicast, but transport = 'unicast'" in str(error)
+
+
+# --- stamps -----------------------------------------------------------------------------------
+
+
+def test_the_kernel_stamps_datagrams_on_loopback() -> None:
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+    try:
+        address = opened._socket.getsockname()
+        before = time.monotonic_ns()
+        opened.send(b"x", address)
+        after = time.monotonic_ns()
+        time.sleep(0.02)
+        (arrival,) = opened.receive()
+    finally:
+        opened.close()
+    assert (arrival.data, arrival.host, opened._wall.soft) == (b"x", "127.0.0.1", 0)
+    assert before - 200_000 <= arrival.t_ns <= after + 5_000_000
+
+
+def test_a_wake_up_drains_at_most_64_datagrams() -> None:
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+    try:
+        for _ in range(70):
+            opened.send(b"x", opened._socket.getsockname())
+        assert [len(opened.receive()), len(opened.receive())] == [64, 6]
+    finally:
+        opened.close()
+
+
+def test_the_network_card_may_be_given_by_address_or_name() -> None:
+    assert local_address("127.0.0.1", None) == "127.0.0.1"
+    assert local_address("10.0.0.1", "127.0.0.1") == "127.0.0.1"
+    assert local_address("10.0.0.1", socket.if_indextoname(1)) == "127.0.0.1"

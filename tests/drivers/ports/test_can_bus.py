@@ -1,0 +1,373 @@
+"""Shared CAN buses: who gets what, what happens when one fails, what a user is told."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from pydantic import ValidationError
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.model import Chunk, Corrupt, ImuSample
+from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
+from jointfit_protocols.can import CanFrame
+from jointfit_protocols.can.slcan import encode_frame
+from jointfit_protocols.xcdi._messages import id_block
+from jointfit_simulators.can_wire import SlcanAdapter
+from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable
+    from pathlib import Path
+
+    from jointfit_protocols.can.slcan import SlcanLine
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def bus_at(folder: Path, **more: Any) -> CanBusSettings:
+    return CanBusSettings(interface="slcan", channel=str(folder / "adapter"), **more)
+
+
+def driver_of(name: str, bus: CanBusSettings, base: int = 0, silence_s: float = 2.0) -> XcdiImu:
+    ids = XcdiIdSettings(sample_time=base + 5, group_counter=base + 6, quaternion=base + 0x21)
+    return XcdiImu(
+        XcdiSettings(id=name, segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=silence_s)
+    )
+
+
+class Running:
+    """A driver at work, its chunks decoded."""
+
+    def __init__(self, driver: XcdiImu) -> None:
+        self.decoder = driver.decoder()
+        self.chunks: list[Chunk] = []
+        self.events: list[Any] = []
+        self.task = asyncio.create_task(driver.run(self._emit))
+
+    def _emit(self, chunk: Chunk) -> None:
+        self.chunks.append(chunk)
+        self.events += self.decoder.feed(chunk)
+
+    @property
+    def samples(self) -> list[ImuSample]:
+        return [event for event in self.events if isinstance(event, ImuSample)]
+
+    async def wait_for(self, count: int) -> None:
+        async with asyncio.timeout(5):
+            while len(self.samples) < count:
+                if self.task.done():
+                    self.task.result()
+                await asyncio.sleep(0.005)
+
+    async def cancel(self) -> None:
+        self.task.cancel()
+        await asyncio.wait({self.task})
+
+
+@asynccontextmanager
+async def serving(*devices: Any) -> AsyncIterator[None]:
+    tasks = [asyncio.create_task(device.run()) for device in devices]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        for device in devices:
+            device.unplug()
+
+
+async def opened(adapter: SlcanAdapter) -> None:
+    async with asyncio.timeout(5):
+        while not adapter.is_open:
+            await asyncio.sleep(0.005)
+        await asyncio.sleep(0.05)
+
+
+async def lost(running: Running, within_s: float = 1.0) -> str:
+    async with asyncio.timeout(within_s):
+        with pytest.raises(DeviceLostError) as told:
+            await running.task
+    return str(told.value)
+
+
+def two_sensors(adapter: SlcanAdapter) -> tuple[XcdiDevice, XcdiDevice]:
+    return (
+        XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100))),
+        XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x200), first_counter=1000)),
+    )
+
+
+async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    devices = two_sensors(adapter)
+    async with serving(*devices):
+        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        await opened(adapter)
+        for number in range(50):
+            for device in devices:
+                device.push(number * 10_000_000, IDENTITY)
+            await asyncio.sleep(0.001)
+        for run in runs:
+            await run.wait_for(50)
+        assert [each.counter for each in runs[0].samples] == list(range(50))
+        assert [each.counter for each in runs[1].samples] == list(range(1000, 1050))
+        assert [run.decoder.foreign for run in runs] == [0, 0]
+        await runs[0].cancel()
+        assert adapter.is_open, "the bus stays open for the other"
+        await runs[1].cancel()
+        await asyncio.sleep(0.05)
+        assert not adapter.is_open, "the last one out closes it"
+
+
+class Eager(SlcanAdapter):
+    """Sends the first group of a sensor in the same write as its answer to `O`."""
+
+    sensor: XcdiDevice
+    group: list[CanFrame] | None = None
+
+    @override
+    def send(self, frames: Iterable[CanFrame]) -> bool:
+        if self.group is None:
+            return super().send(frames)
+        self.group += frames
+        return True
+
+    @override
+    def _obey(self, line: SlcanLine) -> bytes:
+        answer = super()._obey(line)
+        if line.letter != "O":
+            return answer
+        self.group = []
+        self.sensor.push(0, IDENTITY)
+        frames, self.group = self.group, None
+        return answer + b"".join(encode_frame(frame, None) for frame in frames)
+
+
+async def test_slcan_bus_delivers_frames_that_come_with_the_answer_to_open(tmp_path: Path) -> None:
+    adapter, bus = Eager(tmp_path / "adapter"), bus_at(tmp_path)
+    device, _ = two_sensors(adapter)
+    adapter.sensor = device
+    async with serving(device):
+        run = Running(driver_of("S3", bus, 0x100))
+        await opened(adapter)
+        device.push(10_000_000, IDENTITY)
+        await run.wait_for(2)
+        await run.cancel()
+    assert [sample.counter for sample in run.samples] == [0, 1]
+
+
+async def test_an_unplugged_adapter_loses_all_and_gives_all_back(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    devices = two_sensors(adapter)
+    drivers = [driver_of("S3", bus, 0x100), driver_of("S4", bus, 0x200)]
+    async with serving(*devices):
+        runs = list(map(Running, drivers))
+        await opened(adapter)
+        adapter.unplug()
+        for run in runs:
+            assert "adapter" in await lost(run)
+        adapter.plug()
+        runs = list(map(Running, drivers))
+        await opened(adapter)
+        for number in range(10):
+            for device in devices:
+                device.push(number * 10_000_000, IDENTITY)
+        for run in runs:
+            await run.wait_for(10)
+            await run.cancel()
+
+
+async def test_a_silent_sensor_is_lost_alone_and_told_what_else_came(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    talks, _ = two_sensors(adapter)
+    async with serving(talks):
+        heard = Running(driver_of("S3", bus, 0x100))
+        silent = Running(driver_of("S4", bus, 0x200, silence_s=0.4))
+        await opened(adapter)
+        for number in range(60):
+            talks.push(number * 10_000_000, IDENTITY)
+            if silent.task.done():
+                break
+            await asyncio.sleep(0.01)
+        told = await lost(silent)
+        assert "S4" in told
+        assert "no quaternion (0x221) comes, while other sensors send" in told
+        assert not heard.task.done()
+        await heard.cancel()
+
+
+async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        run = Running(driver_of("S3", bus, 0x300, silence_s=0.5))
+        await opened(adapter)
+        for number in range(10):
+            device.push(number * 10_000_000, IDENTITY)
+        told = await lost(run)
+    assert "no quaternion (0x321) comes" in told
+    assert "that no sensor claims: 0x005, 0x006, 0x011, 0x021" in told
+    assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
+
+
+async def test_a_quaternion_that_never_comes_is_missed_though_time_and_counter_do(
+    tmp_path: Path,
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        ids = XcdiIdSettings(quaternion=0x121)
+        driver = XcdiImu(
+            XcdiSettings(id="S3", segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=0.5)
+        )
+        run = Running(driver)
+        await opened(adapter)
+        sending = asyncio.create_task(send_on(device))
+        told = await lost(run, 2.0)
+        assert run.chunks == [], "a sensor without orientation is not there"
+        again = Running(driver)
+        assert await lost(again, 3.0) == told, "the same text, which is reported once"
+        sending.cancel()
+    assert "no quaternion (0x121) comes, though sample_time (0x005), group_counter (0x006)" in told
+    assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
+
+
+async def send_on(device: XcdiDevice) -> None:
+    number = 0
+    while True:
+        number += 1
+        device.push(number * 10_000_000, IDENTITY)
+        await asyncio.sleep(0.01)
+
+
+async def test_a_quaternion_that_stops_is_missed_though_time_and_counter_go_on(
+    tmp_path: Path,
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    async with serving(adapter):
+        run = Running(driver_of("S3", bus, silence_s=0.5))
+        await opened(adapter)
+        for number in range(200):
+            if run.task.done():
+                break
+            time_and_counter = [
+                CanFrame(0, 0x05, number.to_bytes(4, "big")),
+                CanFrame(0, 0x06, number.to_bytes(2, "big")),
+            ]
+            adapter.send(time_and_counter)
+            if number < 5:
+                adapter.send([CanFrame(0, 0x21, bytes.fromhex("7fff000000000000"))])
+            await asyncio.sleep(0.01)
+        told = await lost(run)
+        assert len(run.samples) == 5
+    assert (
+        "no quaternion (0x021) comes, though sample_time (0x005), group_counter (0x006) do" in told
+    )
+
+
+async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        first = Running(driver_of("S3", bus))
+        await opened(adapter)
+        with pytest.raises(DeviceMisconfiguredError, match=r"S4.*0x\d+.*S3.*block of its own"):
+            await Running(driver_of("S4", bus)).task
+        device.push(0, IDENTITY)
+        await first.wait_for(1)
+        await first.cancel()
+
+
+async def test_lost_bytes_of_a_line_are_counted_by_one_device_only(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    async with serving(adapter):
+        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        await opened(adapter)
+        adapter.send_bytes(b"what is this\r")
+        await asyncio.sleep(0.1)
+        found = [event for run in runs for event in run.events]
+        assert found == [Corrupt(13, "no SLCAN line")]
+        for run in runs:
+            await run.cancel()
+
+
+async def test_a_bug_behind_one_device_hurts_no_other(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    devices = two_sensors(adapter)
+
+    def emit(_: Chunk) -> None:
+        raise ZeroDivisionError
+
+    async with serving(*devices):
+        good = Running(driver_of("S3", bus, 0x100))
+        bad = asyncio.create_task(driver_of("S4", bus, 0x200).run(emit))
+        await opened(adapter)
+        for device in devices:
+            device.push(0, IDENTITY)
+        with pytest.raises(ZeroDivisionError):
+            await bad
+        await good.wait_for(1)
+        await good.cancel()
+
+
+async def test_the_adapter_is_told_the_bit_rate(tmp_path: Path) -> None:
+    adapter = SlcanAdapter(tmp_path / "adapter")
+    async with serving(adapter):
+        run = Running(driver_of("S3", bus_at(tmp_path, bitrate=250_000)))
+        await opened(adapter)
+        assert adapter.bitrate == 250_000
+        await run.cancel()
+
+
+async def test_a_bit_rate_slcan_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match=r"no such bit rate in SLCAN.*1000000"):
+        bus_at(tmp_path, bitrate=83_333)
+    unchecked = bus_at(tmp_path).model_copy(update={"bitrate": 83_333})
+    with pytest.raises(DeviceMisconfiguredError, match=r"bit rate 83333.*1000000"):
+        await driver_of("S3", unchecked).run(lambda _: None)
+
+
+async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter)
+    async with serving(device):
+        run = Running(driver_of("S3", bus))
+        await opened(adapter)
+        await run.cancel()
+        adapter._open = True  # the host died without a word
+        for number in range(50):
+            device.push(number * 10_000_000, IDENTITY)
+        run = Running(driver_of("S3", bus))
+        await asyncio.sleep(0.2)
+        await opened(adapter)
+        device.push(50 * 10_000_000, IDENTITY)
+        await run.wait_for(1)
+        assert [each.counter for each in run.samples] == [50], "nothing stale"
+        await run.cancel()
+
+
+class Chatter:
+    """A GPS receiver: talks all the time, listens never."""
+
+    def __init__(self, link: Path) -> None:
+        self._line = PtyLine(link)
+        self.unplug = self._line.unplug
+
+    async def run(self) -> None:
+        while True:
+            self._line.write(b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M*47\r\n")
+            await asyncio.sleep(0.02)
+
+
+async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> None:
+    async with serving(Chatter(tmp_path / "adapter")):
+        with pytest.raises(
+            DeviceMisconfiguredError, match="no SLCAN adapter answers at 115200 baud"
+        ):
+            await driver_of("S3", bus_at(tmp_path)).run(lambda _: None)

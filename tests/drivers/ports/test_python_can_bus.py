@@ -1,0 +1,207 @@
+"""Buses of python-can: pump threads, errors told once, and what a user is told."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from typing import Any
+
+import can
+import pytest
+from pydantic import ValidationError
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.model import Chunk, ImuSample
+from jointfit_drivers.ports.can_bus import shared_bus
+from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
+from jointfit_protocols.can import CanFrame, unpack_frames
+from jointfit_protocols.xcdi._messages import id_block
+from jointfit_simulators.can_wire import PythonCanWire
+from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def driver_of(name: str, bus: CanBusSettings, base: int = 0) -> XcdiImu:
+    ids = XcdiIdSettings(sample_time=base + 5, group_counter=base + 6, quaternion=base + 0x21)
+    return XcdiImu(
+        XcdiSettings(id=name, segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=2.0)
+    )
+
+
+class Running:
+    """A driver at work, its samples decoded."""
+
+    def __init__(self, driver: XcdiImu) -> None:
+        self.decoder = driver.decoder()
+        self.samples: list[ImuSample] = []
+        self.task = asyncio.create_task(driver.run(self._emit))
+
+    def _emit(self, chunk: Chunk) -> None:
+        found = self.decoder.feed(chunk)
+        self.samples += [event for event in found if isinstance(event, ImuSample)]
+
+    async def wait_for(self, count: int) -> None:
+        async with asyncio.timeout(5):
+            while len(self.samples) < count:
+                await asyncio.sleep(0.005)
+
+    async def cancel(self) -> None:
+        self.task.cancel()
+        await asyncio.wait({self.task})
+
+
+async def test_a_bus_of_python_can_is_shared_too() -> None:
+    bus = CanBusSettings(interface="virtual", channel="shared")
+    wire = PythonCanWire("virtual", "shared")
+    devices = [XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(base))) for base in (0x100, 0x200)]
+    try:
+        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        async with shared_bus(bus) as opened_bus:
+            await asyncio.sleep(0.05)
+            began = time.monotonic_ns()
+            for number in range(100):
+                for device in devices:
+                    device.push(number * 10_000_000, IDENTITY)
+            for run in runs:
+                await run.wait_for(100)
+                assert began <= run.samples[0].arrival_ns <= time.monotonic_ns()
+            assert opened_bus.foreign == 0, "python-can filters for us"
+        for run in runs:
+            await run.cancel()
+    finally:
+        wire.unplug()
+
+
+class Broken(can.BusABC):
+    """Stands where a vendor's library stands; fails when read."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(channel="x")
+        self._error = error
+
+    @override
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        time.sleep(0.01)
+        raise self._error
+
+    @override
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (can.CanOperationError("adapter pulled out", 19), DeviceLostError),
+        (can.CanOperationError("something of the vendor's"), DeviceLostError),
+        (ValueError("the backend cannot parse a line"), DeviceLostError),
+        (ZeroDivisionError(), ZeroDivisionError),
+    ],
+)
+async def test_what_a_pump_thread_meets_reaches_the_driver(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception]
+) -> None:
+    monkeypatch.setattr(can, "Bus", lambda **_: Broken(error))
+    bus = CanBusSettings(interface="virtual", channel="broken")
+    with pytest.raises(kind):
+        await driver_of("S3", bus).run(lambda _: None)
+
+
+async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
+    bus = CanBusSettings(interface="socketcna", channel="can0")
+    with pytest.raises(ValidationError, match="did you mean 'socketcan'"):
+        driver_of("S3", bus)
+    with pytest.raises(DeviceMisconfiguredError, match="did you mean 'socketcan'"):
+        async with shared_bus(bus):
+            pass
+
+
+async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
+    bus = CanBusSettings(interface="kvaser", channel="0")
+    with pytest.raises(DeviceMisconfiguredError, match="opened as kvaser"):
+        await driver_of("S3", bus).run(lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "words"),
+    [
+        (97, DeviceMisconfiguredError, "no CAN in this kernel.*can_raw"),
+        (19, DeviceLostError, "no such CAN interface"),
+    ],
+)
+async def test_kernels_without_can_and_absent_links(
+    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], words: str
+) -> None:
+    def refuse(_: str) -> None:
+        raise OSError(number, "as the kernel says it")
+
+    monkeypatch.setattr("jointfit_drivers.ports._python_can_bus._require_interface", refuse)
+    with pytest.raises(kind, match=words):
+        await driver_of("S3", CanBusSettings(channel="can0")).run(lambda _: None)
+
+
+class Filtered(can.BusABC):
+    """SocketCAN as far as one test needs it: a descriptor, stamps, and an error told once."""
+
+    def __init__(self, **_: Any) -> None:
+        self.socket, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.down = False
+        super().__init__(channel="can0")
+
+    @override
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    @override
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            data = self.socket.recv(16)
+        except BlockingIOError:
+            return None, True
+        if data == b"down":
+            raise can.CanOperationError("Network is down", 100)
+        return can.Message(
+            arbitration_id=0x21,
+            is_extended_id=False,
+            data=data,
+            timestamp=time.time(),
+        ), True
+
+    @override
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+    @override
+    def shutdown(self) -> None:
+        super().shutdown()
+        self.socket.close()
+        self.far.close()
+
+
+async def test_a_link_that_goes_down_is_told_once_and_frames_before_it_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[Filtered] = []
+
+    def make(**words: Any) -> Filtered:
+        made.append(Filtered(**words))
+        return made[-1]
+
+    monkeypatch.setattr(can, "Bus", make)
+    monkeypatch.setattr("jointfit_drivers.ports._python_can_bus._require_interface", lambda _: None)
+    chunks: list[Chunk] = []
+    driver = driver_of("S3", CanBusSettings(channel="can0"))
+    task = asyncio.create_task(driver.run(chunks.append))
+    await asyncio.sleep(0.02)
+    for number in range(100):
+        made[0].far.send(bytes([number] * 8))
+    made[0].far.send(b"down")
+    with pytest.raises(DeviceLostError, match="ip link set can0 up"):
+        await task
+    found = [frame for chunk in chunks for frame in unpack_frames(chunk.data)]
+    assert [frame.data[0] for frame in found if isinstance(frame, CanFrame)] == list(range(100))
+    assert max(len(chunk.data) for chunk in chunks) <= 64 * 24

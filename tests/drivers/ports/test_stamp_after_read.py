@@ -1,0 +1,161 @@
+"""What comes while a process is held up before its read is not stamped as if it had come before.
+
+Clocks rest on the earliest arrivals, so one stamp that is milliseconds early moves a clock for a
+minute; a late one moves nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import os
+import termios
+import time
+import tty
+from array import array
+from typing import TYPE_CHECKING, Any
+
+import can
+import pytest
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings
+from jointfit_drivers.ports._python_can_bus import PythonCanBus
+from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.ports.udp_socket import StampedSocket
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jointfit_daemon.model import Chunk
+    from jointfit_protocols.can import CanFrame
+
+HELD_UP_S = 0.005
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """Yield the far end of a serial line, and the path of its near end."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+def waiting(fd: int) -> int:
+    """Return how many bytes are there to be read."""
+    count = array("i", [0])
+    fcntl.ioctl(fd, termios.FIONREAD, count)
+    return count[0]
+
+
+async def test_bytes_of_a_serial_line(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far, path = line
+    came_ns: list[int] = []
+    read = SerialPort._read
+
+    def held_up(port: SerialPort, fd: int) -> bytes | None:
+        time.sleep(HELD_UP_S)
+        came_ns.append(time.monotonic_ns())
+        os.write(far, b"y")
+        while waiting(fd) < 2:  # the kernel takes its time from one end to the other
+            time.sleep(0.001)
+        return read(port, fd)
+
+    monkeypatch.setattr(SerialPort, "_read", held_up)
+    with SerialPort(path, 115200) as port:
+        os.write(far, b"x")
+        chunk: Chunk | None = await port.receive(2.0)
+    assert chunk is not None
+    assert chunk.data == b"xy"
+    assert chunk.t_ns >= came_ns[0]
+
+
+class SlowBus(can.BusABC):
+    """Hands out three frames, each of which comes after the one before was read."""
+
+    def __init__(self, reader: int | None) -> None:
+        super().__init__(channel="vcan")
+        self.came_ns: list[int] = []
+        self._reader = reader
+
+    @override
+    def fileno(self) -> int:
+        if self._reader is None:
+            raise NotImplementedError
+        return self._reader
+
+    @override
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if len(self.came_ns) == 3:
+            time.sleep(timeout or 0.0)
+            return None, True
+        time.sleep(HELD_UP_S)
+        self.came_ns.append(time.monotonic_ns())
+        data = bytes([len(self.came_ns)])
+        return can.Message(arbitration_id=0x21, data=data, timestamp=time.time()), True
+
+    @override
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("descriptor", [True, False], ids=["descriptor", "thread"])
+async def test_frames_of_a_can_bus(
+    monkeypatch: pytest.MonkeyPatch,
+    descriptor: bool,
+) -> None:
+    near, far = os.pipe()
+    os.write(far, b"x")  # always readable
+    bus = SlowBus(near if descriptor else None)
+    monkeypatch.setattr(can, "Bus", lambda **_: bus)
+    found: list[CanFrame] = []
+    stamped: list[int] = []
+
+    def deliver(t_ns: int, frames: list[CanFrame]) -> None:
+        found.extend(frames)
+        stamped.extend([t_ns] * len(frames))
+
+    opened = PythonCanBus(CanBusSettings(interface="virtual", channel="held-up"))
+    await opened.open(deliver, lambda _: None)
+    async with asyncio.timeout(5):
+        while len(found) < 3:
+            await asyncio.sleep(0.01)
+    await opened.close()
+    os.close(near)
+    os.close(far)
+    for frame, came_ns, t_ns in zip(found, bus.came_ns, stamped, strict=True):
+        assert came_ns <= frame.t_ns <= t_ns  # of the frame, and of the chunk it is part of
+
+
+class WithoutStamps:
+    """A socket whose kernel stamps nothing; its second datagram comes while the first is read."""
+
+    def __init__(self, actual: Any) -> None:
+        self._actual = actual
+        self.came_ns: list[int] = []
+
+    def recvmsg(self, size: int, _ancillary: int) -> tuple[bytes, list[Any], int, Any]:
+        time.sleep(HELD_UP_S)
+        if len(self.came_ns) < 2:
+            self.came_ns.append(time.monotonic_ns())
+            self._actual.sendto(b"x", self._actual.getsockname())
+        data, _, flags, address = self._actual.recvmsg(size, 0)
+        return data, [], flags, address
+
+
+def test_datagrams_that_the_kernel_does_not_stamp() -> None:
+    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+    actual = opened._socket
+    unstamped = WithoutStamps(actual)
+    try:
+        opened._socket = unstamped  # type: ignore[assignment]  # as far as it is used
+        arrivals = opened.receive()
+    finally:
+        actual.close()
+    assert len(arrivals) == 2
+    for arrival, came_ns in zip(arrivals, unstamped.came_ns, strict=True):
+        assert arrival.t_ns >= came_ns

@@ -1,0 +1,101 @@
+"""The Xbus driver against the conformance suite of drivers."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from typing_extensions import override
+
+from jointfit_drivers.xbus import XbusImu, XbusSettings
+from jointfit_protocols.xbus.configuration import MAX_RATE
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators.driver_contract import DriverContract
+from jointfit_simulators.felt import Felt
+from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Driver
+    from jointfit_simulators.imu_device import WireNoise
+
+
+def settings(folder: Path, **more: Any) -> XbusSettings:
+    return XbusSettings(
+        id="S1", segment="thigh", driver="xbus", port=str(folder / "imu"), baud=115_200,
+        silence_s=0.4, **more,
+    )  # fmt: skip
+
+
+class Modem:
+    """Answers everything in words, like what ModemManager expects."""
+
+    def __init__(self, link: Path) -> None:
+        self._line = PtyLine(link)
+        self.unplug, self.plug = self._line.unplug, self._line.plug
+
+    async def run(self) -> None:
+        await self._line.serve(self._answer)
+
+    def _answer(self, _: bytes) -> None:
+        self._line.write(b"\r\nERROR\r\n")
+
+
+class TestXbus(DriverContract):
+    registered_as = "xbus"
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
+        return XbusDevice(folder / "imu", wire_noise=wire_noise)
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        return XbusImu(settings(folder))
+
+    @override
+    def make_wrong_device(self, folder: Path) -> Modem:
+        return Modem(folder / "imu")
+
+
+class TestXbusThatStreamsFromTheStart(TestXbus):
+    """Mid-message bytes and old samples come first, as from a real device."""
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
+        options = XbusDeviceOptions(measures_at_once=True, config_delay_s=0.05, gnss=True)
+        return XbusDevice(folder / "imu", options=options, wire_noise=wire_noise)
+
+
+RAW_OUTPUTS = (
+    (Item.PACKET_COUNTER, MAX_RATE),
+    (Item.SAMPLE_TIME_FINE, MAX_RATE),
+    (Item.STATUS_WORD, MAX_RATE),
+    (Item.RATE_OF_TURN, 100),
+    (Item.ACCELERATION, 100),
+)
+
+
+@pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
+class TestXbusThatOnlyFeels(TestXbus):
+    """Raw readings on the wire, orientation on the gateway."""
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
+        options = XbusDeviceOptions(outputs=RAW_OUTPUTS)
+        return XbusDevice(folder / "imu", options=options, wire_noise=wire_noise)
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        return XbusImu(settings(folder, orientation="gateway"))
+
+    @override
+    def matches(self, number: int, measurement: Any) -> bool:
+        """By what it felt: the orientation remembers all that came before."""
+        felt = Felt()
+        felt.moved(0, orientation(number))
+        force = felt.value(Item.ACCELERATION)
+        return bool(measurement.acceleration == pytest.approx(force, abs=0.01))

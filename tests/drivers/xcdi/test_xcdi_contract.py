@@ -1,0 +1,101 @@
+"""The XCDI driver against the conformance suite of drivers, over SLCAN and in one process."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings
+from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
+from jointfit_protocols.xcdi._messages import id_block
+from jointfit_simulators.can_wire import PythonCanWire, SlcanAdapter
+from jointfit_simulators.driver_contract import DriverContract
+from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Driver
+    from jointfit_simulators.imu_device import WireNoise
+
+
+def settings(interface: str, channel: str, **more: Any) -> XcdiSettings:
+    return XcdiSettings(
+        id="S3", segment="shank", driver="xcdi", silence_s=0.4,
+        can=CanBusSettings(interface=interface, channel=channel), **more,
+    )  # fmt: skip
+
+
+class Modem:
+    """Answers everything in words, like what ModemManager expects."""
+
+    def __init__(self, link: Path) -> None:
+        self._line = PtyLine(link)
+        self.unplug, self.plug = self._line.unplug, self._line.plug
+
+    async def run(self) -> None:
+        await self._line.serve(self._answer)
+
+    def _answer(self, _: bytes) -> None:
+        self._line.write(b"\r\nERROR\r\n")
+
+
+class TestXcdiOverSlcan(DriverContract):
+    registered_as = "xcdi"
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
+        return XcdiDevice(SlcanAdapter(folder / "adapter", wire_noise=wire_noise))
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        return XcdiImu(settings("slcan", str(folder / "adapter")))
+
+    @override
+    def make_wrong_device(self, folder: Path) -> Modem:
+        return Modem(folder / "adapter")
+
+
+class TestXcdiWith29BitIdsInMicrosecondsOverAMuteAdapter(TestXcdiOverSlcan):
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
+        options = XcdiDeviceOptions(
+            ids=id_block(0x19FF0000), sample_time_unit="1us", byte_order="little"
+        )
+        adapter = SlcanAdapter(folder / "adapter", wire_noise=wire_noise, mute=True)
+        return XcdiDevice(adapter, options)
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        ids = XcdiIdSettings(
+            sample_time=0x19FF0005, group_counter=0x19FF0006, quaternion=0x19FF0021
+        )
+        return XcdiImu(
+            settings(
+                "slcan",
+                str(folder / "adapter"),
+                ids=ids,
+                extended_ids=True,
+                byte_order="little",
+            )
+        )
+
+
+class TestXcdiOnABusWithoutDescriptor(DriverContract):
+    """python-can's in-process bus: read by a pump thread, as most vendors' libraries are."""
+
+    registered_as = "xcdi"
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> XcdiDevice:
+        return XcdiDevice(PythonCanWire("virtual", str(folder)))
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        return XcdiImu(settings("virtual", str(folder)))
+
+    # An in-process bus has no noise, and anything at all may share it.
+    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
+    test_a_wrong_device_is_named_not_retried = None  # type: ignore[assignment]

@@ -1,0 +1,135 @@
+"""SLCAN, both roles."""
+
+from __future__ import annotations
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from jointfit_protocols.can import CanFrame
+from jointfit_protocols.can.slcan import (
+    BITRATES,
+    Role,
+    SlcanCodec,
+    SlcanLine,
+    bitrate_code,
+    encode_frame,
+)
+from jointfit_protocols.corrupt import Corrupt
+
+payloads = st.binary(max_size=8)
+
+
+def frames_of(
+    kind: str, largest: int, data: st.SearchStrategy[bytes]
+) -> st.SearchStrategy[CanFrame]:
+    flags = {flag: st.just(flag == kind) for flag in ("extended", "error", "remote")}
+    return st.builds(CanFrame, st.just(0), st.integers(0, largest), data, **flags)
+
+
+standard = frames_of("standard", 0x7FF, payloads)
+extended = frames_of("extended", 0x1FFFFFFF, payloads)
+remote = frames_of("remote", 0x7FF, st.just(b""))
+can_frames = standard | extended | remote
+lines = st.builds(encode_frame, can_frames, st.none() | st.integers(0, 10**6))
+answers = st.sampled_from([b"\r", b"\a", b"V1013\r", b"z\r", b"NA123\r"])
+junk = st.binary(max_size=80) | st.text("tTrR0123456789ABCDEF\r\a\n", max_size=80).map(str.encode)
+wires = st.lists(lines | answers | junk).map(b"".join)
+roles = st.sampled_from(["host", "adapter"])
+
+
+def decoded(chunks: list[bytes], role: Role = "host") -> tuple[list[CanFrame | SlcanLine], int]:
+    decoder = SlcanCodec(115_200, role)
+    found = [item for chunk in chunks for item in decoder.feed(chunk, 0)] + decoder.flush()
+    lost = sum(item.discarded for item in found if isinstance(item, Corrupt))
+    assert lost == decoder.discarded_bytes
+    good = [item for item in found if not isinstance(item, Corrupt)]
+    assert decoder.frames == sum(isinstance(item, CanFrame) for item in good)
+    return [i._replace(t_ns=0) if isinstance(i, CanFrame) else i for i in good], lost
+
+
+@given(wires, roles)
+@example(b"V" * 70 + b"\r", "host")
+@example(b"x" * 100 + b"t0212ABCD\r", "host")
+def test_chunking_changes_neither_messages_nor_losses(wire: bytes, role: Role) -> None:
+    assert decoded([wire], role) == decoded([bytes([byte]) for byte in wire], role)
+
+
+@given(wires, roles)
+def test_no_more_is_lost_than_came(wire: bytes, role: Role) -> None:
+    messages, lost = decoded([wire], role)
+    assert lost + len(messages) <= len(wire)
+
+
+@given(st.lists(can_frames), st.booleans())
+def test_frames_come_back_in_both_roles(frames: list[CanFrame], timed: bool) -> None:
+    wire = b"".join(encode_frame(frame, 59_999 if timed else None) for frame in frames)
+    for role in ("host", "adapter"):
+        assert decoded([wire], role) == (frames, 0)
+
+
+@given(st.text("xyz#$% \x00", max_size=60).map(str.encode), can_frames)
+def test_a_frame_behind_noise_is_not_lost(noise: bytes, frame: CanFrame) -> None:
+    assert decoded([noise + encode_frame(frame)]) == ([frame], len(noise))
+
+
+@given(st.binary(max_size=5000))
+def test_what_waits_is_bounded(data: bytes) -> None:
+    decoder = SlcanCodec(115_200)
+    decoder.feed(data.replace(b"\r", b"x"), 0)
+    assert sum(item.discarded for item in decoder.flush()) <= 64
+
+
+def test_digits_are_taken_strictly() -> None:
+    for bad in (b"t0212AB C\r", b"t021 2ABCD\r", b"t+212ABCD\r", b"t0_12ABCD\r", b"t0212ABCG\r"):
+        messages, lost = decoded([bad])
+        assert not messages
+        assert lost == len(bad)
+
+
+def test_ranges_are_checked() -> None:
+    for bad in (b"t80010\r", b"T200000000\r", b"t0219" + b"00" * 9 + b"\r", b"t02124\r"):
+        assert not decoded([bad])[0]
+
+
+def test_an_answer_inside_a_line_ends_it() -> None:
+    assert decoded([b"t02\aV1013\r\r"]) == (
+        [SlcanLine("\a"), SlcanLine("V", "1013"), SlcanLine("")],
+        3,
+    )
+
+
+def test_commands_are_told_from_answers() -> None:
+    wire = b"C\rS8\rO\rV\r"
+    assert decoded([wire], "adapter")[0] == [
+        SlcanLine("C"), SlcanLine("S", "8"), SlcanLine("O"), SlcanLine("V"),
+    ]  # fmt: skip
+    assert decoded([wire], "host") == ([], len(wire))
+
+
+def test_a_frame_is_stamped_at_the_start_of_its_line() -> None:
+    decoder = SlcanCodec(100_000)  # a character in 100 us
+    frame = CanFrame(0, 0x21, b"\1\2\3\4\5\6\7\x08")
+    line = encode_frame(frame)  # 22 characters
+    found = decoder.feed(line + line + b"t02", 1_000_000_000)
+    assert [item.t_ns for item in found if isinstance(item, CanFrame)] == [
+        1_000_000_000 - 47 * 100_000,
+        1_000_000_000 - 25 * 100_000,
+    ]
+    (rest,) = decoder.feed(line[3:], 1_001_900_000)
+    assert isinstance(rest, CanFrame)
+    assert rest.t_ns == 1_001_900_000 - 22 * 100_000
+
+
+def test_a_line_that_came_whole_is_not_stamped_before_the_previous_read() -> None:
+    decoder = SlcanCodec(9_600)  # but the adapter is on USB and much faster
+    line = encode_frame(CanFrame(0, 0x21, bytes(8)))
+    decoder.feed(line, 1_000_000_000)
+    (frame,) = decoder.feed(line, 1_001_000_000)
+    assert isinstance(frame, CanFrame)
+    assert frame.t_ns == 1_000_000_000
+
+
+def test_the_nine_bit_rates() -> None:
+    assert [bitrate_code(rate) for rate in BITRATES] == list(range(9))
+    assert bitrate_code(1_000_000) == 8
+    assert bitrate_code(83_333) is None

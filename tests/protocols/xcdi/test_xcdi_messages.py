@@ -1,0 +1,214 @@
+"""XCDI: the vectors, an independent reader of the tables, groups, and the unit of SampleTime."""
+
+from __future__ import annotations
+
+import json
+import random
+from math import isclose
+from typing import TYPE_CHECKING, Any
+
+import cantools
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.can import CanFrame
+from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.xcdi import (
+    DataId,
+    TickUnit,
+    XcdiCodec,
+    XcdiError,
+    XcdiGroup,
+    XcdiIds,
+    decode,
+    encode,
+    layout,
+    quaternion_counts,
+)
+from jointfit_protocols.xcdi._messages import id_block
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+shorts = st.integers(-32768, 32767)
+quaternions = st.tuples(shorts, shorts, shorts, shorts)
+can_frames = st.builds(
+    CanFrame,
+    st.integers(0, 10**12),
+    st.sampled_from([0x01, 0x05, 0x06, 0x11, 0x21, 0x22]) | st.integers(0, 0x7FF),
+    st.binary(max_size=8),
+    error=st.booleans(),
+)
+
+
+def vectors(shared_data: Path) -> list[dict[str, Any]]:
+    everything = json.loads((shared_data / "imu" / "vectors.json").read_text())
+    return [each for each in everything if each["protocol"] == "xsens-xcdi"]
+
+
+def test_the_vectors(shared_data: Path) -> None:
+    names = {0x05: "sample_time", 0x06: "group_counter", 0x01: "error"}
+    known = vectors(shared_data)
+    assert len(known) == 10
+    for vector in known:
+        counts = decode(DataId(vector["can_id"]), bytes.fromhex(vector["hex"]))
+        if vector["id"] == "xcdi-neg-dlc":
+            assert isinstance(counts, Corrupt)
+        elif vector["can_id"] in names:
+            assert counts == (vector["decoded"][names[vector["can_id"]]],)
+        elif vector["valid"]:
+            assert list(counts) == vector["decoded"]["raw"]
+
+
+MESSAGES = {
+    DataId.ERROR: st.tuples(st.integers(0, 255)),
+    DataId.SAMPLE_TIME: st.tuples(st.integers(0, 2**32 - 1)),
+    DataId.GROUP_COUNTER: st.tuples(st.integers(0, 2**16 - 1)),
+    DataId.STATUS_WORD: st.tuples(st.integers(0, 2**32 - 1)),
+    DataId.QUATERNION: quaternions,
+    DataId.EULER: st.tuples(shorts, shorts, shorts),
+    DataId.RATE_OF_TURN: st.tuples(shorts, shorts, shorts),
+    DataId.ACCELERATION: st.tuples(shorts, shorts, shorts),
+}
+
+
+@pytest.mark.parametrize("data_id", MESSAGES)
+def test_an_independent_reader_agrees(shared_data: Path, data_id: DataId) -> None:
+    oracle = cantools.database.load_file(shared_data / "imu" / "dbc" / "xsens_mti_xcdi.dbc")
+    assert isinstance(oracle, cantools.database.Database)
+    scale = 0.0001 if data_id is DataId.SAMPLE_TIME else layout(data_id).scale  # the DBC's unit
+
+    @given(MESSAGES[data_id])
+    def agree(counts: tuple[int, ...]) -> None:
+        wire = encode(data_id, counts)
+        theirs = oracle.decode_message(int(data_id), wire)
+        assert isinstance(theirs, dict)
+        assert decode(data_id, wire) == counts
+        for their, our in zip(theirs.values(), counts, strict=True):
+            assert isinstance(their, (int, float))
+            assert isclose(their, our * scale, rel_tol=1e-9, abs_tol=1e-9)
+
+    agree()
+
+
+@given(st.sampled_from(list(DataId)), st.binary(max_size=8))
+def test_any_bytes_are_counts_or_corrupt(data_id: DataId, data: bytes) -> None:
+    for byte_order in ("big", "little"):
+        counts = decode(data_id, data, byte_order)
+        if not isinstance(counts, Corrupt):
+            assert encode(data_id, counts, byte_order) == data
+
+
+def test_full_scale_is_rounded_not_overflowed() -> None:
+    assert quaternion_counts((1.0, -1.0, 0.5, 0.0)) == (32767, -32767, 16384, 0)
+
+
+def group(number: int, ids: XcdiIds, t_ns: int = 0) -> list[CanFrame]:
+    extended = ids.extended
+    assert ids.sample_time is not None
+    assert ids.group_counter is not None
+    return [
+        CanFrame(t_ns, ids.sample_time, encode(DataId.SAMPLE_TIME, (100 * number,)), extended),
+        CanFrame(t_ns + 1, ids.group_counter, encode(DataId.GROUP_COUNTER, (number,)), extended),
+        CanFrame(t_ns + 2, ids.quaternion, encode(DataId.QUATERNION, (32767, 0, 0, 0)), extended),
+    ]
+
+
+def groups_of(decoder: XcdiCodec, frames: list[CanFrame]) -> list[XcdiGroup]:
+    return [item for item in map(decoder.feed, frames) if isinstance(item, XcdiGroup)]
+
+
+def test_a_group_is_stamped_with_its_first_frame() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    (found,) = groups_of(decoder, group(7, XcdiIds(), 1000))
+    assert found == XcdiGroup(1000, 700, 7, None, (32767, 0, 0, 0))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_sensors_interleave_freely(seed: int) -> None:
+    order = random.Random(seed)
+    sensors = [id_block(0x100), id_block(0x200), id_block(0x18FF0000, extended=True)]
+    queues = [[f for n in range(20) for f in group(n, ids)] for ids in sensors]
+    mixed = []
+    while any(queues):
+        mixed.append(order.choice([queue for queue in queues if queue]).pop(0))
+    for ids in sensors:
+        decoder = XcdiCodec(ids)
+        found = groups_of(decoder, mixed)
+        assert [(each.ticks, each.counter) for each in found] == [(100 * n, n) for n in range(20)]
+        assert (decoder.messages, decoder.foreign, decoder.incomplete) == (60, 120, 0)
+
+
+def test_a_lost_quaternion_is_an_incomplete_group() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    frames = group(0, XcdiIds())[:2] + group(1, XcdiIds())
+    assert [each.counter for each in groups_of(decoder, frames)] == [1]
+    assert decoder.incomplete == 1
+
+
+def test_a_quaternion_without_sample_time_has_its_own_stamp_and_no_ticks() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    (found,) = groups_of(decoder, group(3, XcdiIds(), 1000)[1:])
+    assert found == XcdiGroup(1002, None, 3, None, (32767, 0, 0, 0))
+    assert decoder.ungrouped == 1
+
+
+def test_a_new_counter_never_joins_an_older_time() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    frames = group(0, XcdiIds())[:2] + group(1, XcdiIds())[1:]
+    (found,) = groups_of(decoder, frames)
+    assert (found.ticks, found.counter) == (None, 1)
+    assert decoder.incomplete == 1
+
+
+def test_status_belongs_to_its_group() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    frames = group(0, XcdiIds())
+    frames.insert(2, CanFrame(0, 0x11, encode(DataId.STATUS_WORD, (2,))))
+    assert [g.status for g in groups_of(decoder, frames + group(1, XcdiIds()))] == [2, None]
+
+
+def test_an_error_is_told() -> None:
+    assert XcdiCodec(XcdiIds()).feed(CanFrame(5, 1, b"\1")) == XcdiError(5, 1)
+
+
+def test_11_and_29_bit_identifiers_are_different() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    assert not groups_of(decoder, group(0, XcdiIds(extended=True)))
+    assert decoder.foreign == 3
+
+
+@given(st.lists(can_frames))
+def test_any_frames_give_groups_and_every_frame_is_accounted_for(frames: list[CanFrame]) -> None:
+    decoder = XcdiCodec(XcdiIds())
+    found = [decoder.feed(frame) for frame in frames]
+    corrupt = sum(isinstance(item, Corrupt) for item in found)
+    assert decoder.messages + decoder.foreign + corrupt == len(frames)
+
+
+def decided(
+    tick_ns: int, rate_hz: float = 100.0, count: int = 11, jitter_ns: int = 0, bunch: int = 1
+) -> int | None:
+    unit, noise, answer = TickUnit(), random.Random(5), None
+    for n in range(count):
+        at = round((n // bunch) * bunch * 1e9 / rate_hz) + n % bunch * 200_000
+        ticks = (2**32 - 500 + round(n * 1e9 / rate_hz / tick_ns)) % 2**32
+        answer = unit.feed(ticks, at + noise.randrange(jitter_ns + 1))
+    return answer
+
+
+def test_the_unit_shows_after_ten_steps_even_over_a_wrap() -> None:
+    for tick_ns in (1_000, 100_000):
+        assert decided(tick_ns, count=10) is None
+        assert decided(tick_ns, count=11) == tick_ns
+
+
+def test_jitter_and_bunched_arrival_do_not_hide_the_unit() -> None:
+    for tick_ns in (1_000, 100_000):
+        assert decided(tick_ns, jitter_ns=8_000_000, count=30) == tick_ns
+        assert decided(tick_ns, rate_hz=400.0, bunch=8, count=60) == tick_ns
+
+
+def test_a_clock_of_another_kind_is_not_forced_into_either_unit() -> None:
+    assert decided(10_000, count=150) is None
