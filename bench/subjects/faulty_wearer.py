@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.fusion import LimbFuser, SensorNews
+    from jointfit_daemon.fusion import LimbFuser, SensorReport
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
 
@@ -136,7 +136,9 @@ def _smooth(share: Array) -> Array:
     return np.asarray(x * x * (3.0 - 2.0 * x))
 
 
-def play(fuser: LimbFuser, person: Worn) -> tuple[list[LimbState], list[tuple[float, SensorNews]]]:
+def play(
+    fuser: LimbFuser, person: Worn
+) -> tuple[list[LimbState], list[tuple[float, SensorReport]]]:
     """Return what fusion says of every frame, and what it told when (s)."""
     rows = {name: [(w, x, y, z) for w, x, y, z in q.tolist()] for name, q in person.said.items()}
     states, told = [], []
@@ -144,7 +146,7 @@ def play(fuser: LimbFuser, person: Worn) -> tuple[list[LimbState], list[tuple[fl
         t_ns = round((BEGIN_S + t_s) * NS)
         heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is silence
         states.append(fuser.fuse(t_ns, t_ns, k, heard))
-        told += [(t_s, news) for news in fuser.news(t_ns)]
+        told += [(t_s, news) for news in fuser.pop_reports(t_ns)]
     return states, told
 
 

@@ -3,6 +3,6 @@
 from jointfit_daemon.fusion._limb_fuser import LimbFuser
 from jointfit_daemon.fusion._optical_origin import OpticalOrigin
 from jointfit_daemon.fusion._segment_fuser import HEADING_SD
-from jointfit_daemon.fusion.faults import SensorNews, SensorWatch
+from jointfit_daemon.fusion.faults import SensorMonitor, SensorReport
 
-__all__ = ["HEADING_SD", "LimbFuser", "OpticalOrigin", "SensorNews", "SensorWatch"]
+__all__ = ["HEADING_SD", "LimbFuser", "OpticalOrigin", "SensorMonitor", "SensorReport"]

@@ -1,7 +1,8 @@
-"""How fast joint angles change. Law: pure, O(1) a frame; only frames that are there are compared.
+"""Rates of joint angles, as difference quotients over the last 50 ms.
 
-A difference over the last twentieth of a second: what single samples scatter is divided by that
-time and no less, and the rate is that of 25 ms ago.
+The span limits the noise of the rate. The rate belongs to an instant 25 ms before the frame.
+
+Invariant: the cost per frame is O(1), and only frames with known angles are compared.
 """
 
 from __future__ import annotations
@@ -12,31 +13,32 @@ from math import pi
 from jointfit_daemon.model import JointAngles
 
 SPAN_NS = 50_000_000
-LONGEST_NS = 120_000_000
-"""Frames further apart than this tell no rate."""
+"""Shortest span of a difference quotient once enough frames exist, ns."""
+MAX_GAP_NS = 120_000_000
+"""Longest time between two frames that give a rate, ns."""
 
 
 class AngleRates:
-    """Follows the angles of the joints of one limb."""
+    """Computes the rates of the joints of one limb."""
 
     def __init__(self) -> None:
         self._past: dict[str, deque[tuple[int, JointAngles]]] = {}
 
-    def rates(
+    def update(
         self, t_ns: int, joint: str, angles: JointAngles | None, *, gimbal: bool
     ) -> JointAngles | None:
-        """Return the rates of a joint's angles, rad/s; None while they are not known.
+        """Add the angles of one joint and return their rates, rad/s, or None if unknown.
 
         Parameters
         ----------
         t_ns : int
-            Instant of the frame; grows from call to call.
+            Instant of the frame; increases from call to call.
         joint : str
-            Which one.
+            Name of the joint.
         angles : JointAngles or None
-            In this frame; None: not known.
+            Angles in this frame, rad; None if unknown.
         gimbal : bool
-            Whether flexion and rotation cannot be told apart: then there is no rate, nor for the
+            Whether the joint is at gimbal lock. Rates are then unknown, and start again with the
             next frames.
         """
         past = self._past.get(joint)
@@ -45,19 +47,21 @@ class AngleRates:
         if angles is None or gimbal:
             past.clear()
             return None
-        while past and (t_ns - past[0][0] > LONGEST_NS or past[0][0] >= t_ns):
+
+        while past and (t_ns - past[0][0] > MAX_GAP_NS or past[0][0] >= t_ns):
             past.popleft()
         while len(past) > 1 and t_ns - past[1][0] >= SPAN_NS:
             past.popleft()
         past.append((t_ns, angles))
-        began_ns, then = past[0]
-        if began_ns == t_ns:
+
+        start_ns, start = past[0]
+        if start_ns == t_ns:
             return None
-        per_s = 1e9 / (t_ns - began_ns)
+        per_s = 1e9 / (t_ns - start_ns)
         return JointAngles(
-            _wrapped(angles.flexion - then.flexion) * per_s,
-            (angles.adduction - then.adduction) * per_s,
-            _wrapped(angles.rotation - then.rotation) * per_s,
+            _wrapped(angles.flexion - start.flexion) * per_s,
+            (angles.adduction - start.adduction) * per_s,
+            _wrapped(angles.rotation - start.rotation) * per_s,
         )
 
 

@@ -1,8 +1,8 @@
-"""Joint positions and angles of one frame, with their standard deviations. Law: floats only.
+"""Forward kinematics of one frame: joint positions and angles with standard deviations.
 
-Orientation errors are taken as isotropic and independent between segments, but for flexion, see
-`read_angles`; what is kept of a position's covariance is its trace, which is all that a LimbState
-carries.
+Orientation errors are taken as isotropic and independent between segments, except for flexion (see
+`joint_angle_estimate`). Of a position covariance only the trace is propagated, since a LimbState
+carries no more.
 """
 
 from __future__ import annotations
@@ -16,75 +16,96 @@ from jointfit_daemon.kinematics.rotation_scalar import along_z_one
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.fusion._segment_fuser import Fused
+    from jointfit_daemon.fusion._segment_fuser import FusedSegment
     from jointfit_daemon.model import JointAngles, Vector
 
 
-class Reach(NamedTuple):
+class SegmentLength(NamedTuple):
     """Length of a segment and its standard deviation, m."""
 
     length: float | None
     sd: float
 
 
-class AngleState(NamedTuple):
+class JointAngleEstimate(NamedTuple):
     """Angles of one joint."""
 
     angles: JointAngles
     inner: float
-    """Between the two segments, rad: pi when straight."""
+    """Angle between the two segments, rad; pi if straight."""
     flexion_sd: float | None
-    """rad."""
+    """Standard deviation of flexion, rad; None at gimbal lock."""
     gimbal: bool
+    """Whether the joint is at gimbal lock."""
 
 
 def joint_positions(
-    origin: Vector, fused: Sequence[Fused], reaches: Sequence[Reach]
+    origin: Vector, fused: Sequence[FusedSegment], lengths: Sequence[SegmentLength]
 ) -> list[tuple[Vector | None, float | None]]:
-    r"""Run the chain from O1 down; return position (m) and variance per axis (m²) of every joint.
+    r"""Return position (m) and variance per axis (m²) of every joint, from O1 downwards.
 
     .. math:: P_{i+1} = P_i - L\,R_i e_z, \qquad
               \mathrm{tr}\,\Sigma_{i+1} = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
 
-    First-order propagation with isotropic orientation errors. Below a segment whose orientation or
-    length is unknown everything is None.
+    First-order propagation with isotropic orientation errors. Both values are None below a segment
+    of unknown orientation or length.
     """
-    place: Vector | None = origin
+    position: Vector | None = origin
     trace = 0.0
     out: list[tuple[Vector | None, float | None]] = [(origin, 0.0)]
-    for one, reach in zip(fused, reaches, strict=True):
-        if place is None or one.q is None or one.sd is None or reach.length is None:
-            place = None
+    for segment, stored in zip(fused, lengths, strict=True):
+        if position is None or segment.q is None or segment.sd is None or stored.length is None:
+            position = None
             out.append((None, None))
             continue
-        length = reach.length
-        dx, dy, dz = along_z_one(one.q, -length)
-        place = (place[0] + dx, place[1] + dy, place[2] + dz)
-        trace += 2.0 * (length * one.sd) ** 2 + reach.sd**2
-        out.append((place, trace / 3.0))
+        length = stored.length
+        dx, dy, dz = along_z_one(segment.q, -length)
+        position = (position[0] + dx, position[1] + dy, position[2] + dz)
+        trace += 2.0 * (length * segment.sd) ** 2 + stored.sd**2
+        out.append((position, trace / 3.0))
     return out
 
 
-def read_angles(
-    above: Fused, below: Fused, *, sign: float, left: bool, alike: float = 0.0
-) -> AngleState | None:
-    r"""Return the angles of one joint, or None where a segment's orientation is unknown.
+def joint_angle_estimate(
+    proximal: FusedSegment,
+    distal: FusedSegment,
+    *,
+    sign: float,
+    left: bool,
+    correlation: float = 0.0,
+) -> JointAngleEstimate | None:
+    r"""Return the angles of one joint, or None if an orientation is unknown.
 
-    With isotropic errors :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, whose
-    first entry is :math:`1 / \cos^2\theta` times the sum: the deviation of flexion, to first order
-    (E: rates of Grood and Suntay's angles to angular velocity). It is None where the axes lock.
-    Where a segment's deviation about its x is known apart, that stands for its sigma: flexion
-    hardly feels the others. Where it is of both, `alike`, the correlation of what both models err
-    about it, takes :math:`2 \rho \sigma_1 \sigma_2` from the sum. What is held, a plain mean
-    or doubted errs by itself.
+    With isotropic errors, :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, where E
+    maps the rates of the Grood and Suntay angles to angular velocity. Its first entry gives the
+    standard deviation of flexion, :math:`\sqrt{\sigma_1^2 + \sigma_2^2} / \cos\theta` with
+    adduction :math:`\theta`, to first order.
+
+    If the standard deviation of a segment about its x axis is known, it replaces the isotropic one,
+    because flexion hardly depends on the other axes. If it is known for both segments,
+    :math:`2 \rho \sigma_1 \sigma_2` is subtracted, where :math:`\rho` is the correlation of the
+    model errors about x. Errors of held, uncorrected or inconsistent segments are treated as
+    independent.
+
+    Parameters
+    ----------
+    proximal, distal : FusedSegment
+        The segments above and below the joint.
+    sign : float
+        Sign of flexion about x, see CONVENTIONS.md.
+    left : bool
+        Whether the limb is on the left side.
+    correlation : float
+        :math:`\rho`.
     """
-    if above.q is None or below.q is None or above.sd is None or below.sd is None:
+    if proximal.q is None or distal.q is None or proximal.sd is None or distal.sd is None:
         return None
-    angles, inner, gimbal = read_joint(above.q, below.q, flexion_sign=sign, left=left)
-    first, second = above.flexion_sd, below.flexion_sd
-    total = (above.sd if first is None else hypot(first, above.doubt)) ** 2
-    total += (below.sd if second is None else hypot(second, below.doubt)) ** 2
+    angles, inner, gimbal = read_joint(proximal.q, distal.q, flexion_sign=sign, left=left)
+
+    first, second = proximal.flexion_sd, distal.flexion_sd
+    total = (proximal.sd if first is None else hypot(first, proximal.fault_sd)) ** 2
+    total += (distal.sd if second is None else hypot(second, distal.fault_sd)) ** 2
     if first is not None and second is not None:
-        total -= 2.0 * alike * first * second
+        total -= 2.0 * correlation * first * second
     sd = None if gimbal else sqrt(total) / cos(angles.adduction)
-    return AngleState(angles, inner, sd, gimbal)
+    return JointAngleEstimate(angles, inner, sd, gimbal)

@@ -1,4 +1,4 @@
-"""What a heading that nobody sees does to a limb's deviations. Law: pure; joints do not mind."""
+"""Effect of an unobserved heading error of the whole limb on the standard deviations of a state."""
 
 from __future__ import annotations
 
@@ -9,33 +9,35 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import JointState, SegmentState
 
 
-def widened_segments(segments: tuple[SegmentState, ...], sd: float) -> tuple[SegmentState, ...]:
-    """Return the segments with a shared heading error of standard deviation `sd`, rad.
+def add_segment_heading_sd(
+    segments: tuple[SegmentState, ...], sd: float
+) -> tuple[SegmentState, ...]:
+    """Return the segments with a common heading error of standard deviation `sd`, rad, added.
 
-    It is an error about one axis of three, and `SegmentState.sd` is per axis.
+    The error is about one axis of three, and ``SegmentState.sd`` is per axis.
     """
     return tuple(
-        one if one.sd is None else one._replace(sd=hypot(one.sd, sd / sqrt(3.0)))
-        for one in segments
+        segment if segment.sd is None else segment._replace(sd=hypot(segment.sd, sd / sqrt(3.0)))
+        for segment in segments
     )
 
 
-def widened_joints(joints: tuple[JointState, ...], sd: float) -> tuple[JointState, ...]:
-    r"""Return the joints likewise: positions turn about the vertical through the first joint.
+def add_joint_heading_sd(joints: tuple[JointState, ...], sd: float) -> tuple[JointState, ...]:
+    r"""Return the joints with the same error added: positions turn about the first joint.
 
     .. math:: \sigma^2 \leftarrow \sigma^2 + \tfrac13 \sigma_h^2 (\Delta x^2 + \Delta y^2)
 
-    Angles between segments stay as sure as they were.
+    Joint angles do not depend on a common heading and keep their standard deviations.
     """
     first = joints[0].position
     return tuple(
-        one
-        if first is None or one.position is None or one.position_sd is None
-        else one._replace(
+        joint
+        if first is None or joint.position is None or joint.position_sd is None
+        else joint._replace(
             position_sd=hypot(
-                one.position_sd,
-                sd / sqrt(3.0) * hypot(one.position[0] - first[0], one.position[1] - first[1]),
+                joint.position_sd,
+                sd / sqrt(3.0) * hypot(joint.position[0] - first[0], joint.position[1] - first[1]),
             ),
         )
-        for one in joints
+        for joint in joints
     )

@@ -1,6 +1,7 @@
-"""One aligned frame in, one LimbState out, whatever sensors are alive.
+"""Fusion of one aligned frame of sensor orientations to the state of a limb.
 
-Law: pure, in order of time, plain floats. Unknown is None; every degradation is a flag.
+Invariant: the same frames in the same order give the same states. Unknown values are None, and
+every degradation sets a flag.
 """
 
 from __future__ import annotations
@@ -9,10 +10,17 @@ from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.fusion._angle_rates import AngleRates
-from jointfit_daemon.fusion._forward_kinematics import Reach, joint_positions, read_angles
-from jointfit_daemon.fusion._heading_uncertainty import widened_joints, widened_segments
-from jointfit_daemon.fusion._segment_fuser import Fused, SegmentFuser
-from jointfit_daemon.fusion.faults import LinkWatch, SensorWatch
+from jointfit_daemon.fusion._forward_kinematics import (
+    SegmentLength,
+    joint_angle_estimate,
+    joint_positions,
+)
+from jointfit_daemon.fusion._heading_uncertainty import (
+    add_joint_heading_sd,
+    add_segment_heading_sd,
+)
+from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
+from jointfit_daemon.fusion.faults import ConsistencyMonitor, SensorMonitor
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.limb_model import flexion_sign, neighbor
 from jointfit_daemon.model import JointState, LimbState, SegmentState
@@ -21,55 +29,57 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from jointfit_daemon.fusion._segment_fuser import Inputs
-    from jointfit_daemon.fusion.faults import SensorNews
+    from jointfit_daemon.fusion.faults import SensorReport
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
-_NOBODY: frozenset[str] = frozenset()
+_NO_SENSORS: frozenset[str] = frozenset()
 
 
 class LimbFuser:
-    """Turns aligned sensor orientations into the state of a limb.
+    """Computes limb states from aligned sensor orientations.
 
     Parameters
     ----------
     chain : Chain
         Joints, segments and sensors of the rig.
     calibration : Calibration or None
-        None, or one of another chain (flag ``other_chain``): every state is ``uncalibrated``.
-    watch : SensorWatch, optional
-        What is known of the sensors already: a calibration that changed is no change of sensors.
+        With None, or with the calibration of another chain (flag ``other_chain``), every state is
+        ``uncalibrated``.
+    sensor_monitor : SensorMonitor, optional
+        Monitor to continue with: sensor states outlive a change of the calibration.
     drifting : collection of str
-        Sensors that are known to have no north, see ``LinkWatch``.
+        Sensors without heading reference, see ``ConsistencyMonitor``.
     """
 
     def __init__(
         self,
         chain: Chain,
         calibration: Calibration | None,
-        watch: SensorWatch | None = None,
+        sensor_monitor: SensorMonitor | None = None,
         drifting: Collection[str] = (),
     ) -> None:
         self._chain, self._drifting = chain, drifting
-        self.watch = watch or SensorWatch(chain)
-        known = calibration is not None and calibration.fits(chain)
-        self._calibration = calibration if known else None
-        self._standing: tuple[str, ...] = ("uncalibrated",)
-        if calibration is not None and not known:
-            self._standing = ("uncalibrated", "other_chain")
+        self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
+        usable = calibration is not None and calibration.fits(chain)
+        self._calibration = calibration if usable else None
+        self._base_flags: tuple[str, ...] = ("uncalibrated",)
+        if calibration is not None and not usable:
+            self._base_flags = ("uncalibrated", "other_chain")
         self._fusers: list[SegmentFuser] = []
-        self._reaches: list[Reach] = []
-        self._mounts: list[tuple[str, Quaternion, Quaternion]] = []
-        self.links: LinkWatch | None = None
+        self._lengths: list[SegmentLength] = []
+        self._alignments: list[tuple[str, Quaternion, Quaternion]] = []
+        """Sensor, q_optical_world and q_sensor_segment."""
+        self.consistency: ConsistencyMonitor | None = None
         self._rates = AngleRates()
         if self._calibration is not None:
             self._prepare(self._calibration)
 
     def _prepare(self, calibration: Calibration) -> None:
         chain = self._chain
-        self._standing = calibration.flags
-        self.links = LinkWatch(chain, calibration, self._drifting)
-        self._mounts = [
+        self._base_flags = calibration.flags
+        self.consistency = ConsistencyMonitor(chain, calibration, self._drifting)
+        self._alignments = [
             (name, item.q_optical_world, item.q_sensor_segment)
             for name, item in calibration.sensor.items()
         ]
@@ -78,15 +88,15 @@ class LimbFuser:
             self._fusers.append(SegmentFuser(segment, chain.sensors[i], stored))
             length, sd = stored.length, stored.length_sd
             if i < len(chain.lengths) and chain.lengths[i] is not None:
-                length = chain.lengths[i]
-            self._reaches.append(Reach(length, sd or 0.0))
+                length = chain.lengths[i]  # rig.toml overrides the calibration
+            self._lengths.append(SegmentLength(length, sd or 0.0))
         self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
-        self._take_correlations(calibration)
+        self._use_correlations(calibration)
 
-    def _take_correlations(self, calibration: Calibration) -> None:
+    def _use_correlations(self, calibration: Calibration) -> None:
         known = calibration.correlations
-        self._alike = [known.get(joint, 0.0) for joint in self._chain.joints]
+        self._correlations = [known.get(joint, 0.0) for joint in self._chain.joints]
 
     def fuse(
         self,
@@ -95,7 +105,7 @@ class LimbFuser:
         seq: int,
         orientations: Mapping[str, Quaternion],
         *,
-        extrapolated: frozenset[str] = _NOBODY,
+        extrapolated: frozenset[str] = _NO_SENSORS,
         optical_origin: Vector | None = None,
         sync: str = "locked",
         mode: str = "imu",
@@ -105,136 +115,156 @@ class LimbFuser:
         Parameters
         ----------
         t_ns, completed_ns, seq
-            Instant, arrival of what completed the frame, running number; handed through.
+            Instant of the frame, arrival of its last sample, and frame number; passed through.
         orientations : mapping of str to Quaternion
-            q_world_sensor of every sensor that is alive, each in its own world; unknown ids are
-            ignored. Not to be changed afterwards.
+            q_world_sensor of every sensor with data, each in its own world. Unknown sensors are
+            ignored. Must not be changed afterwards.
         extrapolated : frozenset of str
             Sensors whose value is extrapolated beyond their last sample.
         optical_origin : Vector, optional
-            Where the cameras see O1 now, m; wins over the configured origin.
+            Position of O1 in the current mocap frame, m; overrides the configured origin.
         sync, mode : str
-            Handed through; without a calibration the mode is ``uncalibrated``.
+            Passed through; without a calibration the mode is ``uncalibrated``.
 
         Notes
         -----
-        Flags: ``uncalibrated``, ``other_chain``, those of the calibration, then ``extrapolating``
-        (a sample was extrapolated in time), ``origin_fixed`` (cameras run but do not see O1, so
-        that it is at the configured origin), ``stuck:`` per sensor, ``slipped:`` per sensor or
-        ``pair_disagrees:`` per segment, ``heading_disagrees:`` per joint, ``heading_unseen``, per
-        segment ``one_sensor:``, ``untrained:`` (outside the movements of the calibration),
-        ``held:``, ``lost:``; ``gimbal`` last.
+        Flags, in this order: ``uncalibrated``, ``other_chain``, those of the calibration,
+        ``extrapolating`` (a sample is extrapolated in time), ``origin_fixed`` (mocap runs but does
+        not see O1, so the configured origin is used), ``stuck:SENSOR``, ``slipped:SENSOR`` or
+        ``pair_disagrees:SEGMENT``, ``heading_disagrees:JOINT``, ``heading_unseen``, and per segment
+        ``one_sensor:``, ``untrained:`` (outside the training range), ``held:``, ``lost:``;
+        ``gimbal`` is last.
         """
-        orientations, stuck = self.watch.look(t_ns, completed_ns, orientations)
+        orientations, stuck = self.sensor_monitor.update(t_ns, completed_ns, orientations)
         if self._calibration is None:
             return self._uncalibrated(t_ns, completed_ns, seq, sync)
+
+        # Chain of rotations: optical world, world, sensor, segment.
         inputs = {
-            name: multiply_one(multiply_one(q_world, orientations[name]), q_mount)
-            for name, q_world, q_mount in self._mounts
+            name: multiply_one(multiply_one(q_world, orientations[name]), q_alignment)
+            for name, q_world, q_alignment in self._alignments
             if name in orientations
         }
-        fused, doubts = self._fused(t_ns, inputs)
-        flags = [*self._standing]
+        fused, fault_flags = self._fuse_segments(t_ns, inputs)
+
+        flags = [*self._base_flags]
         if extrapolated and not extrapolated.isdisjoint(inputs):
             flags.append("extrapolating")
         if optical_origin is None and mode == "imu+mocap":
             flags.append("origin_fixed")
         if stuck:
             flags += [f"stuck:{name}" for name in stuck]
-        flags += doubts
-        for one in fused:
-            flags += one.flags
+        flags += fault_flags
+        for segment in fused:
+            flags += segment.flags
+
         joints = self._joints(t_ns, fused, optical_origin, flags)
         segments = tuple(
             [
-                SegmentState(name, one.q, one.sd, one.used)
-                for name, one in zip(self._chain.segments, fused, strict=True)
+                SegmentState(name, segment.q, segment.sd, segment.used)
+                for name, segment in zip(self._chain.segments, fused, strict=True)
             ]
         )
-        if self.links is not None and (unseen := self.links.common_sd) > 0.0:
-            segments, joints = widened_segments(segments, unseen), widened_joints(joints, unseen)
+        if self.consistency is not None and (sd := self.consistency.common_heading_sd) > 0.0:
+            segments, joints = (
+                add_segment_heading_sd(segments, sd),
+                add_joint_heading_sd(joints, sd),
+            )
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
-    def take_models(self, calibration: Calibration) -> None:
-        """Go over to the models of a calibration that is the same otherwise, without a jump."""
+    def replace_models(self, calibration: Calibration) -> None:
+        """Use the models of a calibration that is otherwise equal; the output fades to them."""
         if self._calibration is None:
             return
         self._calibration = calibration
-        self._take_correlations(calibration)
+        self._use_correlations(calibration)
         for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
-            fuser.take(calibration.segment[name].models)
+            fuser.replace_models(calibration.segment[name].models)
 
-    def worn_since(self, t_ns: int) -> None:
-        """Take it that the calibration is as old as that: headings have wandered since."""
+    def set_calibration_time(self, t_ns: int) -> None:
+        """Set the instant of the static pose, from which heading uncertainty grows."""
         for fuser in self._fusers:
-            fuser.worn_since(t_ns)
+            fuser.set_calibration_time(t_ns)
 
-    def take_over(self, before: LimbFuser) -> None:
-        """Go on where the fuser before a reload was, if the same sensors are worn as then.
+    def resume(self, before: LimbFuser) -> None:
+        """Continue from the fuser before a reload, if sensors and alignments are unchanged.
 
-        What drifted stays taken out, what is doubted stays doubted, and what fades goes on fading:
-        a reload moves nobody's leg.
+        Drift corrections, faults and fading continue, so a reload does not change the output.
         """
-        was, now = before._calibration, self._calibration
-        if was is None or now is None or not _worn_alike(was, now):
+        old, new = before._calibration, self._calibration
+        if old is None or new is None or not _same_alignment(old, new):
             return
         if set(before._drifting) != set(self._drifting):
             return
-        self.links, self._rates, self._fusers = before.links, before._rates, before._fusers
+
+        self.consistency, self._rates = before.consistency, before._rates
+        self._fusers = before._fusers
         for fuser, name in zip(self._fusers, self._chain.segments, strict=True):
-            if was.segment[name].models != now.segment[name].models:
-                fuser.take(now.segment[name].models)
+            if old.segment[name].models != new.segment[name].models:
+                fuser.replace_models(new.segment[name].models)
 
-    def news(self, now_ns: int) -> list[SensorNews]:
-        """Return what is worth telling of the sensors at `now_ns`, each change once."""
-        told = self.watch.news(now_ns)
-        if self.links is not None:
-            told += self.links.news()
-        return told
+    def pop_reports(self, now_ns: int) -> list[SensorReport]:
+        """Return the reports on sensors that are due at `now_ns`, each once."""
+        reports = self.sensor_monitor.pop_reports(now_ns)
+        if self.consistency is not None:
+            reports += self.consistency.pop_reports()
+        return reports
 
-    def _fused(self, t_ns: int, inputs: Inputs) -> tuple[list[Fused], tuple[str, ...]]:
-        """Return the segments, and flags of sensors that contradict each other."""
+    def _fuse_segments(
+        self, t_ns: int, inputs: Inputs
+    ) -> tuple[list[FusedSegment], tuple[str, ...]]:
+        """Return the fused segments and the flags of inconsistent sensors."""
         spread: tuple[float, ...] = ()
         flags: tuple[str, ...] = ()
-        if self.links is not None:
-            inputs = self.links.correct(inputs)
-            spread, slipped, flags = self.links.look(t_ns, inputs)
-            inputs = self.links.brought_together(inputs)
+        if self.consistency is not None:
+            inputs = self.consistency.correct_headings(inputs)
+            spread, slipped, flags = self.consistency.update(t_ns, inputs)
+            inputs = self.consistency.correct_pairs(inputs)
             if slipped:
                 inputs = {name: q for name, q in inputs.items() if name not in slipped}
+
         fused = [
             fuser.fuse(t_ns, inputs, near)
             for fuser, near in zip(self._fusers, self._neighbors, strict=True)
         ]
         if any(spread):
-            fused = [_widened(one, more) for one, more in zip(fused, spread, strict=True)]
+            fused = [_add_sd(segment, sd) for segment, sd in zip(fused, spread, strict=True)]
         return fused, flags
 
     def _joints(
-        self, t_ns: int, fused: list[Fused], optical_origin: Vector | None, flags: list[str]
+        self,
+        t_ns: int,
+        fused: list[FusedSegment],
+        optical_origin: Vector | None,
+        flags: list[str],
     ) -> tuple[JointState, ...]:
         chain = self._chain
         origin = optical_origin or chain.origin or (0.0, 0.0, 0.0)
-        places = joint_positions(origin, fused, self._reaches)
+        positions = joint_positions(origin, fused, self._lengths)
         joints = []
         for i, name in enumerate(chain.joints):
-            position, variance = places[i]
+            position, variance = positions[i]
             sd = None if variance is None else sqrt(variance)
-            if not 0 < i < len(fused):
+            if not 0 < i < len(fused):  # the ends of the chain have no angles
                 joints.append(JointState(name, position, sd))
                 continue
-            above, below = fused[i - 1], fused[i]
-            state = read_angles(
-                above, below, sign=self._signs[i], left=chain.left_side, alike=self._alike[i]
+
+            proximal, distal = fused[i - 1], fused[i]
+            estimate = joint_angle_estimate(
+                proximal,
+                distal,
+                sign=self._signs[i],
+                left=chain.left_side,
+                correlation=self._correlations[i],
             )
-            if state is None:
+            if estimate is None:
                 joints.append(JointState(name, position, sd))
                 continue
-            if state.gimbal and "gimbal" not in flags:
+            if estimate.gimbal and "gimbal" not in flags:
                 flags.append("gimbal")
-            angles, inner, flexion_sd, gimbal = state
-            measured = angles if above.used and below.used else None  # held angles have no rate
-            rates = self._rates.rates(t_ns, name, measured, gimbal=gimbal)
+            angles, inner, flexion_sd, gimbal = estimate
+            measured = angles if proximal.used and distal.used else None  # not while held
+            rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
             joints.append(JointState(name, position, sd, angles, inner, flexion_sd, rates))
         return tuple(joints)
 
@@ -242,21 +272,23 @@ class LimbFuser:
         segments = tuple(SegmentState(name, None, None, ()) for name in self._chain.segments)
         joints = tuple(JointState(name, None, None) for name in self._chain.joints)
         mode = "uncalibrated"
-        return LimbState(seq, t_ns, completed_ns, mode, sync, self._standing, segments, joints)
+        return LimbState(seq, t_ns, completed_ns, mode, sync, self._base_flags, segments, joints)
 
 
-def _worn_alike(was: Calibration, now: Calibration) -> bool:
-    """Tell whether two calibrations are of the same limb, wearing and links."""
-    if (was.joints, was.segments, was.chain_sensors) != (
-        now.joints,
-        now.segments,
-        now.chain_sensors,
+def _same_alignment(old: Calibration, new: Calibration) -> bool:
+    """Return whether two calibrations have the same limb, static pose, alignments and links."""
+    if (old.joints, old.segments, old.chain_sensors) != (
+        new.joints,
+        new.segments,
+        new.chain_sensors,
     ):
         return False
-    poses = all(was.segment[name].q_static == now.segment[name].q_static for name in now.segments)
-    return poses and was.sensor == now.sensor and was.links == now.links
+    poses = all(old.segment[name].q_static == new.segment[name].q_static for name in new.segments)
+    return poses and old.sensor == new.sensor and old.links == new.links
 
 
-def _widened(one: Fused, more: float) -> Fused:
-    """Return a segment with a standard deviation added, per axis, rad."""
-    return one if one.sd is None else one._replace(sd=hypot(one.sd, more), doubt=more)
+def _add_sd(segment: FusedSegment, sd: float) -> FusedSegment:
+    """Return a segment with an independent error added, standard deviation per axis, rad."""
+    if segment.sd is None:
+        return segment
+    return segment._replace(sd=hypot(segment.sd, sd), fault_sd=sd)

@@ -1,7 +1,4 @@
-"""Where O1 is right now, by the markers beside it.
-
-Law: one camera frame in, one place or None out.
-"""
+"""Position of the first joint of a limb (O1) in a mocap frame."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.fusion._cluster_point import CarriedPoint
+from jointfit_daemon.fusion._cluster_point import ClusterPoint
 from jointfit_daemon.limb_model import live_cluster
 
 if TYPE_CHECKING:
@@ -18,21 +15,21 @@ if TYPE_CHECKING:
 
 
 class OpticalOrigin:
-    """Locates the first joint from the body part before it, else from the first segment.
+    """Locates O1 by the markers of the body part proximal to it, else of the first segment.
 
     Parameters
     ----------
     chain : Chain
-        Names O1 and its neighbours.
+        Names O1 and the body parts next to it.
     calibration : Calibration or None
-        Holds the clusters and the joint center; without either nothing is ever located.
+        Marker clusters and joint center; without them O1 is never located.
     """
 
     def __init__(self, chain: Chain, calibration: Calibration | None) -> None:
         self._center: Vector | None = None
         self._clusters: list[Cluster] = []
         self._layout: MocapLayout | None = None
-        self._carried: list[CarriedPoint] = []
+        self._points: list[ClusterPoint] = []
         if calibration is None:
             return
         found = calibration.joint.get(chain.joints[0])
@@ -44,15 +41,16 @@ class OpticalOrigin:
         ]
 
     def locate(self, frame: MocapFrame) -> Vector | None:
-        """Return O1 in the optical world, m; None where too few markers are seen."""
+        """Return O1 in the optical world, m, or None if too few markers are visible."""
         if self._center is None:
             return None
         if frame.layout is not self._layout:
             self._layout = frame.layout
             center = np.array(self._center)
-            self._carried = [CarriedPoint(c, center, frame.layout) for c in self._clusters]
-        for point in self._carried:
-            place = point.locate(frame)
-            if place is not None:
-                return place
+            self._points = [ClusterPoint(c, center, frame.layout) for c in self._clusters]
+
+        for point in self._points:
+            position = point.locate(frame)
+            if position is not None:
+                return position
         return None

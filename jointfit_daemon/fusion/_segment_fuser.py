@@ -1,10 +1,10 @@
-"""One segment's orientation from whatever of its sensors are alive.
+"""Orientation of one segment from the sensors that have data.
 
-Law: no jump, and no silence unsaid.
+In order of preference: the model trained for exactly these sensors, their mean, the last
+orientation for 0.2 s, none. If the set of sensors changes, the difference between the old and the
+new orientation fades out over 0.25 s.
 
-The order is: the model trained for exactly the sensors alive, the plain mean of them, the last
-orientation for a fifth of a second, nothing. When the set alive changes, the difference between
-what was said and what is now to be said fades over a quarter of a second.
+Invariant: the orientation does not jump, and every degradation sets a flag.
 """
 
 from __future__ import annotations
@@ -21,127 +21,137 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import SegmentCalibration, SegmentModel
     from jointfit_daemon.model import Quaternion, Vector
 
-FLOOR_SD = 0.0005
-"""No orientation is claimed to be better than this, rad."""
+MIN_SD = 0.0005
+"""Smallest standard deviation of an orientation, rad: the resolution of common sensors."""
 HEADING_SD = radians(2.0)
-"""How far the heading of a sensor's world has wandered from where the calibration found it, rad: a
-turn about the vertical, common to a segment's pair, that no training frame shows (measured on
-simulated people a minute after calibration). It hardly touches flexion."""
-HEADING_WANDER = radians(0.3)
-"""How it goes on wandering, rad per root of a minute: after an hour the deviation has doubled."""
-_HEADING_VAR, _WANDER_VAR = HEADING_SD * HEADING_SD, HEADING_WANDER * HEADING_WANDER
-BLEND_NS = 250_000_000
-LEARNED_NS = 1_000_000_000
-"""How long models that were learned while running take to replace those before them."""
+"""Standard deviation of the heading of a sensor's world just after calibration, rad. The error is
+common to the sensors of a segment, so the training data cannot show it (measured on simulated
+subjects one minute after calibration). It hardly affects flexion."""
+HEADING_WALK = radians(0.3)
+"""Random walk of that heading, rad per square root of a minute: doubled after an hour."""
+_HEADING_VAR, _WALK_VAR = HEADING_SD * HEADING_SD, HEADING_WALK * HEADING_WALK
+FADE_NS = 250_000_000
+"""Fade time after a change of the set of sensors, ns."""
+MODEL_FADE_NS = 1_000_000_000
+"""Fade time after a change of the models by online learning, ns."""
 HOLD_NS = 200_000_000
+"""Time for which the last orientation is held if no sensor has data, ns."""
 MINUTE_NS = 60_000_000_000
 HELD_RATE = 2.0
-"""How fast a held orientation goes out of date, rad/s: the RMS rate of a walking leg."""
+"""Growth of the standard deviation of a held orientation, rad/s: RMS angular rate of the leg in
+gait."""
 
 Inputs = dict[str, "Quaternion"]
-"""q_optical_segment by sensor: what each alive sensor alone says."""
+"""q_optical_segment by sensor: the segment orientation according to that sensor alone."""
 Names = tuple[str, ...]
 
 
-class Fused(NamedTuple):
-    """What is said of one segment in one frame."""
+class FusedSegment(NamedTuple):
+    """Orientation of one segment in one frame."""
 
     q: Quaternion | None
     sd: float | None
+    """Standard deviation per axis, rad."""
     used: tuple[str, ...]
+    """Sensors that contributed."""
     flags: tuple[str, ...]
     flexion_sd: float | None = None
-    """Standard deviation about the segment's x, rad, where its model tells the axes apart."""
-    doubt: float = 0.0
-    """Standard deviation per axis, rad, that who watches the sensors adds: `sd` has it already."""
+    """Standard deviation about the x axis of the segment, rad, if the model distinguishes axes."""
+    fault_sd: float = 0.0
+    """Standard deviation per axis caused by inconsistent sensors, rad; included in `sd`."""
 
 
 class SegmentFuser:
-    """Says a segment's orientation, frame by frame.
+    """Computes the orientation of one segment, frame by frame.
 
     Parameters
     ----------
     name : str
-        Of the segment; appears in flags.
+        Name of the segment, for flags.
     sensors : sequence of str
-        Its sensors, in the order in which the models were trained.
+        Sensors of the segment, in the order in which the models were trained.
     calibration : SegmentCalibration
-        Models by alive set.
+        Models by set of sensors.
     """
 
     def __init__(self, name: str, sensors: Sequence[str], calibration: SegmentCalibration) -> None:
         self._name, self._sensors = name, tuple(sensors)
         self._models = calibration.models
-        self._models_before: Mapping[str, SegmentModel] | None = None
+        self._replaced_models: Mapping[str, SegmentModel] | None = None
         self._chosen: dict[tuple[Names, Names], tuple[SegmentModel | None, Names]] = {}
-        """By sensors alive, here and on the neighbor: the model, and whom it looks at there."""
+        """Model and its neighbor sensors, by sensors with data on segment and neighbor."""
         self._use(self._models)
-        self._since_ns: int | None = None
+        self._calibrated_ns: int | None = None
         self._last: tuple[int, Quaternion, float] | None = None
         self._before: tuple[Names, Names, Inputs] | None = None
         self._fading: tuple[int, int, Vector] | None = None
+        """Start and length of the current fade, ns, and its initial rotation vector, rad."""
 
-    def take(self, models: Mapping[str, SegmentModel]) -> None:
-        """Go over to other models of the same sensors: what they say otherwise comes slowly."""
-        if self._models_before is None:
-            self._models_before = self._models
+    def replace_models(self, models: Mapping[str, SegmentModel]) -> None:
+        """Use other models of the same sensors; the output fades to them."""
+        if self._replaced_models is None:
+            self._replaced_models = self._models
         self._use(models)
 
-    def worn_since(self, t_ns: int) -> None:
-        """Count the wandering of headings from `t_ns` on, and not from the first frame."""
-        self._since_ns = t_ns
+    def set_calibration_time(self, t_ns: int) -> None:
+        """Set the instant from which heading uncertainty grows; default is the first frame."""
+        self._calibrated_ns = t_ns
 
     def _use(self, models: Mapping[str, SegmentModel]) -> None:
-        widest = max((m.residual_sd for m in models.values()), default=UNREFERENCED_SD)
-        self._models, self._untrained_sd = models, max(widest, FLOOR_SD)
+        largest = max((m.residual_sd for m in models.values()), default=UNREFERENCED_SD)
+        self._models, self._untrained_sd = models, max(largest, MIN_SD)
         self._chosen.clear()
 
-    def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> Fused:
-        """Say the orientation at `t_ns`.
+    def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> FusedSegment:
+        """Return the orientation at `t_ns`.
 
         Parameters
         ----------
+        t_ns : int
+            Instant of the frame.
         inputs : dict
-            q_optical_segment that each alive sensor of the limb says of its own segment.
+            q_optical_segment of all sensors of the limb with data, each of its own segment.
         neighbor : sequence of str
-            Sensors of the segment whose movement the models look at; the same ones every time.
+            Sensors of the segment that the models use as posture input; always the same.
         """
         before = self._before
         if before is not None and inputs.keys() == before[2].keys():
-            alive, near, _ = before  # as nearly always
+            alive, near, _ = before  # the usual case, without new tuples
         else:
-            alive, near = _heard(self._sensors, inputs), _heard(tuple(neighbor), inputs)
+            alive, near = _present(self._sensors, inputs), _present(tuple(neighbor), inputs)
         if not alive:
             return self._hold(t_ns)
-        if self._models_before is not None:
-            self._go_over(t_ns, alive, near, inputs)
-        said = self._say(alive, near, inputs)
-        self._note_change(t_ns, alive, near, inputs, said.q)
-        q = self._faded(t_ns, said.q)
-        if self._since_ns is None:
-            self._since_ns = t_ns
-        flexion_sd, sd = _claimed(said, (t_ns - self._since_ns) / MINUTE_NS)
+
+        if self._replaced_models is not None:
+            self._start_model_fade(t_ns, alive, near, inputs)
+        prediction = self._predict(alive, near, inputs)
+        self._start_fade(t_ns, alive, near, inputs, prediction.q)
+        q = self._faded(t_ns, prediction.q)
+
+        if self._calibrated_ns is None:
+            self._calibrated_ns = t_ns
+        flexion_sd, sd = _standard_deviations(prediction, (t_ns - self._calibrated_ns) / MINUTE_NS)
         self._last, self._before = (t_ns, q, sd), (alive, near, inputs)
-        return Fused(q, sd, alive, self._flags(alive, said.extrapolating), flexion_sd)
+        return FusedSegment(q, sd, alive, self._flags(alive, prediction.extrapolating), flexion_sd)
 
-    def _flags(self, alive: tuple[str, ...], outside: bool) -> tuple[str, ...]:
-        few = len(alive) == 1 and len(self._sensors) > 1
-        if not few and not outside:
+    def _flags(self, alive: tuple[str, ...], extrapolating: bool) -> tuple[str, ...]:
+        single = len(alive) == 1 and len(self._sensors) > 1
+        if not single and not extrapolating:
             return ()
-        flags = (f"one_sensor:{self._name}",) if few else ()
-        return (*flags, f"untrained:{self._name}") if outside else flags
+        flags = (f"one_sensor:{self._name}",) if single else ()
+        return (*flags, f"untrained:{self._name}") if extrapolating else flags
 
-    def _hold(self, t_ns: int) -> Fused:
+    def _hold(self, t_ns: int) -> FusedSegment:
         if self._last is None or t_ns - self._last[0] > HOLD_NS:
             self._before = self._fading = None
-            return Fused(None, None, (), (f"lost:{self._name}",))
-        since, q, sd = self._last
-        age_s = (t_ns - since) * 1e-9
-        wide = sqrt(sd * sd + (HELD_RATE * age_s) ** 2)
-        return Fused(q, wide, (), (f"held:{self._name}",))
+            return FusedSegment(None, None, (), (f"lost:{self._name}",))
+        last_ns, q, sd = self._last
+        age_s = (t_ns - last_ns) * 1e-9
+        held_sd = sqrt(sd * sd + (HELD_RATE * age_s) ** 2)
+        return FusedSegment(q, held_sd, (), (f"held:{self._name}",))
 
-    def _say(self, alive: Names, near: Names, inputs: Inputs) -> Prediction:
-        """Return what the model of this set says: with the neighbor, without, or the plain mean."""
+    def _predict(self, alive: Names, near: Names, inputs: Inputs) -> Prediction:
+        """Return the prediction of the chosen model, or the mean if there is none."""
         chosen = self._chosen.get((alive, near))
         if chosen is None:
             chosen = self._chosen[alive, near] = self._choose(alive, near)
@@ -154,28 +164,29 @@ class SegmentFuser:
         return model.predict_one(sensors, mean_one([inputs[s] for s in others]))
 
     def _choose(self, alive: Names, near: Names) -> tuple[SegmentModel | None, Names]:
-        """Return the model for a set, and which sensors of the neighbor it looks at."""
+        """Return the model for a set of sensors, and the neighbor sensors that it uses."""
         for others in (near, near[:1], ()):
             model = self._models.get(alive_key(alive, "+".join(others) or None))
             if model is not None:
                 return model, others
         return None, ()
 
-    def _go_over(self, t_ns: int, alive: Names, near: Names, inputs: Inputs) -> None:
-        """Begin to fade from what the models before would say of this frame."""
-        newer, older = self._models, self._models_before
-        self._models_before = None
-        if older is None or self._last is None or t_ns - self._last[0] > HOLD_NS:
+    def _start_model_fade(self, t_ns: int, alive: Names, near: Names, inputs: Inputs) -> None:
+        """Start a fade from the prediction of the replaced models to that of the new ones."""
+        new, old = self._models, self._replaced_models
+        self._replaced_models = None
+        if old is None or self._last is None or t_ns - self._last[0] > HOLD_NS:
             return
-        self._use(older)
-        said = self._say(alive, near, inputs).q
-        self._note_change(t_ns, alive, near, inputs, said)
-        old = self._faded(t_ns, said)
-        self._use(newer)
-        offset = turn_one(self._say(alive, near, inputs).q, old)
-        self._fading, self._before = (t_ns, LEARNED_NS, offset), (alive, near, inputs)
 
-    def _note_change(
+        self._use(old)
+        prediction = self._predict(alive, near, inputs).q
+        self._start_fade(t_ns, alive, near, inputs, prediction)
+        output = self._faded(t_ns, prediction)
+        self._use(new)
+        offset = turn_one(self._predict(alive, near, inputs).q, output)
+        self._fading, self._before = (t_ns, MODEL_FADE_NS, offset), (alive, near, inputs)
+
+    def _start_fade(
         self,
         t_ns: int,
         alive: Names,
@@ -183,61 +194,63 @@ class SegmentFuser:
         inputs: Inputs,
         target: Quaternion,
     ) -> None:
-        """Begin to fade when the set alive is another than in the frame before."""
+        """Start a fade if the set of sensors differs from that of the frame before."""
         if self._last is None or t_ns - self._last[0] > HOLD_NS or self._before is None:
             self._fading = None
             return
-        was_alive, was_near, was_inputs = self._before
-        if (alive, near) == (was_alive, was_near):
+        old_alive, old_near, old_inputs = self._before
+        if (alive, near) == (old_alive, old_near):
             return
-        if all(s in inputs for s in (*was_alive, *was_near)):
-            # the old set still speaks: what would it have said now?
-            old = self._faded(t_ns, self._say(was_alive, was_near, inputs).q)
+
+        if all(s in inputs for s in (*old_alive, *old_near)):
+            # The old sensors still have data: compare both sets in this frame.
+            old = self._faded(t_ns, self._predict(old_alive, old_near, inputs).q)
             offset = turn_one(target, old)
-        elif all(s in was_inputs for s in (*alive, *near)):
-            # the new set spoke before: what would it have said then?
-            then = self._say(alive, near, was_inputs).q
-            offset = turn_one(then, self._last[1])
+        elif all(s in old_inputs for s in (*alive, *near)):
+            # The new sensors had data before: compare both sets in the frame before.
+            new = self._predict(alive, near, old_inputs).q
+            offset = turn_one(new, self._last[1])
         else:
             offset = turn_one(target, self._last[1])
-        self._fading = (t_ns, BLEND_NS, offset)
+        self._fading = (t_ns, FADE_NS, offset)
 
     def _faded(self, t_ns: int, target: Quaternion) -> Quaternion:
         if self._fading is None:
             return target
-        began, length, (x, y, z) = self._fading
-        left = 1.0 - (t_ns - began) / length
+        start_ns, length_ns, (x, y, z) = self._fading
+        left = 1.0 - (t_ns - start_ns) / length_ns
         if left <= 0.0:
             self._fading = None
             return target
         return turned_one(target, (left * x, left * y, left * z))
 
 
-def _heard(names: Names, inputs: Inputs) -> Names:
-    """Return those who say something: mostly all, and then nothing is made anew."""
+def _present(names: Names, inputs: Inputs) -> Names:
+    """Return the sensors with data; usually all, and then the given tuple."""
     for name in names:
         if name not in inputs:
             return tuple([s for s in names if s in inputs])
     return names
 
 
-def _claimed(said: Prediction, minutes: float) -> tuple[float | None, float]:
-    """Return the standard deviations about x and overall, with what no training can show.
+def _standard_deviations(prediction: Prediction, minutes: float) -> tuple[float | None, float]:
+    r"""Return the standard deviations about x and per axis, including heading uncertainty, rad.
 
-    A heading wanders about the vertical, one axis of three; `minutes` is the age of the
-    calibration with its static pose.
+    .. math:: \sigma^2 = \sigma_{model}^2 + \tfrac13 (\sigma_h^2 + w^2 t)
+
+    Heading is one axis of three. `minutes` is the time since the static pose.
     """
-    sd = max(said.sd, FLOOR_SD)
-    heading = _HEADING_VAR + _WANDER_VAR * max(minutes, 0.0)
+    sd = max(prediction.sd, MIN_SD)
+    heading = _HEADING_VAR + _WALK_VAR * max(minutes, 0.0)
     sd = sqrt(sd * sd + heading / 3.0)
-    return None if said.axis_sd is None else max(said.axis_sd[0], FLOOR_SD), sd
+    return None if prediction.axis_sd is None else max(prediction.axis_sd[0], MIN_SD), sd
 
 
 def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:
-    """Return the mean of a few orientations that lie within 90° of each other, equal weights.
+    """Return the mean of orientations within 90° of each other, with equal weights.
 
-    Sum of the quaternions on the first one's side, normalised: for two it is the eigenvector mean
-    (Markley et al. 2007) exactly, for more it differs in the third order of their distances.
+    Normalized sum of the quaternions with the sign of the first. For two it equals the eigenvector
+    mean of Markley et al. (2007); for more it differs in third order of their distances.
     """
     w, x, y, z = a, b, c, d = orientations[0]
     for p, i, j, k in orientations[1:]:

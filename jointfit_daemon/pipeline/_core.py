@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.config import drifting, headings
-from jointfit_daemon.fusion import LimbFuser, SensorWatch
+from jointfit_daemon.fusion import LimbFuser, SensorMonitor
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
 from jointfit_daemon.pipeline._health import health_of
@@ -72,7 +72,7 @@ class Core:
         self._grid: FrameGrid | None = None
         self._aligner: FrameAligner
         self._fuser: LimbFuser
-        self._watch: SensorWatch | None = None
+        self._watch: SensorMonitor | None = None
         self._lag_ns: dict[str, int] = {}
         self._lags: LagWatch | None = None
         self._learner: OnlineLearner
@@ -154,13 +154,13 @@ class Core:
             self._grid.follow(rig)
         self._aligner = self._grid.aligner
         if before is None or before.chain != rig.chain:
-            self._watch = SensorWatch(rig.chain)
+            self._watch = SensorMonitor(rig.chain)
         self._session = session
         fuser = None if before is None else self._fuser
         self._use_calibration()
-        self._fuser.worn_since(event.t_ns - round(event.calibration_age_s * 1e9))
+        self._fuser.set_calibration_time(event.t_ns - round(event.calibration_age_s * 1e9))
         if fuser is not None:
-            self._fuser.take_over(fuser)
+            self._fuser.resume(fuser)
         if (doubt := headings(rig.sources)) is not None:
             outputs.append(Notice(event.t_ns, "device", rig.name, doubt, "warning"))
         text = "stored calibration loaded" if event.calibration else "no calibration stored yet"
@@ -292,7 +292,7 @@ class Core:
             outputs += [] if fresh is None else self._session.learn(fresh)
             outputs += self._learner.notices(now_ns)
         outputs += self._bulletin.due(now_ns)
-        if news := self._fuser.news(now_ns):
+        if news := self._fuser.pop_reports(now_ns):
             outputs += sensor_notices(now_ns, news)
         return outputs
 
@@ -335,7 +335,7 @@ class Core:
         """Go on with what is in force now, if it is another."""
         after = self._session.calibration
         if before and after and after is not before and models_only(before, after):
-            self._fuser.take_models(after)
+            self._fuser.replace_models(after)
         elif after is not before:
             self._use_calibration()
 

@@ -38,11 +38,11 @@ def health_of(
             verdicts = _mocap(state, verdicts)
         devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state), **_filter(state)}
         if state.source.kind == "imu":
-            devices[name]["sensor"] = fuser.watch.health(name)
+            devices[name]["sensor"] = fuser.sensor_monitor.state(name)
     return {
         "devices": devices,
         "calibration": {"phase": session.phase, "version": session.version},
-        "fusion": {} if fuser.links is None else fuser.links.health(),
+        "fusion": {} if fuser.consistency is None else fuser.consistency.health(),
     }
 
 

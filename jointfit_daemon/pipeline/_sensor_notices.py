@@ -9,10 +9,10 @@ from jointfit_daemon.pipeline.events import Notice
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from jointfit_daemon.fusion.faults import SensorNews
+    from jointfit_daemon.fusion.faults import SensorReport
 
 
-def sensor_notices(now_ns: int, news: Iterable[SensorNews]) -> list[Notice]:
+def sensor_notices(now_ns: int, news: Iterable[SensorReport]) -> list[Notice]:
     """Return one notice for each change, its new state under ``data.state``."""
     return [
         Notice(now_ns, "sensor", one.id, one.text, one.level, {"state": one.state, **one.data})

@@ -1,4 +1,4 @@
-"""A synthetic wearer, calibrated as the daemon would, for tests of fusion."""
+"""A synthetic subject with a full calibration, for tests of fusion."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def calibrated(subject: Subject, chain: Chain = CHAIN) -> Calibration:
-    """Return what the align phase, a static pose and half a minute of movement give."""
+    """Return the calibration from align phase, static pose and 30 s of movement."""
     static, functional, _ = static_and_functional(subject, 30.0)
     alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
     return fit_calibration(static, functional, alignment, SETTINGS, chain)

@@ -1,4 +1,4 @@
-"""Rates of angles are those of the angles, and are not made up where there are none."""
+"""Rates of joint angles, and when they are unknown."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def angles(*found: float) -> JointAngles:
 
 
 @pytest.mark.parametrize("step_ms", [2, 10, 20, 50])
-def test_a_swing_has_the_rate_of_25_milliseconds_ago_or_half_a_frame(step_ms: int) -> None:
+def test_rate_is_that_of_25_ms_or_half_a_frame_ago(step_ms: int) -> None:
     follower, off = AngleRates(), []
     late_s = max(25, step_ms / 2) * 1e-3
     for t_ms in range(0, 2000, step_ms):
         t_s = t_ms * 1e-3
-        found = follower.rates(
+        found = follower.update(
             t_ms * MS,
             "knee",
             angles(np.sin(3 * t_s), 0.2 * np.sin(3 * t_s), -0.5 * t_s),
@@ -35,19 +35,19 @@ def test_a_swing_has_the_rate_of_25_milliseconds_ago_or_half_a_frame(step_ms: in
     assert np.max(np.abs(off)) < 0.1
 
 
-def test_flexion_and_rotation_run_through_half_a_turn() -> None:
+def test_rates_are_continuous_across_half_a_turn() -> None:
     follower = AngleRates()
-    follower.rates(0, "knee", angles(np.pi - 0.01, 0.0, -np.pi + 0.02), gimbal=False)
-    found = follower.rates(10 * MS, "knee", angles(-np.pi + 0.01, 0.0, np.pi - 0.02), gimbal=False)
+    follower.update(0, "knee", angles(np.pi - 0.01, 0.0, -np.pi + 0.02), gimbal=False)
+    found = follower.update(10 * MS, "knee", angles(-np.pi + 0.01, 0.0, np.pi - 0.02), gimbal=False)
     assert found == pytest.approx((2.0, 0.0, -4.0))
 
 
-def test_the_first_frame_a_gap_a_lock_and_an_unknown_joint_have_no_rate() -> None:
+def test_rate_is_unknown_at_start_gap_gimbal_lock_and_unknown_angle() -> None:
     follower = AngleRates()
-    assert follower.rates(0, "knee", angles(0.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(200 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(210 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=True) is None
-    assert follower.rates(220 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(230 * MS, "knee", None, gimbal=False) is None
-    assert follower.rates(240 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
-    assert follower.rates(250 * MS, "knee", angles(1.01, 0.0, 0.0), gimbal=False) is not None
+    assert follower.update(0, "knee", angles(0.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.update(200 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.update(210 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=True) is None
+    assert follower.update(220 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.update(230 * MS, "knee", None, gimbal=False) is None
+    assert follower.update(240 * MS, "knee", angles(1.0, 0.0, 0.0), gimbal=False) is None
+    assert follower.update(250 * MS, "knee", angles(1.01, 0.0, 0.0), gimbal=False) is not None

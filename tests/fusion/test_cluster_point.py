@@ -1,4 +1,4 @@
-"""One frame's fit against the fit of whole trials, which is written another way."""
+"""The fit of one frame against the independent fit of a whole trial."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.fusion._cluster_point import CarriedPoint
+from jointfit_daemon.fusion._cluster_point import ClusterPoint
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import MAX_FIT_RMS_M, Cluster, rigid_fit
 from jointfit_daemon.model import MocapFrame, MocapLayout
@@ -36,7 +36,7 @@ def seen(positions: np.ndarray) -> MocapFrame:
     st.sampled_from([1.0, 0.001, 0.0]),
     st.sampled_from([0.0, 0.002, 0.02, 0.2]),
 )
-def test_it_finds_what_the_fit_of_trials_finds(
+def test_point_agrees_with_the_fit_of_a_trial(
     seed: int, hidden: list[bool], thickness: float, scatter: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -45,7 +45,7 @@ def test_it_finds_what_the_fit_of_trials_finds(
     positions = turn.apply(template) + rng.normal(size=3) + rng.normal(0, scatter, (5, 3))
     positions[hidden] = np.nan
     part = cluster(template)
-    found = CarriedPoint(part, POINT, LAYOUT).locate(seen(positions))
+    found = ClusterPoint(part, POINT, LAYOUT).locate(seen(positions))
     q, t, rms = (each[0] for each in rigid_fit(template, positions[None]))
     if not rms <= MAX_FIT_RMS_M:
         assert found is None
@@ -54,10 +54,10 @@ def test_it_finds_what_the_fit_of_trials_finds(
         np.testing.assert_allclose(found, rotation.rotate(q, POINT - part.origin) + t, atol=1e-6)
 
 
-def test_a_rigid_body_carries_the_point_from_where_it_stood() -> None:
+def test_rigid_body_moves_the_point() -> None:
     part = cluster(np.eye(3), body="Pelvis")
     frame = seen(np.zeros((5, 3)))
-    point = CarriedPoint(part, POINT, LAYOUT)
+    point = ClusterPoint(part, POINT, LAYOUT)
     assert point.locate(frame) is None
     frame.body_positions[1], frame.body_orientations[1] = part.origin, part.q_body
     assert point.locate(frame) == pytest.approx(tuple(POINT))
@@ -68,8 +68,8 @@ def test_a_rigid_body_carries_the_point_from_where_it_stood() -> None:
     assert point.locate(frame) == pytest.approx(tuple(expected))
 
 
-def test_a_stream_without_the_markers_or_the_body_locates_nothing() -> None:
+def test_stream_without_markers_or_body_gives_none() -> None:
     frame = seen(np.zeros((5, 3)))
     bare = MocapLayout(NAMES[:-1], ("other",))
     for part in (cluster(np.eye(5, 3)), cluster(np.eye(3), body="Pelvis")):
-        assert CarriedPoint(part, POINT, bare).locate(frame) is None
+        assert ClusterPoint(part, POINT, bare).locate(frame) is None

@@ -1,4 +1,4 @@
-"""Positions, angles and deviations of one frame against Monte-Carlo; blending step by step."""
+"""Forward kinematics against Monte-Carlo simulation; fading after a change of sensors."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.fusion._forward_kinematics import Reach, joint_positions, read_angles
-from jointfit_daemon.fusion._segment_fuser import Fused, SegmentFuser, mean_one
+from jointfit_daemon.fusion._forward_kinematics import SegmentLength, joint_positions, joint_angle_estimate
+from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser, mean_one
 from jointfit_daemon.limb_model import MeanModel, SegmentCalibration, alive_key
 
 if TYPE_CHECKING:
@@ -25,15 +25,15 @@ def about_x(degrees: float) -> Quaternion:
     return (float(np.cos(half)), float(np.sin(half)), 0.0, 0.0)
 
 
-def fused(r: Rotation, sd: float) -> Fused:
+def fused(r: Rotation, sd: float) -> FusedSegment:
     w, x, y, z = r.as_quat(scalar_first=True).tolist()
-    return Fused((w, x, y, z), sd, (), ())
+    return FusedSegment((w, x, y, z), sd, (), ())
 
 
-def test_position_deviations_are_those_of_random_errors() -> None:
+def test_position_standard_deviations_match_monte_carlo() -> None:
     rng = np.random.default_rng(0)
     bones = [Rotation.from_rotvec([0.4, 0.1, -0.2]), Rotation.from_rotvec([-0.9, 0.2, 0.3])]
-    sds, reaches = (0.03, 0.05), [Reach(0.42, 0.006), Reach(0.4, 0.01)]
+    sds, reaches = (0.03, 0.05), [SegmentLength(0.42, 0.006), SegmentLength(0.4, 0.01)]
     places = joint_positions(
         (0.1, 0.2, 0.9), [fused(r, sd) for r, sd in zip(bones, sds, strict=True)], reaches
     )
@@ -49,11 +49,11 @@ def test_position_deviations_are_those_of_random_errors() -> None:
         assert variance == pytest.approx(at.var(axis=0).mean(), rel=0.03)
 
 
-def test_flexion_deviation_is_that_of_random_errors() -> None:
+def test_flexion_standard_deviation_matches_monte_carlo() -> None:
     rng = np.random.default_rng(1)
     above, joint = Rotation.random(random_state=rng), Rotation.from_euler("XYZ", [-0.9, 0.5, 0.2])
     below, n = above * joint, 40_000
-    state = read_angles(fused(above, 0.02), fused(below, 0.03), sign=-1.0, left=False)
+    state = joint_angle_estimate(fused(above, 0.02), fused(below, 0.03), sign=-1.0, left=False)
     assert state is not None
     assert state.angles == pytest.approx((0.9, 0.5, 0.2))
     noisy = [
@@ -64,24 +64,26 @@ def test_flexion_deviation_is_that_of_random_errors() -> None:
     assert state.flexion_sd == pytest.approx(flexion.std(), rel=0.03)
 
 
-def test_a_left_limb_reads_like_a_right_one_and_locked_axes_are_said() -> None:
+def test_left_limb_mirrors_the_right_and_gimbal_lock_is_flagged() -> None:
     right = Rotation.from_euler("XYZ", [0.3, 0.2, 0.1])
     left = Rotation.from_euler("XYZ", [0.3, -0.2, -0.1])
     rest = fused(Rotation.identity(), 0.01)
-    a = read_angles(rest, fused(right, 0.01), sign=1.0, left=False)
-    b = read_angles(rest, fused(left, 0.01), sign=1.0, left=True)
+    a = joint_angle_estimate(rest, fused(right, 0.01), sign=1.0, left=False)
+    b = joint_angle_estimate(rest, fused(left, 0.01), sign=1.0, left=True)
     assert a is not None
     assert b is not None
     assert a.angles == pytest.approx(b.angles)
-    locked = read_angles(
+    locked = joint_angle_estimate(
         rest, fused(Rotation.from_euler("XYZ", [0.3, np.pi / 2, 0.1]), 0.01), sign=1.0, left=False
     )
     assert locked is not None
     assert (locked.gimbal, locked.flexion_sd) == (True, None)
-    assert read_angles(rest, Fused(None, None, (), ()), sign=1.0, left=False) is None
+    assert (
+        joint_angle_estimate(rest, FusedSegment(None, None, (), ()), sign=1.0, left=False) is None
+    )
 
 
-def test_a_swap_between_strangers_fades_over_a_quarter_second() -> None:
+def test_exchange_of_all_sensors_fades_over_250_ms() -> None:
     models = {alive_key((s,), None): MeanModel((1.0,), 0.05) for s in ("A", "B")}
     fuser = SegmentFuser("thigh", ("A", "B"), SegmentCalibration(REST, None, None, models))
     assert fuser.fuse(0, {"A": REST}, ()).q == REST
@@ -92,7 +94,7 @@ def test_a_swap_between_strangers_fades_over_a_quarter_second() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(2, 4))
-def test_the_quick_mean_is_the_eigenvector_mean_and_blind_to_signs(seed: int, count: int) -> None:
+def test_mean_equals_the_eigenvector_mean_for_any_signs(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     center = Rotation.random(random_state=rng)
     q = (center * Rotation.from_rotvec(rng.normal(0, 0.1, (count, 3)))).as_quat(scalar_first=True)

@@ -1,4 +1,4 @@
-"""Three segments with three, two and one sensors: calibrated, followed, and hurt."""
+"""Chain of three segments with three, two and one sensors: calibration, fusion and faults."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def play(fuser: LimbFuser, frames: Frames) -> list[LimbState]:
     return [fuser.fuse(t, t, k, said) for k, (t, said) in enumerate(frames)]
 
 
-def test_angles_rates_and_positions_of_all_joints_follow_the_bones(
+def test_angles_rates_and_positions_agree_with_ground_truth(
     fuser: LimbFuser, walk: tuple[Motion, Frames]
 ) -> None:
     moving, frames = walk
@@ -89,7 +89,7 @@ def test_angles_rates_and_positions_of_all_joints_follow_the_bones(
     assert last.flags == ()
 
 
-def test_any_sensor_of_a_segment_may_go_and_the_odd_one_of_three_is_known(
+def test_sensor_loss_and_slip_on_three_sensors(
     fuser: LimbFuser, walk: tuple[Motion, Frames]
 ) -> None:
     frames = walk[1]

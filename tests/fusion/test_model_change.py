@@ -1,4 +1,4 @@
-"""Models that were learned while running take over without a jump."""
+"""Models from online learning replace those in use without a jump."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MS = 1_000_000
 STEP_NS = 10 * MS
 HELD = moving(40, 1.2, 1)
 ROW = 25
-"""A far bend, where old and new models differ most."""
+"""A row with large flexion, where old and new models differ most."""
 
 
 @cache
@@ -34,9 +34,9 @@ def learned() -> Calibration:
     return replace(old, segment=segments)
 
 
-def said(fuser: LimbFuser, k: int, *, without: str = "") -> LimbState:
-    heard = {n: as_quaternion(q[ROW].tolist()) for n, q in HELD.sensors.items() if n != without}
-    return fuser.fuse(k * STEP_NS, k * STEP_NS, k, heard)
+def fuse(fuser: LimbFuser, k: int, *, without: str = "") -> LimbState:
+    measured = {n: as_quaternion(q[ROW].tolist()) for n, q in HELD.sensors.items() if n != without}
+    return fuser.fuse(k * STEP_NS, k * STEP_NS, k, measured)
 
 
 def thigh(state: LimbState) -> Quaternion:
@@ -45,36 +45,36 @@ def thigh(state: LimbState) -> Quaternion:
     return q
 
 
-def test_the_difference_comes_within_a_second_and_never_at_once() -> None:
+def test_new_models_fade_in_within_a_second() -> None:
     fuser = LimbFuser(CHAIN, calibration())
-    states = [said(fuser, k) for k in range(10)]
-    fuser.take_models(learned())
-    states += [said(fuser, k) for k in range(10, 130)]
+    states = [fuse(fuser, k) for k in range(10)]
+    fuser.replace_models(learned())
+    states += [fuse(fuser, k) for k in range(10, 130)]
     steps = [angle_between_one(thigh(a), thigh(b)) for a, b in pairwise(states)]
     whole = angle_between_one(thigh(states[0]), thigh(states[-1]))
     assert whole > np.deg2rad(0.5)  # there is something to fade
     assert max(steps) < 0.012 * whole
     fresh_start = LimbFuser(CHAIN, learned())
-    assert angle_between_one(thigh(said(fresh_start, 0)), thigh(states[-1])) < 1e-9
+    assert angle_between_one(thigh(fuse(fresh_start, 0)), thigh(states[-1])) < 1e-9
 
 
 @pytest.mark.parametrize("first", [False, True])
-def test_a_sensor_lost_in_the_same_moment_makes_no_jump_either(first: bool) -> None:
+def test_sensor_loss_during_the_model_change_causes_no_jump(first: bool) -> None:
     fuser, plain = LimbFuser(CHAIN, calibration()), LimbFuser(CHAIN, calibration())
-    last = said(plain, 0)
+    last = fuse(plain, 0)
     for k in range(10):
-        said(fuser, k)
-        last = said(plain, k)
-    fuser.take_models(learned())
+        fuse(fuser, k)
+        last = fuse(plain, k)
+    fuser.replace_models(learned())
     if first:
-        said(fuser, 10)
-        said(plain, 10)
-    now = said(fuser, 11, without="S2")
+        fuse(fuser, 10)
+        fuse(plain, 10)
+    now = fuse(fuser, 11, without="S2")
     assert angle_between_one(thigh(now), thigh(last)) < np.deg2rad(0.5)
 
 
-def test_models_taken_before_the_first_frame_are_just_used() -> None:
+def test_models_replaced_before_the_first_frame_apply_at_once() -> None:
     fuser = LimbFuser(CHAIN, calibration())
-    fuser.take_models(learned())
-    right = thigh(said(LimbFuser(CHAIN, learned()), 0))
-    assert angle_between_one(thigh(said(fuser, 0)), right) < 1e-12
+    fuser.replace_models(learned())
+    right = thigh(fuse(LimbFuser(CHAIN, learned()), 0))
+    assert angle_between_one(thigh(fuse(fuser, 0)), right) < 1e-12

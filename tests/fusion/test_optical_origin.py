@@ -1,4 +1,4 @@
-"""O1 from the markers beside it, one camera frame at a time."""
+"""Position of O1 in single mocap frames."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def frames() -> tuple[list[MocapFrame], np.ndarray]:
     return rows, hips
 
 
-def test_the_hip_is_where_it_is(calibration: Calibration) -> None:
+def test_hip_is_located(calibration: Calibration) -> None:
     finder, (rows, hips) = OpticalOrigin(CHAIN, calibration), frames()
     found = np.array([finder.locate(frame) for frame in rows[::20]], dtype=float)
     assert np.sqrt(((found - hips[::20]) ** 2).sum(axis=1).mean()) < 0.006
 
 
-def test_without_the_pelvis_the_thigh_serves_and_without_both_nothing(
+def test_thigh_replaces_the_pelvis_and_without_both_the_origin_is_unknown(
     calibration: Calibration,
 ) -> None:
     finder, (rows, hips) = OpticalOrigin(CHAIN, calibration), frames()
@@ -65,7 +65,7 @@ def test_without_the_pelvis_the_thigh_serves_and_without_both_nothing(
     assert finder.locate(replace(frame, markers=markers)) is None
 
 
-def test_an_unknown_joint_or_stream_locates_nothing(calibration: Calibration) -> None:
+def test_unknown_joint_or_stream_gives_none(calibration: Calibration) -> None:
     frame = frames()[0][0]
     assert OpticalOrigin(CHAIN, None).locate(frame) is None
     unknown = {**calibration.joint, "hip": JointCalibration(None, None, "unknown")}

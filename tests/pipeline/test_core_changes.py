@@ -196,7 +196,7 @@ def test_a_calibration_of_yesterday_is_claimed_with_a_heading_of_yesterday() -> 
 def test_a_reload_goes_on_with_the_same_watch_of_a_limb_that_is_worn_alike() -> None:
     worn = {"S1": "thigh", "S2": "thigh", "S3": "shank"}
     bench, calibration = calibrated_by_standing(shaped(worn))
-    watched = bench.core._fuser.links
+    watched = bench.core._fuser.consistency
     assert watched is not None
     bench.feed(
         [
@@ -207,7 +207,7 @@ def test_a_reload_goes_on_with_the_same_watch_of_a_limb_that_is_worn_alike() -> 
             )
         ]
     )
-    assert bench.core._fuser.links is watched
+    assert bench.core._fuser.consistency is watched
 
 
 def reconnected(after: Iterable[Event]) -> tuple[Bench, list[Notice]]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.fusion import SensorNews
+    from jointfit_daemon.fusion import SensorReport
     from jointfit_daemon.limb_model import Calibration
 
 SEEDS = (1, 2, 5, 6, 7, 8)
@@ -61,7 +61,7 @@ def fuser_of(calibration: Calibration) -> LimbFuser:
 def _cases(
     seeds: tuple[int, ...],
     spoil: Callable[[faulty_wearer.Worn, str, float, int], faulty_wearer.Worn],
-) -> Iterator[tuple[float, str, list[tuple[float, SensorNews]], Array]]:
+) -> Iterator[tuple[float, str, list[tuple[float, SensorReport]], Array]]:
     """Yield, for every person and sensor: when the fault began, who, what was told, jumps."""
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, FAULT_S, RATE_HZ)
@@ -195,7 +195,7 @@ def _drifted(seeds: tuple[int, ...], names: tuple[str, ...], rate: float) -> tup
         for watched, found in squares.items():
             fuser = fuser_of(calibration)
             if not watched:
-                fuser.links = None
+                fuser.consistency = None
             states, _ = faulty_wearer.play(fuser, person)
             found.append(float(np.mean(faulty_wearer.joint_errors(states, person)[late] ** 2)))
     left, taken = (float(np.rad2deg(np.sqrt(np.mean(squares[key])))) for key in (False, True))

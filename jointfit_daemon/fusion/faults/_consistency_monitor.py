@@ -1,14 +1,19 @@
-"""Sensors against each other: who slipped, and whose heading drifts.
+"""Consistency of the sensors of a limb: slip, magnetic disturbance and heading drift.
 
-Law: pure, O(1) a frame; looks at the links that calibration learnt, 25 times a second.
+Twenty-five times a second the monitor compares the sensors with the links of the calibration:
 
-A difference that comes within seconds is a slip, or iron nearby if it turns about the vertical; one
-that takes minutes and does is drift. Turns about the vertical are taken out of the sensors before
-anything else looks at them. Only differences can be seen: what all sensors have in common is left
-alone, so the drifts of the segments, and of the sensors of each, have the mean 0.
+* pairs on one segment (:mod:`jointfit_daemon.fusion.faults._slip`),
+* pairs across a hinge (:mod:`jointfit_daemon.fusion.faults._joint_heading`).
 
-A pair that lies further apart than skin moves it is brought together as far as that, either sensor
-by the same: what calibration learnt of skin says nothing of a sensor that slipped.
+A difference within seconds is a slip, or a magnetic disturbance if it is about the vertical. A
+difference about the vertical that grows over minutes is heading drift. Heading errors are removed
+from the sensors before fusion. Only differences are observable, so the drifts of the segments, and
+of the sensors of each segment, have the mean 0.
+
+Pairs with a larger difference than soft tissue causes are brought back to the usual difference,
+each sensor by the same share: the soft-tissue model does not hold for a sensor that slipped.
+
+Invariant: the cost per frame is O(1).
 """
 
 from __future__ import annotations
@@ -17,349 +22,392 @@ from itertools import combinations
 from math import cos, degrees, hypot, radians, sin, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.fusion.faults._fault_reports import drift_told, pair_told, turn_told
-from jointfit_daemon.fusion.faults._heading_drift import HeadingDrift
-from jointfit_daemon.fusion.faults._joint_heading import JointWatch
-from jointfit_daemon.fusion.faults._magnetic_disturbance import Look, SuddenTurns
-from jointfit_daemon.fusion.faults._slip import PairWatch, together, untrained
+from jointfit_daemon.fusion.faults._fault_reports import drift_report, slip_report, heading_report
+from jointfit_daemon.fusion.faults._heading_drift import HeadingDriftFilter
+from jointfit_daemon.fusion.faults._joint_heading import JointHeadingMonitor
+from jointfit_daemon.fusion.faults._magnetic_disturbance import HeadingDifference, MagneticDisturbanceDetector
+from jointfit_daemon.fusion.faults._slip import SlipDetector, pair_corrections, untrained_link
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.limb_model import axis_heading_one, up_one
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from jointfit_daemon.fusion.faults._sensor_monitor import SensorNews
+    from jointfit_daemon.fusion.faults._sensor_monitor import SensorReport
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
     Inputs = dict[str, Quaternion]
 
-LOOK_NS = 39_000_000
-SEEN_DRIFT = radians(0.2)
-"""Headings are corrected from this on."""
-TOLD_DRIFT = radians(5.0)
+UPDATE_NS = 39_000_000
+"""Interval of the comparisons, ns: 25 a second with frames at 100 Hz."""
+MIN_DRIFT = radians(0.2)
+"""Smallest heading drift that is corrected, rad."""
+REPORTED_DRIFT = radians(5.0)
+"""Heading drift that is reported, rad."""
 MAJORITY = 3
-"""Of fewer sensors on a segment nobody can tell which one slipped."""
+"""Fewest sensors on a segment among which a slipped one can be identified."""
 
 
-class Doubt(NamedTuple):
-    """What to make of the segments in this frame."""
+class ConsistencyResult(NamedTuple):
+    """Result of the comparisons of one frame."""
 
     spread: tuple[float, ...]
-    """Standard deviation to add, per axis, by segment, rad."""
+    """Standard deviation to add to each segment, per axis, rad."""
     slipped: frozenset[str]
-    """Sensors that contradict all others of their segment: not to be used."""
+    """Sensors that contradict all others of their segment: excluded from fusion."""
     flags: tuple[str, ...]
 
 
-class LinkWatch:
-    """Watches the links of one calibrated limb.
+class ConsistencyMonitor:
+    """Compares the sensors of one calibrated limb with each other.
 
     Parameters
     ----------
     chain : Chain
-        Who sits where.
+        Sensors by segment.
     calibration : Calibration
-        What was learnt of the links.
+        Its links predict the relations between sensors.
     drifting : collection of str
-        Sensors that are known to have no north: where nobody looks at their headings, the
-        deviation grows without end. Of the others it is not known, and taken to be bounded.
+        Sensors without heading reference. Where no hinge shows their headings, the standard
+        deviation grows without limit; for other sensors the drift is assumed to be bounded.
     """
 
     def __init__(
         self, chain: Chain, calibration: Calibration, drifting: Collection[str] = ()
     ) -> None:
         self._chain = chain
-        known = {(link.a, link.b): link for link in calibration.links}
+        links = {(link.a, link.b): link for link in calibration.links}
         self._pairs = [
-            [PairWatch(known.get((a, b)) or untrained(a, b)) for a, b in combinations(group, 2)]
+            [
+                SlipDetector(links.get((a, b)) or untrained_link(a, b))
+                for a, b in combinations(group, 2)
+            ]
             for group in chain.sensors
         ]
-        self._within = {
-            (pair.link.a, pair.link.b): HeadingDrift(pair.link.spread)
+        self._pair_drifts = {
+            (pair.link.a, pair.link.b): HeadingDriftFilter(pair.link.spread)
             for pairs in self._pairs
             for pair in pairs
-            if (pair.link.a, pair.link.b) in known
+            if (pair.link.a, pair.link.b) in links
         }
         self._joints = [
-            JointWatch(
-                [known[a, b] for a in above for b in below if (a, b) in known],
-                _standing(calibration, chain.segments[i], chain.segments[i + 1]),
+            JointHeadingMonitor(
+                [links[a, b] for a in above for b in below if (a, b) in links],
+                _static_heading(calibration, chain.segments[i], chain.segments[i + 1]),
                 drifts=any(name in drifting for name in (*above, *below)),
             )
             for i, (above, below) in enumerate(zip(chain.sensors, chain.sensors[1:], strict=False))
         ]
-        everyone = [name for group in chain.sensors for name in group]
-        self._common = HeadingDrift(0.0) if any(name in drifting for name in everyone) else None
-        self._turns: dict[str, float] = dict.fromkeys(calibration.sensor, 0.0)
-        """Heading errors that are taken out of the sensors, rad."""
-        self._along = [0.0] * len(chain.segments)
-        """The part of them that all sensors of a segment have in common, rad."""
-        self._backs: dict[str, tuple[float, float]] = {}
-        """cos and sin of half the turn back, of sensors that are corrected."""
-        self._sudden = SuddenTurns(chain.sensors)
-        self._before = {name: group[:k] for group in chain.sensors for k, name in enumerate(group)}
-        """Sensors of the same segment that stand before each."""
-        self._moves: dict[str, Quaternion] = {}
-        """Turns in the segment's axes that bring pairs together."""
-        self._quiet = [True] * len(chain.segments)
-        """By segment, whether no pair there contradicts itself."""
-        self._calm_all = True
+
+        sensors = [name for group in chain.sensors for name in group]
+        self._common = None
+        if any(name in drifting for name in sensors):
+            self._common = HeadingDriftFilter(0.0)
+        self._sensor_drift: dict[str, float] = dict.fromkeys(calibration.sensor, 0.0)
+        """Heading drift that is removed from each sensor, rad."""
+        self._segment_drift = [0.0] * len(chain.segments)
+        """Part of it that is common to all sensors of a segment, rad."""
+        self._half_turns: dict[str, tuple[float, float]] = {}
+        """cos and sin of half the heading correction, for corrected sensors."""
+        self._disturbances = MagneticDisturbanceDetector(chain.sensors)
+        self._preceding = {
+            name: group[:k] for group in chain.sensors for k, name in enumerate(group)
+        }
+        """Sensors of the same segment listed before each sensor."""
+        self._corrections: dict[str, Quaternion] = {}
+        """Rotations in segment axes that reduce the differences of pairs."""
+        self._consistent = [True] * len(chain.segments)
+        """By segment, whether all pairs are consistent."""
+        self._all_consistent = True
         self._next_ns = 0
-        self._calm = Doubt((0.0,) * len(chain.segments), frozenset(), ())
-        self._doubt = self._calm
-        self._news: list[SensorNews] = []
-        self._told_drift: set[int] = set()
+        self._no_fault = ConsistencyResult((0.0,) * len(chain.segments), frozenset(), ())
+        self._result = self._no_fault
+        self._reports: list[SensorReport] = []
+        self._reported_drifts: set[int] = set()
 
     # --- every frame -------------------------------------------------------------------------
 
-    def correct(self, inputs: Inputs) -> Inputs:
-        """Return the sensors without what is known to be wrong with their headings."""
-        if not self._backs:
+    def correct_headings(self, inputs: Inputs) -> Inputs:
+        """Return the orientations with drift and magnetic disturbances removed."""
+        if not self._half_turns:
             return inputs
         return {
-            name: q if (back := self._backs.get(name)) is None else _turned_back(back, q)
+            name: q if (half := self._half_turns.get(name)) is None else _turn_heading(half, q)
             for name, q in inputs.items()
         }
 
-    def brought_together(self, inputs: Inputs) -> Inputs:
-        """Return the sensors no further apart than skin moves them; ask after ``look``."""
-        if not self._moves:
+    def correct_pairs(self, inputs: Inputs) -> Inputs:
+        """Return the orientations with pair differences limited; call after ``update``."""
+        if not self._corrections:
             return inputs
         return {
-            name: q if (move := self._moves.get(name)) is None else multiply_one(q, move)
+            name: q if (turn := self._corrections.get(name)) is None else multiply_one(q, turn)
             for name, q in inputs.items()
         }
 
-    def look(self, t_ns: int, inputs: Inputs) -> Doubt:
-        """Return what is in doubt; look again if it is time. `inputs` are corrected ones."""
-        if t_ns < self._next_ns and self._next_ns - t_ns <= LOOK_NS:
-            return self._doubt
-        self._next_ns = t_ns + LOOK_NS
-        ups = {name: up_one(q) for name, q in inputs.items()}
-        looks = self._look_within(t_ns, inputs, ups)
+    def update(self, t_ns: int, inputs: Inputs) -> ConsistencyResult:
+        """Compare the sensors if the interval has passed; return the latest result.
+
+        Parameters
+        ----------
+        t_ns : int
+            Instant of the frame.
+        inputs : dict
+            q_optical_segment by sensor, headings corrected.
+        """
+        if t_ns < self._next_ns and self._next_ns - t_ns <= UPDATE_NS:
+            return self._result
+        self._next_ns = t_ns + UPDATE_NS
+
+        verticals = {name: up_one(q) for name, q in inputs.items()}
+        differences = self._compare_pairs(t_ns, inputs, verticals)
         for i in range(len(self._joints)):
-            looks += self._look_at_joint(t_ns, i, inputs, ups)
-        turned = self._sudden.look(t_ns, looks)
-        self._tell_pairs()
-        if self._step(t_ns):
-            self._use_headings()
-            self._tell_drift()
-            turned = True
-        if turned:
-            self._turn_back()
-        self._doubt = self._doubts(inputs)
-        return self._doubt
+            differences += self._compare_joint(t_ns, i, inputs, verticals)
+        changed = self._disturbances.update(t_ns, differences)
+        self._report_pairs()
 
-    def _look_within(self, t_ns: int, inputs: Inputs, ups: Mapping[str, Vector]) -> list[Look]:
-        looks: list[Look] = []
+        if self._step_drifts(t_ns):
+            self._distribute_drifts()
+            self._report_drifts()
+            changed = True
+        if changed:
+            self._update_half_turns()
+        self._result = self._evaluate(inputs)
+        return self._result
+
+    def _compare_pairs(
+        self, t_ns: int, inputs: Inputs, verticals: Mapping[str, Vector]
+    ) -> list[HeadingDifference]:
+        differences: list[HeadingDifference] = []
         for pairs in self._pairs:
             for pair in pairs:
-                looks += self._look_at_pair(t_ns, pair, inputs, ups)
-        self._calm_all = True
-        for k, pairs in enumerate(self._pairs):
-            self._quiet[k] = True
-            for pair in pairs:
-                if not pair.calm:
-                    self._quiet[k] = self._calm_all = False
-        return looks
+                differences += self._compare_pair(t_ns, pair, inputs, verticals)
 
-    def _look_at_pair(
-        self, t_ns: int, pair: PairWatch, inputs: Inputs, ups: Mapping[str, Vector]
-    ) -> tuple[Look, ...]:
+        self._all_consistent = True
+        for k, pairs in enumerate(self._pairs):
+            self._consistent[k] = True
+            for pair in pairs:
+                if not pair.consistent:
+                    self._consistent[k] = self._all_consistent = False
+        return differences
+
+    def _compare_pair(
+        self, t_ns: int, pair: SlipDetector, inputs: Inputs, verticals: Mapping[str, Vector]
+    ) -> tuple[HeadingDifference, ...]:
         link = pair.link
         a, b = inputs.get(link.a), inputs.get(link.b)
         if a is None or b is None:
-            pair.silent()
+            pair.clear_excess()
             return ()
+
+        # A slipped neighbor gives a wrong posture and would make this pair look inconsistent, too.
         near = None
-        for teller in link.near:
-            if teller in ups:
-                # a posture told by a sensor that slipped would put the blame on this segment, too
-                near = None if self._tilted(teller) else ups[teller]
+        for neighbor in link.near:
+            if neighbor in verticals:
+                near = None if self._tilted(neighbor) else verticals[neighbor]
                 break
-        pair.look(t_ns, a, b, (ups[link.a], near), taken=self._taken(link.a, link.b))
-        drift = self._within.get((link.a, link.b))
+        correction = self._heading_correction(link.a, link.b)
+        pair.update(t_ns, a, b, (verticals[link.a], near), correction=correction)
+
+        drift = self._pair_drifts.get((link.a, link.b))
         if drift is None or pair.tilted:
             return ()
-        if pair.calm and near is not None:
-            drift.look(pair.turned + self._turns[link.b] - self._turns[link.a])
-        for name in self._before[link.a]:  # one way from sensor to sensor is enough
+        if pair.consistent and near is not None:
+            drift.add_measurement(
+                pair.heading + self._sensor_drift[link.b] - self._sensor_drift[link.a]
+            )
+        for name in self._preceding[link.a]:  # differences must form a forest
             if name in inputs:
                 return ()
-        return (Look(link.a, link.b, pair.turned, link.spread),)
+        return (HeadingDifference(link.a, link.b, pair.heading, link.spread),)
 
-    def _look_at_joint(
-        self, t_ns: int, i: int, inputs: Inputs, ups: Mapping[str, Vector]
-    ) -> list[Look]:
-        joint, looks = self._joints[i], list[Look]()
-        quiet = self._quiet[i] and self._quiet[i + 1]
+    def _compare_joint(
+        self, t_ns: int, i: int, inputs: Inputs, verticals: Mapping[str, Vector]
+    ) -> list[HeadingDifference]:
+        joint, differences = self._joints[i], list[HeadingDifference]()
+        consistent = self._consistent[i] and self._consistent[i + 1]
         for link in joint.links:
             if link.a not in inputs or link.b not in inputs or self._tilted(link.a, link.b):
                 continue
             heading = axis_heading_one(inputs[link.a], inputs[link.b])
             if heading is None:
                 continue
-            (expected,), sd = link.expected(ups[link.a], ups[link.b])
-            left = _wrapped(heading - joint.standing - expected)
-            looks.append(Look(link.a, link.b, left, sd))
-            if quiet:  # one of them tells what they all do
+            (expected,), sd = link.expected(verticals[link.a], verticals[link.b])
+            residual = _wrapped(heading - joint.standing - expected)
+            differences.append(HeadingDifference(link.a, link.b, residual, sd))
+            if consistent:  # one link represents all
                 break
-        if not looks:
+        if not differences:
             return []
-        a, b, left, sd = looks[0]
-        best = min((one.turn + self._taken(one.a, one.b) for one in looks), key=abs)
-        if joint.look(t_ns, left, best, sd):
-            above, below = self._chain.segments[i : i + 2]
-            self._news.append(turn_told(joint.apart, above, below, doubtful=joint.doubtful))
-        turned = left + self._taken(a, b)
-        if quiet and not joint.doubtful:
-            joint.drift.look(turned + self._along[i + 1] - self._along[i])
-        return [Look(a, b, turned, sd)]
 
-    def _taken(self, a: str, b: str) -> float:
-        """Return the sudden turn, b against a, that is taken out of the sensors, rad."""
-        taken = self._sudden.taken
-        return taken.get(b, 0.0) - taken.get(a, 0.0) if taken else 0.0
+        a, b, residual, sd = differences[0]
+        best = min((d.angle + self._heading_correction(d.a, d.b) for d in differences), key=abs)
+        if joint.update(t_ns, residual, best, sd):
+            proximal, distal = self._chain.segments[i : i + 2]
+            self._reports.append(
+                heading_report(joint.difference, proximal, distal, inconsistent=joint.inconsistent)
+            )
+
+        uncorrected = residual + self._heading_correction(a, b)
+        if consistent and not joint.inconsistent:
+            joint.drift.add_measurement(
+                uncorrected + self._segment_drift[i + 1] - self._segment_drift[i]
+            )
+        return [HeadingDifference(a, b, uncorrected, sd)]
+
+    def _heading_correction(self, a: str, b: str) -> float:
+        """Return the correction of magnetic disturbances, b against a, rad."""
+        corrections = self._disturbances.corrections
+        return corrections.get(b, 0.0) - corrections.get(a, 0.0) if corrections else 0.0
 
     def _tilted(self, *sensors: str) -> bool:
-        """Tell whether any of these contradicts its partner in more than heading."""
-        return not self._calm_all and any(
+        """Return whether any of the sensors contradicts its partner in more than heading."""
+        return not self._all_consistent and any(
             pair.tilted and (pair.link.a in sensors or pair.link.b in sensors)
-            for quiet, pairs in zip(self._quiet, self._pairs, strict=True)
-            if not quiet
+            for consistent, pairs in zip(self._consistent, self._pairs, strict=True)
+            if not consistent
             for pair in pairs
         )
 
-    def _tell_pairs(self) -> None:
+    def _report_pairs(self) -> None:
         for segment, pairs in zip(self._chain.segments, self._pairs, strict=True):
             for pair in pairs:
                 if pair.changed:
-                    odd = self._sudden.odd(pair.link.a, pair.link.b)
-                    self._news.append(pair_told(pair, segment, None if pair.tilted else odd))
+                    outlier = self._disturbances.outlier(pair.link.a, pair.link.b)
+                    self._reports.append(
+                        slip_report(pair, segment, None if pair.tilted else outlier)
+                    )
                     pair.changed = False
 
-    # --- headings, once a second -------------------------------------------------------------
+    # --- heading drift, once a second --------------------------------------------------------
 
-    def _step(self, t_ns: int) -> bool:
-        news = [drift.step(t_ns) for drift in self._within.values()]
-        news += [joint.drift.step(t_ns) for joint in self._joints]
+    def _step_drifts(self, t_ns: int) -> bool:
+        renewed = [drift.step(t_ns) for drift in self._pair_drifts.values()]
+        renewed += [joint.drift.step(t_ns) for joint in self._joints]
         if self._common is not None:
-            news.append(self._common.step(t_ns))
-        return any(news)
+            renewed.append(self._common.step(t_ns))
+        return any(renewed)
 
-    def _use_headings(self) -> None:
-        """Work out what to take out of each sensor: sums along the chain, of mean 0."""
+    def _distribute_drifts(self) -> None:
+        """Compute the drift of each sensor: sums along the chain, with mean 0."""
         along = [0.0]
         for joint in self._joints:
             along.append(along[-1] + (joint.drift.heading if joint.links else 0.0))
         middle = sum(along) / len(along)
-        self._along = [turn - middle for turn in along]
-        for i, group in enumerate(self._chain.sensors):
-            own = [0.0, *(self._own(group[0], name) for name in group[1:])]
-            center = sum(own) / len(own)
-            for name, turn in zip(group, own, strict=True):
-                self._turns[name] = self._along[i] + turn - center
-        if max((abs(turn) for turn in self._turns.values()), default=0.0) <= SEEN_DRIFT:
-            self._turns = dict.fromkeys(self._turns, 0.0)
-            self._along = [0.0] * len(self._along)
+        self._segment_drift = [drift - middle for drift in along]
 
-    def _turn_back(self) -> None:
-        taken = self._sudden.taken
-        turns = {name: turn + taken.get(name, 0.0) for name, turn in self._turns.items()}
-        self._backs = {
+        for i, group in enumerate(self._chain.sensors):
+            own = [0.0, *(self._pair_drift(group[0], name) for name in group[1:])]
+            center = sum(own) / len(own)
+            for name, drift in zip(group, own, strict=True):
+                self._sensor_drift[name] = self._segment_drift[i] + drift - center
+
+        largest = max((abs(drift) for drift in self._sensor_drift.values()), default=0.0)
+        if largest <= MIN_DRIFT:
+            self._sensor_drift = dict.fromkeys(self._sensor_drift, 0.0)
+            self._segment_drift = [0.0] * len(self._segment_drift)
+
+    def _pair_drift(self, first: str, name: str) -> float:
+        drift = self._pair_drifts.get((first, name))
+        return 0.0 if drift is None else drift.heading
+
+    def _update_half_turns(self) -> None:
+        corrections = self._disturbances.corrections
+        turns = {
+            name: drift + corrections.get(name, 0.0) for name, drift in self._sensor_drift.items()
+        }
+        self._half_turns = {
             name: (cos(0.5 * turn), -sin(0.5 * turn)) for name, turn in turns.items() if turn
         }
 
-    def _own(self, first: str, name: str) -> float:
-        drift = self._within.get((first, name))
-        return 0.0 if drift is None else drift.heading
-
-    def _tell_drift(self) -> None:
+    def _report_drifts(self) -> None:
         for i, joint in enumerate(self._joints):
             size = abs(joint.drift.heading)
-            if i in self._told_drift and size < 0.5 * TOLD_DRIFT:
-                self._told_drift.discard(i)
-            elif i not in self._told_drift and joint.links and size > TOLD_DRIFT:
-                self._told_drift.add(i)
-                above, below = self._chain.segments[i : i + 2]
+            if i in self._reported_drifts and size < 0.5 * REPORTED_DRIFT:
+                self._reported_drifts.discard(i)
+            elif i not in self._reported_drifts and joint.links and size > REPORTED_DRIFT:
+                self._reported_drifts.add(i)
+                proximal, distal = self._chain.segments[i : i + 2]
                 name = self._chain.joints[i + 1]
-                self._news.append(drift_told(joint.drift.heading, above, below, name))
+                self._reports.append(drift_report(joint.drift.heading, proximal, distal, name))
 
-    # --- doubts ------------------------------------------------------------------------------
+    # --- result ------------------------------------------------------------------------------
 
-    def _doubts(self, inputs: Inputs) -> Doubt:
-        spread, slipped, flags = self._doubts_within(inputs)
+    def _evaluate(self, inputs: Inputs) -> ConsistencyResult:
+        spread, slipped, flags = self._evaluate_pairs(inputs)
         for i, joint in enumerate(self._joints):
-            extra2 = joint.extra2 / 3.0
-            if extra2:
+            variance = joint.extra_variance / 3.0  # one axis of three
+            if variance:
                 for k in (i, i + 1):
-                    spread[k] = sqrt(spread[k] * spread[k] + extra2)
-            if joint.doubtful:
+                    spread[k] = sqrt(spread[k] * spread[k] + variance)
+            if joint.inconsistent:
                 flags.append(f"heading_disagrees:{self._chain.joints[i + 1]}")
-        if self._common is not None and self._common.sd > TOLD_DRIFT:
+        if self._common is not None and self._common.sd > REPORTED_DRIFT:
             flags.append("heading_unseen")
-        if not slipped and not flags and not any(spread):
-            return self._calm
-        return Doubt(tuple(spread), frozenset(slipped), tuple(flags))
 
-    def _doubts_within(self, inputs: Inputs) -> tuple[list[float], set[str], list[str]]:
+        if not slipped and not flags and not any(spread):
+            return self._no_fault
+        return ConsistencyResult(tuple(spread), frozenset(slipped), tuple(flags))
+
+    def _evaluate_pairs(self, inputs: Inputs) -> tuple[list[float], set[str], list[str]]:
         spread, slipped, flags = [], set[str](), []
-        self._moves = {}
+        self._corrections = {}
         for i, pairs in enumerate(self._pairs):
-            odd = None if self._quiet[i] else self._odd_one(i, inputs)
-            if odd is not None:
-                slipped.add(odd)
-                flags.append(f"slipped:{odd}")
-            elif not self._quiet[i] and any(pair.doubtful for pair in pairs):
+            outlier = None if self._consistent[i] else self._slipped_sensor(i, inputs)
+            if outlier is not None:
+                slipped.add(outlier)
+                flags.append(f"slipped:{outlier}")
+            elif not self._consistent[i] and any(pair.inconsistent for pair in pairs):
                 flags.append(f"pair_disagrees:{self._chain.segments[i]}")
-            sure = pairs
-            if odd is not None:
-                sure = [pair for pair in pairs if odd not in (pair.link.a, pair.link.b)]
-            excess = max([pair.excess for pair in sure], default=0.0)
+
+            remaining = pairs
+            if outlier is not None:
+                remaining = [p for p in pairs if outlier not in (p.link.a, p.link.b)]
+            excess = max([pair.excess for pair in remaining], default=0.0)
             spread.append(excess / sqrt(3.0))
-            if excess and any(pair.apart_too_far for pair in sure):
-                self._moves |= together(sure)
+            if excess and any(pair.exceeded for pair in remaining):
+                self._corrections |= pair_corrections(remaining)
         return spread, slipped, flags
 
-    def _odd_one(self, i: int, inputs: Inputs) -> str | None:
-        """Return the one sensor that contradicts all others of its segment, who agree."""
+    def _slipped_sensor(self, i: int, inputs: Inputs) -> str | None:
+        """Return the sensor that contradicts all others of its segment while they agree."""
         group = self._chain.sensors[i]
-        here = [name for name in group if name in inputs] if len(group) >= MAJORITY else []
-        if len(here) < MAJORITY:
+        present = [name for name in group if name in inputs] if len(group) >= MAJORITY else []
+        if len(present) < MAJORITY:
             return None
-        against = [
+        inconsistent = [
             (pair.link.a, pair.link.b)
             for pair in self._pairs[i]
-            if pair.doubtful and pair.link.a in here and pair.link.b in here
+            if pair.inconsistent and pair.link.a in present and pair.link.b in present
         ]
-        for name in here:
-            if len(against) == len(here) - 1 and all(name in pair for pair in against):
+        for name in present:
+            if len(inconsistent) == len(present) - 1 and all(name in p for p in inconsistent):
                 return name
         return None
 
     @property
-    def common_sd(self) -> float:
-        """Standard deviation of the heading that all segments share, rad; nobody here sees it."""
-        unseen = 0.0 if self._common is None else self._common.sd
-        return hypot(unseen, self._sudden.unsure)
+    def common_heading_sd(self) -> float:
+        """Standard deviation of the heading that all segments share, rad; not observable."""
+        unobserved = 0.0 if self._common is None else self._common.sd
+        return hypot(unobserved, self._disturbances.ambiguity)
 
-    # --- out ---------------------------------------------------------------------------------
+    # --- reports -----------------------------------------------------------------------------
 
-    def news(self) -> list[SensorNews]:
-        """Return what is worth telling, each change once."""
-        if not self._news:
+    def pop_reports(self) -> list[SensorReport]:
+        """Return the reports since the last call."""
+        if not self._reports:
             return []
-        told, self._news = self._news, []
-        return told
+        reports, self._reports = self._reports, []
+        return reports
 
     def health(self) -> dict[str, object]:
-        """Return, JSON-able, how far pairs are apart and headings have drifted."""
+        """Return pair distances and heading drifts as JSON values, for ``bridge/health``."""
         pairs = {
             f"{pair.link.a}~{pair.link.b}": {
-                "apart_deg": round(degrees(pair.apart), 2),
+                "apart_deg": round(degrees(pair.distance), 2),
                 "limit_deg": round(degrees(pair.limit), 2),
-                "doubtful": pair.doubtful,
+                "doubtful": pair.inconsistent,
             }
             for pairs in self._pairs
             for pair in pairs
@@ -374,14 +422,14 @@ class LinkWatch:
         return {"pairs": pairs, "headings": headings}
 
 
-def _standing(calibration: Calibration, above: str, below: str) -> float:
+def _static_heading(calibration: Calibration, proximal: str, distal: str) -> float:
     segment = calibration.segment
-    return axis_heading_one(segment[above].q_static, segment[below].q_static) or 0.0
+    return axis_heading_one(segment[proximal].q_static, segment[distal].q_static) or 0.0
 
 
-def _turned_back(back: tuple[float, float], q: Quaternion) -> Quaternion:
-    """Return the orientation in a world turned about the vertical."""
-    c, s = back
+def _turn_heading(half: tuple[float, float], q: Quaternion) -> Quaternion:
+    """Return an orientation turned about the vertical of the world."""
+    c, s = half
     w, x, y, z = q
     return (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
 

@@ -1,65 +1,73 @@
-"""What is told of sensors that contradict each other. Law: words and figures only, no judgement."""
+"""Reports of sensors that contradict each other: texts and data of the events."""
 
 from __future__ import annotations
 
 from math import degrees
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.fusion.faults._sensor_monitor import SensorNews
+from jointfit_daemon.fusion.faults._sensor_monitor import SensorReport
 
 if TYPE_CHECKING:
-    from jointfit_daemon.fusion.faults._slip import PairWatch
+    from jointfit_daemon.fusion.faults._slip import SlipDetector
 
 
-def pair_told(pair: PairWatch, segment: str, turned: tuple[str, float] | None) -> SensorNews:
-    """Return what to tell of a pair whose doubt began or ended.
+def slip_report(
+    pair: SlipDetector, segment: str, disturbed: tuple[str, float] | None
+) -> SensorReport:
+    """Return the report of a pair of sensors that became inconsistent or consistent.
 
     Parameters
     ----------
-    pair : PairWatch
-        Whose last look changed its mind.
+    pair : SlipDetector
+        The pair, after the update that changed its state.
     segment : str
-        On which it sits.
-    turned : tuple of str and float, optional
-        The one of them whose heading is off against all others, and by how much, rad.
+        Segment of the pair.
+    disturbed : tuple of str and float, optional
+        The sensor of the pair whose heading deviates from all others, and its deviation, rad.
     """
     a, b = pair.link.a, pair.link.b
-    data: dict[str, object] = {"pair": [a, b], "apart_deg": round(degrees(pair.apart), 1)}
-    if not pair.doubtful:
-        text = f"{a} and {b} lie as calibration had them again"
-        return SensorNews(segment, "agrees", text, "info", data)
-    text = f"{a} and {b} lie {degrees(pair.apart):.0f} deg from where calibration had them: "
-    if turned is None:
-        text += "one of them slipped; set it right, stand still and take a new static pose"
+    data: dict[str, object] = {"pair": [a, b], "apart_deg": round(degrees(pair.distance), 1)}
+    if not pair.inconsistent:
+        text = f"{a} and {b} agree with the calibration again"
+        return SensorReport(segment, "agrees", text, "info", data)
+
+    text = (
+        f"relative orientation of {a} and {b} differs by {degrees(pair.distance):.0f} deg from the "
+        "calibration: "
+    )
+    if disturbed is None:
+        text += "one of them slipped; reattach it and repeat the static pose"
     else:
-        name, angle = turned
+        name, angle = disturbed
         data |= {"turned": name, "heading_deg": round(degrees(angle), 1)}
         text += (
-            f"the heading of {name} has turned by {degrees(angle):.0f} deg against all others, "
-            "and that is taken out. Iron nearby? If it stays, take a new static pose"
+            f"heading of {name} deviates by {degrees(angle):.0f} deg from all other sensors and is "
+            "corrected; probably a magnetic disturbance. If it persists, repeat the static pose"
         )
-    return SensorNews(segment, "pair_disagrees", text, "warning", data)
+    return SensorReport(segment, "pair_disagrees", text, "warning", data)
 
 
-def drift_told(heading: float, above: str, below: str, joint: str) -> SensorNews:
-    """Return what to tell of a heading that has drifted, rad, `below` against `above`."""
+def drift_report(heading: float, proximal: str, distal: str, joint: str) -> SensorReport:
+    """Return the report of a heading drift of segment `distal` against `proximal`, rad."""
     text = (
-        f"its heading has drifted by {degrees(heading):.0f} deg against {above}; {joint} tells, "
-        "and it is taken out. A new static pose sets headings anew"
+        f"heading drifted by {degrees(heading):.0f} deg against {proximal} (estimated at {joint}, "
+        "corrected). A new static pose resets the headings"
     )
     data = {"heading_deg": round(degrees(heading), 1)}
-    return SensorNews(below, "drift", text, "info", data)
+    return SensorReport(distal, "drift", text, "info", data)
 
 
-def turn_told(heading: float, above: str, below: str, *, doubtful: bool) -> SensorNews:
-    """Return what to tell of two segments whose headings came apart within seconds, rad."""
+def heading_report(
+    heading: float, proximal: str, distal: str, *, inconsistent: bool
+) -> SensorReport:
+    """Return the report of two segments whose headings diverged within seconds, by rad."""
     data = {"heading_deg": round(degrees(heading), 1)}
-    if not doubtful:
-        text = f"its heading agrees with that of {above} again"
-        return SensorNews(below, "agrees", text, "info", data)
+    if not inconsistent:
+        text = f"heading agrees with {proximal} again"
+        return SensorReport(distal, "agrees", text, "info", data)
     text = (
-        f"its heading and that of {above} have turned by {degrees(heading):.0f} deg against each "
-        "other: iron nearby? Angles between them are put right, the heading of both is uncertain. "
-        "If it stays, take a new static pose"
+        f"heading changed by {degrees(heading):.0f} deg against {proximal}; probably a magnetic "
+        "disturbance. Joint angles are corrected, the headings of both segments are uncertain. If "
+        "it persists, repeat the static pose"
     )
-    return SensorNews(below, "heading_disagrees", text, "warning", data)
+    return SensorReport(distal, "heading_disagrees", text, "warning", data)

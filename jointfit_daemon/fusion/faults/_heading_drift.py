@@ -1,16 +1,17 @@
-r"""The slow drift of one heading against another, from looks that are noisy and biased by skin.
+r"""Kalman filter for the slow drift of one heading against another.
 
-Law: pure; a look costs a few additions, once a second a filter of three states runs. What is not
-looked at grows doubtful.
-
-States: heading error (rad), its rate (rad/s), and the bias of the looks (rad): joints and skin that
-repeat with the movement shift what is seen for as long as it goes on.
+States are the heading error :math:`\delta` (rad), its rate :math:`\rho` (rad/s) and the bias
+:math:`b` of the measurements (rad). The bias represents joint motion and soft-tissue artefacts,
+which repeat with the movement and shift the measured heading as long as the movement lasts:
 
 .. math:: \dot\delta = \rho,\quad \dot\rho = -\rho/\tau_\rho + w_1,\quad
           \dot b = -b/\tau_b + w_2,\quad z = \delta + b + n
 
-Rate and bias are stationary (Ornstein and Uhlenbeck) with the standard deviations given; the bias
-fades within :data:`BIAS_S`, so a drift is what stays, and is believed only as far as it must be.
+Rate and bias are stationary Ornstein-Uhlenbeck processes. The bias decays with :data:`BIAS_S`, so
+an offset that persists is attributed to drift.
+
+Invariant: without measurements the standard deviation grows. A measurement costs a few additions;
+the filter runs once per second.
 """
 
 from __future__ import annotations
@@ -20,24 +21,28 @@ from math import exp, radians, sqrt
 import numpy as np
 
 BLOCK_S = 1.0
-LEAST_LOOKS = 5
+"""Interval of the filter, s: measurements within it are averaged."""
+MIN_MEASUREMENTS = 5
+"""Fewest measurements of an interval that update the filter."""
 RATE_SD = radians(3.0) / 60.0
-"""Of the drift of a heading without a magnetometer, rad/s: 3 degrees a minute."""
+"""Standard deviation of the drift of a heading without magnetometer, rad/s: 3 degrees a minute."""
 RATE_S = 300.0
+"""Correlation time of the drift rate, s."""
 BIAS_S = 15.0
+"""Correlation time of the measurement bias, s: a movement rarely lasts longer."""
 START_SD = radians(1.0)
-"""Of the headings that a static pose sets."""
-OUTLIER = 5.0
-"""Sigmas beyond which a look tells of something else: a slip, a restart."""
+"""Standard deviation of the headings that a static pose sets, rad."""
+OUTLIER_SIGMA = 5.0
+"""Innovations beyond this many standard deviations are rejected: they are slips or restarts."""
 
 
-class HeadingDrift:
-    """Follows one relative heading.
+class HeadingDriftFilter:
+    """Estimates the drift of one relative heading.
 
     Parameters
     ----------
     spread : float
-        Standard deviation of a look about its mean over a movement, rad.
+        Standard deviation of a measurement about its mean over a movement, rad.
     """
 
     def __init__(self, spread: float) -> None:
@@ -48,52 +53,55 @@ class HeadingDrift:
         self._sum, self._count = 0.0, 0
         self._t_ns: int | None = None
         self.heading = 0.0
-        """Estimate of the heading error now, rad."""
+        """Estimated heading error, rad."""
         self.sd = START_SD
         """Its standard deviation, rad."""
-        self.least_sd = max(START_SD, 0.6 * spread)
-        """What it comes to while the drift is looked at: part of what calibration saw."""
-        self.refused = 0
-        """Looks, one a second, that contradicted the drift so far and were not used, in a row."""
+        self.observed_sd = max(START_SD, 0.6 * spread)
+        """Standard deviation that is reached with regular measurements, rad. The calibration
+        residuals contain it already."""
+        self.rejected = 0
+        """Number of consecutive intervals whose mean was rejected as an outlier."""
 
-    def look(self, seen: float) -> None:
-        """Take one look at the whole heading error, rad."""
-        self._sum += seen
+    def add_measurement(self, heading: float) -> None:
+        """Add one measurement of the total heading error, rad."""
+        self._sum += heading
         self._count += 1
 
     def step(self, t_ns: int) -> bool:
-        """Let time go on; work once a second. Return whether the estimate is a new one."""
+        """Advance to `t_ns`; return whether the estimate was renewed, which is once a second."""
         if self._t_ns is None:
             self._t_ns = t_ns
         dt = (t_ns - self._t_ns) * 1e-9
         if dt < BLOCK_S:
             return False
+
         self._t_ns = t_ns
         self._predict(dt)
-        if self._count >= LEAST_LOOKS:
+        if self._count >= MIN_MEASUREMENTS:
             self._update(self._sum / self._count)
         self._sum, self._count = 0.0, 0
         self.heading, self.sd = float(self._x[0]), sqrt(float(self._p[0, 0]))
         return True
 
     def _predict(self, dt: float) -> None:
-        keep_rate, keep_bias = exp(-dt / RATE_S), exp(-dt / BIAS_S)
-        flow = np.array([[1.0, dt, 0.0], [0.0, keep_rate, 0.0], [0.0, 0.0, keep_bias]])
+        rate_decay, bias_decay = exp(-dt / RATE_S), exp(-dt / BIAS_S)
+        transition = np.array([[1.0, dt, 0.0], [0.0, rate_decay, 0.0], [0.0, 0.0, bias_decay]])
         noise = np.diag(
-            [0.0, RATE_SD**2 * (1.0 - keep_rate**2), self._bias2 * (1.0 - keep_bias**2)]
+            [0.0, RATE_SD**2 * (1.0 - rate_decay**2), self._bias2 * (1.0 - bias_decay**2)]
         )
-        self._x = flow @ self._x
-        self._p = flow @ self._p @ flow.T + noise
+        self._x = transition @ self._x
+        self._p = transition @ self._p @ transition.T + noise
 
-    def _update(self, seen: float) -> None:
-        h = np.array([1.0, 0.0, 1.0])
+    def _update(self, heading: float) -> None:
+        h = np.array([1.0, 0.0, 1.0])  # a measurement is heading error plus bias
         ph = self._p @ h
         s = float(h @ ph) + 0.5 * self._spread2
-        innovation = seen - float(self._x[0] + self._x[2])
-        if innovation * innovation > OUTLIER**2 * s:
-            self.refused += 1
+        innovation = heading - float(self._x[0] + self._x[2])
+        if innovation * innovation > OUTLIER_SIGMA**2 * s:
+            self.rejected += 1
             return
-        self.refused = 0
+
+        self.rejected = 0
         gain = ph / s
         self._x = self._x + gain * innovation
         self._p = self._p - np.outer(gain, ph)

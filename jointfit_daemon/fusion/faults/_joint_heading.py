@@ -1,7 +1,8 @@
-"""Tells whether the headings of two neighboring segments agree, where a hinge ties them.
+"""Monitoring of the relative heading of two neighboring segments that a hinge joint connects.
 
-Law: pure, O(1) a look. Drift is followed slowly (``heading_drift``); what comes within seconds is
-doubted and, as far as it is not taken out elsewhere, claimed as uncertainty.
+The flexion axis of a hinge is common to both segments, so its heading can be compared. Slow drift
+is estimated by :mod:`jointfit_daemon.fusion.faults._heading_drift`. A change within seconds is a
+fault: it is reported, and the part that is not corrected elsewhere is added to the uncertainty.
 """
 
 from __future__ import annotations
@@ -9,8 +10,13 @@ from __future__ import annotations
 from math import exp, radians
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.fusion.faults._heading_drift import HeadingDrift
-from jointfit_daemon.fusion.faults._slip import LEAST_LIMIT, SMOOTH_S, USUAL, LastingDoubt
+from jointfit_daemon.fusion.faults._heading_drift import HeadingDriftFilter
+from jointfit_daemon.fusion.faults._slip import (
+    MIN_LIMIT,
+    SMOOTHING_S,
+    USUAL_FACTOR,
+    FaultDebouncer,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,71 +24,77 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import SensorLink
 
 HINGE_SPREAD = radians(6.0)
-"""A joint whose flexion axes turn against each other by more than this, posture aside, is no hinge:
-nothing about headings is read from it."""
-LIMIT = 3.0
-"""Headings apart, in standard deviations of a look, from which on they contradict each other."""
-LEFT_S = 0.2
-"""Smoothing of what is left after all is taken out: it goes into the deviation."""
+"""Largest spread of the flexion axes against each other at a hinge, posture removed, rad. Headings
+across a joint with a larger spread are not compared."""
+LIMIT_SIGMA = 3.0
+"""Heading difference at which two segments are inconsistent, in standard deviations of a healthy
+difference."""
+RESIDUAL_SMOOTHING_S = 0.2
+"""Time constant of the remaining heading difference that enters the uncertainty, s."""
 
 
-class JointWatch:
-    """Watches one joint.
+class JointHeadingMonitor:
+    """Monitors the headings of the two segments of one joint.
 
     Parameters
     ----------
     links : sequence of SensorLink
-        Between the sensors of the two segments, as calibration saw them.
+        Links between sensors of the two segments, from the calibration.
     standing : float
         Heading of the distal flexion axis against the proximal one in the static pose, rad.
     drifts : bool
-        Whether a sensor is known to have no north: then a drift goes on unseen without a hinge.
+        Whether a sensor of the joint has no heading reference, so that its heading drifts even
+        where no hinge shows it.
     """
 
     def __init__(self, links: Sequence[SensorLink], standing: float, *, drifts: bool) -> None:
         self.links = [link for link in links if link.spread <= HINGE_SPREAD]
         self.standing = standing
-        self.known = bool(self.links) or drifts
-        """Whether the drift is looked at, or known to go on unseen."""
+        self._uncertain = bool(self.links) or drifts
+        """Whether the drift is measured, or known to grow unmeasured."""
         spread = max((link.spread for link in self.links), default=HINGE_SPREAD)
-        self.drift = HeadingDrift(spread)
+        self.drift = HeadingDriftFilter(spread)
         self._sd = spread
-        self._doubt = LastingDoubt()
-        self._left = self._taken = 0.0
+        self._debouncer = FaultDebouncer()
+        self._residual = self._corrected = 0.0
         self._before_ns: int | None = None
-        self.apart = 0.0
-        """Smoothed distance of the headings whoever is odd on either segment, drift aside, rad."""
+        self.difference = 0.0
+        """Smoothed heading difference of the best agreeing sensors, drift removed, rad."""
 
     @property
-    def doubtful(self) -> bool:
-        """Whether the headings contradict each other for good."""
-        return self._doubt.doubtful
+    def inconsistent(self) -> bool:
+        """Whether the headings contradict each other persistently."""
+        return self._debouncer.active
 
     @property
-    def extra2(self) -> float:
-        """Variance of the heading between the segments beyond what calibration saw, rad²."""
-        drift2 = max(0.0, self.drift.sd**2 - self.drift.least_sd**2) if self.known else 0.0
-        excess = max(0.0, abs(self._left) - USUAL * self._sd)
-        return 0.5 * drift2 + excess * excess + self._taken * self._sd * self._sd
+    def extra_variance(self) -> float:
+        """Variance of the heading between the segments beyond the calibration residuals, rad²."""
+        drift2 = 0.0
+        if self._uncertain:
+            drift2 = max(0.0, self.drift.sd**2 - self.drift.observed_sd**2)
+        excess = max(0.0, abs(self._residual) - USUAL_FACTOR * self._sd)
+        return 0.5 * drift2 + excess * excess + self._corrected * self._sd * self._sd
 
-    def look(self, t_ns: int, left: float, turned: float, sd: float) -> bool:
-        """Take one look; return whether the doubt began or ended with it.
+    def update(self, t_ns: int, residual: float, uncorrected: float, sd: float) -> bool:
+        """Add one measurement; return whether the inconsistency began or ended with it.
 
         Parameters
         ----------
         t_ns : int
-            Instant.
-        left : float
-            Heading error after all corrections, rad.
-        turned : float
-            The same before sudden turns were taken out, of those sensors who agree best, rad.
+            Instant of the frame.
+        residual : float
+            Heading difference after all corrections, rad.
+        uncorrected : float
+            Smallest heading difference of any pair of sensors before the corrections of magnetic
+            disturbances, rad.
         sd : float
-            Standard deviation of a healthy look, rad.
+            Standard deviation of a healthy difference, rad.
         """
         if self._before_ns is None:
             self._before_ns = t_ns
         dt, self._before_ns, self._sd = (t_ns - self._before_ns) * 1e-9, t_ns, sd
-        self._left += (1.0 - exp(-dt / LEFT_S)) * (left - self._left)
-        self._taken = min(abs(turned - left) / self._sd, 1.0)
-        self.apart += (1.0 - exp(-dt / SMOOTH_S)) * (turned - self.apart)
-        return self._doubt.judge(t_ns, abs(self.apart), max(LEAST_LIMIT, LIMIT * sd))
+        self._residual += (1.0 - exp(-dt / RESIDUAL_SMOOTHING_S)) * (residual - self._residual)
+        self._corrected = min(abs(uncorrected - residual) / self._sd, 1.0)
+        self.difference += (1.0 - exp(-dt / SMOOTHING_S)) * (uncorrected - self.difference)
+        limit = max(MIN_LIMIT, LIMIT_SIGMA * sd)
+        return self._debouncer.update(t_ns, abs(self.difference), limit)

@@ -1,18 +1,18 @@
-r"""Headings that turn within seconds: whose, by how much, and how sure that is.
+r"""Detection and correction of magnetic disturbances: headings that change within seconds.
 
-Law: pure, O(1) a look; only differences of headings are seen, so somebody must be believed.
-
-Iron nearby pulls the heading of a sensor that has a magnetometer away within seconds and lets it go
-later. Sensors of one segment see it in each other, segments of a hinge in the axis they share. From
-these differences every sensor gets a heading :math:`h_i` against the first, and what is taken out
-of it is its distance from the weighted median, each segment weighing the same:
+Ferromagnetic objects turn the heading of a sensor with magnetometer within seconds and release it
+later. Pairs on one segment and pairs across a hinge show the differences. From these, each sensor
+gets a heading :math:`h_i` against the first, and its deviation from the weighted median is
+corrected; every segment has the same weight:
 
 .. math:: o_i = h_i - \mathrm{median}(h), \qquad
-          \text{taken out: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
+          \text{correction: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
 
-One sensor of four that turns is thus found and put right, and the others stay as they are. Where
-half of the segments say one thing and half another, the median is an interval: its middle is
-taken, which keeps the angles of the joint, and its half width is how wrong all headings may be.
+One disturbed sensor of four is thus identified and corrected, and the others are unchanged. If two
+halves contradict each other, the median is an interval. Its middle is used, which preserves joint
+angles, and half its width is the uncertainty of all headings.
+
+Only differences are observable: a disturbance that turns all sensors alike is not detected.
 """
 
 from __future__ import annotations
@@ -23,47 +23,50 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-SMOOTH_S, FOLLOW_S = 0.4, 0.25
-"""Of what is seen, and of what is taken out."""
-FORGET_NS = 500_000_000
-"""A difference that was not seen for longer begins anew."""
-FROM, FULLY = 1.6, 3.2
-"""Distances from the median from which on, and from which on fully, it is taken out: standard
-deviations of a look across a joint."""
-FORGOTTEN = 0.002
-"""What is left of a turn that is over, rad, and taken out no more."""
-LEAST_SD = 0.026
-"""Of such a look, rad: 1.5 degrees."""
+SMOOTHING_S = 0.4
+"""Time constant of the measured differences, s."""
+CORRECTION_S = 0.25
+"""Time constant with which corrections follow, s: the output does not jump."""
+STALE_NS = 500_000_000
+"""A difference that was not measured for longer starts from 0 again, ns."""
+CORRECTION_START = 1.6
+"""Deviation from the median at which the correction starts, in standard deviations."""
+CORRECTION_FULL = 3.2
+"""Deviation from which on it is corrected fully, in standard deviations."""
+NEGLIGIBLE = 0.002
+"""Correction below which a disturbance that ended is dropped, rad."""
+MIN_SD = 0.026
+"""Smallest standard deviation of a difference, rad: 1.5 degrees."""
 
 
-class Look(NamedTuple):
-    """Heading of sensor `b` against sensor `a`, beyond what posture and drift make expect."""
+class HeadingDifference(NamedTuple):
+    """Heading of sensor `b` against sensor `a`, posture and drift removed."""
 
     a: str
     b: str
-    turn: float
+    angle: float
     """rad."""
     sd: float
-    """Standard deviation of a healthy one, rad."""
+    """Standard deviation of a healthy difference, rad."""
 
 
-class _Seen:
-    __slots__ = ("before_ns", "sd", "turn")
+class _SmoothedDifference:
+    __slots__ = ("angle", "before_ns", "sd")
 
     def __init__(self) -> None:
-        self.turn, self.sd = 0.0, LEAST_SD
+        self.angle, self.sd = 0.0, MIN_SD
         self.before_ns: int | None = None
 
-    def look(self, t_ns: int, turn: float, sd: float) -> None:
-        if self.before_ns is None or t_ns - self.before_ns > FORGET_NS:
-            self.turn, self.before_ns = 0.0, t_ns
-        share = 1.0 - exp(-(t_ns - self.before_ns) * 1e-9 / SMOOTH_S)
-        self.turn += share * (turn - self.turn)
+    def update(self, t_ns: int, angle: float, sd: float) -> None:
+        if self.before_ns is None or t_ns - self.before_ns > STALE_NS:
+            self.angle, self.before_ns = 0.0, t_ns
+        gain = 1.0 - exp(-(t_ns - self.before_ns) * 1e-9 / SMOOTHING_S)
+        self.angle += gain * (angle - self.angle)
         self.sd, self.before_ns = sd, t_ns
 
 
-class SuddenTurns:
-    """Follows the headings of a limb's sensors against each other.
+class MagneticDisturbanceDetector:
+    """Estimates heading corrections for the sensors of one limb.
 
     Parameters
     ----------
@@ -73,82 +76,93 @@ class SuddenTurns:
 
     def __init__(self, groups: Sequence[Sequence[str]]) -> None:
         self._segment = {name: i for i, group in enumerate(groups) for name in group}
-        self._seen: dict[tuple[str, str], _Seen] = {}
-        self.taken: dict[str, float] = {}
-        """What is to be taken out of the headings of sensors, rad; others stay as they are."""
-        self.unsure = 0.0
-        """How wrong the headings of all may be because half of them contradict the others, rad."""
+        self._differences: dict[tuple[str, str], _SmoothedDifference] = {}
+        self.corrections: dict[str, float] = {}
+        """Angles to subtract from the headings of sensors, rad; absent sensors need none."""
+        self.ambiguity = 0.0
+        """Standard deviation of all headings because halves contradict each other, rad."""
         self._before_ns: int | None = None
-        self.off: dict[str, float] = {}
-        """How far sensors are from the median, rad, as long as anyone may be far."""
+        self._deviations: dict[str, float] = {}
+        """Deviations of sensors from the median, rad; empty while all differences are small."""
 
-    def look(self, t_ns: int, looks: Iterable[Look]) -> bool:
-        """Take one look at all; return whether what is to be taken out has changed.
+    def update(self, t_ns: int, differences: Iterable[HeadingDifference]) -> bool:
+        """Add the differences of one frame; return whether the corrections changed.
 
         Parameters
         ----------
         t_ns : int
-            Instant.
-        looks : iterable of Look
-            Within segments and across hinges; together they must not contradict each other, so
-            there is one way at most from sensor to sensor.
+            Instant of the frame.
+        differences : iterable of HeadingDifference
+            Within segments and across hinges. They must form a forest: at most one path leads from
+            one sensor to another.
         """
         edges = []
-        apart, widest = 0.0, LEAST_SD
-        for a, b, turn, sd in looks:
-            seen = self._seen.get((a, b))
-            if seen is None:
-                seen = self._seen[a, b] = _Seen()
-            seen.look(t_ns, turn, sd)
-            apart, widest = apart + abs(seen.turn), max(widest, sd)
-            edges.append((a, b, seen))
-        wanted: dict[str, float] = {}
-        self.off, unsure = {}, 0.0
-        if apart > FROM * widest:  # nobody can be further from the median than that
-            wanted, unsure = self._decide(edges)
-        return self._follow(t_ns, wanted, unsure)
+        total, max_sd = 0.0, MIN_SD
+        for a, b, angle, sd in differences:
+            smoothed = self._differences.get((a, b))
+            if smoothed is None:
+                smoothed = self._differences[a, b] = _SmoothedDifference()
+            smoothed.update(t_ns, angle, sd)
+            total, max_sd = total + abs(smoothed.angle), max(max_sd, sd)
+            edges.append((a, b, smoothed))
 
-    def odd(self, a: str, b: str) -> tuple[str, float] | None:
-        """Return which of two sensors is off against all others while the other is not."""
-        name, other = (a, b) if abs(self.off.get(a, 0.0)) > abs(self.off.get(b, 0.0)) else (b, a)
-        off, near = self.off.get(name, 0.0), self.off.get(other, 0.0)
-        return (name, off) if name in self.taken and abs(near) < 0.5 * abs(off) else None
+        targets: dict[str, float] = {}
+        self._deviations, ambiguity = {}, 0.0
+        if total > CORRECTION_START * max_sd:  # no deviation can exceed the sum of the differences
+            targets, ambiguity = self._target_corrections(edges)
+        return self._follow(t_ns, targets, ambiguity)
 
-    def _follow(self, t_ns: int, wanted: Mapping[str, float], unsure: float) -> bool:
-        """Let what is taken out go where it should be, without a jump."""
-        share = 1.0 - exp(-(t_ns - (self._before_ns or t_ns)) * 1e-9 / FOLLOW_S)
+    def outlier(self, a: str, b: str) -> tuple[str, float] | None:
+        """Return the corrected sensor of a pair and its deviation, if the other one agrees.
+
+        The other sensor agrees if it deviates by less than half as much.
+        """
+        deviations = self._deviations
+        larger = abs(deviations.get(a, 0.0)) > abs(deviations.get(b, 0.0))
+        name, other = (a, b) if larger else (b, a)
+        deviation, near = deviations.get(name, 0.0), deviations.get(other, 0.0)
+        agrees = abs(near) < 0.5 * abs(deviation)
+        return (name, deviation) if name in self.corrections and agrees else None
+
+    def _follow(self, t_ns: int, targets: Mapping[str, float], ambiguity: float) -> bool:
+        """Move the corrections towards their targets without a jump."""
+        gain = 1.0 - exp(-(t_ns - (self._before_ns or t_ns)) * 1e-9 / CORRECTION_S)
         self._before_ns = t_ns
-        if not wanted and not self.taken:
-            self.unsure = 0.0
+        if not targets and not self.corrections:
+            self.ambiguity = 0.0
             return False
-        moved = {}
-        for name in {**self.taken, **wanted}:
-            before = self.taken.get(name, 0.0)
-            turn = before + share * (wanted.get(name, 0.0) - before)
-            if name in wanted or abs(turn) > FORGOTTEN:
-                moved[name] = turn
-        self.taken = moved
-        self.unsure += share * (unsure - self.unsure)
+
+        corrections = {}
+        for name in {**self.corrections, **targets}:
+            before = self.corrections.get(name, 0.0)
+            angle = before + gain * (targets.get(name, 0.0) - before)
+            if name in targets or abs(angle) > NEGLIGIBLE:
+                corrections[name] = angle
+        self.corrections = corrections
+        self.ambiguity += gain * (ambiguity - self.ambiguity)
         return True
 
-    def _decide(self, edges: list[tuple[str, str, _Seen]]) -> tuple[dict[str, float], float]:
-        wanted, unsure = {}, 0.0
-        for headings, sd in _tied(edges):
+    def _target_corrections(
+        self, edges: list[tuple[str, str, _SmoothedDifference]]
+    ) -> tuple[dict[str, float], float]:
+        targets, ambiguity = {}, 0.0
+        for headings, sd in _connected_headings(edges):
             if len({self._segment[name] for name in headings}) < 2:  # noqa: PLR2004 - no joint
                 continue
-            low, high = _median(self._weighted(headings))
+
+            low, high = _weighted_median(self._segment_weights(headings))
             middle = 0.5 * (low + high)
             for name, heading in headings.items():
-                self.off[name] = heading - middle
-                taken = _ramp(heading - middle, sd)
-                if taken:
-                    wanted[name] = taken
-                    # iron that pulls one may pull the others by as much as is not seen of it
-                    unsure = max(unsure, min(abs(taken), sd))
-            unsure = max(unsure, _ramp(0.5 * (high - low), sd))
-        return wanted, unsure
+                self._deviations[name] = heading - middle
+                correction = _ramp(heading - middle, sd)
+                if correction:
+                    targets[name] = correction
+                    # The same source may disturb the others by as much as stays unobserved.
+                    ambiguity = max(ambiguity, min(abs(correction), sd))
+            ambiguity = max(ambiguity, _ramp(0.5 * (high - low), sd))
+        return targets, ambiguity
 
-    def _weighted(self, headings: Mapping[str, float]) -> list[tuple[float, float]]:
+    def _segment_weights(self, headings: Mapping[str, float]) -> list[tuple[float, float]]:
         counts: dict[int, int] = {}
         for name in headings:
             segment = self._segment[name]
@@ -156,34 +170,36 @@ class SuddenTurns:
         return [(heading, 1.0 / counts[self._segment[name]]) for name, heading in headings.items()]
 
 
-def _tied(edges: list[tuple[str, str, _Seen]]) -> list[tuple[dict[str, float], float]]:
-    """Return the headings of sensors that are tied to each other, and the widest look among them.
+def _connected_headings(
+    edges: list[tuple[str, str, _SmoothedDifference]],
+) -> list[tuple[dict[str, float], float]]:
+    """Return headings and largest standard deviation of each connected set of sensors.
 
-    The first of each is at 0.
+    The first sensor of each set has the heading 0.
     """
     found: list[tuple[dict[str, float], float]] = []
     left = edges
     while left:
-        headings, sd, before = {left[0][0]: 0.0}, LEAST_SD, -1
+        headings, sd, before = {left[0][0]: 0.0}, MIN_SD, -1
         while len(headings) != before:
             before, rest = len(headings), []
             for edge in left:
-                a, b, seen = edge
+                a, b, smoothed = edge
                 if a in headings:
-                    headings[b] = headings[a] + seen.turn
+                    headings[b] = headings[a] + smoothed.angle
                 elif b in headings:
-                    headings[a] = headings[b] - seen.turn
+                    headings[a] = headings[b] - smoothed.angle
                 else:
                     rest.append(edge)
                     continue
-                sd = max(sd, seen.sd)
+                sd = max(sd, smoothed.sd)
             left = rest
         found.append((headings, sd))
     return found
 
 
-def _median(weighted: list[tuple[float, float]]) -> tuple[float, float]:
-    """Return the lowest and highest value that has half of the weight on either side."""
+def _weighted_median(weighted: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return the lowest and highest value with half of the weight on either side."""
     weighted = sorted(weighted)
     half = 0.5 * sum(weight for _, weight in weighted)
     below = 0.0
@@ -196,7 +212,7 @@ def _median(weighted: list[tuple[float, float]]) -> tuple[float, float]:
     return weighted[-1][0], weighted[-1][0]
 
 
-def _ramp(turn: float, sd: float) -> float:
-    """Return what of a turn is taken out: nothing of a small one, all of a large one."""
-    share = (abs(turn) / sd - FROM) / (FULLY - FROM)
-    return turn * min(max(share, 0.0), 1.0)
+def _ramp(angle: float, sd: float) -> float:
+    """Return the corrected part of a deviation: none of a small one, all of a large one."""
+    share = (abs(angle) / sd - CORRECTION_START) / (CORRECTION_FULL - CORRECTION_START)
+    return angle * min(max(share, 0.0), 1.0)

@@ -1,7 +1,9 @@
-"""Which sensors are to be believed, and what to tell when that changes.
+"""State of every sensor of a limb (ok, lost, stuck) and reports of its changes.
 
-Law: pure, O(1) a frame. Fusion drops what is lost or stuck in the very frame in which that is
-known; what is told waits a moment, so that a lost sample is no news and a loose plug no flood.
+Fusion drops a lost or stuck sensor in the frame in which the fault is detected. The report waits
+for the times below, so that single lost samples and loose connectors cause no flood of events.
+
+Invariant: the cost per frame is O(1); a state is reported at most once in a row.
 """
 
 from __future__ import annotations
@@ -10,26 +12,26 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.fusion.faults._stuck import FrozenWatch
+from jointfit_daemon.fusion.faults._stuck import StuckSensorDetector
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.model import Chain, Quaternion
 
-State = Literal["absent", "ok", "lost", "stuck"]
+SensorState = Literal["absent", "ok", "lost", "stuck"]
 
-LOST_NS = 200_000_000
-"""Silence that is told as a loss."""
-BACK_NS = 2_000_000_000
-"""A sensor that was lost or stuck must do well so long before it is told to be back."""
+LOSS_REPORT_NS = 200_000_000
+"""Silence after which a sensor is reported as lost, ns."""
+RECOVERY_REPORT_NS = 2_000_000_000
+"""Time without fault after which a sensor is reported as ok again, ns."""
 
 
-class SensorNews(NamedTuple):
-    """A change worth telling."""
+class SensorReport(NamedTuple):
+    """A change in the state of a sensor or segment, for the event log and MQTT."""
 
     id: str
-    """A sensor, or a segment."""
+    """Name of the sensor or segment."""
     state: str
     text: str
     level: Literal["info", "warning"]
@@ -37,17 +39,17 @@ class SensorNews(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Sensor:
+class _SensorStatus:
     segment: str
     partners: tuple[str, ...]
-    state: State = "absent"
+    state: SensorState = "absent"
     since_ns: int = 0
-    """Of `state`, host arrival time."""
-    told: State = "absent"
+    """Host arrival time at which `state` began."""
+    reported: SensorState = "absent"
 
 
-class SensorWatch:
-    """Follows the sensors of a limb from frame to frame.
+class SensorMonitor:
+    """Follows the state of the sensors of one limb.
 
     Parameters
     ----------
@@ -57,65 +59,71 @@ class SensorWatch:
 
     def __init__(self, chain: Chain) -> None:
         self._sensors = {
-            name: _Sensor(segment, tuple(other for other in group if other != name))
+            name: _SensorStatus(segment, tuple(other for other in group if other != name))
             for segment, group in zip(chain.segments, chain.sensors, strict=True)
             for name in group
         }
         self._items = tuple(self._sensors.items())
-        self._frozen = FrozenWatch(chain.sensors)
-        self._untold = False
-        """Whether any state is another than what was told."""
+        self._stuck_detector = StuckSensorDetector(chain.sensors)
+        self._unreported = False
+        """Whether the state of any sensor differs from its reported state."""
 
-    def look(
-        self, t_ns: int, now_ns: int, said: Mapping[str, Quaternion]
+    def update(
+        self, t_ns: int, now_ns: int, orientations: Mapping[str, Quaternion]
     ) -> tuple[Mapping[str, Quaternion], Sequence[str]]:
-        """Take one frame; return what of it is to be believed, and who is stuck.
+        """Add one frame; return the orientations without stuck sensors, and the stuck sensors.
 
         Parameters
         ----------
         t_ns, now_ns : int
             Instant of the frame, and host time of its completion.
-        said : mapping of str to Quaternion
-            Orientation by sensor, each in its own world; the caller must not change it afterwards.
+        orientations : mapping of str to Quaternion
+            Orientation by sensor, each in its own world; must not be changed afterwards.
         """
-        stuck = self._frozen.look(t_ns, said)
-        for name, one in self._items:
-            state: State = "lost" if name not in said else "stuck" if name in stuck else "ok"
-            if state != one.state and not (state == "lost" and one.state == "absent"):
-                one.state, one.since_ns, self._untold = state, now_ns, True
-                if one.told == "absent":  # that it streams is told already
-                    one.told = "ok"
+        stuck = self._stuck_detector.update(t_ns, orientations)
+
+        for name, sensor in self._items:
+            state: SensorState = (
+                "lost" if name not in orientations else "stuck" if name in stuck else "ok"
+            )
+            if state != sensor.state and not (state == "lost" and sensor.state == "absent"):
+                sensor.state, sensor.since_ns, self._unreported = state, now_ns, True
+                if sensor.reported == "absent":  # the core reports the start of streaming
+                    sensor.reported = "ok"
+
         if not stuck:
-            return said, ()
-        return {name: q for name, q in said.items() if name not in stuck}, stuck
+            return orientations, ()
+        return {name: q for name, q in orientations.items() if name not in stuck}, stuck
 
-    def news(self, now_ns: int) -> list[SensorNews]:
-        """Return what is worth telling at `now_ns`, each change once."""
-        if not self._untold:
+    def pop_reports(self, now_ns: int) -> list[SensorReport]:
+        """Return the reports that are due at `now_ns`, each once."""
+        if not self._unreported:
             return []
-        told = [
-            self._tell(name, one)
-            for name, one in self._items
-            if one.state != one.told and now_ns - one.since_ns >= _patience_ns(one)
+        reports = [
+            self._report(name, sensor)
+            for name, sensor in self._items
+            if sensor.state != sensor.reported
+            and now_ns - sensor.since_ns >= _report_delay_ns(sensor)
         ]
-        self._untold = any(one.state != one.told for _, one in self._items)
-        return told
+        self._unreported = any(sensor.state != sensor.reported for _, sensor in self._items)
+        return reports
 
-    def health(self, name: str) -> State:
+    def state(self, name: str) -> SensorState:
         """Return the state of one sensor."""
         return self._sensors[name].state
 
-    def _tell(self, name: str, one: _Sensor) -> SensorNews:
-        one.told = one.state
-        if one.state == "ok":
-            return SensorNews(name, "ok", f"takes part in {one.segment} again", "info")
-        left = [other for other in one.partners if self._sensors[other].state == "ok"]
-        goes_on = f"goes on with {', '.join(left)}" if left else "is left without a sensor"
-        what = "gives no data" if one.state == "lost" else "is stuck: it repeats itself"
-        return SensorNews(name, one.state, f"{what}; {one.segment} {goes_on}", "warning")
+    def _report(self, name: str, sensor: _SensorStatus) -> SensorReport:
+        sensor.reported = sensor.state
+        if sensor.state == "ok":
+            return SensorReport(name, "ok", f"sensor recovered; used for {sensor.segment}", "info")
+
+        fault = "no data" if sensor.state == "lost" else "stuck: orientation does not change"
+        working = [other for other in sensor.partners if self._sensors[other].state == "ok"]
+        rest = f"uses {', '.join(working)}" if working else "has no working sensor"
+        return SensorReport(name, sensor.state, f"{fault}; {sensor.segment} {rest}", "warning")
 
 
-def _patience_ns(one: _Sensor) -> int:
-    if one.state == "lost":
-        return LOST_NS
-    return BACK_NS if one.state == "ok" else 0
+def _report_delay_ns(sensor: _SensorStatus) -> int:
+    if sensor.state == "lost":
+        return LOSS_REPORT_NS
+    return RECOVERY_REPORT_NS if sensor.state == "ok" else 0

@@ -1,7 +1,9 @@
-"""Tells whether two sensors of one segment still lie to each other as calibration saw it.
+"""Detection of sensor slip: pairs of sensors of one segment against their calibrated relation.
 
-Law: pure, O(1) a look. Doubt is felt at once, as a distance beyond what is usual, and told only
-when it lasts; it ends when it has been well below its limit for a while.
+The calibration predicts the rotation between two sensors of a segment from posture
+(:mod:`jointfit_daemon.calibration.sensor_links`). A difference beyond the usual residual enters
+the uncertainty at once; the pair is reported as inconsistent only if the difference persists, and
+as consistent after it stayed well below the limit for longer.
 """
 
 from __future__ import annotations
@@ -18,200 +20,218 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Quaternion, Vector
 
-SMOOTH_S = 0.4
-LASTS_NS, ENDS_NS = 500_000_000, 2_000_000_000
-LIMIT, LEAST_LIMIT = 2.4, radians(6.0)
-"""Distance, smoothed, in units of its usual RMS length, from which on something slipped: healthy
-sensors stay below 1.5 for hours (simulated skin), below 2.1 in movements that were not trained
-(real skin)."""
-CALM = 0.65
-"""Share of the limit below which a doubt may end."""
-LEVEL = 0.75
-"""Share of the limit up to which what is no turn about the vertical may be skin."""
-USUAL = 1.5
-"""Distance in the same units that is still no reason for doubt."""
-USUAL_SLOW = 1.2
-"""The same of the mean distance over the last second."""
-LATELY_S, JUST_BEFORE = 1.0, 10
-"""Of the mean; and looks back, 0.4 s, to what was just before."""
+SMOOTHING_S = 0.4
+"""Time constant of the difference that is compared with the limit, s."""
+ONSET_NS = 500_000_000
+"""Time above the limit after which a pair is inconsistent, ns."""
+RELEASE_NS = 2_000_000_000
+"""Time below the release limit after which it is consistent again, ns."""
+LIMIT_FACTOR = 2.4
+"""Limit of the smoothed difference in units of its usual RMS length. Healthy sensors stay below 1.5
+for hours (simulated soft tissue) and below 2.1 in movements outside the training (recorded)."""
+MIN_LIMIT = radians(6.0)
+"""Smallest limit, rad."""
+RELEASE_SHARE = 0.65
+"""Share of the limit below which an inconsistency may end."""
+TILT_SHARE = 0.75
+"""Share of the limit up to which a difference other than heading may be soft-tissue artefact."""
+USUAL_FACTOR = 1.5
+"""Largest usual difference of a single frame, in units of its RMS length."""
+USUAL_MEAN_FACTOR = 1.2
+"""Largest usual mean difference over :data:`MEAN_S`, in the same units."""
+MEAN_S = 1.0
+"""Time constant of the mean difference, s."""
+RECENT_FRAMES = 10
+"""Updates back to the frame that sudden changes are measured against: 0.4 s."""
 UNTRAINED_SD = radians(5.0)
-"""Per component, of pairs that no movement has been seen of."""
+"""Standard deviation per component of a pair without training movement, rad."""
 
 
-def untrained(a: str, b: str) -> SensorLink:
-    """Return what is expected of a pair of which only the static pose is known: nothing much."""
+def untrained_link(a: str, b: str) -> SensorLink:
+    """Return the link of a pair of which only the static pose is known: it predicts no rotation."""
     zero = (0.0,) * 10
     return SensorLink(a, b, "pair", (), (zero, zero, zero), zero, zero, 0.0, UNTRAINED_SD)
 
 
-def together(pairs: Sequence[PairWatch]) -> dict[str, Quaternion]:
-    """Return how to turn the sensors of a segment, in its axes, to lie as usual to each other.
+def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
+    """Return the rotations that bring the sensors of a segment back to their usual differences.
 
-    Each moves by the mean of what it lies beyond the usual, so that none is preferred.
+    Every sensor gets an equal share of the excess of its pairs, so none is preferred. The rotations
+    are in segment axes.
     """
     names = {name for pair in pairs for name in (pair.link.a, pair.link.b)}
-    moves = {}
+    corrections = {}
     for name in names:
         x = y = z = 0.0
         for pair in pairs:
-            if pair.apart_too_far and name in (pair.link.a, pair.link.b):
+            if pair.exceeded and name in (pair.link.a, pair.link.b):
                 share = (1.0 if name == pair.link.a else -1.0) / len(names)
-                vx, vy, vz = pair.beyond
+                vx, vy, vz = pair.excess_vector
                 x, y, z = x + share * vx, y + share * vy, z + share * vz
-        moves[name] = exp_one((x, y, z))
-    return moves
+        corrections[name] = exp_one((x, y, z))
+    return corrections
 
 
-class LastingDoubt:
-    """Doubts what has been too far apart for a while, until it has been well within for longer."""
+class FaultDebouncer:
+    """Switches a fault on after :data:`ONSET_NS` above a limit, and off after a longer calm."""
 
     def __init__(self) -> None:
-        self.doubtful = False
+        self.active = False
         self._since_ns: int | None = None
 
-    def begin_again(self) -> None:
-        """Count from now on."""
+    def restart(self) -> None:
+        """Restart the time measurement; the state stays."""
         self._since_ns = None
 
-    def judge(self, t_ns: int, apart: float, limit: float) -> bool:
-        """Take a distance; return whether the doubt began or ended with it."""
-        against = apart < CALM * limit if self.doubtful else apart > limit
-        if not against:
+    def update(self, t_ns: int, difference: float, limit: float) -> bool:
+        """Add a difference; return whether the fault began or ended with it."""
+        pending = difference < RELEASE_SHARE * limit if self.active else difference > limit
+        if not pending:
             self._since_ns = None
             return False
+
         if self._since_ns is None:
             self._since_ns = t_ns
-        if t_ns - self._since_ns < (ENDS_NS if self.doubtful else LASTS_NS):
+        if t_ns - self._since_ns < (RELEASE_NS if self.active else ONSET_NS):
             return False
-        self.doubtful, self._since_ns = not self.doubtful, None
+        self.active, self._since_ns = not self.active, None
         return True
 
 
-class PairWatch:
-    """Watches one pair.
+class SlipDetector:
+    """Compares two sensors of one segment with their calibrated relation.
 
     Parameters
     ----------
     link : SensorLink
-        What calibration saw of it.
+        Relation of the pair from the calibration.
     """
 
     def __init__(self, link: SensorLink) -> None:
         self.link = link
-        self._slow: Vector = (0.0, 0.0, 0.0)
+        self._smooth: Vector = (0.0, 0.0, 0.0)
         self._tilt: Vector = (0.0, 0.0, 0.0)
-        self._lately: Vector = (0.0, 0.0, 0.0)
-        self._looks: deque[Vector] = deque(maxlen=JUST_BEFORE)
+        self._mean: Vector = (0.0, 0.0, 0.0)
+        self._recent: deque[Vector] = deque(maxlen=RECENT_FRAMES)
         self._usual = 0.0
         self._before_ns: int | None = None
-        self._doubt = LastingDoubt()
+        self._debouncer = FaultDebouncer()
         self.changed = False
-        """Whether the last look began or ended the doubt."""
-        self.apart = 0.0
-        """Smoothed distance from what was expected, rad."""
-        self.limit = LEAST_LIMIT
-        """Distance from which on they contradict each other, rad."""
+        """Whether the last update began or ended the inconsistency."""
+        self.distance = 0.0
+        """Smoothed difference from the predicted rotation, rad."""
+        self.limit = MIN_LIMIT
+        """Distance above which the pair is inconsistent, rad."""
         self.excess = 0.0
-        """How far beyond the usual they lie right now, rad, what is taken out left aside."""
-        self.beyond: Vector = (0.0, 0.0, 0.0)
-        """How to turn b, seen from a, segment's axes, rad, while they lie further now."""
-        self.apart_too_far = False
-        """Whether they lie further apart than usual now."""
-        self.turned = 0.0
-        """Part of the last distance that is a turn about the vertical, b seen from a, rad."""
+        """Difference beyond the usual in the last frame, after corrections, rad."""
+        self.excess_vector: Vector = (0.0, 0.0, 0.0)
+        """Excess of b against a as a rotation vector, segment axes, rad; valid if `exceeded`."""
+        self.exceeded = False
+        """Whether the last difference was larger than usual."""
+        self.heading = 0.0
+        """Vertical component of the last difference, b against a, rad."""
 
     @property
-    def doubtful(self) -> bool:
-        """Whether the two contradict each other for good."""
-        return self._doubt.doubtful
+    def inconsistent(self) -> bool:
+        """Whether the pair contradicts its calibrated relation persistently."""
+        return self._debouncer.active
 
     @property
     def tilted(self) -> bool:
-        """Whether they contradict each other, or soon will, in more than heading."""
-        return not self.calm and hypot(*self._tilt) > LEVEL * self.limit
+        """Whether the pair is (or becomes) inconsistent in more than heading."""
+        return not self.consistent and hypot(*self._tilt) > TILT_SHARE * self.limit
 
     @property
-    def calm(self) -> bool:
-        """Whether what they differ by may be a slow drift: no contradiction, nor one coming up."""
-        return not self.doubtful and self.apart < self.limit
+    def consistent(self) -> bool:
+        """Whether the difference may be slow drift: no inconsistency is active or pending."""
+        return not self.inconsistent and self.distance < self.limit
 
-    def silent(self) -> None:
-        """Take it that one of them says nothing."""
-        self.excess, self.apart_too_far = 0.0, False
+    def clear_excess(self) -> None:
+        """Clear the excess: a sensor of the pair is silent."""
+        self.excess, self.exceeded = 0.0, False
 
-    def look(
+    def update(
         self,
         t_ns: int,
         a: Quaternion,
         b: Quaternion,
-        ups: tuple[Vector, Vector | None],
+        verticals: tuple[Vector, Vector | None],
         *,
-        taken: float = 0.0,
+        correction: float = 0.0,
     ) -> None:
-        """Take one look at both, bone-aligned.
+        """Add the bone-aligned orientations of both sensors.
 
         Parameters
         ----------
         t_ns : int
-            Instant.
+            Instant of the frame.
         a, b : Quaternion
-            q_world_segment as each says it.
-        ups : tuple of Vector
-            The vertical in the frames of `a` and of the neighboring segment.
-        taken : float
-            Turn about the vertical, b against a, that is taken out of what is given, rad.
+            q_world_segment of either sensor.
+        verticals : tuple of Vector
+            The vertical in the frame of `a` and in that of the neighboring segment.
+        correction : float
+            Heading correction, b against a, that `a` and `b` already contain, rad.
         """
-        up_a, up_near = ups
+        up_a, up_near = verticals
         (ex, ey, ez), sd = self.link.expected(up_a, up_near)
         dx, dy, dz = turn_one(a, b)
-        left = rx, ry, rz = dx - ex, dy - ey, dz - ez
+        residual = rx, ry, rz = dx - ex, dy - ey, dz - ez
         usual = sqrt(3.0) * sd
+
+        # Split into heading (about the vertical) and tilt; the limit applies before correction.
         ux, uy, uz = up_a
-        turned = rx * ux + ry * uy + rz * uz
-        self.turned = turned + taken
-        tilted = (rx - turned * ux, ry - turned * uy, rz - turned * uz)
-        r = (rx + taken * ux, ry + taken * uy, rz + taken * uz)
-        self._smooth(t_ns, r, left, tilted, usual=usual)
-        self._exceed(left, usual)
-        self.changed = self._doubt.judge(t_ns, self.apart, self.limit)
+        heading = rx * ux + ry * uy + rz * uz
+        self.heading = heading + correction
+        tilt = (rx - heading * ux, ry - heading * uy, rz - heading * uz)
+        uncorrected = (rx + correction * ux, ry + correction * uy, rz + correction * uz)
 
-    def _exceed(self, r: Vector, usual: float) -> None:
-        """See how far beyond the usual they lie: now, for the last second, and against just before.
+        self._smooth_differences(t_ns, uncorrected, residual, tilt, usual=usual)
+        self._update_excess(residual, usual)
+        self.changed = self._debouncer.update(t_ns, self.distance, self.limit)
 
-        Skin may hide a slip in the very moment, but hardly in what has just changed as well.
+    def _update_excess(self, residual: Vector, usual: float) -> None:
+        """Compute the excess of the current frame, of the mean, and of the recent change.
+
+        A soft-tissue artefact may cancel a slip in one frame, but rarely in its change as well.
         """
-        length = hypot(*r)
-        beyond = max(0.0, length - USUAL * usual)
-        self.apart_too_far = beyond > 0.0
-        if self.apart_too_far:
+        length = hypot(*residual)
+        beyond = max(0.0, length - USUAL_FACTOR * usual)
+        self.exceeded = beyond > 0.0
+        if self.exceeded:
             share = beyond / length
-            self.beyond = (share * r[0], share * r[1], share * r[2])
-        x, y, z = self._looks[0]
-        self._looks.append(r)
-        changed = hypot(r[0] - x, r[1] - y, r[2] - z) - USUAL * usual
-        slow = hypot(*self._lately) - USUAL_SLOW * usual
-        self.excess = max(beyond, changed, slow)
+            self.excess_vector = (share * residual[0], share * residual[1], share * residual[2])
 
-    def _smooth(self, t_ns: int, r: Vector, left: Vector, tilted: Vector, *, usual: float) -> None:
-        if self._before_ns is None or t_ns - self._before_ns > LASTS_NS:
-            self._slow = self._tilt = (0.0, 0.0, 0.0)
-            self._lately = left
-            self._looks.clear()
-            self._looks.append(left)
+        x, y, z = self._recent[0]
+        self._recent.append(residual)
+        change = hypot(residual[0] - x, residual[1] - y, residual[2] - z) - USUAL_FACTOR * usual
+        mean = hypot(*self._mean) - USUAL_MEAN_FACTOR * usual
+        self.excess = max(beyond, change, mean)
+
+    def _smooth_differences(
+        self, t_ns: int, uncorrected: Vector, residual: Vector, tilt: Vector, *, usual: float
+    ) -> None:
+        if self._before_ns is None or t_ns - self._before_ns > ONSET_NS:
+            self._smooth = self._tilt = (0.0, 0.0, 0.0)
+            self._mean = residual
+            self._recent.clear()
+            self._recent.append(residual)
             self._usual, self._before_ns = usual, t_ns
-            self._doubt.begin_again()
+            self._debouncer.restart()
+
         dt = (t_ns - self._before_ns) * 1e-9
-        share = 1.0 - exp(-dt / SMOOTH_S)
+        gain = 1.0 - exp(-dt / SMOOTHING_S)
         self._before_ns = t_ns
-        self._lately = _nearer(self._lately, left, 1.0 - exp(-dt / LATELY_S))
-        self._slow, self._tilt = _nearer(self._slow, r, share), _nearer(self._tilt, tilted, share)
-        self._usual += share * (usual - self._usual)
-        self.apart, self.limit = hypot(*self._slow), max(LEAST_LIMIT, LIMIT * self._usual)
+        self._mean = _blend(self._mean, residual, 1.0 - exp(-dt / MEAN_S))
+        self._smooth = _blend(self._smooth, uncorrected, gain)
+        self._tilt = _blend(self._tilt, tilt, gain)
+        self._usual += gain * (usual - self._usual)
+        self.distance = hypot(*self._smooth)
+        self.limit = max(MIN_LIMIT, LIMIT_FACTOR * self._usual)
 
 
-def _nearer(x: Vector, y: Vector, share: float) -> Vector:
+def _blend(x: Vector, y: Vector, gain: float) -> Vector:
     return (
-        x[0] + share * (y[0] - x[0]),
-        x[1] + share * (y[1] - x[1]),
-        x[2] + share * (y[2] - x[2]),
+        x[0] + gain * (y[0] - x[0]),
+        x[1] + gain * (y[1] - x[1]),
+        x[2] + gain * (y[2] - x[2]),
     )

@@ -1,11 +1,15 @@
-"""Sensors that go on talking and say nothing new.
+"""Detection of stuck sensors: sensors that keep sending but no longer follow their segment.
 
-Law: pure, O(1) a frame, indifferent to mounts and worlds: only how far each sensor turned counts.
+A sensor is stuck if either
 
-A sensor is stuck when it repeats itself to the last bit while its partner on the same segment
-turns, or when it stays behind while its partner turns a long way. A live sensor never repeats
-itself for long; how long one does by nature (coarse digits, a slow filter) is learnt from runs that
-ended by themselves. It is trusted again after it has moved for a fifth of a second.
+* it repeats its orientation while another sensor turns, or
+* it follows less than a small share of a large rotation of its partner on the same segment.
+
+How long a healthy sensor repeats itself (coarse resolution, slow filter) is estimated from
+repetitions that ended by themselves. A stuck sensor is used again after 0.2 s of movement.
+
+Invariant: only rotations of each sensor against itself are compared, so neither its alignment nor
+its world matters. The cost per frame is O(1).
 """
 
 from __future__ import annotations
@@ -20,70 +24,81 @@ if TYPE_CHECKING:
 
     Orientations = Mapping[str, Quaternion]
 
-REPEATS_NS = 50_000_000
-"""Shorter repetitions are nobody's concern."""
-REPEATS_AT_REST_NS = 400_000_000
-"""A sensor known to move always is stuck after this, if another one is lively."""
-KNOWN_NS = 5_000_000_000
-"""Time of watching after which it is known how a sensor behaves."""
-NATURAL_FACTOR, NATURAL_MOST_NS = 3, 150_000_000
-PARTNER = radians(1.0)
-"""Turn of another sensor on the same segment that no live sensor sleeps through."""
-NEIGHBOR, NEIGHBOR_NS = radians(10.0), 300_000_000
-"""The same of a sensor on another segment, and how long it must have been slept through."""
+REPEAT_NS = 50_000_000
+"""Shortest repetition that can count as stuck, ns."""
+REPEAT_AT_REST_NS = 400_000_000
+"""Repetition of a sensor at rest that counts as stuck if another sensor still varies, ns."""
+OBSERVATION_NS = 5_000_000_000
+"""Time after which the noise of a sensor at rest is known, ns."""
+NATURAL_FACTOR = 3
+"""Repetitions up to this multiple of the natural repetition time are healthy."""
+NATURAL_LIMIT_NS = 150_000_000
+"""Largest natural repetition time that is learned, ns: a longer one would hide a fault."""
+PARTNER_ROTATION = radians(1.0)
+"""Rotation of a sensor on the same segment that a healthy sensor always follows, rad."""
+OTHER_ROTATION = radians(10.0)
+"""The same for a sensor on another segment, rad: joints allow segments to move alone."""
+OTHER_REPEAT_NS = 300_000_000
+"""Shortest repetition that the rotation of another segment can confirm, ns."""
 WINDOW_NS = 150_000_000
-FAR, SHARE = radians(6.0), 0.05
-"""Turn of a partner within one window, and the share of it that even a loose sensor follows. Two
-windows in a row must say so: nobody turns back at the same moment twice."""
-TRUSTED_NS = 200_000_000
+"""Length of the windows in which rotations of partners are compared, ns."""
+WINDOW_ROTATION = radians(6.0)
+"""Rotation of a partner within one window that starts a comparison, rad."""
+FOLLOWED_SHARE = 0.05
+"""Share of that rotation that even a loosely attached sensor follows. Two consecutive windows
+must fall below it, because a sensor may move back to its start within one window."""
+RECOVERY_NS = 200_000_000
+"""Movement after which a stuck sensor is used again, ns."""
 _ROUNDING = 1e-12
-"""Squared sine of half a turn that is rounding: 2e-6 rad."""
+"""Squared sine of half a rotation that is rounding error: 2e-6 rad."""
 
 
-class _Sensor:
+class _SensorHistory:
     __slots__ = (
-        "asleep", "awake_ns", "behind", "everyone", "first_ns", "natural_ns", "partners", "q",
-        "since_ns", "still", "strangers",
+        "first_ns", "lagging", "natural_ns", "orientations", "others", "partners", "q",
+        "repeated_ns", "repeating", "since_ns", "still",
     )  # fmt: skip
 
-    def __init__(self, partners: tuple[str, ...], strangers: tuple[str, ...]) -> None:
-        self.partners, self.strangers = partners, strangers
+    def __init__(self, partners: tuple[str, ...], others: tuple[str, ...]) -> None:
+        self.partners, self.others = partners, others
         self.since_ns: int | None = None
-        """Since when it says the same; None: it says nothing."""
+        """Start of the current repetition; None while the sensor is silent."""
         self.q: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        """What it says since then."""
-        self.everyone: Orientations = {}
-        """What all sensors said then."""
+        """Orientation at that instant."""
+        self.orientations: Orientations = {}
+        """Orientations of all sensors at that instant."""
         self.first_ns: int | None = None
         self.natural_ns = 0
-        self.asleep = self.behind = self.still = False
-        self.awake_ns = 0
-        """Last instant at which it repeated itself."""
+        self.repeating = self.lagging = self.still = False
+        self.repeated_ns = 0
+        """Last instant at which the sensor repeated itself."""
 
-    def take(self, t_ns: int, q: Quaternion, everyone: Orientations) -> bool:
-        """Take one orientation; tell whether it is the one before again."""
+    def update(self, t_ns: int, q: Quaternion, orientations: Orientations) -> bool:
+        """Add one orientation; return whether it repeats the one before."""
         since_ns = self.since_ns
         if since_ns is not None and _repeats(self.q, q):
-            self.awake_ns = t_ns
+            self.repeated_ns = t_ns
             return True
+
         if since_ns is None:
             self.first_ns = t_ns
-        elif not self.asleep:
+        elif not self.repeating:
             if t_ns - since_ns > self.natural_ns:
-                self.natural_ns = min(t_ns - since_ns, NATURAL_MOST_NS)
-        elif t_ns - self.awake_ns >= TRUSTED_NS:
-            self.asleep = False
-        self.since_ns, self.q, self.everyone = t_ns, q, everyone
+                self.natural_ns = min(t_ns - since_ns, NATURAL_LIMIT_NS)
+        elif t_ns - self.repeated_ns >= RECOVERY_NS:
+            self.repeating = False
+
+        self.since_ns, self.q, self.orientations = t_ns, q, orientations
         return False
 
-    def forget(self) -> None:
-        """Take it that it says nothing: what it says next is not compared with what it said."""
+    def reset(self) -> None:
+        """Mark the sensor as silent: its next orientation is not compared with the last one."""
         self.since_ns = None
-        self.asleep = self.behind = self.still = False
+        self.repeating = self.lagging = self.still = False
 
 
-class FrozenWatch:
-    """Finds sensors that are stuck.
+class StuckSensorDetector:
+    """Detects stuck sensors of one limb.
 
     Parameters
     ----------
@@ -92,11 +107,11 @@ class FrozenWatch:
     """
 
     def __init__(self, groups: Sequence[Sequence[str]]) -> None:
-        everyone = [name for group in groups for name in group]
+        sensors = [name for group in groups for name in group]
         self._sensors = {
-            name: _Sensor(
+            name: _SensorHistory(
                 tuple(other for other in group if other != name),
-                tuple(other for other in everyone if other not in group),
+                tuple(other for other in sensors if other not in group),
             )
             for group in groups
             for name in group
@@ -104,75 +119,90 @@ class FrozenWatch:
         self._items = tuple(self._sensors.items())
         self._window: tuple[int, Orientations] | None = None
 
-    def look(self, t_ns: int, said: Orientations) -> list[str]:
-        """Return the sensors that are stuck at `t_ns`, of those that say something.
+    def update(self, t_ns: int, orientations: Orientations) -> list[str]:
+        """Add one frame and return the ids of the sensors that are stuck.
 
         Parameters
         ----------
         t_ns : int
-            Instant of the frame; grows from call to call.
-        said : mapping of str to Quaternion
-            Orientation by sensor, each in any world of its own. It is kept for a while: the caller
-            must not change it.
+            Instant of the frame; increases from call to call.
+        orientations : mapping of str to Quaternion
+            Orientation by sensor, each in its own world. The detector keeps a reference, so the
+            caller must not change it.
         """
         repeating = []
-        for name, one in self._items:
-            q = said.get(name)
+        for name, sensor in self._items:
+            q = orientations.get(name)
             if q is None:
-                one.forget()
-            elif one.take(t_ns, q, said):
+                sensor.reset()
+            elif sensor.update(t_ns, q, orientations):
                 repeating.append(name)
         for name in repeating:
-            one = self._sensors[name]
-            one.asleep = one.asleep or self._asleep(one, t_ns, said, repeating)
+            sensor = self._sensors[name]
+            sensor.repeating = sensor.repeating or self._is_stuck(
+                sensor, t_ns, orientations, repeating
+            )
+
         if self._window is None or t_ns - self._window[0] >= WINDOW_NS:
             if self._window is not None:
-                self._leave_behind(self._window[1], said)
-            self._window = (t_ns, said)
-        return [name for name, one in self._items if one.asleep or one.behind]
+                self._compare_window(self._window[1], orientations)
+            self._window = (t_ns, orientations)
+        return [name for name, sensor in self._items if sensor.repeating or sensor.lagging]
 
-    def _asleep(
-        self, one: _Sensor, t_ns: int, said: Orientations, repeating: Sequence[str]
+    def _is_stuck(
+        self,
+        sensor: _SensorHistory,
+        t_ns: int,
+        orientations: Orientations,
+        repeating: Sequence[str],
     ) -> bool:
-        """Tell whether others turned, or live on, while `one` repeats itself."""
-        since_ns, first_ns = one.since_ns, one.first_ns
+        """Return whether other sensors turned, or still vary, during a repetition of `sensor`."""
+        since_ns, first_ns = sensor.since_ns, sensor.first_ns
         if since_ns is None or first_ns is None:
             return False
-        length_ns, usual_ns = t_ns - since_ns, NATURAL_FACTOR * one.natural_ns
-        if length_ns < max(REPEATS_NS, usual_ns):
+        length_ns, usual_ns = t_ns - since_ns, NATURAL_FACTOR * sensor.natural_ns
+        if length_ns < max(REPEAT_NS, usual_ns):
             return False
-        then = one.everyone
-        if any(_turned(name, then, said, PARTNER) for name in one.partners):
+
+        # The limb moved.
+        start = sensor.orientations
+        if any(_turned(name, start, orientations, PARTNER_ROTATION) for name in sensor.partners):
             return True
-        if length_ns >= NEIGHBOR_NS and any(
-            _turned(name, then, said, NEIGHBOR) for name in one.strangers
+        if length_ns >= OTHER_REPEAT_NS and any(
+            _turned(name, start, orientations, OTHER_ROTATION) for name in sensor.others
         ):
             return True
-        if length_ns < REPEATS_AT_REST_NS or since_ns - first_ns < KNOWN_NS:
+
+        # The limb is at rest: the noise of other sensors shows that orientations should vary.
+        if length_ns < REPEAT_AT_REST_NS or since_ns - first_ns < OBSERVATION_NS:
             return False
         return any(
-            name in said and name not in repeating for name in (*one.partners, *one.strangers)
+            name in orientations and name not in repeating
+            for name in (*sensor.partners, *sensor.others)
         )
 
-    def _leave_behind(self, then: Orientations, said: Orientations) -> None:
-        """Compare turns over one window: who hardly moves while a partner goes far is stuck."""
-        for name, one in self._items:
-            if any(_turned(other, then, said, FAR) for other in one.partners):
-                known = name in then and name in said
-                before, one.still = one.still, known and not _turned(name, then, said, SHARE * FAR)
-                one.behind = before and one.still
+    def _compare_window(self, start: Orientations, end: Orientations) -> None:
+        """Mark sensors that hardly moved in two windows in which a partner turned far."""
+        for name, sensor in self._items:
+            if any(_turned(other, start, end, WINDOW_ROTATION) for other in sensor.partners):
+                present = name in start and name in end
+                before = sensor.still
+                sensor.still = present and not _turned(
+                    name, start, end, FOLLOWED_SHARE * WINDOW_ROTATION
+                )
+                sensor.lagging = before and sensor.still
 
 
 def _repeats(a: Quaternion, b: Quaternion) -> bool:
-    """Tell whether two orientations differ by rounding; mostly one component denies it."""
+    """Return whether two orientations differ by rounding only; one component mostly decides."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     x = aw * bx - ax * bw - ay * bz + az * by
-    return x * x < _ROUNDING and _sine2(a, b) < _ROUNDING
+    return x * x < _ROUNDING and _squared_half_sine(a, b) < _ROUNDING
 
 
-def _sine2(a: Quaternion, b: Quaternion) -> float:
-    """Return the squared sine of half the turn between two orientations."""
+def _squared_half_sine(a: Quaternion, b: Quaternion) -> float:
+    """Return the squared sine of half the rotation between two orientations."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     x = aw * bx - ax * bw - ay * bz + az * by
@@ -181,9 +211,9 @@ def _sine2(a: Quaternion, b: Quaternion) -> float:
     return x * x + y * y + z * z
 
 
-def _turned(name: str, then: Orientations, now: Orientations, least: float) -> bool:
-    """Tell whether a sensor has turned by `least` rad or more between two frames."""
-    a, b = then.get(name), now.get(name)
+def _turned(name: str, start: Orientations, end: Orientations, angle: float) -> bool:
+    """Return whether a sensor turned by at least `angle` rad between two frames."""
+    a, b = start.get(name), end.get(name)
     if a is None or b is None:
         return False
-    return _sine2(a, b) >= sin(0.5 * least) ** 2
+    return _squared_half_sine(a, b) >= sin(0.5 * angle) ** 2

@@ -14,8 +14,8 @@ from jointfit_daemon.calibration.soft_tissue import (
     error_correlation,
     error_correlations,
 )
-from jointfit_daemon.fusion._forward_kinematics import read_angles
-from jointfit_daemon.fusion._segment_fuser import Fused
+from jointfit_daemon.fusion._forward_kinematics import joint_angle_estimate
+from jointfit_daemon.fusion._segment_fuser import FusedSegment
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.limb_model import Calibration, UnknownSchema
 from jointfit_daemon.model import Chain
@@ -73,11 +73,11 @@ def test_a_joint_that_was_hardly_seen_whole_has_none() -> None:
 
 
 def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
-    above = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
-    below = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S3",), (), 0.04)
+    above = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
+    below = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S3",), (), 0.04)
 
     def sd(alike: float) -> float:
-        state = read_angles(above, below, sign=-1.0, left=False, alike=alike)
+        state = joint_angle_estimate(above, below, sign=-1.0, left=False, correlation=alike)
         assert state is not None
         assert state.flexion_sd is not None
         return state.flexion_sd
@@ -89,18 +89,18 @@ def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
 
 def test_what_no_model_says_is_independent_however_alike_the_models_err() -> None:
     """Held orientations, plain means and doubts of a watch come from elsewhere than the models."""
-    above = Fused((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
-    below = Fused((1.0, 0.0, 0.0, 0.0), 0.4, (), ("held:shank",))
+    above = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
+    below = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.4, (), ("held:shank",))
 
-    def sd(one: Fused, other: Fused) -> float:
-        state = read_angles(one, other, sign=-1.0, left=False, alike=0.9)
+    def sd(one: FusedSegment, other: FusedSegment) -> float:
+        state = joint_angle_estimate(one, other, sign=-1.0, left=False, correlation=0.9)
         assert state is not None
         assert state.flexion_sd is not None
         return state.flexion_sd
 
     assert sd(above, below) == pytest.approx(hypot(0.03, 0.4))
     assert sd(below, below) == pytest.approx(hypot(0.4, 0.4))
-    doubted = above._replace(doubt=0.2)
+    doubted = above._replace(fault_sd=0.2)
     models = 2.0 * 0.03**2 * (1.0 - 0.9)
     assert sd(doubted, doubted) == pytest.approx(sqrt(models + 2.0 * 0.2**2))
 

@@ -1,11 +1,11 @@
-"""The filter of one slow heading: it follows drifts, leaves skin alone, knows how sure it is."""
+"""Heading drift filter: tracking, robustness to soft-tissue bias, and standard deviation."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from jointfit_daemon.fusion.faults._heading_drift import OUTLIER, HeadingDrift
+from jointfit_daemon.fusion.faults._heading_drift import OUTLIER_SIGMA, HeadingDriftFilter
 
 S = 1_000_000_000
 
@@ -13,18 +13,18 @@ S = 1_000_000_000
 def follow(
     rate_deg_min: float, *, seed: int, spread_deg: float = 3.0, seconds: int = 400
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return error and claimed standard deviation, deg, once a second.
+    """Return error and estimated standard deviation, deg, once a second.
 
-    The looks are biased by a movement's skin (half of the variance, 15 s) and scatter.
+    Half of the measurement variance is bias (soft tissue, correlation time 15 s), half is noise.
     """
-    rng, drift = np.random.default_rng(seed), HeadingDrift(np.radians(spread_deg))
+    rng, drift = np.random.default_rng(seed), HeadingDriftFilter(np.radians(spread_deg))
     keep, share = np.exp(-1 / 15), spread_deg * np.sqrt(0.5)
     bias, rows = rng.normal() * share, []
     for second in range(seconds):
         bias = keep * bias + rng.normal() * share * np.sqrt(1 - keep**2)
         true = rate_deg_min * second / 60
         for _ in range(25):
-            drift.look(np.radians(true + bias + rng.normal() * share))
+            drift.add_measurement(np.radians(true + bias + rng.normal() * share))
         drift.step(second * S)
         rows.append((np.degrees(drift.heading) - true, np.degrees(drift.sd)))
     errors, sds = np.array(rows).T
@@ -32,19 +32,19 @@ def follow(
 
 
 @pytest.mark.parametrize("rate", [0.0, 1.0, 3.0, 10.0, -10.0])
-def test_a_drift_is_followed_within_what_skin_allows(rate: float) -> None:
+def test_drift_is_tracked_within_the_soft_tissue_error(rate: float) -> None:
     left = [follow(rate, seed=seed)[0][120:] for seed in range(8)]
     assert np.sqrt(np.mean(np.square(left))) < (1.6 if abs(rate) < 10 else 2.2)
 
 
-def test_the_claimed_deviation_is_what_it_is_off_by() -> None:
+def test_standard_deviation_matches_the_error() -> None:
     runs = [follow(2.0, seed=seed) for seed in range(20)]
     ratio = np.sqrt(np.mean([np.mean((e[60:] / sd[60:]) ** 2) for e, sd in runs]))
     assert 0.6 < ratio < 1.25
 
 
-def test_what_nobody_looks_at_grows_doubtful() -> None:
-    drift = HeadingDrift(np.radians(3.0))
+def test_standard_deviation_grows_without_measurements() -> None:
+    drift = HeadingDriftFilter(np.radians(3.0))
     sds = []
     for second in range(600):
         drift.step(second * S)
@@ -55,12 +55,12 @@ def test_what_nobody_looks_at_grows_doubtful() -> None:
     assert drift.heading == 0.0
 
 
-def test_a_look_that_contradicts_everything_is_not_believed() -> None:
-    drift = HeadingDrift(np.radians(2.0))
+def test_outliers_are_rejected() -> None:
+    drift = HeadingDriftFilter(np.radians(2.0))
     for second in range(60):
         for _ in range(25):
-            drift.look(0.0 if second < 50 else np.radians(40.0))
+            drift.add_measurement(0.0 if second < 50 else np.radians(40.0))
         drift.step(second * S)
     assert abs(np.degrees(drift.heading)) < 0.5
-    assert drift.refused >= 9
-    assert OUTLIER < 40 / 2
+    assert drift.rejected >= 9
+    assert OUTLIER_SIGMA < 40 / 2

@@ -1,4 +1,4 @@
-"""Sensors that fall silent or stuck are noticed in time, told once, and nobody else is blamed."""
+"""Lost and stuck sensors are detected in time and reported once; healthy sensors are not."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.fusion import SensorWatch
-from jointfit_daemon.fusion.faults._stuck import FrozenWatch
+from jointfit_daemon.fusion import SensorMonitor
+from jointfit_daemon.fusion.faults._stuck import StuckSensorDetector
 from jointfit_daemon.model import Chain
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), GROUPS)
 
 
 def limb(seconds: float, *, speed: float = 1.0, noise_deg: float = 0.05, seed: int = 1) -> Frames:
-    """Return what four sensors say of a limb that swings, each from a mount of its own."""
+    """Return orientations of four sensors of a swinging limb, each with a random alignment."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(100 * seconds)) / 100
     swing = {"thigh": 0.5 * np.sin(2 * np.pi * speed * t), "shank": np.sin(2 * np.pi * speed * t)}
@@ -40,144 +40,146 @@ def limb(seconds: float, *, speed: float = 1.0, noise_deg: float = 0.05, seed: i
     return [{name: rows[k] for name, rows in columns.items()} for k in range(len(t))]
 
 
-def stuck_after(frames: Frames, spoil: Callable[[Frames], Frames], name: str) -> float:
-    """Return after how many ms a sensor is found stuck; nobody else ever is."""
-    watch, found = FrozenWatch(GROUPS), np.inf
-    for k, said in enumerate(spoil(frames)):
-        stuck = watch.look(k * STEP, said)
+def detection_time_ms(frames: Frames, inject: Callable[[Frames], Frames], name: str) -> float:
+    """Return the time of detection, ms, and check that no other sensor is detected."""
+    monitor, found = StuckSensorDetector(GROUPS), np.inf
+    for k, orientations in enumerate(inject(frames)):
+        stuck = monitor.update(k * STEP, orientations)
         assert set(stuck) <= {name}
         if stuck and not np.isfinite(found):
             found = 10.0 * k
     return found
 
 
-def frozen(name: str, first: int) -> Callable[[Frames], Frames]:
-    def spoil(frames: Frames) -> Frames:
+def hold_value(name: str, first: int) -> Callable[[Frames], Frames]:
+    def inject(frames: Frames) -> Frames:
         return [f | {name: frames[min(k, first)][name]} for k, f in enumerate(frames)]
 
-    return spoil
+    return inject
 
 
 @pytest.mark.parametrize("first", [600, 613, 625, 650, 671])
 @pytest.mark.parametrize("name", ["S1", "S4"])
-def test_a_sensor_that_repeats_itself_while_its_partner_moves_is_stuck(
-    name: str, first: int
-) -> None:
-    assert stuck_after(limb(8.0), frozen(name, first), name) <= 10 * first + 250
+def test_sensor_repeating_itself_while_its_partner_moves_is_stuck(name: str, first: int) -> None:
+    assert detection_time_ms(limb(8.0), hold_value(name, first), name) <= 10 * first + 250
 
 
 @pytest.mark.parametrize("name", ["S2", "S3"])
-def test_a_sensor_that_freezes_at_rest_is_found_while_all_stand_still(name: str) -> None:
+def test_sensor_that_sticks_at_rest_is_detected_at_rest(name: str) -> None:
     still = limb(9.0, speed=0.0, noise_deg=0.01)
-    assert stuck_after(still, frozen(name, 700), name) <= 7000 + 500
+    assert detection_time_ms(still, hold_value(name, 700), name) <= 7000 + 500
 
 
-def test_a_sensor_that_dithers_in_its_place_is_stuck_too() -> None:
+def test_sensor_with_noise_about_a_fixed_orientation_is_stuck() -> None:
     frames, rng = limb(8.0), np.random.default_rng(3)
 
-    def spoil(frames: Frames) -> Frames:
+    def inject(frames: Frames) -> Frames:
         out = []
-        for k, said in enumerate(frames):
+        for k, orientations in enumerate(frames):
             w, x, y, z = frames[min(k, 630)]["S3"]
             dx, dy = 0.0003 * rng.normal(size=2) * (k > 630)
-            out.append(said | {"S3": (w, x + dx, y + dy, z)})
+            out.append(orientations | {"S3": (w, x + dx, y + dy, z)})
         return out
 
-    assert stuck_after(frames, spoil, "S3") <= 6300 + 500
+    assert detection_time_ms(frames, inject, "S3") <= 6300 + 500
 
 
 @pytest.mark.parametrize("digits", [3, 4])
 @pytest.mark.parametrize("speed", [0.0, 0.05, 1.0])
-def test_coarse_digits_and_slow_filters_are_not_taken_for_stuck(digits: int, speed: float) -> None:
-    """S2 rounds to 3 or 4 digits and renews itself every third frame; the limb rests or moves."""
+def test_coarse_resolution_and_slow_filters_are_not_stuck(digits: int, speed: float) -> None:
+    """S2 rounds to 3 or 4 digits and changes every third frame; the limb rests or moves."""
     frames = limb(20.0, speed=speed, noise_deg=0.02)
-    for k, said in enumerate(frames):
+    for k, orientations in enumerate(frames):
         w, x, y, z = (round(value, digits) for value in frames[k - k % 3]["S2"])
-        said["S2"] = (w, x, y, z)
-    watch = FrozenWatch(GROUPS)
-    stuck = sum(bool(watch.look(k * STEP, said)) for k, said in enumerate(frames))
-    assert stuck <= (50 if digits == 3 and speed < 1 else 0)  # until its habits are known
+        orientations["S2"] = (w, x, y, z)
+    monitor = StuckSensorDetector(GROUPS)
+    stuck = sum(
+        bool(monitor.update(k * STEP, orientations)) for k, orientations in enumerate(frames)
+    )
+    assert stuck <= (
+        50 if digits == 3 and speed < 1 else 0
+    )  # until its natural repetition time is known
 
 
-def test_the_last_sensor_of_a_segment_is_judged_by_the_other_segment() -> None:
-    frames = [{k: q for k, q in said.items() if k != "S2"} for said in limb(8.0)]
-    assert stuck_after(frames, frozen("S1", 640), "S1") <= 6400 + 500
+def test_only_sensor_of_a_segment_is_compared_with_the_other_segment() -> None:
+    frames = [{k: q for k, q in orientations.items() if k != "S2"} for orientations in limb(8.0)]
+    assert detection_time_ms(frames, hold_value("S1", 640), "S1") <= 6400 + 500
 
 
-def test_both_sensors_of_a_segment_may_stick_at_once() -> None:
-    frames = frozen("S2", 640)(frozen("S1", 640)(limb(8.0)))
-    watch = FrozenWatch(GROUPS)
-    stuck = [set(watch.look(k * STEP, said)) for k, said in enumerate(frames)]
+def test_both_sensors_of_a_segment_stuck_at_once_are_detected() -> None:
+    frames = hold_value("S2", 640)(hold_value("S1", 640)(limb(8.0)))
+    monitor = StuckSensorDetector(GROUPS)
+    stuck = [set(monitor.update(k * STEP, orientations)) for k, orientations in enumerate(frames)]
     assert set().union(*stuck[:641]) == set()
     assert all(found == {"S1", "S2"} for found in stuck[690:])
 
 
-def test_a_sensor_that_moves_again_is_trusted_after_a_fifth_of_a_second() -> None:
+def test_stuck_sensor_is_used_again_after_200_ms_of_movement() -> None:
     frames = limb(9.0)
-    watch = FrozenWatch(GROUPS)
+    monitor = StuckSensorDetector(GROUPS)
     again = [
         f | ({"S1": frames[600]["S1"]} if 600 <= k < 700 else {}) for k, f in enumerate(frames)
     ]
-    stuck = [bool(watch.look(k * STEP, said)) for k, said in enumerate(again)]
+    stuck = [bool(monitor.update(k * STEP, orientations)) for k, orientations in enumerate(again)]
     assert all(stuck[630:700])
     assert not any(stuck[722:])
 
 
-# --- what is told -------------------------------------------------------------------------------
+# --- reports -------------------------------------------------------------------------------
 
 
-def told(frames: Frames) -> list[tuple[int, str, str]]:
-    """Return time (ms), id and state of everything told while these frames come."""
-    watch, out = SensorWatch(CHAIN), []
-    for k, said in enumerate(frames):
-        watch.look(k * STEP, k * STEP, said)
-        out += [(10 * k, news.id, news.state) for news in watch.news(k * STEP)]
+def reports(frames: Frames) -> list[tuple[int, str, str]]:
+    """Return time (ms), id and state of all reports over the frames."""
+    monitor, out = SensorMonitor(CHAIN), []
+    for k, orientations in enumerate(frames):
+        monitor.update(k * STEP, k * STEP, orientations)
+        out += [(10 * k, report.id, report.state) for report in monitor.pop_reports(k * STEP)]
     return out
 
 
-def silent(name: str, first: int, end: int, frames: Frames) -> Frames:
+def remove_samples(name: str, first: int, end: int, frames: Frames) -> Frames:
     return [
-        {n: q for n, q in said.items() if n != name or not first <= k < end}
-        for k, said in enumerate(frames)
+        {n: q for n, q in orientations.items() if n != name or not first <= k < end}
+        for k, orientations in enumerate(frames)
     ]
 
 
-def test_nothing_is_told_of_sensors_that_do_well_or_lose_a_few_samples() -> None:
-    assert told(limb(10.0)) == []
-    assert told(silent("S1", 300, 315, limb(5.0))) == []
+def test_healthy_sensors_and_short_gaps_give_no_report() -> None:
+    assert reports(limb(10.0)) == []
+    assert reports(remove_samples("S1", 300, 315, limb(5.0))) == []
 
 
-def test_a_loss_and_a_return_are_told_once_each_in_time() -> None:
-    lost, back = told(silent("S1", 300, 400, limb(8.0)))
+def test_loss_and_recovery_are_reported_once_each_in_time() -> None:
+    lost, back = reports(remove_samples("S1", 300, 400, limb(8.0)))
     assert lost[1:] == ("S1", "lost")
     assert 3000 <= lost[0] <= 3500
     assert back[1:] == ("S1", "ok")
     assert 6000 <= back[0] <= 6500
 
 
-def test_a_loose_plug_is_told_as_one_loss() -> None:
+def test_loose_connector_is_reported_as_one_loss() -> None:
     frames = limb(20.0)
     for first in range(300, 1500, 100):
-        frames = silent("S3", first, first + 50, frames)
-    assert [state for _, _, state in told(frames)] == ["lost", "ok"]
+        frames = remove_samples("S3", first, first + 50, frames)
+    assert [state for _, _, state in reports(frames)] == ["lost", "ok"]
 
 
-def test_silence_of_all_sensors_at_once_is_told() -> None:
+def test_silence_of_all_sensors_is_reported() -> None:
     frames = limb(8.0)
     frames[300:400] = [{}] * 100
-    news = told(frames)
-    assert {(name, state) for _, name, state in news[:4]} == {
+    report = reports(frames)
+    assert {(name, state) for _, name, state in report[:4]} == {
         (s, "lost") for g in GROUPS for s in g
     }
-    assert {t for t, _, _ in news[:4]} == {3200}
+    assert {t for t, _, _ in report[:4]} == {3200}
 
 
-def test_what_is_told_names_who_goes_on() -> None:
-    watch = SensorWatch(CHAIN)
-    for k, said in enumerate(silent("S1", 100, 200, limb(2.0))):
-        watch.look(k * STEP, k * STEP, said)
-        for news in watch.news(k * STEP):
-            assert news.text == "gives no data; thigh goes on with S2"
-            assert news.level == "warning"
-    assert watch.health("S1") == "lost"
-    assert watch.health("S2") == "ok"
+def test_report_names_the_remaining_sensors() -> None:
+    monitor = SensorMonitor(CHAIN)
+    for k, orientations in enumerate(remove_samples("S1", 100, 200, limb(2.0))):
+        monitor.update(k * STEP, k * STEP, orientations)
+        for report in monitor.pop_reports(k * STEP):
+            assert report.text == "no data; thigh uses S2"
+            assert report.level == "warning"
+    assert monitor.state("S1") == "lost"
+    assert monitor.state("S2") == "ok"
