@@ -100,10 +100,8 @@ class ConsistencyMonitor:
             for i, (above, below) in enumerate(zip(chain.sensors, chain.sensors[1:], strict=False))
         ]
 
-        sensors = [name for group in chain.sensors for name in group]
-        self._common = None
-        if any(name in drifting for name in sensors):
-            self._common = HeadingDriftFilter(0.0)
+        drifts = any(name in drifting for group in chain.sensors for name in group)
+        self._common = HeadingDriftFilter(0.0) if drifts else None
         self._sensor_drift: dict[str, float] = dict.fromkeys(calibration.sensor, 0.0)
         """Heading drift that is removed from each sensor, rad."""
         self._segment_drift = [0.0] * len(chain.segments)
