@@ -10,7 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.fusion._forward_kinematics import SegmentLength, joint_positions, joint_angle_estimate
+from jointfit_daemon.fusion._forward_kinematics import (
+    SegmentLength,
+    joint_angle_estimate,
+    joint_positions,
+)
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser, mean_one
 from jointfit_daemon.limb_model import MeanModel, SegmentCalibration, alive_key
 

@@ -22,10 +22,13 @@ from itertools import combinations
 from math import cos, degrees, hypot, radians, sin, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.fusion.faults._fault_reports import drift_report, slip_report, heading_report
+from jointfit_daemon.fusion.faults._fault_reports import drift_report, heading_report, slip_report
 from jointfit_daemon.fusion.faults._heading_drift import HeadingDriftFilter
 from jointfit_daemon.fusion.faults._joint_heading import JointHeadingMonitor
-from jointfit_daemon.fusion.faults._magnetic_disturbance import HeadingDifference, MagneticDisturbanceDetector
+from jointfit_daemon.fusion.faults._magnetic_disturbance import (
+    HeadingDifference,
+    MagneticDisturbanceDetector,
+)
 from jointfit_daemon.fusion.faults._slip import SlipDetector, pair_corrections, untrained_link
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.limb_model import axis_heading_one, up_one
