@@ -19,15 +19,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from jointfit_daemon.kinematics.chains import ChainState, moved, rest_state
+from jointfit_daemon.kinematics.chains import ChainState, rest_state, step_state
 from jointfit_daemon.kinematics.inverse_kinematics import (
     OPEN_M2,
     Band,
-    Fit,
     IkOptions,
-    fit,
+    MarkerFit,
     lower_equations,
-    slots_of,
+    marker_fit,
+    marker_slots,
     solve_frames,
 )
 
@@ -100,7 +100,7 @@ class LiveInverseKinematics:
     def __init__(self, model: ChainModel, options: LiveOptions | None = None) -> None:
         self._model = model
         self._options = options or LiveOptions()
-        self._slots = slots_of(model)
+        self._slots = marker_slots(model)
         self._state: ChainState | None = None
         self._variance = (self._options.marker_sd_m or _FIRST_SD_M) ** 2
         weighing = model.weights[model.weights > 0.0]
@@ -179,11 +179,11 @@ class LiveInverseKinematics:
         self, state: ChainState, step: Array | None, measured: Array, weights: Array
     ) -> _Place:
         if step is not None:
-            state = moved(self._slots.layout, state, step[None])
-        at = fit(self._slots, state, measured, weights)
+            state = step_state(self._slots.layout, state, step[None])
+        at = marker_fit(self._slots, state, measured, weights)
         return _Place(state, at, float(at.cost[0]))
 
-    def _robust(self, at: Fit, weights: Array) -> Array:
+    def _robust(self, at: MarkerFit, weights: Array) -> Array:
         if self._options.huber_m is None:
             return weights
         errors = at.errors
@@ -264,7 +264,7 @@ class _Place:
     """Where the chain may be."""
 
     state: ChainState
-    at: Fit
+    at: MarkerFit
     cost: float
     moved: Array = field(default_factory=lambda: _ZERO)
     """Step from the last instant."""

@@ -29,7 +29,7 @@ from jointfit_daemon.driver import (
     driver_names,
     find_driver,
 )
-from jointfit_daemon.files.text import plain_fault
+from jointfit_daemon.files.text import find_structure_fault
 from jointfit_daemon.model import Chain
 from jointfit_daemon.nearest_name import nearest_name
 
@@ -74,7 +74,7 @@ def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
     ConfigError
         Lists every fault of the table.
     """
-    if (fault := plain_fault(table)) is not None:
+    if (fault := find_structure_fault(table)) is not None:
         raise ConfigError(source, [Fault("TOML", fault)])
     return _rig_of(deepcopy(dict(table)), source, [])
 

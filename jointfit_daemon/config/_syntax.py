@@ -9,7 +9,13 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config._fault_messages import ConfigError, Fault
-from jointfit_daemon.files.text import DEEPEST, Malformed, parse_toml, plain_fault, read_text
+from jointfit_daemon.files.text import (
+    MAX_NESTING,
+    MalformedFileError,
+    find_structure_fault,
+    parse_toml,
+    read_text,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,18 +37,18 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
     """
     try:
         text = read_text(path, _MOST_BYTES)
-    except Malformed as error:
+    except MalformedFileError as error:
         raise ConfigError(
             str(path), [Fault("file", str(error).removeprefix(f"{path}: "))]
         ) from error
     try:
         table, faults = _parse(text.split("\n"))
     except RecursionError as error:
-        fault = Fault("TOML", f"nested more than {DEEPEST} levels deep")
+        fault = Fault("TOML", f"nested more than {MAX_NESTING} levels deep")
         raise ConfigError(str(path), [fault]) from error
     if table is None:
         raise ConfigError(str(path), faults)
-    if (text_of_fault := plain_fault(table)) is not None:
+    if (text_of_fault := find_structure_fault(table)) is not None:
         raise ConfigError(str(path), [*faults, Fault("TOML", text_of_fault)])
     return table, faults
 

@@ -11,7 +11,7 @@ from math import cos, hypot, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.joint_angles import read_joint
-from jointfit_daemon.kinematics.rotation_scalar import along_z_one
+from jointfit_daemon.kinematics.rotation_scalar import rotate_z_one
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,7 +59,7 @@ def joint_positions(
             out.append((None, None))
             continue
         length = stored.length
-        dx, dy, dz = along_z_one(segment.q, -length)
+        dx, dy, dz = rotate_z_one(segment.q, -length)
         position = (position[0] + dx, position[1] + dy, position[2] + dz)
         trace += 2.0 * (length * segment.sd) ** 2 + stored.sd**2
         out.append((position, trace / 3.0))

@@ -12,7 +12,7 @@ from __future__ import annotations
 from math import radians, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.kinematics.rotation_scalar import normalize_one, turn_one, turned_one
+from jointfit_daemon.kinematics.rotation_scalar import difference_one, normalize_one, perturb_one
 from jointfit_daemon.limb_model import UNREFERENCED_SD, Prediction, alive_key
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ class SegmentFuser:
         self._start_fade(t_ns, alive, near, inputs, prediction)
         output = self._faded(t_ns, prediction)
         self._use(new)
-        offset = turn_one(self._predict(alive, near, inputs).q, output)
+        offset = difference_one(self._predict(alive, near, inputs).q, output)
         self._fading, self._before = (t_ns, MODEL_FADE_NS, offset), (alive, near, inputs)
 
     def _start_fade(
@@ -205,13 +205,13 @@ class SegmentFuser:
         if all(s in inputs for s in (*old_alive, *old_near)):
             # The old sensors still have data: compare both sets in this frame.
             old = self._faded(t_ns, self._predict(old_alive, old_near, inputs).q)
-            offset = turn_one(target, old)
+            offset = difference_one(target, old)
         elif all(s in old_inputs for s in (*alive, *near)):
             # The new sensors had data before: compare both sets in the frame before.
             new = self._predict(alive, near, old_inputs).q
-            offset = turn_one(new, self._last[1])
+            offset = difference_one(new, self._last[1])
         else:
-            offset = turn_one(target, self._last[1])
+            offset = difference_one(target, self._last[1])
         self._fading = (t_ns, FADE_NS, offset)
 
     def _faded(self, t_ns: int, target: Quaternion) -> Quaternion:
@@ -222,7 +222,7 @@ class SegmentFuser:
         if left <= 0.0:
             self._fading = None
             return target
-        return turned_one(target, (left * x, left * y, left * z))
+        return perturb_one(target, (left * x, left * y, left * z))
 
 
 def _present(names: Names, inputs: Inputs) -> Names:

@@ -63,7 +63,7 @@ def rotate_one(q: Quaternion, v: Vector) -> Vector:
     )
 
 
-def along_z_one(q: Quaternion, length: float) -> Vector:
+def rotate_z_one(q: Quaternion, length: float) -> Vector:
     """Return ``rotate_one(q, (0, 0, length))``, as bones need it, for less."""
     w, x, y, z = q
     tx, ty = 2.0 * (y * length), -2.0 * (x * length)
@@ -88,7 +88,7 @@ def log_one(q: Quaternion) -> Vector:
     return (scale * x, scale * y, scale * z)
 
 
-def turn_one(a: Quaternion, b: Quaternion) -> Vector:
+def difference_one(a: Quaternion, b: Quaternion) -> Vector:
     """Return ``log_one(between_one(a, b))``, the turn from a to b, rad, by one call."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
@@ -103,7 +103,7 @@ def turn_one(a: Quaternion, b: Quaternion) -> Vector:
     return (scale * x, scale * y, scale * z)
 
 
-def turned_one(q: Quaternion, r: Vector) -> Quaternion:
+def perturb_one(q: Quaternion, r: Vector) -> Quaternion:
     """Return ``multiply_one(q, exp_one(r))``, q turned by r in its own frame, by one call."""
     pw, px, py, pz = q
     x, y, z = r
@@ -139,8 +139,8 @@ def normalize_one(q: Sequence[float]) -> Quaternion:
 
 def interpolate_one(q0: Quaternion, q1: Quaternion, a: float) -> Quaternion:
     """Go the share `a` of the short way from q0 to q1."""
-    x, y, z = turn_one(q0, q1)
-    return turned_one(q0, (a * x, a * y, a * z))
+    x, y, z = difference_one(q0, q1)
+    return perturb_one(q0, (a * x, a * y, a * z))
 
 
 def as_quaternion(q: Iterable[float]) -> Quaternion:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.rotation_scalar import turn_one
+from jointfit_daemon.kinematics.rotation_scalar import difference_one
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,9 +57,9 @@ def relative_rotations_one(
     sensors: Sequence[Quaternion], mean: Quaternion, q_other: Quaternion
 ) -> list[float]:
     """Return the same of one frame."""
-    found = [*turn_one(mean, q_other)]
+    found = [*difference_one(mean, q_other)]
     for q in sensors[1:]:
-        found += turn_one(sensors[0], q)
+        found += difference_one(sensors[0], q)
     return found
 
 

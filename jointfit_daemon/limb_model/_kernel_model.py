@@ -26,7 +26,7 @@ import numpy as np
 from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.rotation_scalar import turned_one
+from jointfit_daemon.kinematics.rotation_scalar import perturb_one
 from jointfit_daemon.limb_model._kernel_expert import Expert
 from jointfit_daemon.limb_model._kernel_features import (
     relative_rotations,
@@ -116,7 +116,7 @@ class KernelModel(SegmentModel):
         sds = self.spread.at(far)
         x, y, z = sds
         sd = sqrt((x * x + y * y + z * z) / 3.0)
-        return Prediction(turned_one(mean, c), sd, far > OUTSIDE, sds)
+        return Prediction(perturb_one(mean, c), sd, far > OUTSIDE, sds)
 
     @override
     def to_dict(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.files.captures import read_capture
-from jointfit_daemon.files.captures._capture import CaptureUnreadable
+from jointfit_daemon.files.captures._capture import UnreadableCaptureError
 from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
@@ -35,7 +35,7 @@ from jointfit_daemon.files.orientations import (
     write_orientations_sto,
     write_sto,
 )
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.text import MalformedFileError
 from jointfit_simulators.c3d_file import c3d_bytes
 from jointfit_simulators.sample_data import _write_models
 from jointfit_simulators.settings import Knobs
@@ -148,7 +148,7 @@ def outcome(read: Callable[[Path], object], path: Path) -> str:
             warnings.simplefilter("error")
             read(path)
         message = ""
-    except (Malformed, CaptureUnreadable) as error:
+    except (MalformedFileError, UnreadableCaptureError) as error:
         message = str(error)
         assert str(path) in message
     finally:

@@ -57,13 +57,13 @@ def test_a_vector_turns_as_scipy_turns_it(q: Quaternion, v: Vector) -> None:
 
 @given(quaternions, quaternions, vectors)
 def test_one_call_is_two_calls(p: Quaternion, q: Quaternion, r: Vector) -> None:
-    assert one.turn_one(p, q) == one.log_one(one.between_one(p, q))
-    assert one.turned_one(p, r) == one.multiply_one(p, one.exp_one(r))
+    assert one.difference_one(p, q) == one.log_one(one.between_one(p, q))
+    assert one.perturb_one(p, r) == one.multiply_one(p, one.exp_one(r))
 
 
 @given(quaternions, components)
 def test_a_bone_turns_as_any_vector_does(q: Quaternion, length: float) -> None:
-    assert one.along_z_one(q, length) == one.rotate_one(q, (0.0, 0.0, length))
+    assert one.rotate_z_one(q, length) == one.rotate_one(q, (0.0, 0.0, length))
 
 
 @given(quaternions)

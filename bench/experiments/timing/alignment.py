@@ -24,7 +24,12 @@ from jointfit_daemon.kinematics.rotation_scalar import (
     multiply_one,
     normalize_one,
 )
-from jointfit_daemon.timing.alignment import BEND, FrameAligner, StreamSpec, beyond
+from jointfit_daemon.timing.alignment import (
+    CURVATURE_SHARE,
+    FrameAligner,
+    StreamSpec,
+    extrapolate_orientation,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -182,7 +187,7 @@ def _ahead_rms(
         for ahead in (1, 2, 3):
             k = 3 * last + ahead
             earlier, before, a = samples[last - 2 : last + 1]
-            q = beyond(earlier, before, a, k * period_ns, bend)
+            q = extrapolate_orientation(earlier, before, a, k * period_ns, bend)
             found.append(degrees(angle_between_one(q, truth[k])))
     return _rms(found)
 
@@ -197,7 +202,8 @@ def ahead(data: Path) -> list[Figure]:
     ):
         truth, rate_hz = _board(data, trial)
         straight, bent, full = (
-            _ahead_rms(truth, rate_hz, np.radians(scatter_deg), bend) for bend in (0.0, BEND, 1.0)
+            _ahead_rms(truth, rate_hz, np.radians(scatter_deg), bend)
+            for bend in (0.0, CURVATURE_SHARE, 1.0)
         )
         figures += [
             Figure(f"{name}: RMS", bent, goal),

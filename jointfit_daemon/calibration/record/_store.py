@@ -20,7 +20,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.record._content_check import content_faults
-from jointfit_daemon.files.text import Malformed, parse_json, plain_fault, read_bounded
+from jointfit_daemon.files.text import (
+    MalformedFileError,
+    find_structure_fault,
+    parse_json,
+    read_bounded,
+)
 from jointfit_daemon.limb_model import Calibration, UnknownSchema
 
 if TYPE_CHECKING:
@@ -150,7 +155,7 @@ class CalibrationStore:
             raise CalibrationUnreadable(f"{path}: no such version; stored: {known}")
         try:
             data = read_bounded(path, MOST_BYTES)
-        except Malformed as error:
+        except MalformedFileError as error:
             raise CalibrationUnreadable(str(error)) from error
         try:
             return _calibration_of(data)
@@ -219,7 +224,7 @@ def _calibration_of(data: bytes) -> Calibration:
     # A bare calibration was written before there were checksums.
     if content is not table and table.get("sha256") != checksum(content):
         raise ValueError("the checksum differs: it was damaged, or edited by hand")
-    if fault := plain_fault(content):
+    if fault := find_structure_fault(content):
         raise ValueError(fault)
     calibration = Calibration.from_dict(content)
     if faults := content_faults(calibration):

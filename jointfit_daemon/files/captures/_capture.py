@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.files.captures._candump import RECORD_BYTES, is_candump, read_candump
 from jointfit_daemon.files.captures._packet_capture import PCAP_MAGICS, PCAPNG_MAGIC, read_udp
-from jointfit_daemon.files.text import refuse_device
+from jointfit_daemon.files.text import reject_device
 from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ NS_PER_BYTE = 10 * 10**9 // 921_600
 """Invented time of a raw stream: ten bits a byte at 921 600 baud."""
 
 
-class CaptureUnreadable(ValueError):  # noqa: N818 - named for what the file is
+class UnreadableCaptureError(ValueError):
     """The file cannot be a capture of this wire: the message says what was found and expected."""
 
 
@@ -52,23 +52,23 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
 
     Raises
     ------
-    CaptureUnreadable
+    UnreadableCaptureError
         The file holds another wire than the driver reads.
     OSError
         The file cannot be read.
     """
-    refuse_device(path)
+    reject_device(path)
     data = path.read_bytes()
     if data.startswith(PCAPNG_MAGIC) or data[:4] in PCAP_MAGICS:
         if wire != "datagram":
-            raise CaptureUnreadable(
+            raise UnreadableCaptureError(
                 f"{path}: a network capture, where a {wire} is expected: name the driver of the"
                 " device that was recorded"
             )
         return _datagrams(data, port)
     if is_candump(data):
         if wire != "can":
-            raise CaptureUnreadable(
+            raise UnreadableCaptureError(
                 f"{path}: candump text, where a {wire} is expected: name the driver of the device"
                 " that was recorded"
             )
@@ -88,7 +88,7 @@ def _raw(data: bytes, wire: Wire, path: Path) -> Iterator[Chunk]:
     if wire == "stream":
         return _pieces(data, PIECE)
     if len(data) % RECORD_BYTES:
-        raise CaptureUnreadable(
+        raise UnreadableCaptureError(
             f"{path}: neither `candump -L` text nor CAN records of {RECORD_BYTES} bytes: record"
             " with `candump -L can0`"
         )

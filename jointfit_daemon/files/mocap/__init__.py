@@ -3,7 +3,7 @@
 from jointfit_daemon.files.mocap._marker_trial import (
     Axis,
     MarkerTrial,
-    UnknownMarker,
+    UnknownMarkerError,
     read_marker_trial,
 )
 from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc, write_trc
@@ -12,7 +12,7 @@ __all__ = [
     "Axis",
     "MarkerTrajectories",
     "MarkerTrial",
-    "UnknownMarker",
+    "UnknownMarkerError",
     "read_marker_trial",
     "read_trc",
     "write_trc",

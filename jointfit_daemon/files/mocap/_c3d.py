@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jointfit_daemon.files.mocap._trc import METRES, MarkerTrajectories
-from jointfit_daemon.files.text import Malformed, refuse_device
+from jointfit_daemon.files.text import MalformedFileError, reject_device
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class PackageMissing(ImportError):  # noqa: N818 - named for what happened
+class MissingPackageError(ImportError):
     """The optional package that reads this kind of file is not installed; says how to get it."""
 
 
@@ -35,9 +35,9 @@ def read_c3d(path: Path) -> MarkerTrajectories:
 
     Raises
     ------
-    PackageMissing
+    MissingPackageError
         The package ``c3d`` is not installed.
-    Malformed
+    MalformedFileError
         Not a C3D file, a broken one, or one without points, or a unit that is no length.
     """
     return _open(path)[0]
@@ -52,34 +52,40 @@ def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
     try:
         import c3d  # noqa: PLC0415 - optional, and slow to import
     except ModuleNotFoundError as missing:
-        raise PackageMissing(
+        raise MissingPackageError(
             f"{path}: reading C3D needs a package: pip install 'jointfitd[c3d]'"
         ) from missing
-    refuse_device(path)
+    reject_device(path)
     with path.open("rb") as handle, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of every file without analog channels
         try:
             return _read(path, c3d.Reader(handle))
-        except Malformed:
+        except MalformedFileError:
             raise
         except Exception as fault:
-            raise Malformed(f"{path}: not a C3D file, or cut off: export it again") from fault
+            raise MalformedFileError(
+                f"{path}: not a C3D file, or cut off: export it again"
+            ) from fault
 
 
 def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
     names = tuple(_labels(reader))[: reader.point_used]
     if not names:
-        raise Malformed(f"{path}: no points with labels in this C3D file: export it with markers")
+        raise MalformedFileError(
+            f"{path}: no points with labels in this C3D file: export it with markers"
+        )
     unit = (_text(reader, "POINT:UNITS") or "mm").lower()
     if unit not in METRES:
-        raise Malformed(f"{path}: POINT:UNITS is {unit!r}, expected one of {', '.join(METRES)}")
+        raise MalformedFileError(
+            f"{path}: POINT:UNITS is {unit!r}, expected one of {', '.join(METRES)}"
+        )
     frames = [points[: len(names), :4].copy() for _, points, _ in reader.read_frames(copy=False)]
     if not frames:
-        raise Malformed(f"{path}: a header without frames: export the trial again")
+        raise MalformedFileError(f"{path}: a header without frames: export the trial again")
     cells = np.array(frames, dtype=np.float64).reshape(-1, len(names), 4)
     first, rate_hz = int(reader.first_frame), float(reader.point_rate)
     if not 0.0 < rate_hz < math.inf:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
         )
     numbers = np.arange(first, first + len(cells), dtype=np.int64)

@@ -14,7 +14,7 @@ import numpy as np
 
 from jointfit_daemon.files.mocap._c3d import read_c3d_with_up
 from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ Axis = Literal["x", "y", "z"]
 _TO_Z_UP: dict[str, list[int]] = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 
 
-class UnknownMarker(ValueError):  # noqa: N818 - named for what happened
+class UnknownMarkerError(ValueError):
     """A marker that is not in the trial; the message names the nearest ones."""
 
 
@@ -48,13 +48,13 @@ class MarkerTrial:
 
         Raises
         ------
-        UnknownMarker
+        UnknownMarkerError
             All names that are not there, each with the nearest spelling.
         """
         wanted = [self._index(name) for name in names]
         unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
         if unknown:
-            raise UnknownMarker(self._explain(unknown, taken=set(names)))
+            raise UnknownMarkerError(self._explain(unknown, taken=set(names)))
         return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
@@ -105,8 +105,10 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
 
     Raises
     ------
-    Malformed
-        Neither TRC nor C3D, or broken; `PackageMissing` where the reader of C3D is not installed.
+    MalformedFileError
+        Neither TRC nor C3D, or broken.
+    MissingPackageError
+        The optional C3D reader is not installed.
     """
     kind = path.suffix.lower()
     if kind == ".trc":
@@ -115,7 +117,7 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
         trajectories, said = read_c3d_with_up(path)
         custom = "z"
     else:
-        raise Malformed(f"{path}: expected a file that ends in .trc or .c3d")
+        raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d")
     up = up_axis or said or custom
     turned = trajectories.positions[..., _TO_Z_UP[up]]
     turned[(turned == 0.0).all(axis=-1)] = np.nan

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.files.text import (
-    Malformed,
+    MalformedFileError,
     cells_of,
     number,
     read_lines,
     require_times,
     rows_of_numbers,
     separator_of,
-    without_trailing_blanks,
+    strip_trailing_empty,
     written,
 )
 
@@ -71,27 +71,31 @@ def read_trc(path: Path) -> MarkerTrajectories:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         Not a TRC file, one without markers or rows, or a unit that is no length.
     """
     lines = read_lines(path)
     if len(lines) < _HEADER_ROWS or not lines[0].startswith("PathFileType"):
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: not a TRC file (its first cell must be PathFileType): export it again"
         )
     separator = separator_of(lines[3])
     header, rate_hz = _header(path, lines)
-    names = tuple(without_trailing_blanks(cells_of(lines[3], separator))[2::3])
+    names = tuple(strip_trailing_empty(cells_of(lines[3], separator))[2::3])
     if not names:
-        raise Malformed(f"{path}, line 4: no marker names after Frame# and Time: export it again")
+        raise MalformedFileError(
+            f"{path}, line 4: no marker names after Frame# and Time: export it again"
+        )
     body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)
     rows = rows_of_numbers(path, body, separator, 2 + 3 * len(names))
     unit = header.get("Units", "mm").lower()
     if unit not in METRES:
-        raise Malformed(f"{path}: Units is {unit!r}, expected one of {', '.join(METRES)}")
+        raise MalformedFileError(f"{path}: Units is {unit!r}, expected one of {', '.join(METRES)}")
     require_times(path, rows[:, 1])
     if not (np.abs(rows[:, 0]) < _MOST_FRAMES).all():
-        raise Malformed(f"{path}: the first column must hold frame numbers: export it again")
+        raise MalformedFileError(
+            f"{path}: the first column must hold frame numbers: export it again"
+        )
     return MarkerTrajectories(
         names,
         rows[:, 1],
@@ -109,7 +113,9 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, str], float]:
     rate_hz = number(path, 3, header.get("DataRate", ""))
     if not 0.0 < rate_hz < math.inf:
         found = header.get("DataRate", "missing")
-        raise Malformed(f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)")
+        raise MalformedFileError(
+            f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)"
+        )
     return header, rate_hz
 
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, get_args
 
-from jointfit_daemon.files.models._units import in_metres
-from jointfit_daemon.files.text import Malformed, read_json, read_toml
+from jointfit_daemon.files.models._units import require_metres
+from jointfit_daemon.files.text import MalformedFileError, read_json, read_toml
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
-    ImpossibleModel,
+    InvalidChainModelError,
     Joint,
     JointKind,
     Marker,
@@ -49,23 +49,23 @@ def read_model(path: Path) -> ChainModel:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         Broken, keys that are not known, values of the wrong kind, segments that make no chain,
         lengths that cannot be metres.
     """
     data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
     wrong = _wrong(data)
     if wrong:
-        raise Malformed(f"{path}: {'; '.join(wrong)}")
+        raise MalformedFileError(f"{path}: {'; '.join(wrong)}")
     try:
         model = ChainModel(
             tuple(_segment(s) for s in data.get("segment", ())),
             tuple(_marker(m) for m in data.get("marker", ())),
             data.get("name", path.stem),
         )
-    except ImpossibleModel as error:
-        raise Malformed(f"{path}: {error}") from error
-    return in_metres(path, model)
+    except InvalidChainModelError as error:
+        raise MalformedFileError(f"{path}: {error}") from error
+    return require_metres(path, model)
 
 
 def write_model(path: Path, model: ChainModel) -> None:

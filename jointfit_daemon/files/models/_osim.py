@@ -14,10 +14,16 @@ import numpy as np
 
 from jointfit_daemon.files.models._osim_document import GROUND, markers_of, read_document, read_xml
 from jointfit_daemon.files.models._osim_joints import nearest_joint
-from jointfit_daemon.files.models._units import in_metres
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.models._units import require_metres
+from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.chains import ChainModel, ImpossibleModel, Joint, Marker, Segment
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
+    InvalidChainModelError,
+    Joint,
+    Marker,
+    Segment,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -72,7 +78,7 @@ def read_osim(
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         No OpenSim 4 model; joints or functions that are not known; names that are not there;
         lengths that are not metres.
     """
@@ -82,7 +88,7 @@ def read_osim(
     try:
         tree = _Tree(document)
     except ValueError as error:
-        raise Malformed(f"{path}: {error}") from error
+        raise MalformedFileError(f"{path}: {error}") from error
     chosen = [
         m
         for m in found
@@ -95,9 +101,9 @@ def read_osim(
     segments = tree.kept(keep)
     try:
         model = ChainModel(tuple(segments), tuple(riders), document.name)
-    except ImpossibleModel as error:
-        raise Malformed(f"{path}: {error}") from error
-    return ImportedModel(in_metres(path, model), tuple(tree.remarks))
+    except InvalidChainModelError as error:
+        raise MalformedFileError(f"{path}: {error}") from error
+    return ImportedModel(require_metres(path, model), tuple(tree.remarks))
 
 
 def read_marker_set(path: Path) -> tuple[OsimMarker, ...]:
@@ -105,9 +111,11 @@ def read_marker_set(path: Path) -> tuple[OsimMarker, ...]:
     try:
         found = markers_of(read_xml(path))
     except ValueError as error:
-        raise Malformed(f"{path}: {error}") from error
+        raise MalformedFileError(f"{path}: {error}") from error
     if not found:
-        raise Malformed(f"{path}: no markers in it (expected OpenSimDocument with a MarkerSet)")
+        raise MalformedFileError(
+            f"{path}: no markers in it (expected OpenSimDocument with a MarkerSet)"
+        )
     return found
 
 
@@ -127,7 +135,7 @@ def _check(
         if m.body not in document.bodies and m.body != GROUND
     ]
     if unknown:
-        raise Malformed(f"{path}: {'; '.join(unknown)}")
+        raise MalformedFileError(f"{path}: {'; '.join(unknown)}")
 
 
 class _Tree:

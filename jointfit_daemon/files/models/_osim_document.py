@@ -13,7 +13,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from jointfit_daemon.files.text import Malformed, refuse_device
+from jointfit_daemon.files.text import MalformedFileError, reject_device
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -87,21 +87,23 @@ def read_document(path: Path) -> OsimDocument:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         No OpenSim model of version 4, broken XML, XML with a document type, a file out of size,
         another unit of length than metres.
     """
     root = read_xml(path)
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
-        raise Malformed(f"{path}: not an OpenSim model (expected OpenSimDocument with a Model)")
+        raise MalformedFileError(
+            f"{path}: not an OpenSim model (expected OpenSimDocument with a Model)"
+        )
     if model.find("JointSet") is None:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: written by OpenSim before 4.0; open it there once and save it again"
         )
     unit = text_of(model, "length_units", _METRES)
     if unit != _METRES:
-        raise Malformed(f"{path}: length_units is {unit!r}, expected {_METRES!r}")
+        raise MalformedFileError(f"{path}: length_units is {unit!r}, expected {_METRES!r}")
     try:
         return OsimDocument(
             model.get("name", path.stem),
@@ -115,20 +117,22 @@ def read_document(path: Path) -> OsimDocument:
             ),
         )
     except (KeyError, ValueError) as error:
-        raise Malformed(f"{path}: {error}") from error
+        raise MalformedFileError(f"{path}: {error}") from error
 
 
 def read_xml(path: Path) -> ET.Element:
-    """Return the root of an XML file without a document type; `Malformed` otherwise."""
-    refuse_device(path)
+    """Return the root of an XML file without a document type; `MalformedFileError` otherwise."""
+    reject_device(path)
     if path.stat().st_size > LARGEST:
-        raise Malformed(f"{path}: more than {LARGEST} bytes, which no model has: check the path")
+        raise MalformedFileError(
+            f"{path}: more than {LARGEST} bytes, which no model has: check the path"
+        )
     data = path.read_bytes()
     builder = ET.TreeBuilder()
     parser = expat.ParserCreate()
 
     def refuse(*_: object) -> None:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: has a document type declaration, which no OpenSim file has: save the model"
             " from OpenSim again"
         )
@@ -140,14 +144,16 @@ def read_xml(path: Path) -> ET.Element:
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: not XML, or cut off, at line {error.lineno}, column {error.offset}: save the"
             " model from OpenSim again"
         ) from error
-    except Malformed:
+    except MalformedFileError:
         raise
     except (ValueError, LookupError) as error:  # an encoding that Python does not know
-        raise Malformed(f"{path}: unknown text encoding: save the file as UTF-8") from error
+        raise MalformedFileError(
+            f"{path}: unknown text encoding: save the file as UTF-8"
+        ) from error
     return builder.close()
 
 

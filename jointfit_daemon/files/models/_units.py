@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.text import MalformedFileError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 FARTHEST_M = 10.0
 
 
-def in_metres(path: Path, model: ChainModel) -> ChainModel:
+def require_metres(path: Path, model: ChainModel) -> ChainModel:
     """Return the model.
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         A marker or a joint center lies more than 10 m from its segment's origin.
     """
     points = {f"marker {m.name!r}": m.position for m in model.markers}
@@ -38,7 +38,7 @@ def in_metres(path: Path, model: ChainModel) -> ChainModel:
     far = {what: float(np.abs(at).max()) for what, at in points.items()}
     what = max(far, key=lambda name: far[name])
     if far[what] > FARTHEST_M:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: {what} is {far[what]:.3g} m away from its segment; lengths must be metres: is"
             " the file in millimetres?"
         )

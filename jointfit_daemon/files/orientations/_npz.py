@@ -22,7 +22,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from jointfit_daemon.files.text import Malformed, refuse_device, require_times
+from jointfit_daemon.files.text import MalformedFileError, reject_device, require_times
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -70,18 +70,20 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         It is none, is cut off, unpacks to more than `LARGEST`, or holds Python objects.
     """
-    refuse_device(path)
+    reject_device(path)
     with path.open("rb") as file:
         try:
             with ZipFile(file) as archive:
                 return _arrays(path, archive)
-        except Malformed:
+        except MalformedFileError:
             raise
         except Exception as fault:  # zipfile and its codecs raise ten kinds for broken archives
-            raise Malformed(f"{path}: not an NPZ file, or cut off: export it again") from fault
+            raise MalformedFileError(
+                f"{path}: not an NPZ file, or cut off: export it again"
+            ) from fault
 
 
 def _arrays(path: Path, archive: ZipFile) -> dict[str, NDArray[Any]]:
@@ -89,7 +91,7 @@ def _arrays(path: Path, archive: ZipFile) -> dict[str, NDArray[Any]]:
     members = archive.infolist()
     unpacked = sum(member.file_size for member in members)
     if unpacked > LARGEST:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: {unpacked / _GIB:.1f} GiB when unpacked, at most {LARGEST / _GIB:g} GiB are"
             " read: split the trial"
         )
@@ -107,7 +109,7 @@ def _array(path: Path, archive: ZipFile, member: ZipInfo) -> NDArray[Any]:
         }[version]
         shape, by_columns, dtype = read_header(file)
         if dtype.kind not in _KINDS:
-            raise Malformed(
+            raise MalformedFileError(
                 f"{path}: array {member.filename} holds {dtype.name} values, expected numbers:"
                 " save it without Python objects"
             )
@@ -121,7 +123,7 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         As `read_arrays`; no ``t``, or neither a sensor nor a bone.
     """
     arrays = read_arrays(path)
@@ -129,7 +131,7 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     bones = [n.removeprefix(_BONE) for n in arrays if n.startswith(_BONE)]
     if "t" not in arrays or not (names or bones):
         found = ", ".join(arrays) or "none"
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: arrays t and ID_quat or q_BONE are missing: found {found}; rename or add them"
         )
     z_up = "up" in arrays and str(arrays["up"]) == "z"
@@ -154,13 +156,13 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
 def _numbers(
     path: Path, arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, int] | None
 ) -> NDArray[np.float64]:
-    """Return an array of `shape` (None: of one dimension) as numbers; `Malformed` otherwise."""
+    """Return an array of `shape` (None: one-dimensional) as floats; else `MalformedFileError`."""
     array = arrays[name]
     if array.dtype.kind == "U":
-        raise Malformed(f"{path}: {name} holds text, expected numbers: save it as float64")
+        raise MalformedFileError(f"{path}: {name} holds text, expected numbers: save it as float64")
     if array.shape != shape and not (shape is None and array.ndim == 1):
         wanted = "(n,)" if shape is None else str(shape)
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: {name} has shape {array.shape}, expected {wanted}: one row for each instant"
             " of t; gaps are NaN"
         )

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.files.text import (
-    Malformed,
+    MalformedFileError,
     cells_of,
     number,
     read_lines,
-    refuse_vast,
+    reject_sparse_table,
     require_times,
     rows_of_numbers,
     separator_of,
-    without_trailing_blanks,
+    strip_trailing_empty,
     written,
 )
 
@@ -76,7 +76,7 @@ def read_sto(path: Path) -> TimeTable:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         No ``endheader``, no column row, no rows of data, or a first column that is not time.
     """
     name, header, columns, separator, body = _open(path)
@@ -98,18 +98,18 @@ def read_orientations_sto(path: Path) -> OrientationTable:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         As `read_sto`, or cells that are not four numbers.
     """
     _, header, columns, separator, body = _open(path)
     if header.get("datatype", "").lower() != "quaternion" or separator == ",":
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: not a table of orientations: expected DataType=Quaternion in the header and"
             " tabs between the cells"
         )
     times, found, characters = [], [], 0
     for at, line in body:
-        cells = without_trailing_blanks(cells_of(line, separator))
+        cells = strip_trailing_empty(cells_of(line, separator))
         if not cells:
             continue
         times.append(number(path, at, cells[0]))
@@ -117,7 +117,7 @@ def read_orientations_sto(path: Path) -> OrientationTable:
         characters += len(line)
     t_s = np.array(times, dtype=np.float64)
     require_times(path, t_s)
-    refuse_vast(
+    reject_sparse_table(
         path,
         rows=len(found),
         columns=_QUATERNION * (len(columns) - 1),
@@ -136,12 +136,12 @@ def _quaternion(path: Path, at: int, cell: str) -> list[float]:
         return [np.nan] * _QUATERNION
     parts = cell.split(",")
     if len(parts) > _QUATERNION:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}, line {at}: {cell[:_SHOWN]!r} is more than w,x,y,z: if it has decimal"
             " commas, export the table with decimal points"
         )
     if len(parts) != _QUATERNION:
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}, line {at}: {cell[:_SHOWN]!r} is not w,x,y,z: correct the cell, or leave it"
             " empty"
         )
@@ -163,13 +163,17 @@ def _open(
         if equals:
             header[key.strip().lower()] = value.strip()
     else:
-        raise Malformed(f"{path}: not a STO or MOT file (no endheader line): export it again")
+        raise MalformedFileError(
+            f"{path}: not a STO or MOT file (no endheader line): export it again"
+        )
     if end + 1 >= len(lines):
-        raise Malformed(f"{path}: no column names after endheader: export it again")
+        raise MalformedFileError(f"{path}: no column names after endheader: export it again")
     separator = separator_of(lines[end + 1])
-    columns = tuple(without_trailing_blanks(cells_of(lines[end + 1], separator)))
+    columns = tuple(strip_trailing_empty(cells_of(lines[end + 1], separator)))
     if not columns or columns[0].lower() != "time":
-        raise Malformed(f"{path}, line {end + 2}: the first column must be called time: name it so")
+        raise MalformedFileError(
+            f"{path}, line {end + 2}: the first column must be called time: name it so"
+        )
     body = enumerate(lines[end + 2 :], start=end + 3)
     return lines[0].rstrip(", \t"), header, columns, separator, body
 

@@ -1,7 +1,7 @@
-"""TOML and JSON files from anywhere, read within bounds: every fault is `Malformed`.
+"""TOML and JSON files from anywhere, read within bounds: every fault is `MalformedFileError`.
 
-Invariant: no content of a file raises anything but `Malformed`, reads more than `most_bytes`, waits
-for a writer or exceeds the recursion limit of a later reader.
+Invariant: no content of a file raises anything but `MalformedFileError`, reads more than
+`most_bytes`, waits for a writer or exceeds the recursion limit of a later reader.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import stat
 import tomllib
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.files.text._tables import Malformed
+from jointfit_daemon.files.text._tables import MalformedFileError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 4 * 1024 * 1024
 """Size of the largest TOML or JSON file written by hand, with a large margin."""
-DEEPEST = 32
+MAX_NESTING = 32
 """Levels of nesting; no format of the project needs ten."""
 _MOST_BITS = 64
 _KINDS = {
@@ -33,9 +33,9 @@ _KINDS = {
 }
 _PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*')"""
 _DEEP_KEY = re.compile(
-    rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{DEEPEST}}}{_PART}", re.MULTILINE
+    rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{MAX_NESTING}}}{_PART}", re.MULTILINE
 )
-"""A dotted key of more than `DEEPEST` parts, as the key of a value or of a table."""
+"""A dotted key of more than `MAX_NESTING` parts, as the key of a value or of a table."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -44,7 +44,7 @@ def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         It cannot be read, is no regular file, too large, not UTF-8 or not TOML.
     """
     table: dict[str, Any] = _parsed(path, "TOML", parse_toml, read_text(path, most_bytes))
@@ -56,7 +56,7 @@ def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         It cannot be read, is no regular file, too large, not UTF-8 or not JSON.
     """
     return _parsed(path, "JSON", parse_json, read_text(path, most_bytes))
@@ -67,7 +67,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         It cannot be read, is no regular file, too large or not UTF-8.
     """
     data = read_bounded(path, most_bytes)
@@ -76,7 +76,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     except UnicodeDecodeError as error:
         found = "UTF-16" if data.startswith(_UTF_16) else f"byte {data[error.start]:#04x}"
         line = data.count(b"\n", 0, error.start) + 1
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: is not UTF-8: found {found} (line {line}): save the file as UTF-8"
         ) from error
 
@@ -86,7 +86,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         It cannot be read, is no regular file or holds more than `most_bytes`.
     """
     try:
@@ -95,19 +95,19 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
             kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
             if kind != stat.S_IFREG:
                 found = _KINDS.get(kind, "a special file")
-                raise Malformed(f"{path}: is {found}, expected a regular file")
+                raise MalformedFileError(f"{path}: is {found}, expected a regular file")
             with os.fdopen(descriptor, "rb", closefd=False) as file:
                 data = file.read(most_bytes + 1)
         finally:
             os.close(descriptor)
-    except ValueError as error:  # a NUL in the name; or Malformed, from above
-        if isinstance(error, Malformed):
+    except ValueError as error:  # a NUL in the name; or MalformedFileError, from above
+        if isinstance(error, MalformedFileError):
             raise
-        raise Malformed(f"{str(path)!r}: is no name of a file: {error}") from error
+        raise MalformedFileError(f"{str(path)!r}: is no name of a file: {error}") from error
     except OSError as error:
-        raise Malformed(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise MalformedFileError(f"{path}: cannot be read: {error.strerror or error}") from error
     if len(data) > most_bytes:
-        raise Malformed(f"{path}: larger than {most_bytes} bytes: is it the right file?")
+        raise MalformedFileError(f"{path}: larger than {most_bytes} bytes: is it the right file?")
     return data
 
 
@@ -123,7 +123,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     """
     # tomllib needs time and memory that grow with the square of the parts of a dotted key.
     if _DEEP_KEY.search(text):
-        raise RecursionError(f"a key of more than {DEEPEST} parts")
+        raise RecursionError(f"a key of more than {MAX_NESTING} parts")
     return tomllib.loads(text)
 
 
@@ -148,15 +148,15 @@ def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> An
     try:
         value = parse(text)
     except RecursionError as error:
-        raise Malformed(f"{path}: nested more than {DEEPEST} levels deep") from error
+        raise MalformedFileError(f"{path}: nested more than {MAX_NESTING} levels deep") from error
     except ValueError as error:  # an integer of 5000 digits is one, too
-        raise Malformed(f"{path}: not {name}: {error}") from error
-    if fault := plain_fault(value):
-        raise Malformed(f"{path}: {fault}")
+        raise MalformedFileError(f"{path}: not {name}: {error}") from error
+    if fault := find_structure_fault(value):
+        raise MalformedFileError(f"{path}: {fault}")
     return value
 
 
-def plain_fault(value: object) -> str | None:
+def find_structure_fault(value: object) -> str | None:
     """Return why a parsed value would make a later reader fail, or None.
 
     Checked are the depth and integers beyond 64 bits. Iterative, since the value may be deeper than
@@ -165,8 +165,8 @@ def plain_fault(value: object) -> str | None:
     waiting: list[tuple[object, str, int]] = [(value, "", 0)]
     while waiting:
         here, key, depth = waiting.pop()
-        if depth > DEEPEST:
-            return f"{key[:60]}…: nested more than {DEEPEST} levels deep"
+        if depth > MAX_NESTING:
+            return f"{key[:60]}…: nested more than {MAX_NESTING} levels deep"
         if isinstance(here, dict):
             waiting += [
                 (inner, f"{key}.{name}" if key else str(name), depth + 1)

@@ -1,8 +1,8 @@
 """Rows of numbers in text files, whoever wrote them: tab, comma or blanks between cells.
 
-Invariants: every fault of a file is `Malformed`; memory grows with the size of the file, whatever
-its header claims. An empty cell, or anything that spells "not a number", is missing (NaN). Declared
-counts are hints: real files carry wrong ones, so rows are counted, never believed.
+Invariants: every fault of a file is `MalformedFileError`; memory grows with the size of the file,
+whatever its header claims. An empty cell, or anything that spells "not a number", is missing (NaN).
+Declared counts are hints: real files carry wrong ones, so rows are counted, never believed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DIGITS = 8
 """Significant digits of what is written."""
 
 
-class Malformed(ValueError):  # noqa: N818 - named for what happened
+class MalformedFileError(ValueError):
     """A file that is not what its name says; the message names file, line and remedy."""
 
 
@@ -39,26 +39,28 @@ def read_lines(path: Path) -> list[str]:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         A device instead of a file, or UTF-16.
     """
-    refuse_device(path)
+    reject_device(path)
     data = path.read_bytes()
     if data.startswith(_UTF_16):
-        raise Malformed(f"{path}: is UTF-16 text, expected UTF-8: save it as UTF-8")
+        raise MalformedFileError(f"{path}: is UTF-16 text, expected UTF-8: save it as UTF-8")
     return data.decode("utf-8-sig", errors="replace").splitlines()
 
 
-def refuse_device(path: Path) -> None:
+def reject_device(path: Path) -> None:
     """Refuse devices and sockets, which may never end.
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         `path` is one.
     """
     if path.is_char_device() or path.is_block_device() or path.is_socket():
-        raise Malformed(f"{path}: is a device or a socket, expected a file: check the path")
+        raise MalformedFileError(
+            f"{path}: is a device or a socket, expected a file: check the path"
+        )
 
 
 def separator_of(line: str) -> str | None:
@@ -73,7 +75,7 @@ def cells_of(line: str, separator: str | None) -> list[str]:
     return [cell.strip() for cell in line.split(separator)]
 
 
-def without_trailing_blanks(cells: Sequence[str]) -> list[str]:
+def strip_trailing_empty(cells: Sequence[str]) -> list[str]:
     """Return `cells` without the empty ones at the end: padding, not columns."""
     end = len(cells)
     while end and not cells[end - 1]:
@@ -86,7 +88,7 @@ def number(path: Path, at: int, cell: str) -> float:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         It is none; a decimal comma is named as such.
     """
     try:
@@ -96,7 +98,7 @@ def number(path: Path, at: int, cell: str) -> float:
         remedy = "correct the cell, or leave it empty"
         if "," in cell and _is_number(cell.replace(",", ".", 1)):
             remedy = "it has a decimal comma: export the table with decimal points"
-        raise Malformed(f"{path}, line {at}: {shown!r} is no number: {remedy}") from None
+        raise MalformedFileError(f"{path}, line {at}: {shown!r} is no number: {remedy}") from None
 
 
 def _is_number(cell: str) -> bool:
@@ -107,16 +109,16 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def refuse_vast(path: Path, *, rows: int, columns: int, characters: int) -> None:
+def reject_sparse_table(path: Path, *, rows: int, columns: int, characters: int) -> None:
     """Refuse a table that would take far more memory than its file.
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         Nearly all cells are missing.
     """
     if rows * columns > max(_FEW_CELLS, _CELLS_PER_CHARACTER * characters):
-        raise Malformed(
+        raise MalformedFileError(
             f"{path}: {rows} rows for {columns} columns, nearly all of them empty: does the row of"
             " names belong to this table?"
         )
@@ -127,14 +129,16 @@ def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         Either is so.
     """
     if not len(t_s):
-        raise Malformed(f"{path}: a header without rows of data: export the trial again")
+        raise MalformedFileError(f"{path}: a header without rows of data: export the trial again")
     if not np.isfinite(t_s).all():
         row = int(np.argmin(np.isfinite(t_s))) + 1
-        raise Malformed(f"{path}: row {row} of the data has no time: correct it, or leave it out")
+        raise MalformedFileError(
+            f"{path}: row {row} of the data has no time: correct it, or leave it out"
+        )
 
 
 def rows_of_numbers(
@@ -155,7 +159,7 @@ def rows_of_numbers(
 
     Raises
     ------
-    Malformed
+    MalformedFileError
         A cell is neither empty nor a number; nearly all cells are missing.
     """
     rows: list[list[float]] = []
@@ -165,7 +169,7 @@ def rows_of_numbers(
         if any(cells):
             rows.append([number(path, at, cell) for cell in cells])
             characters += len(line)
-    refuse_vast(path, rows=len(rows), columns=width, characters=characters)
+    reject_sparse_table(path, rows=len(rows), columns=width, characters=characters)
 
     table = np.full((len(rows), width), np.nan)
     for to, row in zip(table, rows, strict=True):

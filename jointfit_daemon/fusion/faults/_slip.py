@@ -12,7 +12,7 @@ from collections import deque
 from math import exp, hypot, radians, sqrt
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.kinematics.rotation_scalar import exp_one, turn_one
+from jointfit_daemon.kinematics.rotation_scalar import difference_one, exp_one
 from jointfit_daemon.limb_model import SensorLink
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ class SlipDetector:
         """
         up_a, up_near = verticals
         (ex, ey, ez), sd = self.link.expected(up_a, up_near)
-        dx, dy, dz = turn_one(a, b)
+        dx, dy, dz = difference_one(a, b)
         residual = rx, ry, rz = dx - ex, dy - ey, dz - ez
         usual = sqrt(3.0) * sd
 

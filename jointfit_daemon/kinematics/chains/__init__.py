@@ -1,10 +1,10 @@
 """Chain models: rigid segments on joints with markers, and the pose of a chain."""
 
 from jointfit_daemon.kinematics.chains._coupled_joint import CoupledCurve
-from jointfit_daemon.kinematics.chains._layout import Layout, layout_of
+from jointfit_daemon.kinematics.chains._layout import ChainLayout, layout_of
 from jointfit_daemon.kinematics.chains._model import (
     ChainModel,
-    ImpossibleModel,
+    InvalidChainModelError,
     Joint,
     JointKind,
     Marker,
@@ -18,23 +18,23 @@ from jointfit_daemon.kinematics.chains._motion import (
     exp_matrix,
     jacobian,
     marker_positions,
-    moved,
-    placed,
+    place_coupled,
     rest_state,
     segment_poses,
     step_between,
+    step_state,
     transforms,
     twists,
 )
 
 __all__ = [
+    "ChainLayout",
     "ChainModel",
     "ChainState",
     "CoupledCurve",
-    "ImpossibleModel",
+    "InvalidChainModelError",
     "Joint",
     "JointKind",
-    "Layout",
     "Marker",
     "Sample",
     "Segment",
@@ -44,11 +44,11 @@ __all__ = [
     "jacobian",
     "layout_of",
     "marker_positions",
-    "moved",
-    "placed",
+    "place_coupled",
     "rest_state",
     "segment_poses",
     "step_between",
+    "step_state",
     "transforms",
     "twists",
 ]

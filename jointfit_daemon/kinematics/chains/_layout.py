@@ -27,7 +27,7 @@ LEVI.setflags(write=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class ChainLayout:
     """What every computation on a chain needs; S segments, nq degrees of freedom."""
 
     nq: int
@@ -67,16 +67,16 @@ class Layout:
     """Segment, column and curve of each coupled joint."""
 
 
-def layout_of(model: ChainModel) -> Layout:
+def layout_of(model: ChainModel) -> ChainLayout:
     """Return the layout of a model; the model keeps it."""
     kept = model.__dict__.get("_layout")
-    if not isinstance(kept, Layout):
+    if not isinstance(kept, ChainLayout):
         kept = _layout(model)
         model.__dict__["_layout"] = kept  # beside its cached properties, as frozen as they are
     return kept
 
 
-def _layout(model: ChainModel) -> Layout:
+def _layout(model: ChainModel) -> ChainLayout:
     joints = [s.joint for s in model.segments]
     parents = model.parents.tolist()
     is_free = np.array([j.kind == "free" for j in joints])
@@ -96,7 +96,7 @@ def _layout(model: ChainModel) -> Layout:
     turns = np.zeros((len(columns), 4, 2))
     turns[:, :3, 0], turns[:, :3, 1], turns[:, 3, 1] = axes, center[segment_of], 1.0
     lower = np.tril(below[np.ix_(segment_of, segment_of)].T)
-    return Layout(
+    return ChainLayout(
         nq=len(columns),
         levels=_levels(parents),
         free=_index(np.flatnonzero(is_free).tolist()),

@@ -37,7 +37,7 @@ _UNIT_TOLERANCE = 1e-6
 _FEWEST_SAMPLES = 4
 
 
-class ImpossibleModel(ValueError):  # noqa: N818 - named for what happened
+class InvalidChainModelError(ValueError):
     """Segments, joints and markers that make no chain; the message lists all reasons."""
 
 
@@ -91,7 +91,7 @@ class ChainModel:
 
     Raises
     ------
-    ImpossibleModel
+    InvalidChainModelError
         Doubled names, unknown parents or segments, parents after children, a free joint below a
         parent, axes or rests that are no unit, limits the wrong way round, values not finite.
     """
@@ -103,7 +103,7 @@ class ChainModel:
     def __post_init__(self) -> None:
         wrong = [*_wrong_segments(self.segments), *_wrong_markers(self.segments, self.markers)]
         if wrong:
-            raise ImpossibleModel(f"{self.name}: {'; '.join(wrong)}")
+            raise InvalidChainModelError(f"{self.name}: {'; '.join(wrong)}")
 
     @cached_property
     def nq(self) -> int:
@@ -178,7 +178,7 @@ class ChainModel:
         """
         unknown = set(factors) - set(self.segment_names)
         if unknown:
-            raise ImpossibleModel(f"{self.name}: no segments {', '.join(sorted(unknown))}")
+            raise InvalidChainModelError(f"{self.name}: no segments {', '.join(sorted(unknown))}")
 
         def stretch(segment: str | None, point: Vector) -> Vector:
             x, y, z = (np.asarray(point) * np.asarray(factors.get(segment or "", 1.0))).tolist()

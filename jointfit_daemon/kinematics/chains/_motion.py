@@ -19,7 +19,7 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chains._coupled_joint import COLUMNS
-from jointfit_daemon.kinematics.chains._layout import LEVI, Layout, layout_of
+from jointfit_daemon.kinematics.chains._layout import LEVI, ChainLayout, layout_of
 from jointfit_daemon.kinematics.chains._model import ChainModel, rest_rotations
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def rest_state(model: ChainModel, count: int = 1) -> ChainState:
     """Return the chain at rest, free origins in the world's, at `count` instants."""
     free = sum(s.joint.kind == "free" for s in model.segments)
     rest = np.broadcast_to(rest_rotations(model), (count, len(model.segments), 3, 3))
-    return placed(layout_of(model), rest.copy(), np.zeros((count, free, 3)), None)
+    return place_coupled(layout_of(model), rest.copy(), np.zeros((count, free, 3)), None)
 
 
 def segment_poses(model: ChainModel, state: ChainState) -> tuple[Array, Array]:
@@ -76,7 +76,7 @@ def segment_poses(model: ChainModel, state: ChainState) -> tuple[Array, Array]:
     return world[..., :3, :3], world[..., :3, 3]
 
 
-def transforms(layout: Layout, state: ChainState) -> Array:
+def transforms(layout: ChainLayout, state: ChainState) -> Array:
     """Return each segment's transform to the world, shape (T, S, 4, 4), one level at a time."""
     rotations = state.rotations
     local = np.empty((*rotations.shape[:2], 4, 4))
@@ -101,7 +101,7 @@ def marker_positions(model: ChainModel, state: ChainState) -> Array:
     return placed
 
 
-def twists(layout: Layout, world: Array, couplings: Array | None = None) -> Array:
+def twists(layout: ChainLayout, world: Array, couplings: Array | None = None) -> Array:
     r"""Return what each degree of freedom does to points: shape (T, nq, 6).
 
     A point x moves by :math:`\alpha\times x + \beta`; the row is :math:`(\alpha, \beta)`. For a
@@ -154,20 +154,22 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
 
 def apply_step(model: ChainModel, state: ChainState, delta: Array) -> ChainState:
     """Return the state moved by `delta`, rad and m, shape (T, nq)."""
-    return moved(layout_of(model), state, delta)
+    return step_state(layout_of(model), state, delta)
 
 
-def moved(layout: Layout, state: ChainState, delta: Array) -> ChainState:
+def step_state(layout: ChainLayout, state: ChainState, delta: Array) -> ChainState:
     """Return the state moved by `delta`, shape (T, nq)."""
-    rotations = turned(layout, state.rotations, delta)
+    rotations = step_rotations(layout, state.rotations, delta)
     origins = state.origins + delta[:, layout.shifts].reshape(len(delta), -1, 3)
     if state.couplings is None:
         return ChainState(rotations, origins)
     columns = [column for _, column, _ in layout.coupled]
-    return placed(layout, rotations, origins, state.couplings[..., 0] + delta[:, columns])
+    return place_coupled(layout, rotations, origins, state.couplings[..., 0] + delta[:, columns])
 
 
-def placed(layout: Layout, rotations: Array, origins: Array, amounts: Array | None) -> ChainState:
+def place_coupled(
+    layout: ChainLayout, rotations: Array, origins: Array, amounts: Array | None
+) -> ChainState:
     """Return a state with the coupled joints where their coordinates say.
 
     Parameters
@@ -186,7 +188,7 @@ def placed(layout: Layout, rotations: Array, origins: Array, amounts: Array | No
     return ChainState(rotations, origins, found)
 
 
-def turned(layout: Layout, rotations: Array, delta: Array) -> Array:
+def step_rotations(layout: ChainLayout, rotations: Array, delta: Array) -> Array:
     """Return A exp(delta) for all joints but coupled ones: (T, S, 3, 3) by (T, nq)."""
     vectors = (delta @ layout.spread).reshape(*rotations.shape[:2], 3)
     exp = exp_matrix if len(vectors) > 1 else _exp_of_few
@@ -236,7 +238,7 @@ def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
     return step
 
 
-def between_coordinates(layout: Layout, a: ChainState, b: ChainState, step: Array) -> None:
+def between_coordinates(layout: ChainLayout, a: ChainState, b: ChainState, step: Array) -> None:
     """Write how far coupled joints are in b from where they are in a into their columns."""
     if a.couplings is not None and b.couplings is not None:
         columns = [column for _, column, _ in layout.coupled]

@@ -1,11 +1,11 @@
-"""Inverse kinematics: the poses of a chain model that best fit measured markers."""
+"""Inverse kinematics: the poses of a chain model that best marker_fit measured markers."""
 
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import Band, limits_of
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
-    Fit,
-    fit,
+    MarkerFit,
     lower_equations,
-    slots_of,
+    marker_fit,
+    marker_slots,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._solver import (
     OPEN_M2,
@@ -18,13 +18,13 @@ from jointfit_daemon.kinematics.inverse_kinematics._solver import (
 __all__ = [
     "OPEN_M2",
     "Band",
-    "Fit",
     "IkOptions",
     "IkResult",
-    "fit",
+    "MarkerFit",
     "limits_of",
     "lower_equations",
-    "slots_of",
+    "marker_fit",
+    "marker_slots",
     "solve_frames",
     "tracking_error",
 ]

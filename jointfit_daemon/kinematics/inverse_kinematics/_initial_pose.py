@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.chains import exp_matrix, placed, rest_state
-from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import Slots, slots_of
+from jointfit_daemon.kinematics.chains import exp_matrix, place_coupled, rest_state
+from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
+    MarkerSlots,
+    marker_slots,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,7 +46,7 @@ def start_from_markers(
     weights
         Shape (T, S, K), zero where nothing was measured.
     """
-    slots, count = slots_of(model), len(measured)
+    slots, count = marker_slots(model), len(measured)
     rest = rest_state(model).rotations[0]
     curves = {segment: curve for segment, _, curve in slots.layout.coupled}
     amounts: list[Array] = []
@@ -84,7 +87,7 @@ def start_from_markers(
         else:
             world_t[:, i] = center - world_R[:, i] @ own
     found = np.stack(amounts, axis=1) if amounts else None
-    return placed(slots.layout, A, world_t[:, slots.layout.free], found), guessed
+    return place_coupled(slots.layout, A, world_t[:, slots.layout.free], found), guessed
 
 
 def _with_center(
@@ -116,7 +119,7 @@ def _laid(
     return R, middle_y - (R @ middle_p[..., None])[..., 0], second
 
 
-def _has_markers(slots: Slots, i: int) -> bool:
+def _has_markers(slots: MarkerSlots, i: int) -> bool:
     """Return whether a segment has markers of its own at all: without any, nothing is guessed."""
     return bool((slots.places // slots.shape[1] == i).any())
 

@@ -20,21 +20,21 @@ from jointfit_daemon.kinematics.chains import (
     ChainState,
     between_coordinates,
     layout_of,
-    moved,
     rest_state,
+    step_state,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
-    Fit,
-    fit,
+    MarkerFit,
+    marker_fit,
+    marker_slots,
     normal_equations,
-    slots_of,
 )
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.kinematics.chains import ChainModel, Layout
+    from jointfit_daemon.kinematics.chains import ChainLayout, ChainModel
 
 _DAMPING = 1e-4
 _EASIER, _HARDER, _HOPELESS = 0.2, 8.0, 1e6
@@ -68,7 +68,7 @@ class Band:
             self, reference=self.reference.take(instants), weights=self.weights[instants]
         )
 
-    def excess(self, layout: Layout, state: ChainState) -> Array:
+    def excess(self, layout: ChainLayout, state: ChainState) -> Array:
         """Return how far turns are outside, rad, shape (T, nq)."""
         between = self.reference.rotations.swapaxes(-1, -2) @ state.rotations
         v = log_matrix(between).reshape(len(between), -1) @ layout.spread.T
@@ -109,7 +109,7 @@ def log_matrix(R: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class SearchProblem:
     """What is searched for, at T instants."""
 
     model: ChainModel
@@ -129,7 +129,7 @@ class Problem:
         weighing = self.weights[self.weights > 0.0]
         return float(np.median(weighing)) if weighing.size else 1.0
 
-    def take(self, instants: NDArray[np.intp], hold: Band | None = None) -> Problem:
+    def take(self, instants: NDArray[np.intp], hold: Band | None = None) -> SearchProblem:
         """Return the problem at some instants, with one band more if given."""
         kept = tuple(b if len(b.weights) == 1 else b.take(instants) for b in self.bands)
         return replace(
@@ -139,18 +139,18 @@ class Problem:
             bands=kept if hold is None else (*kept, hold),
         )
 
-    def at(self, state: ChainState) -> tuple[Fit, Array]:
+    def at(self, state: ChainState) -> tuple[MarkerFit, Array]:
         """Return the fit of a state and its cost, m^2, shape (T,)."""
-        found = fit(slots_of(self.model), state, self.measured, self.weights)
+        found = marker_fit(marker_slots(self.model), state, self.measured, self.weights)
         cost = found.cost
         for band in self.bands:
             excess = band.excess(layout_of(self.model), state)
             cost = cost + np.einsum("tk,tk->t", band.weights * excess, excess)
         return found, cost
 
-    def equations(self, state: ChainState, at: Fit) -> tuple[Array, Array]:
+    def equations(self, state: ChainState, at: MarkerFit) -> tuple[Array, Array]:
         """Return the normal matrix, shape (T, nq, nq), and the gradient, shape (T, nq)."""
-        H, g = normal_equations(slots_of(self.model), at)
+        H, g = normal_equations(marker_slots(self.model), at)
         for band in self.bands:
             excess = band.excess(layout_of(self.model), state)
             g = g + band.weights * excess
@@ -160,7 +160,7 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SearchResult:
     """The end of a search."""
 
     state: ChainState
@@ -170,7 +170,7 @@ class Found:
     iterations: NDArray[np.intp]
 
 
-def search(problem: Problem, start: ChainState) -> Found:
+def search(problem: SearchProblem, start: ChainState) -> SearchResult:
     """Return the least cost from `start`, robust weights included."""
     found = _descend(problem, start)
     if problem.huber_m is None:
@@ -186,7 +186,7 @@ def search(problem: Problem, start: ChainState) -> Found:
     return replace(found, iterations=iterations)
 
 
-def _descend(problem: Problem, start: ChainState) -> Found:
+def _descend(problem: SearchProblem, start: ChainState) -> SearchResult:
     count = len(start)
     found = start.copy()
     converged = np.zeros(count, dtype=np.bool_)
@@ -200,7 +200,7 @@ def _descend(problem: Problem, start: ChainState) -> Found:
         diagonal = np.einsum("tkk->tk", H)
         diagonal += damping[:, None] * diagonal + _RIDGE
         step = np.asarray(-np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
-        onward = moved(layout, state, step)
+        onward = step_state(layout, state, step)
         there, new_cost = part.at(onward)
         better = new_cost < cost
         done = better & (cost - new_cost < problem.tolerance * cost)
@@ -220,12 +220,12 @@ def _descend(problem: Problem, start: ChainState) -> Found:
             if not len(here):
                 break
     found.put(here, state)
-    return Found(found, problem.weights, converged, iterations)
+    return SearchResult(found, problem.weights, converged, iterations)
 
 
 def _kept(
-    better: NDArray[np.bool_], new: tuple[ChainState, Fit], old: tuple[ChainState, Fit]
-) -> tuple[ChainState, Fit]:
+    better: NDArray[np.bool_], new: tuple[ChainState, MarkerFit], old: tuple[ChainState, MarkerFit]
+) -> tuple[ChainState, MarkerFit]:
     """Return the new where it is better."""
     keep = better[:, None, None]
     (onward, there), (state, at) = new, old
@@ -241,4 +241,4 @@ def _kept(
     )
     pairs = ((there.world, at.world), (there.cloud, at.cloud), (there.weighted, at.weighted))
     world, cloud, weighted = (np.where(keep[..., None], n, o) for n, o in pairs)
-    return state, Fit(world, cloud, weighted, couplings)
+    return state, MarkerFit(world, cloud, weighted, couplings)

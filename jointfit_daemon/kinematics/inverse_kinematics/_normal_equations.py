@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.kinematics.chains import Layout, layout_of, transforms, twists
+from jointfit_daemon.kinematics.chains import ChainLayout, layout_of, transforms, twists
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Slots:
+class MarkerSlots:
     """Where each marker of a model sits in arrays (T, S, 3, K)."""
 
-    layout: Layout
+    layout: ChainLayout
     points: Array
     """(x, y, z, 1) of each slot in segment axes, shape (S, 4, K)."""
     places: NDArray[np.intp]
@@ -63,16 +63,16 @@ class Slots:
         return np.asarray(flat[:, self.places])
 
 
-def slots_of(model: ChainModel) -> Slots:
+def marker_slots(model: ChainModel) -> MarkerSlots:
     """Return the slots of a model's markers; the model keeps them."""
     kept = model.__dict__.get("_slots")
-    if not isinstance(kept, Slots):
+    if not isinstance(kept, MarkerSlots):
         kept = _slots(model)
         model.__dict__["_slots"] = kept
     return kept
 
 
-def _slots(model: ChainModel) -> Slots:
+def _slots(model: ChainModel) -> MarkerSlots:
     segments = model.marker_segments
     count = np.bincount(segments, minlength=len(model.segments))
     width = max(int(count.max(initial=0)), 1)
@@ -80,11 +80,11 @@ def _slots(model: ChainModel) -> Slots:
     points = np.zeros((len(model.segments), 4, width))
     points[:, 3] = 1.0
     points[segments, :3, order.astype(np.intp)] = model.positions
-    return Slots(layout_of(model), points, (segments * width + order).astype(np.intp))
+    return MarkerSlots(layout_of(model), points, (segments * width + order).astype(np.intp))
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class MarkerFit:
     """A chain at T instants beside its measured markers."""
 
     world: Array
@@ -108,13 +108,13 @@ class Fit:
             np.einsum("tsik,tsik->t", self.cloud[..., 4:, :], self.weighted[..., 4:, :])
         )
 
-    def take(self, instants: NDArray[np.intp]) -> Fit:
+    def take(self, instants: NDArray[np.intp]) -> MarkerFit:
         """Return the fit at some instants."""
         some = None if self.couplings is None else self.couplings[instants]
-        return Fit(self.world[instants], self.cloud[instants], self.weighted[instants], some)
+        return MarkerFit(self.world[instants], self.cloud[instants], self.weighted[instants], some)
 
 
-def fit(slots: Slots, state: ChainState, measured: Array, weights: Array) -> Fit:
+def marker_fit(slots: MarkerSlots, state: ChainState, measured: Array, weights: Array) -> MarkerFit:
     """Return the chain beside its markers.
 
     Parameters
@@ -132,7 +132,7 @@ def fit(slots: Slots, state: ChainState, measured: Array, weights: Array) -> Fit
     cloud = np.empty((*world.shape[:2], 7, slots.shape[1]))
     np.matmul(world, slots.points, out=cloud[..., :4, :])
     np.subtract(cloud[..., :3, :], measured, out=cloud[..., 4:, :])
-    return Fit(world, cloud, cloud * weights[:, :, None, :], state.couplings)
+    return MarkerFit(world, cloud, cloud * weights[:, :, None, :], state.couplings)
 
 
 def _sums_to_inertia() -> Array:
@@ -157,13 +157,13 @@ def _sums_to_inertia() -> Array:
 _INERTIA = _sums_to_inertia()
 
 
-def normal_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
+def normal_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
     """Return J^T W J, shape (T, nq, nq), and J^T W e, shape (T, nq)."""
     lower, g = lower_equations(slots, at)
     return lower + (lower * slots.layout.strictly_lower).swapaxes(-1, -2), g
 
 
-def lower_equations(slots: Slots, at: Fit) -> tuple[Array, Array]:
+def lower_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
     """Return the lower triangle of J^T W J, which is all a Cholesky factor needs, and J^T W e."""
     layout, count = slots.layout, len(at.world)
     sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)

@@ -19,14 +19,14 @@ import numpy as np
 from jointfit_daemon.kinematics.inverse_kinematics._initial_pose import start_from_markers
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import (
     Band,
-    Problem,
+    SearchProblem,
     limits_of,
     search,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
-    fit,
+    marker_fit,
+    marker_slots,
     normal_equations,
-    slots_of,
 )
 
 if TYPE_CHECKING:
@@ -113,8 +113,8 @@ def solve_frames(
     w = checked_weights(model, weights, seen)
     if start is not None and len(start) != len(measured):
         raise ValueError(f"start has {len(start)} instants, the markers {len(measured)}")
-    slots = slots_of(model)
-    problem = Problem(
+    slots = marker_slots(model)
+    problem = SearchProblem(
         model,
         slots.filled_vectors(measured),
         slots.filled(w),
@@ -141,14 +141,14 @@ def solve_frames(
 class _Solution:
     """What is being found, instant by instant; its arrays are written in place."""
 
-    problem: Problem
+    problem: SearchProblem
     state: ChainState
     weights: Array
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
 
     @classmethod
-    def of(cls, problem: Problem, start: ChainState) -> _Solution:
+    def of(cls, problem: SearchProblem, start: ChainState) -> _Solution:
         count = len(start)
         return cls(
             problem,
@@ -173,8 +173,8 @@ class _Solution:
         That is where a pivot of the normal matrix is small, each being what the markers say about
         one degree of freedom when those after it are free to follow.
         """
-        slots = slots_of(self.problem.model)
-        at = fit(slots, self.state, self.problem.measured, self.weights)
+        slots = marker_slots(self.problem.model)
+        at = marker_fit(slots, self.state, self.problem.measured, self.weights)
         return open_instants(normal_equations(slots, at)[0] / self.problem.typical_weight)
 
     def follow(
@@ -193,8 +193,8 @@ class _Solution:
             self.solve(instants, hold)
 
     def result(self, seen: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> IkResult:
-        slots = slots_of(self.problem.model)
-        at = fit(slots, self.state, self.problem.measured, self.weights)
+        slots = marker_slots(self.problem.model)
+        at = marker_fit(slots, self.state, self.problem.measured, self.weights)
         residuals = slots.taken(at.errors)
         residuals[~seen] = np.nan
         return IkResult(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.timing.clock import TIE_STALE_NS, Edge, SyncLine
+from jointfit_daemon.timing.clock import SYNC_STALE_NS, Edge, SyncLine
 
 if TYPE_CHECKING:
     from jointfit_daemon.timing.clock import DeviceClock
@@ -45,7 +45,7 @@ class SyncLines:
     def edge(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
         """Take an edge that `source` stamped on line `number`."""
         line = self._lines.setdefault(number, _Line())
-        silent = edge.t_ns - line.heard_ns > TIE_STALE_NS
+        silent = edge.t_ns - line.heard_ns > SYNC_STALE_NS
         if line.reference is None or (silent and number not in self._cameras):
             line.reference, line.edges = source, SyncLine()
         if line.reference == source:
@@ -69,4 +69,4 @@ class SyncLines:
         reference = line.clocks.get(line.reference or "")
         for own, other in line.edges.matched(name):
             if reference is not None:
-                line.clocks[name].feed_tie(own, other, reference)
+                line.clocks[name].feed_sync_edge(own, other, reference)

@@ -6,6 +6,13 @@ from jointfit_daemon.timing.alignment._frame_aligner import (
     Mode,
     StreamSpec,
 )
-from jointfit_daemon.timing.alignment._interpolation import BEND, beyond
+from jointfit_daemon.timing.alignment._interpolation import CURVATURE_SHARE, extrapolate_orientation
 
-__all__ = ["BEND", "AlignedFrame", "FrameAligner", "Mode", "StreamSpec", "beyond"]
+__all__ = [
+    "CURVATURE_SHARE",
+    "AlignedFrame",
+    "FrameAligner",
+    "Mode",
+    "StreamSpec",
+    "extrapolate_orientation",
+]

@@ -21,14 +21,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.timing.alignment._stream import Stream, StreamSpec, Verdict
+from jointfit_daemon.timing.alignment._stream import SampleOutcome, Stream, StreamSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.model import Quaternion, Vector
 
-__all__ = ["AlignedFrame", "FrameAligner", "Mode", "StreamSpec", "Verdict"]
+__all__ = ["AlignedFrame", "FrameAligner", "Mode", "SampleOutcome", "StreamSpec"]
 
 Mode = Literal["smooth", "fast"]
 """``smooth`` waits for samples and interpolates; ``fast`` extrapolates by a period at most."""
@@ -124,7 +124,7 @@ class FrameAligner:
         synced: bool = True,
         epoch: int = 0,
         rate: Vector | None = None,
-    ) -> Verdict | None:
+    ) -> SampleOutcome | None:
         """Take one sample; return its verdict if that is certain already.
 
         Parameters

@@ -13,19 +13,19 @@ from __future__ import annotations
 from math import sqrt
 from typing import TYPE_CHECKING, Protocol
 
-from jointfit_daemon.kinematics.rotation_scalar import turn_one, turned_one
+from jointfit_daemon.kinematics.rotation_scalar import difference_one, perturb_one
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
 _NS = 1e-9
-BEND = 0.5
+CURVATURE_SHARE = 0.5
 """Share of the measured curvature that is extrapolated: see docs/timing.md."""
 _CONTRADICTS, _CONTRADICTS_RAD = 0.25, 0.02
 """By how much a turn between two samples may differ from their rates: relative, and rad."""
 
 
-class Known(Protocol):
+class OrientationSample(Protocol):
     """A sample as far as this module looks at it."""
 
     t_ns: int
@@ -37,7 +37,9 @@ class Known(Protocol):
     so, and again when another sample comes between them."""
 
 
-def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
+def interpolate_orientation(
+    before: OrientationSample | None, a: OrientationSample, b: OrientationSample, t_ns: int
+) -> Quaternion:
     r"""Return the orientation at `t_ns`, between the neighbors `a` and `b`.
 
     With rates at both ends a cubic (Hermite) in the tangent space of `a`; else with a sample
@@ -51,7 +53,7 @@ def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
 
     Parameters
     ----------
-    before, a, b : Known
+    before, a, b : OrientationSample
         Neighbors in order of time; `before` may be missing. Signs of quaternions do not matter.
     t_ns : int
         Instant in ``[a.t_ns, b.t_ns]``.
@@ -67,11 +69,15 @@ def between(before: Known | None, a: Known, b: Known, t_ns: int) -> Quaternion:
     else:
         share = x / h
         r = (share * turn[0], share * turn[1], share * turn[2])
-    return turned_one(a.q, r)
+    return perturb_one(a.q, r)
 
 
-def beyond(
-    earlier: Known | None, before: Known, a: Known, t_ns: int, bend: float = BEND
+def extrapolate_orientation(
+    earlier: OrientationSample | None,
+    before: OrientationSample,
+    a: OrientationSample,
+    t_ns: int,
+    bend: float = CURVATURE_SHARE,
 ) -> Quaternion:
     r"""Return the orientation at `t_ns`, after the last sample `a`.
 
@@ -86,7 +92,7 @@ def beyond(
 
     Parameters
     ----------
-    earlier, before, a : Known
+    earlier, before, a : OrientationSample
         The last samples in order of time; `earlier` may be missing.
     t_ns : int
         Instant at or after ``a.t_ns``.
@@ -103,18 +109,18 @@ def beyond(
         r = _combine(x / h0, turn, 0.0, turn)
         if earlier is not None:
             h1 = (before.t_ns - earlier.t_ns) * _NS
-            first = turn_one(a.q, earlier.q)
+            first = difference_one(a.q, earlier.q)
             # in the tangent space of `a`: earlier at `first`, before at -turn, a at 0
             weight = bend * (x_c * (x_c + h0) + (2.0 * x_c + h0) * (x - x_c)) / (h0 + h1)
             bent = _combine(weight * (1.0 / h0 + 1.0 / h1), turn, weight / h1, first)
             r = (r[0] + bent[0], r[1] + bent[1], r[2] + bent[2])
-    return turned_one(a.q, r)
+    return perturb_one(a.q, r)
 
 
-def _turn_to(sample: Known, before: Known) -> Vector:
+def _turn_to(sample: OrientationSample, before: OrientationSample) -> Vector:
     """Return the turn from the sample before, which the next interval asks for, too."""
     if sample.turn is None:
-        sample.turn = turn_one(before.q, sample.q)
+        sample.turn = difference_one(before.q, sample.q)
     return sample.turn
 
 

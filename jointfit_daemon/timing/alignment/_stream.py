@@ -48,7 +48,7 @@ class StreamSpec(NamedTuple):
     """Nominal time from sample to sample, ns."""
 
 
-class Verdict(StrEnum):
+class SampleOutcome(StrEnum):
     """What became of a sample."""
 
     USED = "used"
@@ -102,17 +102,17 @@ class Stream:
         self.waited_for = False
         """Whether more is expected of it."""
         self._received = 0
-        self._counts = dict.fromkeys(Verdict, 0)
+        self._counts = dict.fromkeys(SampleOutcome, 0)
         self.newest_ns = self.newest_arrival_ns = 0
         self.extrapolated = self.synced = False
         """What the last ``at`` did, and whether the clock behind it had settled."""
 
     # --- in ----------------------------------------------------------------------------------
 
-    def idle(self) -> Verdict:
+    def idle(self) -> SampleOutcome:
         """Count a sample nobody wants."""
         self._received += 1
-        return self._count(Verdict.IDLE)
+        return self._count(SampleOutcome.IDLE)
 
     def push(
         self,
@@ -124,13 +124,13 @@ class Stream:
         epoch: int,
         passed_ns: int | None,
         rate: Vector | None = None,
-    ) -> Verdict | None:
+    ) -> SampleOutcome | None:
         """Take a sample; `passed_ns` is the last frame that is out. Return an early verdict."""
         self._received += 1
         if t_ns > arrival_ns + FUTURE_NS:
-            return self._count(Verdict.DROPPED)
+            return self._count(SampleOutcome.DROPPED)
         if t_ns < arrival_ns - PAST_NS:
-            return self._count(Verdict.LATE)
+            return self._count(SampleOutcome.LATE)
         if epoch != self.epoch:
             self.reset()
             self.epoch = epoch
@@ -149,19 +149,19 @@ class Stream:
         if arrival_ns > self.newest_arrival_ns:  # noqa: PLR1730 - max() costs more
             self.newest_arrival_ns = arrival_ns
         if len(samples) > CAPACITY:
-            self._leave(samples.popleft(), Verdict.DROPPED)
+            self._leave(samples.popleft(), SampleOutcome.DROPPED)
         return None
 
-    def _insert(self, sample: _Sample) -> Verdict | None:
+    def _insert(self, sample: _Sample) -> SampleOutcome | None:
         """Put a reordered sample where it belongs, if it is still worth anything there."""
         samples = self._samples
         at = len(samples)
         while at and samples[at - 1].t_ns > sample.t_ns:
             at -= 1
         if at and samples[at - 1].t_ns == sample.t_ns:
-            return self._count(Verdict.DUPLICATE)
+            return self._count(SampleOutcome.DUPLICATE)
         if sample.late or at == 0 or len(samples) >= CAPACITY:
-            return self._count(Verdict.LATE)
+            return self._count(SampleOutcome.LATE)
         samples[at].turn = None
         samples.insert(at, sample)
         return None
@@ -225,7 +225,7 @@ class Stream:
         if not after:
             return None
         while after > _BEHIND:
-            self._leave(samples.popleft(), Verdict.DECIMATED)
+            self._leave(samples.popleft(), SampleOutcome.DECIMATED)
             after -= 1
         last = after - 1
         a = samples[last]
@@ -255,7 +255,7 @@ class Stream:
             before.used = True
         else:
             before = None
-        return _interpolation.between(before, a, b, t_ns)
+        return _interpolation.interpolate_orientation(before, a, b, t_ns)
 
     def _beyond(self, last: int, t_ns: int) -> Quaternion | None:
         before = self._before(last)
@@ -268,7 +268,7 @@ class Stream:
             earlier.used = True
         else:
             earlier = None
-        return _interpolation.beyond(earlier, before, a, t_ns)
+        return _interpolation.extrapolate_orientation(earlier, before, a, t_ns)
 
     # --- end ---------------------------------------------------------------------------------
 
@@ -285,7 +285,7 @@ class Stream:
         """Forget all samples; what no frame used is dropped."""
         samples = self._samples
         while samples:
-            self._leave(samples.popleft(), Verdict.DROPPED)
+            self._leave(samples.popleft(), SampleOutcome.DROPPED)
         self.waited_for, self.epoch = False, None
 
     def counts(self) -> dict[str, int]:
@@ -293,14 +293,14 @@ class Stream:
         verdicts = {verdict.value: count for verdict, count in self._counts.items()}
         return {"received": self._received, **verdicts, "pending": len(self._samples)}
 
-    def _leave(self, sample: _Sample, otherwise: Verdict) -> None:
+    def _leave(self, sample: _Sample, otherwise: SampleOutcome) -> None:
         if sample.used:
-            self._count(Verdict.USED)
-        elif sample.late and otherwise is Verdict.DECIMATED:
-            self._count(Verdict.LATE)
+            self._count(SampleOutcome.USED)
+        elif sample.late and otherwise is SampleOutcome.DECIMATED:
+            self._count(SampleOutcome.LATE)
         else:
             self._count(otherwise)
 
-    def _count(self, verdict: Verdict) -> Verdict:
+    def _count(self, verdict: SampleOutcome) -> SampleOutcome:
         self._counts[verdict] += 1
         return verdict

@@ -1,6 +1,6 @@
-"""What a clock has to tell beside stamps: why it began anew, and what cannot be true.
+"""Events of a device clock: restarts, jumps and implausible rates, with their texts.
 
-Law: pure; words and figures only. Texts say what was found and what is the likely cause.
+Each text names the finding and its likely cause.
 """
 
 from __future__ import annotations
@@ -11,106 +11,138 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SKEW_LIMIT_PPM = 500.0
-"""No crystal is as wrong as this."""
+"""Largest plausible skew of a crystal, ppm."""
 SERVER_SKEW_LIMIT_PPM = 100.0
-"""Nor the clock of a server PC as this."""
+"""Largest plausible skew of a server PC's clock, ppm."""
 
 _MS, _S = 1e6, 1e9
 _BOOT_NS = 2_000_000_000
+"""Tolerance, ns, when a new device time is compared with the time elapsed since the last sample."""
 
 
-class ClockNews(NamedTuple):
-    """Something to be published."""
+class ClockEvent(NamedTuple):
+    """An event to be published."""
 
     kind: Literal["restart", "clock", "warning"]
-    """``restart``: the device itself began anew; ``clock``: only its time did; ``warning``."""
+    """``restart``: the device restarted; ``clock``: only its time changed; ``warning``."""
     text: str
     data: Mapping[str, object]
 
 
-def began_anew(before_ns: int, now_ns: int, elapsed_ns: int) -> ClockNews:
-    """Explain device time that does not go on: `elapsed_ns` passed between two arrivals."""
+def clock_restart_event(before_ns: int, now_ns: int, elapsed_ns: int) -> ClockEvent:
+    """Return the event for device time that does not continue.
+
+    Parameters
+    ----------
+    before_ns, now_ns : int
+        Device time of the last sample and of this one, ns.
+    elapsed_ns : int
+        Host time between their arrivals, ns.
+    """
     jump = now_ns - before_ns - elapsed_ns
     data = {"jump_ms": round(jump / _MS, 3)}
     if 0 <= now_ns <= elapsed_ns + _BOOT_NS and now_ns < before_ns:
-        up = f"its clock shows {now_ns / _S:.2f} s"
-        return ClockNews("restart", f"the device rebooted: {up} after {before_ns / _S:.2f} s", data)
-    back = f"its clock jumped {'back' if jump < 0 else 'ahead'} by {abs(jump) / _MS:.1f} ms"
-    return ClockNews("clock", back, data)
+        up = f"its clock restarted at {now_ns / _S:.2f} s"
+        return ClockEvent("restart", f"device rebooted: {up} after {before_ns / _S:.2f} s", data)
+
+    direction = "back" if jump < 0 else "ahead"
+    text = f"device clock jumped {direction} by {abs(jump) / _MS:.1f} ms"
+    return ClockEvent("clock", text, data)
 
 
-def too_early(early_ns: float) -> ClockNews:
-    """Explain samples that arrive before they were taken."""
+def early_arrival_event(early_ns: float) -> ClockEvent:
+    """Return the event for samples that arrive before their sampling instant."""
     text = (
-        f"its clock jumped ahead by {early_ns / _MS:.1f} ms, or the clock of this host stood still "
+        f"device clock jumped ahead by {early_ns / _MS:.1f} ms, or this host's clock stopped "
         "(suspend)"
     )
-    return ClockNews("clock", text, {"jump_ms": round(early_ns / _MS, 3)})
+    return ClockEvent("clock", text, {"jump_ms": round(early_ns / _MS, 3)})
 
 
-def too_late(late_ns: float, seconds: float) -> ClockNews:
-    """Explain samples that stay late."""
-    text = f"samples have been {late_ns / _MS:.1f} ms late for {seconds:g} s: its clock stood still"
-    return ClockNews("clock", text, {"jump_ms": round(-late_ns / _MS, 3)})
+def late_arrival_event(late_ns: float, seconds: float) -> ClockEvent:
+    """Return the event for samples that stay late for `seconds`."""
+    text = (
+        f"samples have arrived {late_ns / _MS:.1f} ms late for {seconds:g} s: the device clock "
+        "stopped for that time"
+    )
+    return ClockEvent("clock", text, {"jump_ms": round(-late_ns / _MS, 3)})
 
 
-def after_reopening(news: ClockNews) -> ClockNews:
-    """Return `news` as a restart: of a device that was away, a new time is a new start."""
-    return ClockNews("restart", f"after reconnecting, {news.text}", news.data)
+def as_restart_event(news: ClockEvent) -> ClockEvent:
+    """Return `event` as a restart: a device that was disconnected may have been restarted."""
+    return ClockEvent("restart", f"after reconnecting, {news.text}", news.data)
 
 
-UNKNOWN_WHILE_AWAY = ClockNews(
+UNKNOWN_AFTER_RECONNECT = ClockEvent(
     "restart",
-    "it reconnected, and nothing in its data shows whether it ran on: taken for a restart",
+    "device reconnected; its data do not show whether it kept running: treated as a restart",
     {},
 )
 
 
-def did_not_run_on(step_ns: int, elapsed_ns: int) -> ClockNews:
-    """Explain device time that is not where the time on this host says it must be."""
-    text = f"its time moved by {step_ns / _S:.2f} s in {elapsed_ns / _S:.2f} s: it restarted"
-    return ClockNews("restart", text, {"jump_ms": round((step_ns - elapsed_ns) / _MS, 3)})
+def clock_reset_event(step_ns: int, elapsed_ns: int) -> ClockEvent:
+    """Return the event for a device that restarted while its port was closed."""
+    text = (
+        f"device time advanced by {step_ns / _S:.2f} s in {elapsed_ns / _S:.2f} s: the device "
+        "restarted"
+    )
+    return ClockEvent("restart", text, {"jump_ms": round((step_ns - elapsed_ns) / _MS, 3)})
 
 
-def off_echoes(off_ns: int) -> ClockNews:
-    """Explain an echo that no clock could give that was where it was."""
-    text = f"its clock jumped by {off_ns / _MS:.1f} ms against its own echoes: restarted, or set"
-    return ClockNews("clock", text, {"jump_ms": round(off_ns / _MS, 3)})
+def echo_jump_event(off_ns: int) -> ClockEvent:
+    """Return the event for an echo that contradicts the echoes before."""
+    text = (
+        f"device clock jumped by {off_ns / _MS:.1f} ms relative to its echoes: the device "
+        "restarted or its clock was set"
+    )
+    return ClockEvent("clock", text, {"jump_ms": round(off_ns / _MS, 3)})
 
 
-def moved(step_ns: int) -> ClockNews:
-    """Explain an estimate that moved too far to be followed slowly."""
-    text = f"the estimate of its clock moved by {step_ns / _MS:.1f} ms at once"
-    return ClockNews("clock", text, {"step_ms": round(step_ns / _MS, 3)})
+def estimate_step_event(step_ns: int) -> ClockEvent:
+    """Return the event for a clock estimate that moved too far to be slewed."""
+    text = f"clock estimate stepped by {step_ns / _MS:.1f} ms"
+    return ClockEvent("clock", text, {"step_ms": round(step_ns / _MS, 3)})
 
 
-def said(text: str) -> ClockNews:
-    """Return news without figures."""
-    return ClockNews("clock", text, {})
+def clock_event(text: str) -> ClockEvent:
+    """Return a clock event without data."""
+    return ClockEvent("clock", text, {})
 
 
-ANOTHER_WAY = said("it tells time in another way now")
+CLOCK_SOURCE_CHANGED = clock_event("clock source changed")
 
 
-def contradicted(direct_ns: int, estimate_ns: int) -> ClockNews:
-    """Explain why a direct time is not used."""
+def sync_disagreement_event(direct_ns: int, estimate_ns: int) -> ClockEvent:
+    """Return the warning for sync times that arrival times contradict."""
     off = (direct_ns - estimate_ns) / _MS
     text = (
-        f"its sync time differs from what arrivals tell by {off:.1f} ms and is not used: wrong "
-        "line, edge or clock declared?"
+        f"sync time differs from arrival times by {off:.1f} ms and is discarded: check the "
+        "configured line, edge and clock"
     )
-    return ClockNews("warning", text, {"off_ms": round(off, 3)})
+    return ClockEvent("warning", text, {"off_ms": round(off, 3)})
 
 
-def skew_warning(kind: str, skew_ppm: float, sigma_ppm: float) -> ClockNews | None:
-    """Return a warning if no clock can be so wrong; `kind` is ``ticks``, ``samples``, ``echo``."""
+def skew_warning(kind: str, skew_ppm: float, sigma_ppm: float) -> ClockEvent | None:
+    """Return a warning if the skew exceeds the limit by more than three standard deviations.
+
+    Parameters
+    ----------
+    kind : {"ticks", "samples", "echo"}
+        Source of the clock.
+    skew_ppm, sigma_ppm : float
+        Skew and its standard deviation, ppm.
+    """
     limit = SERVER_SKEW_LIMIT_PPM if kind == "echo" else SKEW_LIMIT_PPM
     if abs(skew_ppm) - 3.0 * sigma_ppm <= limit:
         return None
+
     cause = {
-        "ticks": "is its tick rate what the driver takes it for?",
-        "samples": "is rate_hz the rate it really sends at?",
-        "echo": "is the server's clock stepped or slewed by its operating system?",
+        "ticks": "check the tick rate that the driver declares",
+        "samples": "check that rate_hz is the rate the device sends at",
+        "echo": "check whether the server's operating system steps or slews its clock",
     }[kind]
-    text = f"its clock is {skew_ppm:+.0f} ppm off, more than any crystal (limit {limit:g}): {cause}"
-    return ClockNews("warning", text, {"skew_ppm": round(skew_ppm, 1)})
+    text = (
+        f"device clock skew is {skew_ppm:+.0f} ppm, more than any crystal (limit {limit:g} ppm): "
+        f"{cause}"
+    )
+    return ClockEvent("warning", text, {"skew_ppm": round(skew_ppm, 1)})

@@ -1,38 +1,40 @@
-"""Counters that start again at zero. Law: integers only; one function, no state.
+"""Unwrapping of counters that restart at zero.
 
-A counter of `modulus` values tells its true count only up to whole turns. Neighbours settle the
-rest: two readings closer than half a turn are told apart by sign; over a longer silence the
-arrival times say how many turns passed unseen.
+A counter of `modulus` values determines the count up to whole turns. Between readings close in time
+the change is taken as less than half a turn in either direction. After a longer silence the elapsed
+host time gives the number of turns.
 """
 
 from __future__ import annotations
 
 _QUARTER = 4
+"""Elapsed time of more than 1/4 turn: host time resolves the number of turns."""
 
 
 def unwrap(raw: int, last: int, modulus: int | None, elapsed_ns: int, turn_ns: int) -> int:
-    """Return the true count whose remainder is `raw`, given the true count before it.
+    """Return the unwrapped count for the reading `raw`.
 
     Parameters
     ----------
     raw : int
         Count as read, in [0, modulus).
     last : int
-        True count of the previous reading (its remainder is what was read then).
+        Unwrapped count of the previous reading.
     modulus : int or None
-        Values of the counter; None if it never starts again: `raw` is returned.
+        Number of counter values; None for a counter that never wraps: `raw` is returned.
     elapsed_ns : int
         Host time between the two arrivals, ns.
     turn_ns : int
-        Time of one whole turn, ns.
+        Duration of one whole turn, ns.
 
     Returns
     -------
     int
-        Below `last` when the reading is a reordered older one.
+        Below `last` if the reading is an older, reordered one.
     """
     if modulus is None:
         return raw
+
     forward = (raw - last) % modulus
     if _QUARTER * elapsed_ns > turn_ns:
         turns = round((elapsed_ns - forward * turn_ns / modulus) / turn_ns)

@@ -1,8 +1,8 @@
-"""How late and how often samples come: percentiles and rate of the last minute.
+"""Delay percentiles and sample rate of the last minute.
 
-Law: constant memory and time a sample. Two halves of half a minute take turns; what is told covers
-the running half and the one before it. Delays are counted in bins of an eighth of an octave, so a
-percentile is right within 5 %; the greatest delay is exact.
+Constant memory and time per sample. Two half-minute histograms alternate; results cover the running
+one and the one before. Bins are an eighth of an octave wide, so percentiles are accurate to 5 %.
+The maximum is exact.
 """
 
 from __future__ import annotations
@@ -10,17 +10,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 HALF_NS = 30_000_000_000
+"""Length of one histogram, ns."""
 
-_UNIT_BITS = 10  # finest step, about a microsecond
+_UNIT_BITS = 10
+"""Finest step: 2**10 ns, about a microsecond."""
 _SUB_BITS = 3
+"""Eight bins per octave."""
 _SUBS = 1 << _SUB_BITS
 _BINS = (40 - _UNIT_BITS) * _SUBS
 _LINEAR = 2 * _SUBS
 _NS = 1e9
 
 
-class DelayFigures(NamedTuple):
-    """Delays from sampled instant to arrival, ns."""
+class DelayPercentiles(NamedTuple):
+    """Delays from sampling instant to arrival, ns."""
 
     p50_ns: float
     p99_ns: float
@@ -35,7 +38,7 @@ class _Half:
         self.count = self.first_ns = self.last_ns = self.worst = 0
 
 
-class LastMinute:
+class DelayStatistics:
     """Arrivals and delays of one source in the last half to whole minute."""
 
     __slots__ = ("_before", "_end_ns", "_now")
@@ -45,24 +48,25 @@ class LastMinute:
         self._end_ns: int | None = None
 
     def feed(self, arrival_ns: int, delay_ns: int) -> None:
-        """Count one sample; a delay below 0 counts as 0."""
+        """Count one sample; negative delays count as 0."""
         end = self._end_ns
         if end is None or arrival_ns >= end:
             idle = end is None or arrival_ns >= end + HALF_NS
             self._before = _Half() if idle else self._now
             self._now, self._end_ns = _Half(), arrival_ns + HALF_NS
+
         half = self._now
         if half.count == 0:
             half.first_ns = arrival_ns
         half.count += 1
         half.last_ns = arrival_ns
-        if delay_ns > half.worst:  # noqa: PLR1730 - max() costs more than the rest of this
+        if delay_ns > half.worst:  # noqa: PLR1730 - max() costs more than the rest of the method
             half.worst = delay_ns
         half.bins[bin_of(delay_ns)] += 1
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples a second as they arrived, silences included; None before the second."""
+        """Arrival rate, Hz, silences included; None with fewer than two samples."""
         before, now = self._before, self._now
         count = before.count + now.count
         first = before.first_ns if before.count else now.first_ns
@@ -71,29 +75,31 @@ class LastMinute:
         return (count - 1) * _NS / (now.last_ns - first)
 
     @property
-    def delays(self) -> DelayFigures | None:
+    def delays(self) -> DelayPercentiles | None:
         """Percentiles of the delays; None before the first sample."""
         before, now = self._before, self._now
         count = before.count + now.count
         if not count:
             return None
+
         bins = [a + b for a, b in zip(before.bins, now.bins, strict=True)]
         worst = max(before.worst, now.worst)
         p50, p99 = (min(_height(bins, share * count), float(worst)) for share in (0.5, 0.99))
-        return DelayFigures(p50, p99, worst)
+        return DelayPercentiles(p50, p99, worst)
 
 
 def bin_of(delay_ns: int) -> int:
-    """Return the bin of a delay: linear up to 16 units, then eight to an octave."""
+    """Return the bin of a delay: linear up to 16 units, then eight bins per octave."""
     units = delay_ns >> _UNIT_BITS if delay_ns > 0 else 0
     if units < _LINEAR:
         return units
+
     octave = units.bit_length() - _SUB_BITS - 1
     return min((octave << _SUB_BITS) + (units >> octave), _BINS - 1)
 
 
 def _height(bins: list[int], rank: float) -> float:
-    """Return the delay that `rank` samples do not exceed, interpolated in its bin, ns."""
+    """Return the delay, ns, at a rank of the histogram, interpolated in its bin."""
     below = 0
     for index, count in enumerate(bins):
         if count and below + count >= rank:
@@ -104,6 +110,6 @@ def _height(bins: list[int], rank: float) -> float:
 
 
 def _edge(index: int) -> float:
-    """Return where bin `index` begins, ns."""
+    """Return the lower edge of a bin, ns."""
     octave = max(0, (index >> _SUB_BITS) - 1)
     return float((index - (octave << _SUB_BITS)) << octave << _UNIT_BITS)

@@ -1,8 +1,8 @@
-"""What a device says of time, as nanoseconds that only grow: from ticks, a counter, or nothing.
+"""Device time in nanoseconds from ticks, a sample counter, or arrivals.
 
-Law: pure; one reader lives from one restart of a device to the next. ``feed`` returns the device
-time u of a sample in ns, smaller than before if the sample was reordered, and None when the device
-must have restarted: then this reader is of no more use and a fresh one reads the sample again.
+One reader lives from one restart of a device to the next. ``feed`` returns the device time u of a
+sample in ns; a reordered sample gets a smaller one. It returns None if the device must have
+restarted; a new reader must then read the sample again.
 """
 
 from __future__ import annotations
@@ -10,56 +10,72 @@ from __future__ import annotations
 from math import log
 from typing import TYPE_CHECKING, Protocol
 
-from jointfit_daemon.timing.clock._clock_events import began_anew, said
+from jointfit_daemon.timing.clock._clock_events import clock_event, clock_restart_event
 from jointfit_daemon.timing.clock._counter_wrap import unwrap
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import TickClock
-    from jointfit_daemon.timing.clock._clock_events import ClockNews
-    from jointfit_daemon.timing.clock._minimum_delay import Envelope
+    from jointfit_daemon.timing.clock._clock_events import ClockEvent
+    from jointfit_daemon.timing.clock._minimum_delay import MinimumDelayFilter
 
 NS = 1_000_000_000
+"""Nanoseconds per second."""
 FALL_NS = 500_000_000
-"""Device time that falls by more is a restart, not a reordered sample."""
+"""Decrease of device time that indicates a restart instead of a reordered sample, ns."""
 BACKWARD_LIMIT = 4
-"""Samples in a row from the past that are a restart, however small the fall."""
+"""Consecutive samples from the past that indicate a restart, however small the decrease."""
 COUNTER_WIDTHS = (1 << 8, 1 << 16, 1 << 32)
+"""Moduli of sample counters."""
 
 _GAP = 1.5
+"""Intervals above this multiple of the usual one are compared with the counter."""
 _SLACK = 3
+"""Counts by which time and counter may disagree."""
 _WRAP_SLACK = 8
+"""Counts by which a wrap may differ from the elapsed time while the counter width is unknown."""
 _LATE = 0.65
+"""Delay from which a sample counts as late, periods."""
 _DOUBTFUL = 0.35
+"""Largest distance of a delay from whole periods that is accepted as lost samples, periods."""
 _LATE_LEAST_NS = 50_000_000
+"""Least duration of lateness before samples count as lost, ns."""
 _LATE_PERIODS = 3
+"""Least duration of lateness before samples count as lost, periods."""
 _LATE_SHARE_GAIN = 0.02
+"""Gain of the running share of late samples."""
 _LATE_SHARE_FIRST = 0.2
-_LATE_SHARE_LEAST, _LATE_SHARE_MOST = 0.03, 0.65  # 4 to 32 late samples in a row decide
-_LATE_LOG_CHANCE = -14.0  # one in a million
+"""Initial share of late samples."""
+_LATE_SHARE_LEAST = 0.03
+"""Least share of late samples: at least 4 in a row are needed."""
+_LATE_SHARE_MOST = 0.65
+"""Largest share of late samples: at most 32 in a row are needed."""
+_LATE_LOG_CHANCE = -14.0
+"""Log-probability of a run of late samples by chance: one in a million."""
 _SILENCE_NS = 2 * NS
+"""Silence after which samples without device time cannot be numbered, ns."""
 
 
 class DeviceTime(Protocol):
-    """Reads the time of one device between two restarts."""
+    """Reader of the time of one device between two restarts."""
 
     @property
     def turn_ns(self) -> int | None:
-        """Time after which the readings repeat, ns: 0 if they never do, None if they are none."""
+        """Period of the readings, ns; 0 if they never repeat, None without readings."""
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope
+        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter
     ) -> int | None:
-        """Return device time in ns, or None for a restart."""
+        """Return the device time, ns, or None for a restart."""
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:
-        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:
+        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
 
 
 class TickTime:
-    """Reads time stamps: wraps, and a counter beside them that must not contradict them.
+    """Reader of device timestamps, with wraps and a consistency check against a sample counter.
 
-    A step forward together with the counter is a gap in the same clock; a step that the counter
-    does not share is a restart.
+    A step forward shared by the counter is a gap in the same clock. A step not shared by the
+    counter is a restart.
     """
 
     __slots__ = ("_arrival_ns", "_backward", "_clock", "_counter", "_last", "_step", "_turn_ns")
@@ -70,31 +86,31 @@ class TickTime:
         self._last: int | None = None
         self._arrival_ns = self._backward = 0
         self._counter: int | None = None
-        self._step: float | None = None  # ticks a count
+        self._step: float | None = None  # ticks per count
 
     @property
     def turn_ns(self) -> int | None:
-        """Time after which the ticks start again, ns; 0 if they never do."""
+        """Period of the ticks, ns; 0 if they never repeat."""
         return self._turn_ns
 
     def forget_counter(self) -> None:
-        """Compare the next sample by time alone: a device that is configured counts no samples."""
+        """Skip the counter check for the next sample: devices do not count while configured."""
         self._counter = None
 
     def to_ns(self, ticks: int) -> int:
-        """Return unwrapped ticks in ns, by integers only."""
+        """Return unwrapped ticks in ns, in integer arithmetic."""
         rate = self._clock.ticks_per_s
         return ticks * self._clock.tick_ns if rate is None else ticks * NS // rate
 
     def echo_ns(self, ticks: int) -> int:
-        """Return the time of an echo, ns, on the turn nearest to the last sample."""
+        """Return the device time of an echo, ns, on the turn nearest to the last sample."""
         last = ticks if self._last is None else self._last
         return self.to_ns(unwrap(ticks, last, self._clock.modulus, 0, self._turn_ns))
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter  # noqa: ARG002 - the readers' common shape
     ) -> int | None:  # fmt: skip
-        """Return device time in ns, or None for a restart."""
+        """Return the device time, ns, or None for a restart."""
         if ticks is None:
             return None
         last = self._last
@@ -109,12 +125,12 @@ class TickTime:
         self._counter = counter
         return self.to_ns(ticks)
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:  # noqa: ARG002 - the readers' common shape
-        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
+        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
         before, modulus = self._last or 0, self._clock.modulus
         if modulus:
             before %= modulus
-        return began_anew(self.to_ns(before), self.to_ns(ticks or 0), elapsed_ns)
+        return clock_restart_event(self.to_ns(before), self.to_ns(ticks or 0), elapsed_ns)
 
     def _past(self, ticks: int, last: int) -> int | None:
         self._backward += 1
@@ -123,13 +139,14 @@ class TickTime:
         return self.to_ns(ticks)
 
     def _contradicted(self, step: int, counter: int | None) -> bool:
-        """Tell whether `step` ticks and the counts passed meanwhile cannot both be true."""
+        """Return whether `step` ticks and the counter change contradict each other."""
         before = self._counter
         if counter is None or before is None or step == 0:
             return False
         counts, usual = counter - before, self._step
         if counts == 1 and step == usual:
-            return False  # as nearly always
+            return False  # the usual case
+
         if usual is not None and step > _GAP * usual:
             expected = round(step / usual)
             slack = _SLACK + expected // 100
@@ -146,7 +163,7 @@ class TickTime:
 
 
 class CounterTime:
-    """Numbers samples by the device's own counter; its width is learned when it first wraps."""
+    """Reader of a sample counter; its width is determined at the first wrap."""
 
     __slots__ = ("_arrival_ns", "_backward", "_last", "_period_ns", "_raw", "_width")
 
@@ -158,13 +175,13 @@ class CounterTime:
 
     @property
     def turn_ns(self) -> int | None:
-        """Time after which the counter starts again, ns, the shortest that is possible."""
+        """Shortest possible period of the counter, ns."""
         return self._period_ns * (self._width or min(w for w in COUNTER_WIDTHS if w > self._raw))
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter  # noqa: ARG002 - the readers' common shape
     ) -> int | None:  # fmt: skip
-        """Return the number of the sample times the nominal period, or None for a restart."""
+        """Return sample number times nominal period, ns, or None for a restart."""
         if counter is None:
             return None
         last, number = self._last, counter
@@ -178,10 +195,10 @@ class CounterTime:
         self._last, self._raw, self._arrival_ns, self._backward = number, counter, arrival_ns, 0
         return number * self._period_ns
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:  # noqa: ARG002 - the readers' common shape
-        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
+        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
         period = self._period_ns
-        return began_anew(self._raw * period, (counter or 0) * period, elapsed_ns)
+        return clock_restart_event(self._raw * period, (counter or 0) * period, elapsed_ns)
 
     def _unwrap(self, counter: int, last: int, elapsed_ns: int) -> int:
         period = self._period_ns
@@ -199,13 +216,13 @@ class CounterTime:
 
 
 class ArrivalTime:
-    """Numbers the samples of a device that says nothing: they are evenly spaced.
+    """Numbering of the evenly spaced samples of a device without timestamps or counter.
 
-    A late sample may be one of a bunch, or others before it may be lost, and only the next ones
-    can tell: a bunch catches up with the envelope, a loss does not. So numbers are consecutive
-    until samples have stayed late for longer than the usual share of late ones explains; then the
-    whole periods they are late were losses. A rest that is no whole period is a doubt, and the
-    numbering begins anew.
+    A late sample is either part of a burst or follows lost samples. Only the next samples decide: a
+    burst catches up with the minimum-delay line, a loss does not. Numbers are therefore consecutive
+    until samples have stayed late for longer than the usual share of late samples explains. The
+    whole periods of their delay then count as lost. If the delay is not a multiple of the period,
+    numbering restarts.
     """
 
     __slots__ = (
@@ -221,16 +238,17 @@ class ArrivalTime:
 
     @property
     def turn_ns(self) -> int | None:
-        """Return None: arrivals show nothing of the device's own time."""
+        """None: arrivals do not show the device's own time."""
         return None
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: Envelope  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter  # noqa: ARG002 - the readers' common shape
     ) -> int | None:  # fmt: skip
-        """Return the number of the sample times the nominal period, or None for a restart."""
+        """Return sample number times nominal period, ns, or None for a restart."""
         number, period = self._number + 1, self._period_ns
         if number and arrival_ns - self._arrival_ns > _SILENCE_NS:
             return None
+
         u = number * period
         late = envelope.residual(u, arrival_ns - u) / period
         self._late_share += _LATE_SHARE_GAIN * ((late >= _LATE) - self._late_share)
@@ -247,18 +265,25 @@ class ArrivalTime:
                     return None
                 number += lost
                 self._late_samples = 0
+
         self._number, self._arrival_ns = number, arrival_ns
         return number * period
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockNews:  # noqa: ARG002 - the readers' common shape
-        """Say why this sample, `elapsed_ns` after the one before, was a restart."""
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
+        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
         if elapsed_ns > _SILENCE_NS:
-            return said(f"nothing for {elapsed_ns / NS:.1f} s, and it does not number its samples")
-        return said("its samples are late by no whole number of periods: numbered anew")
+            return clock_event(
+                f"no samples for {elapsed_ns / NS:.1f} s from a device without sample counter; "
+                "sample numbering restarted"
+            )
+        return clock_event(
+            "sample delay is not a multiple of the period; sample numbering restarted"
+        )
 
     def _decided(self, arrival_ns: int) -> bool:
         waited = arrival_ns - self._late_ns
         if waited < max(_LATE_PERIODS * self._period_ns, _LATE_LEAST_NS):
             return False
+
         share = min(max(self._late_share, _LATE_SHARE_LEAST), _LATE_SHARE_MOST)
         return self._late_samples >= _LATE_LOG_CHANCE / log(share)

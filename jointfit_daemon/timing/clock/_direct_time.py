@@ -1,12 +1,12 @@
-"""Time that needs no statistics: edges two clocks both saw, and clocks that are the host's own.
+"""Direct time: sync edges stamped by two clocks, and clocks declared to be the host's.
 
-Law: pure; constant memory. A direct time beats every estimate from arrivals, and an estimate that
-contradicts it makes an event of it (``clock``).
+Direct time takes precedence over estimates from arrivals. If an estimate contradicts it, a
+``clock`` event is published.
 
-A sync pulse is one instant with two names: u on the device's clock, v on the reference's. The line
-``v(u)`` through the pulses of the last minute ties the two clocks to microseconds, and whatever
-maps v to host time then maps u as well: what is unsure about that mapping is shared by both, so it
-drops out of every difference between them, and no smallest delay is left in it.
+A sync edge is one instant with two timestamps: u on the device's clock, v on the reference's. The
+line ``v(u)`` through the edges of the last minute relates the two clocks to microseconds. The
+mapping of v to host time then applies to u. Its uncertainty is common to both and cancels in
+differences between them, including the minimum delay.
 """
 
 from __future__ import annotations
@@ -21,26 +21,32 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import TickClock
 
 EDGE_SD_NS = 1_000.0
-"""Standard deviation of an edge's stamp beside the grain of the device's ticks."""
-TIE_SKEW_SD = 100e-6
-"""Prior standard deviation of the speed of one clock against another."""
-TIE_STALE_NS = 20_000_000_000
+"""Standard deviation of an edge's timestamp in addition to tick quantization, ns."""
+SYNC_SKEW_SD = 100e-6
+"""Prior standard deviation of the relative skew of two clocks, dimensionless."""
+SYNC_STALE_NS = 20_000_000_000
+"""Age of the last edge after which the fit is unusable, ns."""
 KNOWN_SD_NS = 10_000.0
-"""What a clock that is declared to be the host's is believed to."""
+"""Standard deviation of a clock declared to be the host's, ns."""
 MARGIN_NS = 3_000_000
-"""How far beyond its prior the smallest delay may be before a direct time is doubted."""
+"""Tolerance, ns, beyond the prior of the minimum delay before a direct time is discarded."""
 LATEST_NS = 2_000_000_000
-"""Nothing live comes later than this."""
+"""Largest delay of a live sample, ns."""
 
 _LEAST_PAIRS = 5
+"""Least number of edges of a usable fit."""
 _CAPACITY = 120
+"""Largest number of edges in memory."""
 _SPACING_NS = 500_000_000
+"""Least interval between two edges in memory, ns."""
 _STRAY_NS = 500_000
+"""Residual above which an edge is an outlier, ns."""
 _STRAYS = 5
+"""Outliers in a row that invalidate the fit."""
 
 
 class HostTime(Protocol):
-    """A clock whose time can be told in host time."""
+    """A clock with a conversion to host time."""
 
     epoch: int
 
@@ -50,7 +56,7 @@ class HostTime(Protocol):
 
     @property
     def settled(self) -> bool:
-        """Whether ``host_ns`` means anything yet."""
+        """Whether ``host_ns`` is valid."""
 
     def host_ns(self, u: int) -> int:
         """Return the host time of the clock's own time `u`, ns."""
@@ -59,15 +65,15 @@ class HostTime(Protocol):
         """Return the standard deviation of ``host_ns(u)``, ns."""
 
 
-class Direct(Protocol):
-    """A way from device to host time that does not look at arrivals."""
+class DirectTime(Protocol):
+    """A conversion from device to host time that does not use arrivals."""
 
     @property
     def slope(self) -> float:
         """d(host - device) / d device."""
 
     def usable(self, u: int) -> bool:
-        """Tell whether it holds at device time `u`."""
+        """Return whether the conversion is valid at device time `u`."""
 
     def host_ns(self, u: int) -> int:
         """Return the host time of device time `u`, ns."""
@@ -76,14 +82,14 @@ class Direct(Protocol):
         """Return the standard deviation of ``host_ns(u)``, ns."""
 
 
-class KnownOffset(NamedTuple):
-    """The device's clock is the host's, but for an offset the host knows."""
+class DeclaredOffset(NamedTuple):
+    """A device clock that is the host's clock plus a known offset."""
 
     offset_ns: int
     """Host time minus device time."""
     slope: float = 0.0
 
-    def usable(self, u: int) -> bool:  # noqa: ARG002 - it always is
+    def usable(self, u: int) -> bool:  # noqa: ARG002 - the offset is constant
         """Return True."""
         return True
 
@@ -96,15 +102,15 @@ class KnownOffset(NamedTuple):
         return KNOWN_SD_NS
 
 
-class PulseTie:
-    """Ties one clock to another by the edges both stamped.
+class SyncEdgeFit:
+    """Relation of two clocks from the edges both stamped.
 
     Parameters
     ----------
     reference : HostTime
         The other clock.
     grain_ns : float
-        Both clocks' ticks, ns, as one root of a sum of squares: an edge falls anywhere in a tick.
+        Tick lengths of both clocks, ns, combined as root sum of squares.
     """
 
     __slots__ = ("_epoch", "_line", "_pairs", "_ref", "_strays", "_variance", "reference")
@@ -113,7 +119,7 @@ class PulseTie:
         self.reference = reference
         self._epoch = reference.epoch
         self._pairs: deque[tuple[int, int]] = deque(maxlen=_CAPACITY)
-        self._line = FittedLine(0.0, 0.0, inf, 0.0, TIE_SKEW_SD**2)
+        self._line = FittedLine(0.0, 0.0, inf, 0.0, SYNC_SKEW_SD**2)
         self._ref = (0, 0)
         self._variance = EDGE_SD_NS**2 + grain_ns**2 / 12
         self._strays = 0
@@ -125,33 +131,34 @@ class PulseTie:
 
     @property
     def pairs(self) -> int:
-        """Edges the line rests on."""
+        """Number of edges in the fit."""
         return len(self._pairs)
 
     @property
     def broken(self) -> bool:
-        """Whether the reference began anew, or edge after edge was off the line: of no more use."""
+        """Whether the reference restarted or several edges in a row were outliers."""
         return self._strays >= _STRAYS or self.reference.epoch != self._epoch
 
     def feed(self, u: int, v: int) -> None:
-        """Take an edge: device time and reference time, ns, in order."""
+        """Add an edge: device time and reference time, ns, in order."""
         pairs = self._pairs
         stray = len(pairs) >= _LEAST_PAIRS and abs(v - self._reference_ns(u)) > _STRAY_NS
         self._strays = self._strays + 1 if stray else 0
         if stray or (len(pairs) >= _LEAST_PAIRS and u - pairs[-1][0] < _SPACING_NS):
             return
         pairs.append((u, v))
+
         u0, v0 = self._ref = pairs[0]
         weight = 1.0 / self._variance
         rows = [(float(a - u0), float(b - v0 - (a - u0)), weight) for a, b in pairs]
-        self._line = fit_line(rows, TIE_SKEW_SD)
+        self._line = fit_line(rows, SYNC_SKEW_SD)
 
     def usable(self, u: int) -> bool:
-        """Tell whether the tie holds at device time `u`."""
+        """Return whether the fit is valid at device time `u`."""
         pairs = self._pairs
         return (
             len(pairs) >= _LEAST_PAIRS
-            and u - pairs[-1][0] <= TIE_STALE_NS
+            and u - pairs[-1][0] <= SYNC_STALE_NS
             and self.reference.epoch == self._epoch
             and self.reference.settled
         )
@@ -173,23 +180,23 @@ class PulseTie:
         return hypot(self.tie_sigma_at(u), self.reference.sigma_at(self._reference_ns(u)))
 
 
-def declared(clock: TickClock, unix_offset_ns: int | None) -> KnownOffset | None:
-    """Return the way to host time of a clock that is declared to be the host's; None if it is not.
+def declared(clock: TickClock, unix_offset_ns: int | None) -> DeclaredOffset | None:
+    """Return the conversion of a clock declared to be the host's, or None.
 
     Parameters
     ----------
     clock : TickClock
-        What the decoder says of the device's clock.
+        Clock of the device as declared by its decoder.
     unix_offset_ns : int or None
         UNIX time minus CLOCK_MONOTONIC, ns; None while unknown.
     """
     if clock.scale == "monotonic":
-        return KnownOffset(0)
+        return DeclaredOffset(0)
     if clock.scale == "unix" and unix_offset_ns is not None:
-        return KnownOffset(-unix_offset_ns)
+        return DeclaredOffset(-unix_offset_ns)
     return None
 
 
 def possible(t_ns: int, arrival_ns: int) -> bool:
-    """Tell whether something taken at `t_ns` may have arrived at `arrival_ns`, ns."""
+    """Return whether a sample taken at `t_ns` may arrive at `arrival_ns`."""
     return -MARGIN_NS <= arrival_ns - t_ns <= LATEST_NS

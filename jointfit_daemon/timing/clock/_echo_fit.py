@@ -1,15 +1,13 @@
-"""Server clock to host clock from answered echoes (Cristian 1989, NTP's minimum-delay filter).
+"""Server clock offset and skew from echoes (Cristian 1989; NTP's minimum-delay filter).
 
-Law: pure; one echo a second makes cost no matter.
+An echo sent at a and received at b, answered with server time u, gives ``theta = u - (a + b)/2``
+with an error of at most half the round-trip time ``rho = b - a``. The echoes with round-trip times
+near the minimum are fitted by ``theta(m) = theta_0 + s (m - m_0)``: weighted least squares with
+Huber weights and a prior on s, which keeps the slope small in the first seconds. Half the path
+asymmetry remains in theta_0; ``bound_ns`` is its limit.
 
-An echo sent at a and answered at b with server time u in between says ``theta = u - (a + b)/2``
-with an error of at most half the round trip ``rho = b - a``. Echoes near the smallest round trip
-are kept, and ``theta(m) = theta_0 + s (m - m_0)`` is fitted to them by weighted least squares with
-Huber weights and a prior on s, so that the first seconds give no wild slope. Half the asymmetry of
-the path stays in theta_0: ``bound_ns`` says how much that can be at most.
-
-An answer that contradicts the fit is set aside. Only a second one in a row that agrees with it
-shows that the server's clock began anew: a single wrong or forged answer changes nothing.
+Invariant: a single wrong or forged echo changes nothing. An echo that contradicts the fit is set
+aside; only a second one in a row that agrees with it indicates a restart of the server clock.
 """
 
 from __future__ import annotations
@@ -21,17 +19,23 @@ from typing import NamedTuple
 from jointfit_daemon.timing.clock._line_fit import FittedLine, fit_line
 
 MEMORY_NS = 120_000_000_000
+"""Time span of the echoes that are fitted, ns."""
 CAPACITY = 256
+"""Largest number of echoes in memory."""
 BURST = 10
-"""Echoes after which the fit may be used as it is."""
+"""Number of echoes after which the fit is used."""
 BURST_GAP_NS = 2_000_000_000
-"""Echoes further apart than this make no burst that is worth waiting for."""
+"""Longest interval between two echoes of one burst, ns."""
 LEAST_MARGIN_NS = 50_000
+"""Least tolerance above the minimum round-trip time, ns."""
 STAMP_SD_NS = 20_000.0
+"""Standard deviation of a host timestamp, ns."""
 SKEW_SD = 50e-6
+"""Prior standard deviation of the skew, dimensionless."""
 STALE_NS = 20_000_000_000
+"""Age of the last echo after which the fit is reported as stale, ns."""
 JUMP_NS = 5_000_000
-"""A server clock that disagrees by more than this, beyond the echo's own bound, began anew."""
+"""Disagreement beyond an echo's own error bound that indicates a jump of the server clock, ns."""
 
 
 class _Echo(NamedTuple):
@@ -53,15 +57,15 @@ class EchoFit:
         self._ref = self._theta_ref = 0
         self._line = FittedLine(0.0, 0.0, inf, 0.0, SKEW_SD**2)
         self.slope = 0.0
-        """d theta / d host time: positive when the server clock runs fast."""
+        """d theta / d host time; positive when the server clock runs fast."""
         self.bound_ns = inf
-        """Hard limit of the unseen constant, half the smallest round trip, ns."""
+        """Limit of the constant error: half the smallest round-trip time, ns."""
         self.echoes = 0
-        """Echoes taken since the fit began."""
+        """Number of echoes since the fit started."""
 
     @property
     def settled(self) -> bool:
-        """Whether the connect burst is complete."""
+        """Whether the initial burst is complete."""
         return self.echoes >= BURST
 
     @property
@@ -70,7 +74,7 @@ class EchoFit:
         return self._echoes[-1].middle_ns if self._echoes else None
 
     def expects_more(self, now_ns: int) -> bool:
-        """Tell whether the burst goes on: no worse estimate need be believed meanwhile."""
+        """Return whether the initial burst is still in progress."""
         last_ns = self.last_ns
         return not self.settled and last_ns is not None and now_ns - last_ns < BURST_GAP_NS
 
@@ -80,14 +84,14 @@ class EchoFit:
         return sqrt(self._line.slope_var)
 
     def contradicts(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Tell whether an answer cannot come from the clock that was fitted."""
+        """Return whether an echo contradicts the fit by more than its own error bound."""
         if not self.settled:
             return False
         middle = (sent_ns + received_ns) // 2
         return abs(u - self.device_ns(middle)) > (received_ns - sent_ns) / 2 + JUMP_NS
 
     def confirms_restart(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Take a contradicting answer; return whether it agrees with the one set aside before."""
+        """Set a contradicting echo aside; return whether it agrees with the one before."""
         middle = (sent_ns + received_ns) // 2
         before = self._doubtful
         self._doubtful = now = _Echo(middle, u - middle, received_ns - sent_ns)
@@ -97,7 +101,7 @@ class EchoFit:
         return abs(now.theta_ns - before.theta_ns) <= slack_ns
 
     def feed(self, u: int, sent_ns: int, received_ns: int) -> None:
-        """Take one answered echo: host stamps and server time, ns. Impossible ones are ignored."""
+        """Add one echo: server time and host timestamps, ns; impossible ones are ignored."""
         if received_ns < sent_ns:
             return
         middle = (sent_ns + received_ns) // 2
@@ -107,13 +111,14 @@ class EchoFit:
         self.echoes += 1
         while echoes[0].middle_ns < middle - MEMORY_NS:
             echoes.popleft()
+
         least = min(echo.round_trip_ns for echo in echoes)
         self.bound_ns = least / 2
         limit = least + max(LEAST_MARGIN_NS, least // 4)
         self._fit([echo for echo in echoes if echo.round_trip_ns <= limit], least)
 
     def _fit(self, kept: list[_Echo], least: int) -> None:
-        """Weighted least squares for (theta, slope) about the mean instant of `kept`."""
+        """Fit (theta, slope) about the mean instant of `kept` by weighted least squares."""
         ref = sum(echo.middle_ns for echo in kept) // len(kept)
         theta_ref = kept[0].theta_ns
         rows = [
@@ -124,6 +129,7 @@ class EchoFit:
             )
             for echo in kept
         ]
+
         self._ref, self._theta_ref = ref, theta_ref
         self._line = fit_line(rows, SKEW_SD)
         self.slope = self._line.slope
@@ -134,7 +140,7 @@ class EchoFit:
         return host_ns + self._theta_ref + round(theta)
 
     def host_ns(self, u: int) -> int:
-        """Return the host time of server time `u`, ns: solves ``u = m + theta(m)``."""
+        """Return the host time of server time `u`, ns: the solution m of ``u = m + theta(m)``."""
         ahead = u - self._ref - self._theta_ref
         return (
             self._ref + ahead - round((self._line.height + self.slope * ahead) / (1.0 + self.slope))

@@ -1,52 +1,58 @@
-"""Lines that pass below all points of a cloud: where they are on average, and how far apart.
+"""Mean and covariance of the lines below a set of points with one-sided errors.
 
-Law: pure functions of points with integer coordinates.
+For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if it lies above no
+point. Near the minimum delay the points have a constant density G per nanosecond of height,
+whatever the shape of the delay distribution. The likelihood of a feasible line is then ``exp(G
+sum_mean)`` with ``sum_mean = c + s mean(u)``. Its maximum is the edge of the lower convex hull that
+straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002).
 
-Of points ``y = c + s u + D`` with delays D >= 0 a line (c, s) is *feasible* if it lies above no
-point. The smallest delays come at a constant rate of G points a nanosecond of height, whatever the
-shape of the others, so the likelihood of a feasible line is ``exp(G sum_mean)``, where
-``sum_mean = c + s mean(u)``. Its maximum is the edge of the lower convex hull that straddles the
-mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002). Its mean, under a
-normal prior of s, errs less and has a covariance to tell of. Given s, c is at most ``h(s) =
-min(y - s u)`` and exponentially distributed below that, with mean ``h(s) - 1/G``; what is left is
-an integral over s alone.
+The posterior mean under a normal prior on s has a smaller error than the maximum, and a covariance.
+Given s, c is at most ``h(s) = min(y - s u)`` and exponentially distributed below, with mean ``h(s)
+- 1/G``; the remaining integral over s is evaluated numerically.
+
+Coordinates are integers, so the hull is exact.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
 from math import exp, log
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.timing.clock._line_fit import FittedLine
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 Point = tuple[int, int]
-"""Device time and difference, ns."""
+"""Device time u and difference y, ns."""
 
-_SUPPORTS = 2  # points that every edge rests on
-_FINEST_NS = 1_000.0  # no cloud of points is taken to define its lower edge better
-_JAM_NS = 25_000_000.0  # higher up a starved host or a full queue was at work, and no jitter
-_LEAST = 5  # points that are not, to tell jitter by
-_LEAP, _LEAP_NS, _LEAP_LEAST = 20.0, 3_000_000.0, 4  # or one leap: chance makes it once in 400
-_LIKELY = 1e-3  # no clock that is read right is further off
-_TAIL = 14.0  # of the logarithm of the likelihood
+_SUPPORTS = 2
+"""Number of points that define an edge of the hull."""
+_FINEST_NS = 1_000.0
+"""Least mean height of the points above the edge, ns."""
+_JAM_NS = 25_000_000.0
+"""Height above which a point is attributed to a starved host or a full queue, ns."""
+_LEAST = 5
+"""Least number of points below ``_JAM_NS`` before the others are excluded."""
+_LEAP = 20.0
+"""Ratio of consecutive ranked heights that separates congestion from jitter."""
+_LEAP_NS = 3_000_000.0
+"""Least height of a point excluded by that ratio, ns."""
+_LEAP_LEAST = 4
+"""Least number of points below the gap; jitter alone produces such a gap once in 400 cases."""
+_LIKELY = 1e-3
+"""Largest slope of a device clock with a correct tick rate, dimensionless."""
+_TAIL = 14.0
+"""Decrease of the log-likelihood at which the integral is cut off."""
 _PRIOR_TAIL = 6.0
-_WILDEST = 5e-3  # no clock's slope is beyond this
+"""Standard deviations of the prior at which the integral is cut off."""
+_WILDEST = 5e-3
+"""Largest slope of any clock, dimensionless."""
 _STEPS = 20
+"""Intervals of the slope grid."""
 _PASSES = 3
-
-
-class Line(NamedTuple):
-    """Mean and covariance of the feasible lines."""
-
-    height: float
-    """At the reference, ns."""
-    slope: float
-    height_var: float
-    both: float
-    """Covariance of height and slope."""
-    slope_var: float
+"""Refinements of the slope grid."""
 
 
 def lower_hull(points: Iterable[Point]) -> list[Point]:
@@ -58,7 +64,7 @@ def lower_hull(points: Iterable[Point]) -> list[Point]:
             if (u1 - u0) * (y - y0) > (y1 - y0) * (u - u0):
                 break
             hull.pop()
-        if hull and hull[-1][0] == u:  # same instant, and not lower: sorted() put the lower first
+        if hull and hull[-1][0] == u:  # same u and not lower, since the points are sorted
             continue
         hull.append((u, y))
     return hull
@@ -72,30 +78,38 @@ def straddling_edge(hull: Sequence[Point], mean_u: float) -> tuple[Point, Point]
     return hull[-2], hull[-1]
 
 
-def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd: float) -> Line:
-    """Return the mean of the lines below `points`, weighted by their likelihood.
+def mean_feasible_line(
+    points: Sequence[Point], ref: int, prior: float, prior_sd: float
+) -> FittedLine:
+    """Return the posterior mean of the lines below `points`, with its covariance.
 
     Parameters
     ----------
     points : sequence of (int, int)
         (u, y) in ns, three or more, at different u.
     ref : int
-        The u at which the height is asked for, ns.
+        Value of u at which the height is returned, ns.
     prior, prior_sd : float
-        What is known of the slope beforehand.
+        Prior mean and standard deviation of the slope.
     """
     hull = lower_hull(points)
     likely = max(_PRIOR_TAIL * prior_sd, _LIKELY)
     on_time = _on_time(points, hull, prior - likely, prior + likely)
     if len(on_time) < len(points):
         points, hull = on_time, lower_hull(on_time)
+
     mean_u = sum(at for at, _ in points) / len(points)
     (ua, ya), (ub, yb) = straddling_edge(hull, mean_u)
-    most = max(_PRIOR_TAIL * prior_sd, _WILDEST)  # else a burst read at once, y = A - u, is an edge
+    # Without a limit, a burst read at one instant (y = A - u) would be an edge of slope -1.
+    most = max(_PRIOR_TAIL * prior_sd, _WILDEST)
     edge = min(max((yb - ya) / (ub - ua), prior - most), prior + most)
+
+    # Scale of the heights above the edge, 1/G.
     heights = [y - ya - edge * (at - ua) for at, y in points]
     least_height = min(heights)
     scale = _edge_scale([height - least_height for height in heights])
+
+    # Range of slopes with relevant weight, limited by the prior.
     rows = [(float(at - ref), float(y - ya)) for at, y in hull]
     middle, least = mean_u - ref, (hull[-1][0] - hull[0][0]) / 100
     low = edge - _TAIL * scale / max(mean_u - ua, least)
@@ -103,6 +117,7 @@ def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd
     near, far = prior - _PRIOR_TAIL * prior_sd, prior + _PRIOR_TAIL * prior_sd
     if low < far and near < high:
         low, high = max(low, near), min(high, far)
+
     grid = _weighed(rows, middle, scale, (low, high), (prior, prior_sd))
     return _moments(grid, scale, float(ya))
 
@@ -110,22 +125,24 @@ def mean_feasible_line(points: Sequence[Point], ref: int, prior: float, prior_sd
 def _on_time(
     points: Sequence[Point], hull: Sequence[Point], near: float, far: float
 ) -> Sequence[Point]:
-    """Return the points that no starved host held up: those tell neither height nor jitter.
+    """Return the points that were not delayed by congestion.
 
-    Heights are above the hull, which goes on at a likely slope (`near` to `far`) where an edge of
-    it ends at what was late.
+    Heights are measured above the hull. Where an edge of the hull ends at a delayed point, the hull
+    is continued at the nearest likely slope (`near` to `far`).
     """
     u0, tilt = points[0][0], _slope(points[0], points[-1])
     rests = [y - tilt * (u - u0) for u, y in points]
-    if max(rests) - min(rests) < _LEAP_NS:  # as nearly always: nothing can have leapt
+    if max(rests) - min(rests) < _LEAP_NS:  # the usual case: no point is congested
         return points
     first, last = 0, len(hull) - 1
     while first < last and _slope(hull[first], hull[first + 1]) < near:
         first += 1
     while first < last and _slope(hull[last - 1], hull[last]) > far:
         last -= 1
+
     supports = hull[first : last + 1]
     heights = [_height(point, supports, near, far) for point in points]
+
     ranked = sorted(heights)
     for k in range(_LEAP_LEAST, len(ranked)):
         leaps = ranked[k] > max(_LEAP_NS, _LEAP * ranked[k - 1])
@@ -139,7 +156,7 @@ def _slope(left: Point, right: Point) -> float:
 
 
 def _height(point: Point, supports: Sequence[Point], near: float, far: float) -> float:
-    """Return how far a point lies above the chain of `supports`."""
+    """Return the height of a point above the chain of `supports`, ns."""
     u, y = point
     if u <= supports[0][0]:
         return y - supports[0][1] - near * (u - supports[0][0])
@@ -152,8 +169,8 @@ def _height(point: Point, supports: Sequence[Point], near: float, far: float) ->
 def _edge_scale(rests: list[float]) -> float:
     """Return 1/G, ns, from the heights of all points above the edge."""
     rests.sort()
-    # Half of the points lie within log(2) mean heights. The two that the edge rests on say nothing,
-    # and a third is the price of not knowing the mean height beforehand.
+    # The median height is log(2) mean heights. The two points that define the edge carry no
+    # information, and estimating the mean height costs one more degree of freedom.
     median = rests[(len(rests) + _SUPPORTS) // 2]
     return max(median / log(2.0), _FINEST_NS) / max(1, len(rests) - _SUPPORTS - 1)
 
@@ -165,7 +182,7 @@ def _weighed(
     limits: tuple[float, float],
     prior: tuple[float, float],
 ) -> list[tuple[float, float, float]]:
-    """Return slope, highest feasible height and weight over the slopes that matter."""
+    """Return (slope, greatest feasible height, weight) over the relevant slopes."""
     low, high = limits
     mean, sd = prior
     grid: list[tuple[float, float, float]] = []
@@ -177,17 +194,19 @@ def _weighed(
             s = low + k * step
             height = min([y - s * u for u, y in rows])
             grid.append((s, height, (height + s * middle) / scale - 0.5 * ((s - mean) / sd) ** 2))
+
         top = max([row[2] for row in grid])
         kept = [k for k, row in enumerate(grid) if row[2] > top - _TAIL]
         low, high = grid[max(0, kept[0] - 1)][0], grid[min(_STEPS, kept[-1] + 1)][0]
     return [(s, height, exp(weight - top)) for s, height, weight in grid]
 
 
-def _moments(grid: list[tuple[float, float, float]], scale: float, base: float) -> Line:
+def _moments(grid: list[tuple[float, float, float]], scale: float, base: float) -> FittedLine:
     total = sum([w for _, _, w in grid])
     slope = sum([w * s for s, _, w in grid]) / total
     height = sum([w * h for _, h, w in grid]) / total
     slope_var = sum([w * (s - slope) ** 2 for s, _, w in grid]) / total
     both = sum([w * (s - slope) * (h - height) for s, h, w in grid]) / total
     height_var = sum([w * (h - height) ** 2 for _, h, w in grid]) / total
-    return Line(base + height - scale, slope, height_var + scale**2, both, slope_var)
+
+    return FittedLine(base + height - scale, slope, height_var + scale**2, both, slope_var)

@@ -1,7 +1,7 @@
-"""A straight line through points of unequal worth, some of them wrong. Law: pure; no state.
+"""Robust weighted fit of a straight line.
 
-Weighted least squares with Huber weights and a normal prior of the slope (mean 0), so that a short
-span gives no wild slope.
+Weighted least squares with Huber weights and a zero-mean normal prior on the slope, which keeps the
+slope small while the data span is short.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _HUBER = 1.345
+"""Huber threshold in standard deviations: 95 % efficiency for normal errors."""
 _PASSES = 4
+"""Passes of iteratively reweighted least squares."""
 
 
 class FittedLine(NamedTuple):
-    """``y = height + slope x`` with its covariance."""
+    """Line ``y = height + slope x`` with its covariance."""
 
     height: float
     slope: float
@@ -32,16 +34,27 @@ class FittedLine(NamedTuple):
 
 
 def fit_line(rows: Sequence[tuple[float, float, float]], slope_sd: float) -> FittedLine:
-    """Return the line through `rows`, each (x, y, 1/variance of y); at least one."""
+    """Return the line through `rows`, each (x, y, 1/variance of y).
+
+    Parameters
+    ----------
+    rows : sequence of (float, float, float)
+        At least one.
+    slope_sd : float
+        Prior standard deviation of the slope; its mean is 0.
+    """
     height, slope = rows[0][1], 0.0
     height_var = both = slope_var = 0.0
     for number in range(_PASSES):
         a = b = d = p = q = 0.0
+
         for x, y, weight in rows:
             residual = abs(y - height - slope * x) * sqrt(weight)
             w = weight if number == 0 or residual <= _HUBER else weight * _HUBER / residual
             a, b, d = a + w, b + w * x, d + w * x * x
             p, q = p + w * y, q + w * x * y
+
+        # Normal equations of the slope prior, mean 0.
         d += 1.0 / slope_sd**2
         det = a * d - b * b
         height, slope = (d * p - b * q) / det, (a * q - b * p) / det

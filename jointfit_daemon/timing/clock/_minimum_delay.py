@@ -1,11 +1,11 @@
-"""The line under the fastest samples: device clock to host clock without asking the device.
+"""Minimum-delay filter: device clock to host clock from arrival times alone.
 
-Law: pure, integers in, constant memory, constant time a sample (a refit now and then).
+With device time u and arrival A, the difference ``y = A - u = c + s u + D`` contains a delay ``D >=
+D_min`` of unknown distribution. The filter fits the line below all points (``mean_feasible_line``).
+It depends on the fastest samples only, so jitter of any distribution leaves it unbiased, except for
+the constant D_min, which one-way measurements cannot observe.
 
-With device time u and arrival A the difference ``y = A - u = c + s u + D`` has a delay
-``D >= D_min`` of unknown shape. The line wanted passes below every point and as close as it can:
-``feasible`` tells its mean and covariance. It rests on the fastest samples, so jitter of any shape
-leaves it unbiased but for D_min, which nobody can see from one side.
+Integer inputs, constant memory, constant time per sample except for the periodic refit.
 """
 
 from __future__ import annotations
@@ -20,32 +20,36 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock._feasible_line import Point
 
 BUCKET_NS = 250_000_000
-"""Of each bucket only the fastest sample is kept."""
+"""Length of a bucket, ns; the fastest sample of each is used."""
 BUCKETS = 240
-"""One minute: long against jitter, short against the temperature of a crystal."""
+"""Number of buckets: one minute, long against jitter and short against thermal drift of a crystal.
+"""
 YOUNG_NS = 10_000_000_000
-"""Until this span every bucket is worth a refit; later one in four seconds is."""
+"""Span below which each bucket triggers a refit, ns; later one in four seconds does."""
 SETTLED_NS = 2_000_000_000
+"""Least span of a settled line, ns."""
 SETTLED_POINTS = 10
+"""Least number of buckets of a settled line."""
 TRUSTED_NS = 500_000.0
-"""Standard deviation below which the line is taken for settled; scattered delays leave it above."""
+"""Standard deviation below which the line counts as settled, ns."""
 FLOOR_NS = 10_000.0
-"""No envelope is believed better than this."""
+"""Least standard deviation of the line, ns."""
 CRYSTAL = 50e-6
-"""Prior standard deviation of the skew of a clock."""
+"""Prior standard deviation of the skew of a crystal clock, dimensionless."""
 NOMINAL_RATE = 5000e-6
-"""Prior standard deviation of a sample rate against its nominal value."""
+"""Prior standard deviation of a sample rate relative to its nominal value."""
 
 _OLD_REFIT_BUCKETS = 16
+"""Buckets between refits of a line older than ``YOUNG_NS``."""
 _FLOOR_VAR = FLOOR_NS**2
-_LINE_POINTS = 3  # two make a line, the third a doubt
+_LINE_POINTS = 3
+"""Least number of points for a line with a standard deviation."""
 
 
-class Envelope:
-    """Streaming lower envelope of (u, y).
+class MinimumDelayFilter:
+    """Streaming line below the points (u, y).
 
-    The slope stays near its prior as long as the points cannot tell: with a short span or a few
-    scattered ones it is near 0, later the prior no longer matters.
+    With a short span or few points the slope stays near its prior.
 
     Parameters
     ----------
@@ -60,9 +64,9 @@ class Envelope:
 
     def __init__(self, skew_sd: float = CRYSTAL) -> None:
         self.skew = 0.0
-        """Slope s, dimensionless: positive when the device clock runs slow."""
+        """Slope s, dimensionless; positive when the device clock runs slow."""
         self.settled = False
-        """Whether the line rests on enough."""
+        """Whether the line has enough points, span and precision."""
         self._prior, self._prior_sd = 0.0, skew_sd
         self._points: deque[Point] = deque(maxlen=BUCKETS)
         self._best: Point | None = None
@@ -77,13 +81,13 @@ class Envelope:
         return sqrt(self._variance[2])
 
     def residual(self, u: int, y: int) -> float:
-        """Return how far (u, y) lies above the line, ns; 0 before the first point."""
+        """Return the height of (u, y) above the line, ns; 0 before the first point."""
         if self._best is None:
             return 0.0
         return y - self._y0 - self._c - self.skew * (u - self._ref)
 
     def offset_ns(self, u: int) -> int:
-        """Return the height of the line at `u`, ns: host time minus device time, plus D_min."""
+        """Return the line at `u`, ns: host time minus device time, plus D_min."""
         return self.at(u)[0]
 
     def sigma_ns(self, u: int) -> float:
@@ -91,7 +95,7 @@ class Envelope:
         return self.at(u)[1]
 
     def at(self, u: int) -> tuple[int, float]:
-        """Return ``offset_ns`` and ``sigma_ns`` together, as every sample needs them."""
+        """Return ``offset_ns`` and ``sigma_ns`` in one call, for the hot path."""
         ahead = u - self._ref
         height, both, slope = self._variance
         spread = height + ahead * (2.0 * both + ahead * slope)
@@ -99,15 +103,16 @@ class Envelope:
         return self._y0 + round(self._c + self.skew * ahead), sigma
 
     def feed(self, u: int, y: int) -> float:
-        """Take a point with increasing `u`; return how far above the line it was, ns.
+        """Add a point with increasing `u`; return its height above the line, ns.
 
-        A point below the line pulls it down at once: nothing arrives before it was sent.
+        A point below the line lowers it immediately, since no sample arrives before it was sent.
         """
         if self._best is None:
             self._y0, self._ref, self._bucket_end = y, u, u + BUCKET_NS
             self._best, self._best_key = (u, 0), 0.0
             return 0.0
         y -= self._y0
+
         key = y - self.skew * (u - self._ref)
         residual = key - self._c
         if u >= self._bucket_end:
@@ -126,14 +131,17 @@ class Envelope:
         while points and points[0][0] < oldest:
             points.popleft()
         self._span = u - points[0][0] if points else 0
+
         enough = len(points) >= SETTLED_POINTS and self._span >= SETTLED_NS
+
         self._sealed += 1
-        if not points:  # a silence of a whole window: the slope is still a good guess
+        if not points:  # silence longer than the window: the last slope becomes the prior
             self._prior, self._prior_sd = self.skew, CRYSTAL / 10
             self._c, self._ref = float(y), u
             self._variance = (inf, 0.0, self._prior_sd**2)
         elif self._span < YOUNG_NS or not self.settled or self._sealed % _OLD_REFIT_BUCKETS == 0:
             self._refit(u)
+
         self.settled = enough and (self.settled or self.sigma_ns(u) <= TRUSTED_NS)
         self._best, self._best_key = (u, y), y - self.skew * (u - self._ref)
         self._bucket_end = u + BUCKET_NS

@@ -1,8 +1,8 @@
-"""Stamps that never run backwards and never jump: what an estimate becomes on its way out.
+"""Host timestamps of one device: monotonic, and slewed toward the clock estimate.
 
-Law: pure; knows of estimates only that they come with each sample and may be moved. Once synced, a
-stamp approaches its estimate by at most 500 ppm of the time passed; an error too big for that is a
-step, and whoever asks is told so.
+Invariants: a timestamp in device order never decreases. Once synced, a timestamp approaches its
+estimate by at most 500 ppm of the elapsed time. A larger error is a step, which the caller gets
+returned.
 """
 
 from __future__ import annotations
@@ -10,37 +10,41 @@ from __future__ import annotations
 from typing import NamedTuple
 
 STEP_NS = 5_000_000
-"""An error of more than this is not slewed away."""
+"""Largest error that is corrected by slewing, ns; a larger one is a step."""
 SLEW = 500e-6
+"""Largest slew rate, dimensionless: correction per elapsed time."""
 
 
 class Stamp(NamedTuple):
-    """Host time of a sample, and what it is worth."""
+    """Host time of a sample, with its standard deviation."""
 
     t_ns: int
-    """Host CLOCK_MONOTONIC, ns; greater than the stamp before, unless reordered or duplicate."""
+    """Host CLOCK_MONOTONIC, ns; increasing, except for reordered and duplicate samples."""
     sigma_ns: float
-    """Standard deviation, ns; the unseen smallest delay is not in it. May be inf at first."""
+    """Standard deviation, ns; inf before the first fit. The constant minimum delay is not included.
+    """
     synced: bool
     """False while the clock settles."""
     epoch: int
-    """Grows whenever time before and after do not belong together."""
+    """Incremented when earlier and later times must not be combined."""
     duplicate: bool = False
-    """The device gave this sample the time of the one before."""
+    """The sample has the same device time as the one before."""
 
 
 Estimate = tuple[int, float, bool, float, float]
-"""Host time, ns; skew; whether it is settled; standard deviation, ns; and the delay beyond the
-fastest sample, or with echoes beyond the sampled instant, ns."""
+"""Host time, ns; skew; settled; standard deviation, ns; delay, ns. The delay is measured from the
+fastest samples or, with echoes, from the sampling instant.
+"""
 
 
-class StampLine:
-    """The stamps of one device in order.
+class MonotonicStamps:
+    """Timestamps of one device in order.
 
     Parameters
     ----------
     period_ns : int
-        Nominal time between two samples, ns: while unsynced, half of it is the least step.
+            Nominal sample period, ns. While unsynced, consecutive timestamps are at least half a
+        period apart.
     """
 
     __slots__ = ("_newest", "_period_ns", "last_t", "last_u")
@@ -48,10 +52,10 @@ class StampLine:
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self.last_u: int | None = None
-        """Device time of the last sample in order; None after a restart."""
+        """Device time of the last sample in order, ns; None after a restart."""
         self.last_t: int | None = None
-        """Its stamp, which a restart does not forget: time never runs backwards."""
-        self._newest: int | None = None  # also of samples without device time
+        """Timestamp of that sample, ns; it survives a restart, so time never runs backwards."""
+        self._newest: int | None = None  # includes samples without device time
 
     @property
     def offset_ns(self) -> int | None:
@@ -61,9 +65,25 @@ class StampLine:
         return self.last_t - self.last_u
 
     def stamp(self, u: int, target: int, skew: float, *, slew: bool) -> tuple[int, int]:
-        """Return the stamp nearest to `target` that neither runs backwards nor, if asked, jumps.
+        """Return the timestamp closest to `target`, and the step if one was needed.
 
-        And the error that was too big to slew, ns: 0 if the stamp joins those before it.
+        Parameters
+        ----------
+        u : int
+            Device time of the sample, ns.
+        target : int
+            Estimated host time, ns.
+        skew : float
+            Slope of host minus device time, dimensionless.
+        slew : bool
+            Limit the correction to ``SLEW``.
+
+        Returns
+        -------
+        t_ns : int
+            Timestamp, later than every timestamp before.
+        step_ns : int
+            Error too large to be slewed, ns; 0 if the timestamp continues those before.
         """
         last_t, last_u, step = self.last_t, self.last_u, 0
         if last_t is not None and last_u is not None:
@@ -78,13 +98,14 @@ class StampLine:
                         target = due + (limit if error > 0 else -limit)
             else:
                 target = max(target, last_t + min(passed, self._period_ns) // 2)
-        newest = self._newest  # as `forward` does: a call costs as much as the rest
+
+        newest = self._newest  # inlined `forward`: the call would cost as much as the rest
         t = target if newest is None or target > newest else newest + 1
         self.last_u, self.last_t, self._newest = u, t, t
         return t, step
 
     def forward(self, t: int) -> int:
-        """Return `t`, or the first instant after every stamp given so far."""
+        """Return `t`, or the first instant after all timestamps returned so far."""
         if self._newest is not None and t <= self._newest:
             t = self._newest + 1
         self._newest = t

@@ -1,8 +1,8 @@
-"""One electrical sync line: which edge of one device is which instant of the reference.
+"""Matching of sync edges: which edge of a device is which instant of the reference.
 
-Law: pure; bounded memory. Every edge is the same instant on all devices of a line. The estimates
-from arrivals are good to a few milliseconds, so of two edges that are estimated near each other,
-and near compared with the time between edges, both are one.
+All devices on a sync line stamp the same physical edges. Arrival-based clock estimates are accurate
+to a few milliseconds. So two stamps belong to the same edge if their estimates are close compared
+with the interval between edges.
 """
 
 from __future__ import annotations
@@ -11,23 +11,26 @@ from bisect import bisect_left
 from typing import NamedTuple
 
 UNAMBIGUOUS = 0.35
-"""Share of the time between edges by which two estimates of one edge may differ."""
+"""Largest distance of two estimates of one edge, as a fraction of the interval between edges."""
 FARTHEST_NS = 20_000_000
+"""Largest distance of two estimates of one edge, ns."""
 _INSTANTS = 512
+"""Reference instants in memory; the older half is dropped on overflow."""
 _WAITING = 64
+"""Unmatched edges in memory per device."""
 
 
 class Edge(NamedTuple):
-    """One edge as one device stamped it."""
+    """One edge as stamped by one device."""
 
     t_ns: int
-    """Its host time as estimated, ns."""
+    """Estimated host time, ns."""
     own_ns: int
-    """Its time on the device's own clock, ns."""
+    """Time on the device's own clock, ns."""
 
 
 class SyncLine:
-    """Matches edges of devices to instants of the reference."""
+    """Matches the edges of devices to instants of the reference."""
 
     __slots__ = ("_instants", "_waiting", "unmatched")
 
@@ -35,21 +38,21 @@ class SyncLine:
         self._instants: list[Edge] = []
         self._waiting: dict[str, list[Edge]] = {}
         self.unmatched = 0
-        """Edges that were no instant of the reference, or not clearly one."""
+        """Number of edges without a match, or with an ambiguous one."""
 
     def instant(self, edge: Edge) -> None:
-        """Take the next instant of the reference: a camera frame, or an edge it stamped."""
+        """Add the next instant of the reference: a camera frame or an edge."""
         instants = self._instants
         if instants and edge.t_ns <= instants[-1].t_ns:
             if instants[-1].t_ns - edge.t_ns < FARTHEST_NS:
                 return
-            instants.clear()  # the reference began anew
+            instants.clear()  # the reference restarted
         instants.append(edge)
         if len(instants) > _INSTANTS:
             del instants[: _INSTANTS // 2]
 
     def pulse(self, name: str, edge: Edge) -> None:
-        """Take an edge of another device on the line."""
+        """Add an edge of another device on the line."""
         waiting = self._waiting.setdefault(name, [])
         waiting.append(edge)
         if len(waiting) > _WAITING:
@@ -57,7 +60,7 @@ class SyncLine:
             self.unmatched += 1
 
     def matched(self, name: str) -> list[tuple[int, int]]:
-        """Return (own time, reference's own time), ns, of the edges that can be told by now."""
+        """Return the newly matched edges as (device time, reference time), ns."""
         waiting, instants = self._waiting.get(name), self._instants
         pairs: list[tuple[int, int]] = []
         while waiting and instants and waiting[0].t_ns < instants[-1].t_ns:
@@ -74,6 +77,7 @@ class SyncLine:
         after = bisect_left(instants, t_ns, key=lambda edge: edge.t_ns)
         if after == 0:
             return None
+
         left, right = instants[after - 1], instants[after]
         apart = right.t_ns - left.t_ns
         near = left if t_ns - left.t_ns < right.t_ns - t_ns else right

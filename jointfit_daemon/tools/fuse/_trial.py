@@ -232,11 +232,11 @@ def _refuse_moving(path: Path, found: Mapping[str, RobustMean]) -> None:
 
 def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
     """Return mounts from a JSON file ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``."""
-    from jointfit_daemon.files.text import Malformed, read_json
+    from jointfit_daemon.files.text import MalformedFileError, read_json
 
     try:
         said = read_json(path)
-    except Malformed as fault:
+    except MalformedFileError as fault:
         raise Unusable(str(fault)) from fault
     mounts = said.get("q_bias") if isinstance(said, dict) else None
     if not isinstance(mounts, dict):

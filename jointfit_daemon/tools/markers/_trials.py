@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
-from jointfit_daemon.files.mocap import UnknownMarker, read_marker_trial
+from jointfit_daemon.files.mocap import UnknownMarkerError, read_marker_trial
 from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def load(
     Raises
     ------
     ValueError
-        Unknown names in locks; `Malformed` for broken files.
+        Unknown names in locks; `MalformedFileError` for broken files.
     """
     read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
     judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
@@ -108,6 +108,6 @@ def _motion(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:
     for at, marker in enumerate(chain.marker_names):
         try:
             targets[:, at] = trial.points([marker])[:, 0]
-        except UnknownMarker:
+        except UnknownMarkerError:
             continue  # missing throughout; the refinement says so
     return MotionTrial(name, targets, trial.trajectories.rate_hz)

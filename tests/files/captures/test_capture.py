@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._candump import read_candump
-from jointfit_daemon.files.captures._capture import CaptureUnreadable
+from jointfit_daemon.files.captures._capture import UnreadableCaptureError
 from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_protocols.can import host_count, unpack_frames
 from jointfit_protocols.can._candump import parse_candump
@@ -180,5 +180,5 @@ def test_the_wrong_kind_of_file_is_refused_by_name(
     tmp_path: Path, data: bytes, wire: str, found: str
 ) -> None:
     (tmp_path / "f").write_bytes(data)
-    with pytest.raises(CaptureUnreadable, match=found):
+    with pytest.raises(UnreadableCaptureError, match=found):
         read_capture(tmp_path / "f", wire)  # type: ignore[arg-type]

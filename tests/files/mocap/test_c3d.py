@@ -11,12 +11,12 @@ import pytest
 
 from jointfit_daemon.files.mocap import (
     MarkerTrajectories,
-    UnknownMarker,
+    UnknownMarkerError,
     read_marker_trial,
     write_trc,
 )
-from jointfit_daemon.files.mocap._c3d import PackageMissing, read_c3d
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.mocap._c3d import MissingPackageError, read_c3d
+from jointfit_daemon.files.text import MalformedFileError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -122,16 +122,18 @@ def test_a_subjects_prefix_may_be_left_out_and_misspellings_are_met_halfway(
     write_c3d(tmp_path / "trial.c3d", positions)
     trial = read_marker_trial(tmp_path / "trial.c3d")
     assert np.array_equal(trial.points(["LKNE"]), trial.points(["Tom:LKNE"]), equal_nan=True)
-    with pytest.raises(UnknownMarker, match=r"'LKNEE': did you mean 'LKNE.*'XX'; there are: Tom"):
+    with pytest.raises(
+        UnknownMarkerError, match=r"'LKNEE': did you mean 'LKNE.*'XX'; there are: Tom"
+    ):
         trial.points(["LKNEE", "LASI", "XX"])
 
 
 def test_a_file_that_is_no_c3d_is_named(tmp_path: Path) -> None:
     for name, data in (("a.c3d", b"hello"), ("b.c3d", bytes(2048)), ("c.c3d", b"")):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(Malformed, match=name):
+        with pytest.raises(MalformedFileError, match=name):
             read_c3d(tmp_path / name)
-    with pytest.raises(Malformed, match=r"\.trc or \.c3d"):
+    with pytest.raises(MalformedFileError, match=r"\.trc or \.c3d"):
         read_marker_trial(tmp_path / "trial.csv")
 
 
@@ -146,7 +148,7 @@ def test_a_broken_c3d_is_named_never_a_traceback(
         for at in rng.integers(0, len(data), 5):
             data[at] = int(rng.integers(0, 256))
         (tmp_path / "broken.c3d").write_bytes(bytes(data))
-        with suppress(Malformed):
+        with suppress(MalformedFileError):
             read_c3d(tmp_path / "broken.c3d")
 
 
@@ -154,5 +156,5 @@ def test_without_the_package_the_message_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "c3d", None)
-    with pytest.raises(PackageMissing, match=r"pip install 'jointfitd\[c3d\]'"):
+    with pytest.raises(MissingPackageError, match=r"pip install 'jointfitd\[c3d\]'"):
         read_c3d(tmp_path / "any.c3d")

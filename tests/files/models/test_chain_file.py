@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.files.models import read_model, write_model
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics.chains import ChainModel, Joint, Marker, Segment
 
 if TYPE_CHECKING:
@@ -113,13 +113,13 @@ def test_a_model_is_short_by_hand(tmp_path: Path) -> None:
 )
 def test_all_that_is_wrong_is_told(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "m.toml").write_text(text)
-    with pytest.raises(Malformed, match=said):
+    with pytest.raises(MalformedFileError, match=said):
         read_model(tmp_path / "m.toml")
 
 
 def test_json_that_is_no_table_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.json").write_text("[1, 2]")
-    with pytest.raises(Malformed, match="expected a table"):
+    with pytest.raises(MalformedFileError, match="expected a table"):
         read_model(tmp_path / "m.json")
 
 
@@ -127,12 +127,12 @@ def test_a_path_in_millimetres_is_refused(tmp_path: Path) -> None:
     path = tuple((float(q), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -20.0 * q) for q in range(4))
     shank = Segment("shank", "thigh", Joint("coupled", path=path))
     write_model(tmp_path / "m.toml", ChainModel((Segment("thigh"), shank), ()))
-    with pytest.raises(Malformed, match="path of 'shank' at 3 is 60 m away"):
+    with pytest.raises(MalformedFileError, match="path of 'shank' at 3 is 60 m away"):
         read_model(tmp_path / "m.toml")
 
 
 def test_samples_of_other_lengths_are_named(tmp_path: Path) -> None:
     path = tmp_path / "m.toml"
     path.write_text('[[segment]]\nname = "a"\njoint = "coupled"\npath = [[0, 1, 0, 0, 0]]\n')
-    with pytest.raises(Malformed, match="path must be a list of samples, 8 numbers each"):
+    with pytest.raises(MalformedFileError, match="path must be a list of samples, 8 numbers each"):
         read_model(path)

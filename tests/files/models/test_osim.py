@@ -10,7 +10,7 @@ import pytest
 
 from jointfit_daemon.files.models import read_osim, to_y_up, to_z_up
 from jointfit_daemon.files.models._osim import read_marker_set
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics.chains import apply_step, marker_positions, rest_state
 from jointfit_daemon.kinematics.chains._motion import coupled_coordinates, hinge_angles
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
@@ -324,25 +324,25 @@ def model_of(text: str) -> str:
 )
 def test_what_is_not_understood_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "m.osim").write_text(text)
-    with pytest.raises(Malformed, match=said):
+    with pytest.raises(MalformedFileError, match=said):
         read_osim(tmp_path / "m.osim")
 
 
 def test_names_that_are_not_there_are_told_together(tmp_path: Path) -> None:
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
-    with pytest.raises(Malformed, match="no body 'shin'; no marker 'tibia9'"):
+    with pytest.raises(MalformedFileError, match="no body 'shin'; no marker 'tibia9'"):
         read_osim(path, bodies=["shin"], markers=["tibia9"])
 
 
 def test_millimetres_are_refused_whether_they_are_told_or_not(tmp_path: Path) -> None:
     large = [(name, body, tuple(1000 * np.array(at)), fixed) for name, body, at, fixed in MARKERS]
     path = write_osim(tmp_path / "mm.osim", [ROOT, HIP, KNEE], large)
-    with pytest.raises(Malformed, match="must be metres: is the file in millimetres"):
+    with pytest.raises(MalformedFileError, match="must be metres: is the file in millimetres"):
         read_osim(path)
     path = write_osim(tmp_path / "told.osim", [ROOT, HIP, KNEE], MARKERS)
     text = path.read_text().replace("<BodySet>", "<length_units>mm</length_units><BodySet>", 1)
     path.write_text(text)
-    with pytest.raises(Malformed, match="length_units is 'mm', expected 'meters'"):
+    with pytest.raises(MalformedFileError, match="length_units is 'mm', expected 'meters'"):
         read_osim(path)
 
 

@@ -14,7 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.config import ConfigError, load_rig
-from jointfit_daemon.files.text import Malformed, parse_toml, read_bounded, read_json, read_toml
+from jointfit_daemon.files.text import (
+    MalformedFileError,
+    parse_toml,
+    read_bounded,
+    read_json,
+    read_toml,
+)
 from jointfit_daemon.files.text._structured import MOST_BYTES
 
 if TYPE_CHECKING:
@@ -38,7 +44,7 @@ if TYPE_CHECKING:
 def test_hostile_toml_is_one_fault(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "x.toml"
     path.write_bytes(content)
-    with pytest.raises(Malformed, match=said) as caught:
+    with pytest.raises(MalformedFileError, match=said) as caught:
         read_toml(path)
     assert str(path) in str(caught.value)
 
@@ -55,7 +61,9 @@ def test_a_key_of_many_parts_costs_little_memory(
 
     tracemalloc.start()
     try:
-        with pytest.raises((Malformed, ConfigError), match="nested more than 32 levels deep"):
+        with pytest.raises(
+            (MalformedFileError, ConfigError), match="nested more than 32 levels deep"
+        ):
             read(path)
         _, peak_bytes = tracemalloc.get_traced_memory()
     finally:
@@ -81,7 +89,7 @@ def test_dotted_text_that_is_no_deep_key_is_read(text: str) -> None:
 def test_hostile_json_is_one_fault(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.json"
     path.write_bytes(content)
-    with pytest.raises(Malformed, match=r"x\.json"):
+    with pytest.raises(MalformedFileError, match=r"x\.json"):
         read_json(path)
 
 
@@ -97,10 +105,10 @@ def test_what_is_no_regular_file_is_named_at_once(tmp_path: Path) -> None:
     began = time.monotonic()
     kinds = {tmp_path: "a directory", fifo: "a FIFO", Path("/dev/zero"): "a device"}
     for path, kind in kinds.items():
-        with pytest.raises(Malformed, match=f"is {kind}, expected a regular file"):
+        with pytest.raises(MalformedFileError, match=f"is {kind}, expected a regular file"):
             read_bounded(path, 100)
     for path in (tmp_path / "none", Path("a\0b")):
-        with pytest.raises(Malformed):
+        with pytest.raises(MalformedFileError):
             read_bounded(path, 100)
     assert time.monotonic() - began < 1.0
 
@@ -113,5 +121,5 @@ def test_any_content_is_a_value_or_malformed(tmp_path: Path, content: bytes) -> 
     for read in (read_toml, read_json):
         try:
             read(path)
-        except Malformed:
+        except MalformedFileError:
             continue

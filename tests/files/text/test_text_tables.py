@@ -23,7 +23,7 @@ from jointfit_daemon.files.orientations import (
     write_orientations_sto,
     write_sto,
 )
-from jointfit_daemon.files.text import Malformed
+from jointfit_daemon.files.text import MalformedFileError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -149,9 +149,9 @@ def test_any_separator_is_accepted(tmp_path: Path, separator: str) -> None:
 def test_a_file_of_another_kind_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.sto"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(Malformed, match=r"a\.sto"):
+    with pytest.raises(MalformedFileError, match=r"a\.sto"):
         read_sto(path)
-    with pytest.raises(Malformed, match=r"a\.sto"):
+    with pytest.raises(MalformedFileError, match=r"a\.sto"):
         read_trc(path)
 
 

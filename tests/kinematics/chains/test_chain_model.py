@@ -11,7 +11,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     ChainState,
-    ImpossibleModel,
+    InvalidChainModelError,
     Joint,
     Marker,
     Sample,
@@ -145,7 +145,7 @@ def test_scaling_a_segment_stretches_all_that_is_fixed_to_it() -> None:
     assert scaled.segments[1].joint.center == knee.center
     assert scaled.markers[0].position == pytest.approx((0.2, 0.0, 0.3))
     assert scaled.markers[1].position == (0.1, 0.0, 0.2)
-    with pytest.raises(ImpossibleModel, match="shin"):
+    with pytest.raises(InvalidChainModelError, match="shin"):
         model.scaled({"shin": 1.1})
 
 
@@ -175,5 +175,5 @@ def test_markers_moved_or_locked_are_another_model() -> None:
 def test_what_makes_no_chain_is_refused_by_name(
     segments: tuple[Segment, ...], markers: tuple[Marker, ...], said: str
 ) -> None:
-    with pytest.raises(ImpossibleModel, match=said):
+    with pytest.raises(InvalidChainModelError, match=said):
         ChainModel(segments, markers)

@@ -15,7 +15,7 @@ from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     CoupledCurve,
-    ImpossibleModel,
+    InvalidChainModelError,
     Joint,
     Marker,
     Sample,
@@ -27,7 +27,12 @@ from jointfit_daemon.kinematics.chains import (
     step_between,
 )
 from jointfit_daemon.kinematics.chains._motion import coupled_coordinates
-from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, fit, slots_of, solve_frames
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    IkOptions,
+    marker_fit,
+    marker_slots,
+    solve_frames,
+)
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import normal_equations
 
 BENT = np.linspace(-0.3, 2.3, 40)
@@ -139,8 +144,10 @@ def test_sums_over_segments_are_the_dense_normal_equations(seed: int) -> None:
     state = apply_step(model, rest_state(model, 3), rng.normal(0.0, 1.0, (3, model.nq)))
     y = marker_positions(model, state) + rng.normal(0.0, 0.1, (3, len(model.markers), 3))
     w = rng.uniform(0.0, 2.0, y.shape[:2])
-    slots = slots_of(model)
-    H, g = normal_equations(slots, fit(slots, state, slots.filled_vectors(y), slots.filled(w)))
+    slots = marker_slots(model)
+    H, g = normal_equations(
+        slots, marker_fit(slots, state, slots.filled_vectors(y), slots.filled(w))
+    )
     J, e = jacobian(model, state), marker_positions(model, state) - y
     np.testing.assert_allclose(H, np.einsum("tmik,tm,tmil->tkl", J, w, J), atol=1e-9)
     np.testing.assert_allclose(g, np.einsum("tmik,tm,tmi->tk", J, w, e), atol=1e-9)
@@ -221,7 +228,7 @@ def test_scaling_the_parent_stretches_the_way_of_the_center() -> None:
     ],
 )
 def test_what_is_no_path_is_refused(joint: Joint, said: str) -> None:
-    with pytest.raises(ImpossibleModel, match=said):
+    with pytest.raises(InvalidChainModelError, match=said):
         ChainModel((Segment("thigh"), Segment("shank", "thigh", joint)), ())
 
 

@@ -25,8 +25,8 @@ from jointfit_daemon.kinematics.chains import (
 from jointfit_daemon.kinematics.chains._motion import hinge_angles
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
-    fit,
-    slots_of,
+    marker_fit,
+    marker_slots,
     solve_frames,
     tracking_error,
 )
@@ -91,8 +91,8 @@ def test_sums_over_segments_are_the_dense_normal_equations(seed: int) -> None:
     state = walk(model, 3)
     y = marker_positions(model, state) + rng.normal(0.0, 0.1, (3, len(model.markers), 3))
     w = rng.uniform(0.0, 2.0, y.shape[:2])
-    slots = slots_of(model)
-    found = fit(slots, state, slots.filled_vectors(y), slots.filled(w))
+    slots = marker_slots(model)
+    found = marker_fit(slots, state, slots.filled_vectors(y), slots.filled(w))
     H, g = normal_equations(slots, found)
     J, e = jacobian(model, state), marker_positions(model, state) - y
     np.testing.assert_allclose(H, np.einsum("tmik,tm,tmil->tkl", J, w, J), atol=1e-10)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner, StreamSpec
-from jointfit_daemon.timing.alignment._frame_aligner import Verdict
+from jointfit_daemon.timing.alignment._frame_aligner import SampleOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MS = 1_000_000
 T0 = 5_000 * MS
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-VERDICTS = [verdict.value for verdict in Verdict]
+VERDICTS = [verdict.value for verdict in SampleOutcome]
 
 Push = tuple[int, str, int]
 """Arrival, stream, stamp."""
@@ -191,7 +191,7 @@ def test_a_slow_stream_is_interpolated_between_its_samples() -> None:
 def test_the_same_stamp_twice_is_a_duplicate() -> None:
     a = aligner(A=10 * MS)
     a.push("A", T0, T0, IDENTITY)
-    assert a.push("A", T0, T0 + MS, IDENTITY) is Verdict.DUPLICATE
+    assert a.push("A", T0, T0 + MS, IDENTITY) is SampleOutcome.DUPLICATE
 
 
 def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
@@ -200,7 +200,7 @@ def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
         a.push("A", T0 + t * MS, T0 + t * MS, turned(T0 + t * MS))
     assert a.push("A", T0 + 20 * MS, T0 + 31 * MS, turned(T0 + 20 * MS)) is None
     a.advance(T0 + 40 * MS)
-    assert a.push("A", T0 + 15 * MS, T0 + 41 * MS, IDENTITY) is Verdict.LATE
+    assert a.push("A", T0 + 15 * MS, T0 + 41 * MS, IDENTITY) is SampleOutcome.LATE
 
 
 def test_a_frame_does_not_remember_neighbors_that_a_reordered_sample_parted() -> None:
@@ -312,12 +312,12 @@ def test_samples_that_come_when_their_frames_are_out_are_late() -> None:
 
 def test_a_stamp_from_the_future_is_dropped() -> None:
     a = aligner(A=10 * MS)
-    assert a.push("A", T0 + 3_600_000 * MS, T0, IDENTITY) is Verdict.DROPPED
+    assert a.push("A", T0 + 3_600_000 * MS, T0, IDENTITY) is SampleOutcome.DROPPED
 
 
 def test_a_stamp_long_before_its_arrival_makes_no_frame() -> None:
     a = aligner(A=10 * MS)
-    assert a.push("A", T0 - 60_000 * MS, T0, IDENTITY) is Verdict.LATE
+    assert a.push("A", T0 - 60_000 * MS, T0, IDENTITY) is SampleOutcome.LATE
     assert a.advance(T0 + 1000 * MS) == []
 
 
@@ -333,7 +333,7 @@ def test_an_inactive_aligner_counts_what_comes_as_idle() -> None:
     play(a, stream("A", 10 * MS, 10))
     a.active = False
     assert assert_accounted(a, "A")["pending"] == 0
-    assert a.push("A", T0 + 100 * MS, T0 + 100 * MS, IDENTITY) is Verdict.IDLE
+    assert a.push("A", T0 + 100 * MS, T0 + 100 * MS, IDENTITY) is SampleOutcome.IDLE
     assert a.advance(T0 + 200 * MS) == []
     assert a.next_deadline_ns is None
 

@@ -19,7 +19,10 @@ from jointfit_daemon.kinematics.rotation_scalar import (
     log_one,
     normalize_one,
 )
-from jointfit_daemon.timing.alignment._interpolation import between, beyond
+from jointfit_daemon.timing.alignment._interpolation import (
+    extrapolate_orientation,
+    interpolate_orientation,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,10 +95,12 @@ def test_fast_motion_is_met_better_with_a_third_sample_and_best_with_rates() -> 
         return interpolate_one(sample(t).q, sample(t + STEP).q, x / STEP)
 
     def parabola(t: int, x: int) -> Quaternion:
-        return between(sample(t - STEP), sample(t), sample(t + STEP), t + x)
+        return interpolate_orientation(sample(t - STEP), sample(t), sample(t + STEP), t + x)
 
     def cubic(t: int, x: int) -> Quaternion:
-        return between(None, sample(t, rate=True), sample(t + STEP, rate=True), t + x)
+        return interpolate_orientation(
+            None, sample(t, rate=True), sample(t + STEP, rate=True), t + x
+        )
 
     assert errors(parabola) < errors(slerp) / 4
     assert errors(cubic) < errors(parabola) / 4
@@ -104,13 +109,15 @@ def test_fast_motion_is_met_better_with_a_third_sample_and_best_with_rates() -> 
 
 def test_a_bend_and_rates_both_shorten_the_error_of_an_extrapolation() -> None:
     def straight(t: int, x: int) -> Quaternion:
-        return beyond(None, sample(t - STEP), sample(t), t + x)
+        return extrapolate_orientation(None, sample(t - STEP), sample(t), t + x)
 
     def bent(t: int, x: int) -> Quaternion:
-        return beyond(sample(t - 2 * STEP), sample(t - STEP), sample(t), t + x)
+        return extrapolate_orientation(sample(t - 2 * STEP), sample(t - STEP), sample(t), t + x)
 
     def measured(t: int, x: int) -> Quaternion:
-        return beyond(None, sample(t - STEP, rate=True), sample(t, rate=True), t + x)
+        return extrapolate_orientation(
+            None, sample(t - STEP, rate=True), sample(t, rate=True), t + x
+        )
 
     assert errors(bent) < errors(straight) * 0.7
     assert errors(measured) < errors(straight) / 4
@@ -131,10 +138,10 @@ def test_samples_themselves_are_met_whatever_their_signs(
     before.t_ns, b.t_ns = -gap * MS, step * MS
     for left in (None, before, negated(before)):
         for right in (b, negated(b)):
-            assert angle_between_one(between(left, a, right, a.t_ns), a.q) < 1e-6
-            assert angle_between_one(between(left, a, right, b.t_ns), b.q) < 1e-6
-    assert angle_between_one(beyond(None, before, a, a.t_ns), a.q) < 1e-6
-    assert angle_between_one(beyond(b, before, a, a.t_ns), a.q) < 1e-6
+            assert angle_between_one(interpolate_orientation(left, a, right, a.t_ns), a.q) < 1e-6
+            assert angle_between_one(interpolate_orientation(left, a, right, b.t_ns), b.q) < 1e-6
+    assert angle_between_one(extrapolate_orientation(None, before, a, a.t_ns), a.q) < 1e-6
+    assert angle_between_one(extrapolate_orientation(b, before, a, a.t_ns), a.q) < 1e-6
 
 
 @given(st.floats(-20, 20), st.integers(0, 25 * MS), st.booleans())
@@ -145,27 +152,40 @@ def test_a_constant_rate_is_met_exactly(speed: float, x: int, known: bool) -> No
         return Sample(t, (cos(half), sin(half), 0.0, 0.0), rate)
 
     past, now, soon = at(-STEP), at(0), at(25 * MS)
-    assert angle_between_one(between(past, now, soon, x), at(x).q) < 1e-6
-    assert angle_between_one(beyond(at(-STEP - 7 * MS), past, now, x), at(x).q) < 1e-6
+    assert angle_between_one(interpolate_orientation(past, now, soon, x), at(x).q) < 1e-6
+    assert (
+        angle_between_one(extrapolate_orientation(at(-STEP - 7 * MS), past, now, x), at(x).q) < 1e-6
+    )
 
 
 def test_rates_that_contradict_the_orientations_are_not_used() -> None:
     """Degrees for radians, other axes, another sign: then the samples have to do."""
     a, b, before = sample(0), sample(STEP), sample(-STEP)
-    plain, beyond_plain = between(before, a, b, 4 * MS), beyond(None, before, a, 4 * MS)
+    plain, beyond_plain = (
+        interpolate_orientation(before, a, b, 4 * MS),
+        extrapolate_orientation(None, before, a, 4 * MS),
+    )
     _, w = MOTION(0.5)
     for wrong in ((w[1], w[2], w[0]), (-w[0], -w[1], -w[2]), tuple(180 / pi * c for c in w)):
         for s in (a, b, before):
             s.rate = (wrong[0], wrong[1], wrong[2])
-        assert between(before, a, b, 4 * MS) == plain
-        assert beyond(None, before, a, 4 * MS) == beyond_plain
+        assert interpolate_orientation(before, a, b, 4 * MS) == plain
+        assert extrapolate_orientation(None, before, a, 4 * MS) == beyond_plain
 
 
 def test_a_bend_does_not_grow_beyond_one_interval() -> None:
     """Two periods on, a parabola would have turned twice as far as the last rate says."""
     earlier, before, a = (Sample(k * STEP, turned(x)) for k, x in ((-2, 0.0), (-1, 0.1), (0, 0.3)))
-    assert angle_between_one(beyond(earlier, before, a, STEP), turned(0.3 + 0.25)) < 1e-9
-    assert angle_between_one(beyond(earlier, before, a, 2 * STEP), turned(0.3 + 0.525)) < 1e-9
+    assert (
+        angle_between_one(extrapolate_orientation(earlier, before, a, STEP), turned(0.3 + 0.25))
+        < 1e-9
+    )
+    assert (
+        angle_between_one(
+            extrapolate_orientation(earlier, before, a, 2 * STEP), turned(0.3 + 0.525)
+        )
+        < 1e-9
+    )
 
 
 def turned(angle: float) -> Quaternion:
@@ -182,7 +202,9 @@ def test_means_since_the_sample_before_are_worse_than_no_rates() -> None:
 
     def by(make: Callable[[int], Sample]) -> float:
         return errors(
-            lambda t, x: between(make(t // STEP - 1), make(t // STEP), make(t // STEP + 1), t + x)
+            lambda t, x: interpolate_orientation(
+                make(t // STEP - 1), make(t // STEP), make(t // STEP + 1), t + x
+            )
         )
 
     assert by(mean) > 2.0 * by(lambda number: sample(number * STEP))

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.timing.clock._delay_statistics import HALF_NS, LastMinute, bin_of
+from jointfit_daemon.timing.clock._delay_statistics import HALF_NS, DelayStatistics, bin_of
 
 S = 1_000_000_000
 
 
 @given(st.lists(st.integers(1, 10**11), min_size=200, max_size=400))
 def test_percentiles_are_those_of_the_samples(delays: list[int]) -> None:
-    minute = LastMinute()
+    minute = DelayStatistics()
     for k, delay in enumerate(delays):
         minute.feed(k * 1000, delay)
     found = minute.delays
@@ -31,7 +31,7 @@ def test_bins_are_in_order(delay: int, more: int) -> None:
 
 
 def test_what_is_older_than_a_minute_is_forgotten() -> None:
-    minute = LastMinute()
+    minute = DelayStatistics()
     minute.feed(0, 10 * S)
     for k in range(1, 75):
         minute.feed(k * S, S // 1000)
@@ -41,7 +41,7 @@ def test_what_is_older_than_a_minute_is_forgotten() -> None:
 
 
 def test_after_a_long_silence_the_rate_is_that_of_what_came_since() -> None:
-    minute = LastMinute()
+    minute = DelayStatistics()
     for start in (0, 3 * HALF_NS):
         for k in range(101):
             minute.feed(start + k * S // 100, 0)
@@ -49,7 +49,7 @@ def test_after_a_long_silence_the_rate_is_that_of_what_came_since() -> None:
 
 
 def test_nothing_is_known_of_nothing() -> None:
-    minute = LastMinute()
+    minute = DelayStatistics()
     assert minute.delays is None
     minute.feed(5, 7)
     assert minute.rate_hz is None

@@ -79,7 +79,7 @@ class Wired:
 
     def _tie(self) -> None:
         for u, v in self.line.matched("imu"):
-            self.imu.feed_tie(u, v, self.server)
+            self.imu.feed_sync_edge(u, v, self.server)
 
     def sample(self, t: int) -> None:
         delay = self.least + int(self.rng.exponential(3e5))

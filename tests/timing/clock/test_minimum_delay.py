@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.timing.clock._counter_wrap import unwrap
 from jointfit_daemon.timing.clock._feasible_line import lower_hull, straddling_edge
-from jointfit_daemon.timing.clock._minimum_delay import Envelope
+from jointfit_daemon.timing.clock._minimum_delay import MinimumDelayFilter
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -86,7 +86,7 @@ def test_delaying_a_point_off_the_hull_changes_nothing(
 
 
 def test_the_envelope_never_lies_above_a_point_of_its_window() -> None:
-    rng, envelope = np.random.default_rng(0), Envelope()
+    rng, envelope = np.random.default_rng(0), MinimumDelayFilter()
     for k in range(2000):
         y = int(rng.exponential(MS))
         envelope.feed(k * PERIOD, y)
