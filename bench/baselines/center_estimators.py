@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.subjects.model_joint_centers import ModelTrial, gait2354, opencap
-from jointfit_daemon.calibration.center.estimate import estimate_center
+from jointfit_daemon.center_of_rotation import estimate_center
 from jointfit_daemon.tools.center.trial import Reduced, reduce
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from jointfit_daemon.calibration.center.result import CenterEstimate
+    from jointfit_daemon.center_of_rotation import CenterEstimate
 
 OPENCAP = ("squats1", "STS1", "DJ1", "walking1")
 _PELVIS = ("r.ASIS", "L.ASIS", "r.PSIS", "L.PSIS")

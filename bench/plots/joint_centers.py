@@ -13,7 +13,7 @@ import numpy as np
 from bench.baselines.center_estimators import Judged, hinge, judged
 from bench.experiments.joint_center.real_trials import METHODS, TRIALS
 from bench.framework.experiment import DATA
-from jointfit_daemon.calibration.center.planar_reduction import plane_of
+from jointfit_daemon.center_of_rotation.planar import plane_of
 from jointfit_daemon.tools.plotting import new_figure
 
 if TYPE_CHECKING:

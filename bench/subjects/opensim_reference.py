@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.subjects.model_joint_centers import quiet
-from jointfit_daemon.calibration.marker_refinement.block import Carriers
+from jointfit_daemon.calibration.marker_refinement import Carriers
 from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
 from jointfit_daemon.files.models import to_y_up
 from jointfit_daemon.files.orientations import read_sto

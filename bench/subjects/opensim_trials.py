@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.subjects.opensim_reference import judge, shared_markers, trial_frames
-from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
+from jointfit_daemon.calibration.marker_refinement import MotionTrial
 from jointfit_daemon.files.models import read_osim, to_z_up
 
 if TYPE_CHECKING:

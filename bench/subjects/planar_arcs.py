@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.center.bounds import circle_rms_bound
-from jointfit_daemon.calibration.center.circle import Method, fit_circles
-from jointfit_daemon.calibration.center.moments import GATE, ellipse_scale
+from jointfit_daemon.center_of_rotation import circle_rms_bound
+from jointfit_daemon.center_of_rotation.planar import GATE, Method, ellipse_scale, fit_circles
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

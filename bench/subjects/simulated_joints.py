@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.center.movement import BodyPoses
-from jointfit_daemon.calibration.center.parent_noise import spatial_noise
+from jointfit_daemon.center_of_rotation import BodyPoses
+from jointfit_daemon.center_of_rotation.spatial import spatial_noise
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import rigid_fit
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.center.result import CenterEstimate
+    from jointfit_daemon.center_of_rotation import CenterEstimate
 
 
 CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])

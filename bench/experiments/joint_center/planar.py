@@ -14,17 +14,20 @@ from bench.subjects.planar_arcs import (
     share_covered,
     upper_rms,
 )
-from jointfit_daemon.calibration.center.bounds import circle_rms_bound
-from jointfit_daemon.calibration.center.circle import fit_circle, fit_circles
-from jointfit_daemon.calibration.center.error_prediction import (
+from jointfit_daemon.center_of_rotation import circle_rms_bound
+from jointfit_daemon.center_of_rotation.planar import (
+    Limits,
+    RunningCircle,
     arbitrary_error,
+    circle_estimate,
+    combine,
     equal_step_error,
+    fit_circle,
+    fit_circles,
+    geometric_estimate,
+    three_frame_center,
     triangle_error,
 )
-from jointfit_daemon.calibration.center.geometric import combine, geometric_estimate
-from jointfit_daemon.calibration.center.planar_estimate import Limits, circle_estimate
-from jointfit_daemon.calibration.center.running_circle import RunningCircle
-from jointfit_daemon.calibration.center.three_frames import three_frame_center
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,9 +9,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.planar_arcs import arc_points
-from jointfit_daemon.calibration.center.circle import fit_circles
-from jointfit_daemon.calibration.center.oriented import oriented_estimate
-from jointfit_daemon.calibration.center.planar_estimate import Limits
+from jointfit_daemon.center_of_rotation.planar import Limits, fit_circles, oriented_estimate
 
 if TYPE_CHECKING:
     from pathlib import Path

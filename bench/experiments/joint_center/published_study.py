@@ -6,7 +6,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from bench.framework.experiment import Experiment, Figure, near
-from jointfit_daemon.calibration.center.study import PRINTED, PairMaps, StudySetup, run_study
+from jointfit_daemon.center_of_rotation.study import PRINTED, PairMaps, StudySetup, run_study
 from jointfit_daemon.tools.report.tables import NEAREST, correlations
 
 if TYPE_CHECKING:

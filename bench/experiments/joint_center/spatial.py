@@ -24,14 +24,20 @@ from bench.subjects.simulated_joints import (
     star_turns,
     watched,
 )
-from jointfit_daemon.calibration.center.parent_noise import relative, spatial_noise
-from jointfit_daemon.calibration.center.planar_estimate import Limits, circle_estimate
-from jointfit_daemon.calibration.center.running_sphere import RunningSphere, fit_running
-from jointfit_daemon.calibration.center.sara import fit_axis
-from jointfit_daemon.calibration.center.score import fit_score
-from jointfit_daemon.calibration.center.several import fuse_centers
-from jointfit_daemon.calibration.center.sphere import fit_sphere, gamage_lasenby, halvorsen
-from jointfit_daemon.calibration.center.sphere_solve import SphereOptions
+from jointfit_daemon.center_of_rotation import fuse_centers
+from jointfit_daemon.center_of_rotation.planar import Limits, circle_estimate
+from jointfit_daemon.center_of_rotation.spatial import (
+    RunningSphere,
+    SphereOptions,
+    fit_axis,
+    fit_running,
+    fit_score,
+    fit_sphere,
+    gamage_lasenby,
+    halvorsen,
+    relative,
+    spatial_noise,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,9 +17,7 @@ import numpy as np
 from bench.framework.experiment import Experiment, Figure, near
 from bench.subjects.opensim_reference import CONVERGED, OpenSimFollower, judge
 from bench.subjects.opensim_trials import GAIT, OPENCAP, gait2354, opencap
-from jointfit_daemon.calibration.marker_refinement.motion import RefinementSettings
-from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
-from jointfit_daemon.calibration.marker_refinement.search import search
+from jointfit_daemon.calibration.marker_refinement import RefinementSettings, refine_markers, search
 from jointfit_daemon.files.models import to_z_up
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
 
     from bench.subjects.opensim_reference import Verdict
     from bench.subjects.opensim_trials import Subject
-    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
+    from jointfit_daemon.calibration.marker_refinement import Refinement
 
 _MM, _MM2 = 1000.0, 1e6
 _ALL = 10_000

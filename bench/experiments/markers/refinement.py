@@ -18,8 +18,11 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
-from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial, RefinementSettings
-from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
+from jointfit_daemon.calibration.marker_refinement import (
+    MotionTrial,
+    RefinementSettings,
+    refine_markers,
+)
 from jointfit_daemon.kinematics.chains import marker_positions, step_between
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
 
@@ -29,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
+    from jointfit_daemon.calibration.marker_refinement import Refinement
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _MM = 1000.0

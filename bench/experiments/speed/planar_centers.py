@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.measurement import Bench, Row, per_item
-from jointfit_daemon.calibration.center.running_circle import RunningCircle
+from jointfit_daemon.center_of_rotation.planar import RunningCircle
 
 if TYPE_CHECKING:
     from collections.abc import Callable

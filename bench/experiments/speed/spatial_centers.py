@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.framework.measurement import Bench, Row, per_item
 from bench.subjects.simulated_joints import ball_turns, carried
-from jointfit_daemon.calibration.center.running_sphere import RunningSphere
+from jointfit_daemon.center_of_rotation.spatial import RunningSphere
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.center.sphere_directions import Limits
-from jointfit_daemon.calibration.center.sphere_solve import (
+from jointfit_daemon.center_of_rotation.spatial import (
+    Limits,
     SphereOptions,
     judge_sphere,
+    objection,
     solve_sphere,
 )
-from jointfit_daemon.calibration.center.sphere_verdict import objection
 from jointfit_daemon.limb_model import visible
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.anatomy._marker_clusters import ClusterTrack
-    from jointfit_daemon.calibration.center.result import CenterEstimate
+    from jointfit_daemon.center_of_rotation import CenterEstimate
 
 
 MIN_FRAMES = 50

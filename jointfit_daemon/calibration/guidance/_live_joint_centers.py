@@ -29,16 +29,15 @@ from jointfit_daemon.calibration.anatomy import (
     settle_unseen,
     stand_straight,
 )
-from jointfit_daemon.calibration.center.running_sphere import RunningSphere
-from jointfit_daemon.calibration.center.sphere_sums import centered
 from jointfit_daemon.calibration.guidance._live_clusters import LiveParts
+from jointfit_daemon.center_of_rotation.spatial import RunningSphere, centered
 from jointfit_daemon.limb_model import body_parts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.center.result import CenterEstimate
+    from jointfit_daemon.center_of_rotation import CenterEstimate
     from jointfit_daemon.limb_model import Cluster
     from jointfit_daemon.model import Chain, MocapFrame
 

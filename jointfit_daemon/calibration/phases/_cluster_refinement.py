@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial, Unrefinable
-from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
+from jointfit_daemon.calibration.marker_refinement import MotionTrial, Unrefinable, refine_markers
 from jointfit_daemon.kinematics.chains import ChainModel, Marker, Segment
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames
 
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.anatomy import ClusterTrack
-    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
+    from jointfit_daemon.calibration.marker_refinement import Refinement
     from jointfit_daemon.limb_model import Cluster
 
 FARTHEST_M = 0.03

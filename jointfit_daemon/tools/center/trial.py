@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.anatomy import moving_template
-from jointfit_daemon.calibration.center.estimate import METHODS, estimate_center
-from jointfit_daemon.calibration.center.movement import BodyPoses, Movement
-from jointfit_daemon.calibration.center.planar_reduction import plane_of
+from jointfit_daemon.center_of_rotation import METHODS, BodyPoses, Movement, estimate_center
+from jointfit_daemon.center_of_rotation.planar import plane_of
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line, steady_fit, visible
 from jointfit_daemon.nearest_name import did_you_mean
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.center.result import CenterEstimate
+    from jointfit_daemon.center_of_rotation import CenterEstimate
     from jointfit_daemon.files.mocap import Axis, MarkerTrial
 
 

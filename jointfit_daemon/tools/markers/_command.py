@@ -12,11 +12,11 @@ from jointfit_daemon.tools.command_group import EXIT_FAILED
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement.motion import (
+    from jointfit_daemon.calibration.marker_refinement import (
+        Refinement,
         RefinementMethod,
         RefinementSettings,
     )
-    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
     from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.tools.markers._trials import Asked
 
@@ -91,10 +91,7 @@ def markers(
 
     Ends with 1 where model and trials do not belong together.
     """
-    from jointfit_daemon.calibration.marker_refinement.motion import (
-        RefinementSettings,
-        Unrefinable,
-    )
+    from jointfit_daemon.calibration.marker_refinement import RefinementSettings, Unrefinable
     from jointfit_daemon.tools.markers._trials import Asked
 
     _check(method=method, up=up, out=out or [], plot=plot)
@@ -120,7 +117,7 @@ def markers(
 def _check(*, method: str, up: str | None, out: Sequence[Path], plot: Path | None) -> None:
     from typing import get_args
 
-    from jointfit_daemon.calibration.marker_refinement.motion import RefinementMethod
+    from jointfit_daemon.calibration.marker_refinement import RefinementMethod
     from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.output_files import check_output, check_plot
 
@@ -140,7 +137,7 @@ def _refined(
     from rich.console import Console
     from rich.progress import Progress, TextColumn
 
-    from jointfit_daemon.calibration.marker_refinement.refine import refine_markers
+    from jointfit_daemon.calibration.marker_refinement import refine_markers
     from jointfit_daemon.tools.markers._trials import load
 
     chain, remarks, learned, judged = load(asked, *trials)

@@ -11,7 +11,7 @@ from jointfit_daemon.tools.plotting import new_figure
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.calibration.marker_refinement.outcome import Refinement
+    from jointfit_daemon.calibration.marker_refinement import Refinement
 
 _MM = 1000.0
 _BEFORE, _AFTER, _MOVED = "tab:gray", "tab:blue", "tab:orange"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement.outcome import (
+    from jointfit_daemon.calibration.marker_refinement import (
         Fit,
         MarkerOutcome,
         Refinement,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from jointfit_daemon.calibration.marker_refinement.motion import MotionTrial
+from jointfit_daemon.calibration.marker_refinement import MotionTrial
 from jointfit_daemon.files.mocap import UnknownMarkerError, read_marker_trial
 from jointfit_daemon.nearest_name import did_you_mean
 

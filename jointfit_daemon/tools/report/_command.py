@@ -12,7 +12,7 @@ from jointfit_daemon.tools.output_files import check_output
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.center.study import PairMaps, StudySetup
+    from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
 
 
 def report(
@@ -46,7 +46,7 @@ def report(
 
 
 def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:
-    from jointfit_daemon.calibration.center.study import StudySetup
+    from jointfit_daemon.center_of_rotation.study import StudySetup
     from jointfit_daemon.tools.report.tables import as_json, tables
 
     plain = StudySetup()
@@ -73,7 +73,7 @@ def _computed(setup: StudySetup) -> list[PairMaps]:
     from rich.console import Console
     from rich.progress import Progress
 
-    from jointfit_daemon.calibration.center.study import run_study
+    from jointfit_daemon.center_of_rotation.study import run_study
 
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from jointfit_daemon.calibration.center.study import PairMaps
+    from jointfit_daemon.center_of_rotation.study import PairMaps
 
 _MM = 1000.0
 _TOP_MM = {"α–σ": 50.0, "r–σ": 15.0, "r–α": 20.0}

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration.center.study import CLIPS_M, PRINTED, correlation
+from jointfit_daemon.center_of_rotation.study import CLIPS_M, PRINTED, correlation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.calibration.center.study import PairMaps, StudySetup
+    from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
 """The clip, m, at which each pair comes nearest to the printed table."""

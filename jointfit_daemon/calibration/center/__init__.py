@@ -1,1 +1,0 @@
-"""Centers of rotation: planar and spatial, batch and one frame at a time, with their errors."""

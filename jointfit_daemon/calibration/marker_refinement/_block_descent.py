@@ -1,0 +1,145 @@
+r"""Markers and poses in turns: block-coordinate descent, accelerated only where that helps.
+
+Law: it asks of a model nothing but to follow given markers, so it runs on any inverse kinematics.
+Poses fixed, the best positions are a weighted mean of the measured ones in segment axes and of
+the nominal ones,
+
+.. math::
+
+    p_m = \frac{\sum_t w_{tm} R^T (y_{tm} - t) + \lambda n_m p^0_m}{\sum_t w_{tm} + \lambda n_m}
+
+With Huber's loss the weights are those at the last errors. Both halves lower F; an accelerated
+guess is kept only if it lowers F, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.calibration.marker_refinement._anderson import Anderson
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement._objective import Problem
+
+_TOLERANCE = 1e-4
+_MOST_ITERATIONS = 30
+
+
+class Carriers(NamedTuple):
+    """Where the segment of every marker is; frames first."""
+
+    rotations: Array
+    """R_world_segment of each marker's segment, shape (T, M, 3, 3)."""
+    origins: Array
+    """m, shape (T, M, 3)."""
+    overturning: float = 0.0
+    """What hinges beyond their limits add to F."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """A place on the way: positions and the poses that follow them."""
+
+    positions: Array
+    carriers: Carriers
+    cost: float
+
+
+def solve_in_turns(
+    problem: Problem,
+    follow: Callable[[Array, Array], Carriers],
+    on_step: Callable[[Turn], bool] | None = None,
+    *,
+    start: Array | None = None,
+    tolerance: float = _TOLERANCE,
+    most_iterations: int = _MOST_ITERATIONS,
+) -> list[Turn]:
+    """Refine by turns of inverse kinematics and weighted means.
+
+    Parameters
+    ----------
+    follow
+        Given positions, m, shape (M, 3), and weights of squared errors, shape (T, M): the poses.
+    on_step
+        Told every accepted place; True ends the iteration.
+    start
+        Positions to begin with, m, shape (M, 3); the nominal ones if None.
+    tolerance
+        Relative decrease of F in one turn at which it is done.
+
+    Returns
+    -------
+    list of Turn
+        Start and every accepted place; F falls along it.
+    """
+    turns = _Turns(problem, follow)
+    path, anderson = [turns.first(start)], Anderson()
+    while len(path) <= most_iterations:
+        last = path[-1]
+        plain = turns.means(last)
+        guess = anderson.propose(last.positions[problem.free], plain[problem.free])
+        new = None if guess is None else turns.follow(turns.filled(guess), last)
+        if new is None or new.cost >= last.cost:
+            if guess is not None:
+                anderson.forget()
+            new = turns.follow(plain, last)
+        if new.cost >= last.cost:  # both halves are at their best, up to rounding
+            break
+        path.append(new)
+        done = last.cost - new.cost < tolerance * last.cost
+        if done or (on_step is not None and on_step(new)):
+            break
+    return path
+
+
+class _Turns:
+    """The two halves of a turn."""
+
+    def __init__(self, problem: Problem, follow: Callable[[Array, Array], Carriers]) -> None:
+        self._problem = problem
+        self._follow = follow
+
+    def first(self, start: Array | None) -> Turn:
+        begin = self._problem.model.positions if start is None else start
+        return self._at(begin, self._follow(begin, self._problem.weights))
+
+    def follow(self, positions: Array, last: Turn) -> Turn:
+        """Return the poses for new positions, robust weights as at the last poses."""
+        distances = np.linalg.norm(self._errors(positions, last.carriers), axis=-1)
+        return self._at(positions, self._follow(positions, self._problem.robust(distances)))
+
+    def means(self, last: Turn) -> Array:
+        """Return the best positions at fixed poses."""
+        problem = self._problem
+        e = self._errors(last.positions, last.carriers)
+        w = problem.robust(np.linalg.norm(e, axis=-1))
+        nominal = problem.model.positions
+        pulled = (w[..., None] * (last.positions - e)).sum(axis=0) + problem.pull * nominal
+        total = w.sum(axis=0)[:, None] + problem.pull
+        means = last.positions.copy()
+        means[problem.free] = (pulled / np.where(total > 0.0, total, 1.0))[problem.free]
+        return means
+
+    def filled(self, free: Array) -> Array:
+        """Return all positions from the free coordinates."""
+        positions = self._problem.model.positions.copy()
+        positions[self._problem.free] = free
+        return positions
+
+    def _at(self, positions: Array, carriers: Carriers) -> Turn:
+        distances = np.linalg.norm(self._errors(positions, carriers), axis=-1)
+        cost = self._problem.cost(distances, positions) + carriers.overturning
+        return Turn(positions, carriers, cost)
+
+    def _errors(self, positions: Array, carriers: Carriers) -> Array:
+        """Return errors in segment axes, shape (T, M, 3); zero where a marker is missing."""
+        problem = self._problem
+        away = (problem.seen - carriers.origins)[..., None]
+        local = (np.swapaxes(carriers.rotations, -1, -2) @ away)[..., 0]
+        return np.where((problem.weights > 0.0)[..., None], positions - local, 0.0)

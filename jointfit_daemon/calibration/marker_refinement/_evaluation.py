@@ -1,0 +1,109 @@
+"""How well a model follows trials, and how far its joints turned by being refined.
+
+Law: unit weights and plain squares, so that figures of different fits can be laid side by side.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.marker_refinement._refinement_result import (
+    Fit,
+    MarkerOutcome,
+    TrialOutcome,
+)
+from jointfit_daemon.kinematics.chains import step_between
+from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement._motion_trial import MotionTrial
+    from jointfit_daemon.kinematics.chains import ChainModel
+    from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, IkResult
+
+
+def fit_of(residuals: Array) -> Fit:
+    """Return the figures of residuals, m, shape (T, M, 3), NaN where missing."""
+    square = np.einsum("tmi,tmi->tm", residuals, residuals)
+    seen = np.isfinite(square)
+    square = np.where(seen, square, 0.0)
+    frame = np.sqrt(_mean(square, seen, axis=1))
+    return Fit(
+        float(np.sqrt(square.sum() / max(seen.sum(), 1))),
+        float(np.var(frame[seen.any(axis=1)])) if seen.any() else float("nan"),
+        np.sqrt(_mean(square, seen, axis=0)),
+    )
+
+
+def _mean(square: Array, seen: NDArray[np.bool_], axis: int) -> Array:
+    counted = seen.sum(axis=axis)
+    total = square.sum(axis=axis)
+    return np.where(counted > 0, total / np.maximum(counted, 1), np.nan)
+
+
+def judge_trial(
+    before: ChainModel,
+    after: ChainModel,
+    trial: MotionTrial,
+    *,
+    trained: bool,
+    options: IkOptions | None = None,
+) -> TrialOutcome:
+    """Return what a refinement did to one trial; both models follow it anew."""
+    ones = np.ones(len(before.markers))
+    old = solve_frames(before, trial.targets, ones, options=options)
+    new = solve_frames(after, trial.targets, ones, start=old.state, options=options)
+    return TrialOutcome(
+        trial.name,
+        trained,
+        len(trial.targets),
+        trial.rate_hz,
+        fit_of(old.residuals),
+        fit_of(new.residuals),
+        turned(before, old, new),
+    )
+
+
+def turned(model: ChainModel, old: IkResult, new: IkResult) -> dict[str, tuple[float, float]]:
+    """Return RMS and greatest turn of every joint between two solutions, rad, by segment."""
+    well = ~(old.underdetermined | new.underdetermined)
+    if not well.any():
+        return {}
+    step = step_between(model, old.state.take(well), new.state.take(well))
+    found = {}
+    for segment, columns in zip(model.segments, model.columns, strict=True):
+        if segment.joint.kind != "free":
+            angle = np.linalg.norm(step[:, columns], axis=-1)
+            found[segment.name] = float(np.sqrt(np.mean(angle**2))), float(angle.max())
+    return found
+
+
+def marker_outcomes(
+    before: ChainModel,
+    after: ChainModel,
+    free: NDArray[np.bool_],
+    trials: Sequence[TrialOutcome],
+) -> tuple[MarkerOutcome, ...]:
+    """Return every marker's own line."""
+    old = _pooled([t.before for t in trials], [t.frames for t in trials])
+    new = _pooled([t.after for t in trials], [t.frames for t in trials])
+    moved = after.positions - before.positions
+    return tuple(
+        MarkerOutcome(m.name, m.segment, tuple(d), tuple(~f), float(a), float(b))
+        for m, d, f, a, b in zip(before.markers, moved.tolist(), free, old, new, strict=True)
+    )
+
+
+def _pooled(fits: Sequence[Fit], frames: Sequence[int]) -> Array:
+    square = np.array([fit.by_marker**2 for fit in fits])
+    seen = np.isfinite(square)
+    weight = seen * np.array(frames)[:, None]
+    total = (np.where(seen, square, 0.0) * weight).sum(axis=0)
+    counted = weight.sum(axis=0)
+    return np.sqrt(np.where(counted > 0, total / np.maximum(counted, 1), np.nan))

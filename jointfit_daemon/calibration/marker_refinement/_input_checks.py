@@ -1,0 +1,208 @@
+"""What is looked at before markers are refined, because a fit would hide it.
+
+Law: a refinement moves markers to wherever errors are least, so wrong units, exchanged labels and
+unscaled models come out as a good fit. They are found here and named; nothing is mended in silence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.marker_refinement._motion_trial import MotionTrial, Unrefinable
+from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+_LEAST_FRAMES = 10
+_UNIT_FACTOR = 100.0
+"""No body is a hundred times as large as its model: another unit is."""
+_MOST_STRETCH = 1.3
+_TOLD_STRETCH = 1.1
+_APART_M = 0.04
+"""Distances between markers of one segment are compared from here on."""
+_MOST_RMS_M = 0.08
+_SWAP_GAIN = 0.2
+"""Exchanged labels leave less than this share of the squared error when exchanged back."""
+_SWAP_LEAST_M = 0.05
+_SWAPPED_TRIAL = 0.5
+"""Share of the frames from which a whole trial counts as labelled wrongly."""
+_ROBUST = IkOptions(huber_m=0.02, reweightings=4)
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Trials fit to learn from, coordinates that may move, and what had to be said."""
+
+    trials: tuple[MotionTrial, ...]
+    free: NDArray[np.bool_]
+    """Shape (M, 3)."""
+    notes: tuple[str, ...]
+
+
+def check(
+    model: ChainModel, trials: Sequence[MotionTrial], validation: Sequence[MotionTrial] = ()
+) -> Checked:
+    """Return what of model and trials may be used.
+
+    Raises
+    ------
+    Unrefinable
+        Everything that rules the refinement out, all at once.
+    """
+    every = [*trials, *validation]
+    faults = [f for trial in every for f in _wrong_size(model, trial)]
+    free, held = _movable(model, trials)
+    if not trials:
+        faults.append("no trial to learn from")
+    elif not free.any():
+        faults.append(_why_nothing_moves(model))
+    if faults:
+        raise Unrefinable("; ".join(faults))
+    mended, notes = [], [*held, *_gaps(model, every), *_stretches(model, every)]
+    for trial in trials:
+        fixed, said, wrong = _labels(model, trial)
+        mended.append(fixed)
+        notes += said
+        faults += wrong
+    if faults:
+        raise Unrefinable("; ".join(faults))
+    return Checked(tuple(mended), free, tuple(notes))
+
+
+def _wrong_size(model: ChainModel, trial: MotionTrial) -> list[str]:
+    whole = np.isfinite(trial.targets).all(axis=-1)
+    if (whole.sum(axis=1) >= 3).sum() < _LEAST_FRAMES:
+        return [
+            f"{trial.name}: fewer than {_LEAST_FRAMES} frames show three or more of the model's"
+            " markers: are the names the model's?"
+        ]
+    stretch = _stretch(model, trial)
+    if not np.isfinite(stretch):
+        return []
+    if stretch > _UNIT_FACTOR or stretch < 1.0 / _UNIT_FACTOR:
+        return [
+            f"{trial.name}: {stretch:.3g} times as large as the model: the file's unit is not what"
+            " it says (millimetres called metres?)"
+        ]
+    if not 1.0 / _MOST_STRETCH < stretch < _MOST_STRETCH:
+        return [
+            f"{trial.name}: {stretch:.2f} times as large as the model: scale the model first,"
+            " or refinement would hide it"
+        ]
+    return []
+
+
+def _stretch(model: ChainModel, trial: MotionTrial) -> float:
+    """Return measured over nominal distance of markers on one segment, the median pair."""
+    p, y, s = model.positions, trial.targets, model.marker_segments
+    ratios = []
+    for i, j in combinations(range(len(p)), 2):
+        apart = float(np.linalg.norm(p[i] - p[j]))
+        both = np.isfinite(y[:, i] - y[:, j]).all(axis=-1)
+        if s[i] == s[j] and apart > _APART_M and both.any():
+            measured = np.linalg.norm(y[both, i] - y[both, j], axis=-1)
+            ratios.append(float(np.median(measured)) / apart)
+    return float(np.median(ratios)) if ratios else float("nan")
+
+
+def _stretches(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
+    return [
+        f"{trial.name}: {stretch:.2f} times as large as the model: scale it, part of what moves is"
+        " size"
+        for trial in trials
+        if np.isfinite(stretch := _stretch(model, trial))
+        and not 1.0 / _TOLD_STRETCH < stretch < _TOLD_STRETCH
+    ]
+
+
+def _movable(
+    model: ChainModel, trials: Sequence[MotionTrial]
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return the coordinates that trials speak of, and why others are held."""
+    seen = np.zeros(len(model.markers), dtype=np.bool_)
+    for trial in trials:
+        seen |= np.isfinite(trial.targets).all(axis=-1).any(axis=0)
+    seen &= model.weights > 0.0
+    counted = np.bincount(model.marker_segments[seen], minlength=len(model.segments))
+    alone = seen & (counted[model.marker_segments] == 1)
+    free = ~model.locked & (seen & ~alone)[:, None]
+    notes = []
+    absent = [m.name for m, there in zip(model.markers, seen, strict=True) if not there]
+    if absent:
+        notes.append(f"not in any training trial, kept: {', '.join(absent)}")
+    notes += [
+        f"{m.name}: the only marker on {m.segment}, which would follow it anywhere: kept"
+        for m, only in zip(model.markers, alone, strict=True)
+        if only and not all(m.locked)
+    ]
+    return free, notes
+
+
+def _why_nothing_moves(model: ChainModel) -> str:
+    if model.locked.all():
+        return "all coordinates are locked: nothing to refine"
+    return "no unlocked marker can be refined: each is locked, unseen or alone on its segment"
+
+
+def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
+    """Name markers that are in some trials only."""
+    present: NDArray[np.bool_] = np.array(
+        [np.isfinite(t.targets).all(axis=-1).any(axis=0) for t in trials]
+    )
+    partly = np.any(present, axis=0) & ~np.all(present, axis=0)
+    return [
+        f"{trial.name}: {', '.join(missing)} missing throughout"
+        for trial, there in zip(trials, present, strict=True)
+        if (
+            missing := [
+                m.name for m, p, t in zip(model.markers, partly, there, strict=True) if p and not t
+            ]
+        )
+    ]
+
+
+def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[str], list[str]]:
+    """Return the trial without frames of exchanged labels, notes, and faults."""
+    found = solve_frames(model, trial.targets, options=_ROBUST)
+    if not (trial.targets.shape[0] and np.isfinite(found.residuals).any()):
+        return trial, [], [f"{trial.name}: the model follows none of its frames"]
+    faults, notes, targets = [], [], trial.targets.copy()
+    for i, j, frames in _exchanged(found.residuals, trial.targets):
+        pair = f"{model.markers[i].name} and {model.markers[j].name}"
+        if frames.mean() >= _SWAPPED_TRIAL:
+            faults.append(f"{trial.name}: {pair} look exchanged: exchange their labels back")
+        else:
+            notes.append(f"{trial.name}: {pair} look exchanged in {frames.sum()} frames: left out")
+            targets[frames, i] = targets[frames, j] = np.nan
+    rms = tracking_error(found.residuals)
+    if rms > _MOST_RMS_M and not faults:
+        faults.append(
+            f"{trial.name}: the model is {1000 * rms:.0f} mm RMS off its markers: labels, scaling"
+            " or axes are wrong, which no marker should make up for"
+        )
+    return replace(trial, targets=targets), notes, faults
+
+
+def _exchanged(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray[np.bool_]]]:
+    """Return pairs of markers that fit far better with each other's label, and when."""
+    places = targets + residuals  # where the model has them
+    own = np.einsum("tmi,tmi->tm", residuals, residuals)
+    found = []
+    for i, j in combinations(range(targets.shape[1]), 2):
+        kept = own[:, i] + own[:, j]
+        crossed = ((places[:, i] - targets[:, j]) ** 2).sum(axis=-1)
+        crossed += ((places[:, j] - targets[:, i]) ** 2).sum(axis=-1)
+        frames = (crossed < _SWAP_GAIN * kept) & (kept > _SWAP_LEAST_M**2)
+        if frames.any():
+            found.append((i, j, frames))
+    return found

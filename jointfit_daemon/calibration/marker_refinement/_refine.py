@@ -1,0 +1,280 @@
+"""From a model and trials to a refined model and the report of what that did.
+
+Law: what is fitted, what decides when to stop, and what judges are kept apart: training frames, the
+hold-out at the end of each training trial, validation trials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers, solve_in_turns
+from jointfit_daemon.calibration.marker_refinement._coordinate_search import search
+from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial, marker_outcomes
+from jointfit_daemon.calibration.marker_refinement._gauge import Gauge, gauge_of
+from jointfit_daemon.calibration.marker_refinement._input_checks import Checked, check
+from jointfit_daemon.calibration.marker_refinement._motion_trial import RefinementSettings
+from jointfit_daemon.calibration.marker_refinement._objective import Problem
+from jointfit_daemon.calibration.marker_refinement._refinement_result import Refinement
+from jointfit_daemon.calibration.marker_refinement._simultaneous import (
+    linearize,
+    place,
+    solve_jointly,
+)
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    IkOptions,
+    IkResult,
+    solve_frames,
+    tracking_error,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement._motion_trial import MotionTrial
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+    Progress = Callable[[float, float], None]
+    """Told how far the work is, 0 to 1, and the training error, m."""
+
+_FINE = 1e-9
+_RISES = 2
+"""The hold-out's error may rise this often in a row."""
+
+
+def refine_markers(
+    model: ChainModel,
+    trials: Sequence[MotionTrial],
+    settings: RefinementSettings | None = None,
+    validation: Sequence[MotionTrial] = (),
+    progress: Progress | None = None,
+) -> Refinement:
+    """Refine where markers are on their segments.
+
+    Parameters
+    ----------
+    model
+        Nominal positions, locks, weights.
+    trials
+        To learn from.
+    validation
+        Only judged.
+
+    Raises
+    ------
+    Unrefinable
+        What `check` finds.
+    """
+    settings = settings or RefinementSettings()
+    thin = [trial.thinned(settings.frames) for trial in trials]
+    unseen = [trial.thinned(settings.frames) for trial in validation]
+    checked = check(model, thin, unseen)
+    task = _task(model, checked, settings)
+    ended = _METHODS[settings.method](task, settings, progress)
+    after = model.with_markers(ended.positions)
+    within = IkOptions(limit_m2=settings.limit_m2)
+    outcomes = tuple(
+        judge_trial(model, after, t, trained=n < len(thin), options=within)
+        for n, t in enumerate((*checked.trials, *unseen))
+    )
+    return Refinement(
+        after,
+        settings.method,
+        settings.prior,
+        marker_outcomes(model, after, checked.free, outcomes),
+        outcomes,
+        ended.costs,
+        ended.runs,
+        ended.stopped,
+        _gauge(task, ended.positions, settings),
+        (*checked.notes, *_rates([*trials, *validation])),
+    )
+
+
+def _rates(trials: Sequence[MotionTrial]) -> list[str]:
+    rates = sorted({round(trial.rate_hz, 6) for trial in trials})
+    if len(rates) == 1:
+        return []
+    told = ", ".join(f"{rate:g}" for rate in rates)
+    return [f"recorded at {told} Hz: every trial counts by its frames, not by its time"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    problem: Problem
+    first: IkResult
+    """Poses of the training frames at the nominal positions."""
+    holdout: _HoldOut | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    positions: Array
+    costs: tuple[float, ...]
+    runs: int
+    stopped: str
+
+
+def _task(model: ChainModel, checked: Checked, settings: RefinementSettings) -> _Task:
+    parts = [trial.split(settings.holdout_share) for trial in checked.trials]
+    targets = np.concatenate([part.targets for part, _ in parts])
+    present = np.isfinite(targets).all(axis=-1)
+    weights = present * model.weights
+    problem = Problem(
+        model,
+        targets,
+        weights,
+        checked.free,
+        settings.prior,
+        settings.huber_m,
+        settings.limit_m2,
+    )
+    options = IkOptions(huber_m=settings.huber_m, limit_m2=settings.limit_m2)
+    first = solve_frames(model, targets, weights, options=options)
+    if settings.evenness > 0.0:
+        lengths = [len(part.targets) for part, _ in parts]
+        problem = replace(
+            problem, weights=weights * _even(first, lengths, settings.evenness)[:, None]
+        )
+    held = [part.targets for _, part in parts if len(part.targets)]
+    within = IkOptions(limit_m2=settings.limit_m2)
+    return _Task(problem, first, _HoldOut(model, np.concatenate(held), within) if held else None)
+
+
+def _even(first: IkResult, lengths: Sequence[int], power: float) -> Array:
+    """Return a weight for every frame: its trial's error to a power, one on average."""
+    ends = np.cumsum(lengths)[:-1]
+    errors = np.array([tracking_error(part) for part in np.split(first.residuals, ends)])
+    weights = np.repeat(errors**power, lengths)
+    return np.asarray(weights / weights.mean())
+
+
+class _HoldOut:
+    """Frames that only tell when to stop."""
+
+    def __init__(self, model: ChainModel, targets: Array, options: IkOptions) -> None:
+        self._model, self._targets, self._options = model, targets, options
+        self._last = solve_frames(model, targets, options=options)
+        self._best = tracking_error(self._last.residuals)
+        self._rises = 0
+        self.positions = model.positions
+
+    def enough(self, positions: Array) -> bool:
+        """Take note of a place; tell whether the error has risen twice running."""
+        model = self._model.with_markers(positions)
+        self._last = solve_frames(
+            model, self._targets, start=self._last.state, options=self._options
+        )
+        error = tracking_error(self._last.residuals)
+        self._rises = self._rises + 1 if error >= self._best else 0
+        if error < self._best:
+            self._best, self.positions = error, positions
+        return self._rises >= _RISES
+
+
+def _jointly(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
+    problem = task.problem
+    start = place(problem, problem.model.positions, task.first.state)
+    watch = _Watch(task.holdout, problem, progress)
+    tolerance = settings.tolerance or 1e-6
+    steps = solve_jointly(problem, start, lambda s: watch(s.positions, s.cost), tolerance)
+    return watch.ended(steps[-1].positions, [s.cost for s in steps], 1)
+
+
+def _in_turns(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
+    problem = task.problem
+    chain = Follower(problem, task.first)
+    watch = _Watch(task.holdout, problem, progress)
+    tolerance = settings.tolerance or 1e-4
+    turns = solve_in_turns(
+        problem, chain, lambda t: watch(t.positions, t.cost), tolerance=tolerance
+    )
+    return watch.ended(turns[-1].positions, [t.cost for t in turns], chain.runs)
+
+
+def _searching(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
+    problem, last = task.problem, task.first
+    present = problem.weights > 0.0
+    within = IkOptions(limit_m2=settings.limit_m2)
+
+    def error(positions: Array) -> float:
+        nonlocal last
+        model = problem.model.with_markers(positions)
+        last = solve_frames(
+            model, problem.targets, problem.weights, start=last.state, options=within
+        )
+        distances = np.linalg.norm(last.residuals, axis=-1)
+        return float(np.sqrt(np.mean(distances[present] ** 2)))
+
+    first_step = settings.search.first_step_m
+
+    def told(step: float, at: float) -> None:
+        if progress is not None:
+            halvings = np.log2(first_step / step) if step > 0 else np.inf
+            all_of_them = np.log2(first_step / settings.search.threshold_m) + 1.0
+            progress(min(1.0, float(halvings / all_of_them)), at)
+
+    found = search(error, problem.model.positions, problem.free, settings.search, told)
+    stopped = "every step is below the threshold"
+    return _Ended(found.positions, found.errors, found.runs, stopped)
+
+
+_METHODS = {"joint": _jointly, "block": _in_turns, "search": _searching}
+
+
+class Follower:
+    """Inverse kinematics of the chain as `solve_in_turns` asks for it, warm from run to run."""
+
+    def __init__(self, problem: Problem, first: IkResult) -> None:
+        self._problem, self._state = problem, first.state
+        self.runs = 0
+
+    def __call__(self, positions: Array, weights: Array) -> Carriers:
+        """Return the poses that follow the markers at these positions."""
+        model = self._problem.model.with_markers(positions)
+        fine = IkOptions(tolerance=_FINE, limit_m2=self._problem.limit_m2)
+        found = solve_frames(model, self._problem.targets, weights, start=self._state, options=fine)
+        self._state = found.state
+        self.runs += 1
+        s = model.marker_segments
+        beyond = self._problem.overturning(found.state)
+        return Carriers(found.rotations[:, s], found.origins[:, s], beyond)
+
+
+class _Watch:
+    """What is asked after every step: whether to stop."""
+
+    def __init__(
+        self, holdout: _HoldOut | None, problem: Problem, progress: Progress | None
+    ) -> None:
+        self._holdout, self._progress = holdout, progress
+        self._total = float(problem.weights.sum())
+        self._count = 0
+        self._early = False
+
+    def __call__(self, positions: Array, cost: float) -> bool:
+        self._count += 1
+        if self._progress is not None:
+            self._progress(1.0 - 0.5**self._count, float(np.sqrt(2.0 * cost / self._total)))
+        self._early = self._holdout is not None and self._holdout.enough(positions)
+        return self._early
+
+    def ended(self, positions: Array, costs: Sequence[float], runs: int) -> _Ended:
+        stopped = "the hold-out's error rose" if self._early else "nothing more to gain"
+        if self._holdout is not None:
+            positions = self._holdout.positions
+        return _Ended(positions, tuple(costs), runs, stopped)
+
+
+def _gauge(task: _Task, positions: Array, settings: RefinementSettings) -> Gauge:
+    plain = replace(task.problem, prior=0.0, huber_m=None, limit_m2=0.0)
+    model = plain.model.with_markers(positions)
+    state = solve_frames(model, plain.targets, plain.weights, start=task.first.state).state
+    names = np.repeat([m.name for m in model.markers], 3)[plain.free.ravel()]
+    S = linearize(plain, positions, state).reduced()
+    prior = 0.0 if settings.method == "search" else settings.prior
+    return gauge_of(S, len(state), names.tolist(), prior=prior)

@@ -1,0 +1,103 @@
+"""What a refinement found, and what it did to errors and joint angles.
+
+Law: plain data, SI. All errors have unit weights, whatever weights the fit used. Variances have
+divisor N: over the frames of one trial, and over trials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement._gauge import Gauge
+    from jointfit_daemon.calibration.marker_refinement._motion_trial import RefinementMethod
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How one model follows one trial."""
+
+    rms: float
+    """Over all markers and frames, m."""
+    variance: float
+    """Over time, of every frame's RMS over its markers, m²."""
+    by_marker: Array
+    """RMS of every marker, m, shape (M,); NaN where it is never seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialOutcome:
+    """One trial before and after."""
+
+    name: str
+    trained: bool
+    """False: the refinement never saw it."""
+    frames: int
+    rate_hz: float
+    before: Fit
+    after: Fit
+    angles: dict[str, tuple[float, float]]
+    """Change of each joint's turn, RMS and greatest, rad, by segment; the root left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerOutcome:
+    """One marker before and after."""
+
+    name: str
+    segment: str
+    moved: tuple[float, float, float]
+    """In segment axes, m."""
+    held: tuple[bool, bool, bool]
+    """Coordinates that were locked, or that nothing in the trials speaks of."""
+    rms_before: float
+    """Over all trials, m; NaN if never seen."""
+    rms_after: float
+
+    @property
+    def distance(self) -> float:
+        """How far it moved, m."""
+        return float(np.linalg.norm(self.moved))
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """A refined model and what there is to know about it."""
+
+    model: ChainModel
+    method: RefinementMethod
+    prior: float
+    markers: tuple[MarkerOutcome, ...]
+    trials: tuple[TrialOutcome, ...]
+    costs: tuple[float, ...]
+    """What was minimized, at the start and after every step; it never rises."""
+    runs: int
+    """Times inverse kinematics was run over all frames (`search`, `block`)."""
+    stopped: str
+    gauge: Gauge
+    notes: tuple[str, ...] = ()
+    """What was handled and should be known."""
+
+    def variance_of_trials(self, *, trained: bool) -> tuple[float, float]:
+        """Return the variance of the trials' RMS before and after, m²; NaN below two trials."""
+        some = [t for t in self.trials if t.trained == trained]
+        return _variance([t.before.rms for t in some]), _variance([t.after.rms for t in some])
+
+    def angle_change(self) -> tuple[float, float]:
+        """Return RMS and greatest change of any joint's turn in any trial, rad."""
+        pairs = [pair for t in self.trials for pair in t.angles.values()]
+        if not pairs:
+            return float("nan"), float("nan")
+        rms, most = np.array(pairs).T
+        return float(np.sqrt(np.mean(rms**2))), float(most.max())
+
+
+def _variance(values: Sequence[float]) -> float:
+    return float(np.var(values)) if len(values) > 1 else float("nan")

@@ -1,0 +1,45 @@
+"""Statistics of marker paths that planar and spatial estimators share."""
+
+from __future__ import annotations
+
+from math import pi, sin, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+
+
+def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
+    """Return the lag-one correlation of residuals, shape (n, k), 0 to 0.99; chance is 0."""
+    both = seen[1:] & seen[:-1]
+    count = int(np.count_nonzero(seen))
+    power = float((e[seen] ** 2).sum()) / max(count, 1)
+    if power < 1e-18 or not both.any():
+        return 0.0
+    rho = float((e[1:] * e[:-1])[both].mean()) / power
+    return min(rho, 0.99) if rho > 2.0 / sqrt(count) else 0.0
+
+
+def arc_of_spread(spread: float) -> float:
+    r"""Return the evenly covered arc, rad, whose points have this variance over R².
+
+    .. math:: 1 - \left( \frac{\sin(\varphi/2)}{\varphi/2} \right)^2 = \text{spread}
+    """
+    if spread <= 0.0:
+        return 0.0
+    if spread >= 1.0:
+        return 2.0 * pi
+    low, high = 0.0, pi
+    for _ in range(30):
+        half = (low + high) / 2
+        low, high = (half, high) if 1.0 - (sin(half) / half) ** 2 < spread else (low, half)
+    return low + high
+
+
+def arc_of(resultant: float) -> float:
+    """Return the arc that directions spread evenly over have this mean resultant, rad."""
+    return arc_of_spread(1.0 - min(max(resultant, 0.0), 1.0) ** 2)

@@ -1,0 +1,80 @@
+"""What every estimator of a center of rotation answers.
+
+Law: one type for all methods, planar or spatial. What was not observed is said (`unseen`,
+`refused`), never hidden in a finite number, and never NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
+
+@dataclass(frozen=True, slots=True)
+class CenterEstimate:
+    """A point at rest in the parent segment and in the child, as far as the movement shows it."""
+
+    method: str
+    """Name of the estimator: ``hyper``, ``sphere``, ``score``, ..."""
+    center: Array
+    """m, shape (d,), d = 2 (plane) or 3 (space), in the parent's coordinates."""
+    covariance: Array
+    """m², shape (d, d): of the observed directions; zero along those in `unseen`."""
+    noise: float
+    """Standard deviation of a point per coordinate, estimated from the residuals, m."""
+    residual: float
+    """RMS of what is left after the fit, m (radial; for SCoRE the gap between the two sides)."""
+    radii: Array
+    """Distance of each marker from the center, m, shape (k,)."""
+    arc: float
+    """Angle the markers went through about the center, rad."""
+    bound: float
+    """Cramér-Rao bound of the RMS error at `noise`, m; inf where a direction is unseen."""
+    conditioning: float
+    """T, about the curvature over its standard error: below 6 a circle is not usable."""
+    frames: int
+    effective_frames: float
+    """`frames` after forgetting weights and correlation from frame to frame."""
+    unseen: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """Unit directions in which nothing was observed, shape (u, d)."""
+    axis: Array | None = None
+    """Unit axis of a hinge in the parent's coordinates, shape (3,), where one was found."""
+    flags: tuple[str, ...] = ()
+    """What the user should know and what was done about it, e.g. ``orientation_inconsistent``."""
+    within95: float | None = None
+    """Squared Mahalanobis distance eᵀC⁻¹e that 95 % of the centers published by this method stay
+    within: the published ellipse. None: the quantile of chi-square is the best that is known."""
+    refused: str | None = None
+    """Why the center must not be used and what to do; None if it may be used."""
+
+    @property
+    def sd(self) -> float:
+        """Return the predicted RMS error √tr(covariance), m; inf where a direction is unseen."""
+        if len(self.unseen) > 0:
+            return inf
+        return sqrt(max(float(np.trace(self.covariance)), 0.0))
+
+
+def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
+    """Return an estimate that knows nothing, in any direction, and says why."""
+    return CenterEstimate(
+        method=method,
+        center=np.full(d, np.nan),
+        covariance=np.zeros((d, d)),
+        noise=inf,
+        residual=inf,
+        radii=np.zeros(0),
+        arc=0.0,
+        bound=inf,
+        conditioning=0.0,
+        frames=frames,
+        effective_frames=0.0,
+        unseen=np.eye(d),
+        refused=reason,
+    )

@@ -1,0 +1,48 @@
+"""Circle fits: centers of rotation in a plane."""
+
+from jointfit_daemon.center_of_rotation.planar._circle_estimate import Limits, circle_estimate
+from jointfit_daemon.center_of_rotation.planar._circle_fit import (
+    Circles,
+    Method,
+    fit_circle,
+    fit_circles,
+)
+from jointfit_daemon.center_of_rotation.planar._error_prediction import (
+    arbitrary_error,
+    equal_step_error,
+    triangle_error,
+)
+from jointfit_daemon.center_of_rotation.planar._geometric_fit import combine, geometric_estimate
+from jointfit_daemon.center_of_rotation.planar._grid_search import Grid, grid_center
+from jointfit_daemon.center_of_rotation.planar._moments import GATE, ellipse_scale
+from jointfit_daemon.center_of_rotation.planar._oriented_fit import AngleNoise, oriented_estimate
+from jointfit_daemon.center_of_rotation.planar._plane import plane_of
+from jointfit_daemon.center_of_rotation.planar._running_circle import RunningCircle
+from jointfit_daemon.center_of_rotation.planar._three_frames import (
+    three_frame_center,
+    three_frame_estimate,
+)
+
+__all__ = [
+    "GATE",
+    "AngleNoise",
+    "Circles",
+    "Grid",
+    "Limits",
+    "Method",
+    "RunningCircle",
+    "arbitrary_error",
+    "circle_estimate",
+    "combine",
+    "ellipse_scale",
+    "equal_step_error",
+    "fit_circle",
+    "fit_circles",
+    "geometric_estimate",
+    "grid_center",
+    "oriented_estimate",
+    "plane_of",
+    "three_frame_center",
+    "three_frame_estimate",
+    "triangle_error",
+]

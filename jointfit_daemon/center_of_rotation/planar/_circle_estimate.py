@@ -1,0 +1,246 @@
+r"""From a circle's moments to a published center: the error told, or why there is none.
+
+Law: one verdict for all planar estimators. A refusal names its cause and the remedy; nothing that
+is not known is given as a number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import degrees, inf, isfinite, pi, radians, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation._path_statistics import arc_of_spread
+from jointfit_daemon.center_of_rotation._result import CenterEstimate
+from jointfit_daemon.center_of_rotation.planar._circle_fit import (
+    Method,
+    circle_of,
+    temper,
+)
+from jointfit_daemon.center_of_rotation.planar._moments import (
+    GATE,
+    ROUNDING,
+    CircleMoments,
+    Judged,
+    arc_shows,
+    ellipse_scale,
+    judge,
+    moments_of_one,
+    noise_of,
+    seen_places,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+
+
+STILL_M = 0.001
+"""RMS distance from their mean below which points are one place seen again and again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a planar center must keep to be published."""
+
+    gate: float = GATE
+    """Least T."""
+    reach: tuple[float, float] = (0.02, 1.0)
+    """Distance of a marker from the center, m."""
+    arc: float = radians(10.0)
+    """Least angle gone through, rad."""
+    sd: float = 0.02
+    """Largest predicted RMS error, m."""
+
+
+def circle_estimate(
+    points: ArrayLike,
+    weights: ArrayLike | None = None,
+    *,
+    method: Method = "hyper",
+    limits: Limits | None = None,
+) -> CenterEstimate:
+    """Estimate the center one marker turns about from all its frames at once.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2)
+        In the parent's coordinates, in order of time, m; NaN where not seen.
+    weights : array_like, shape (n,), optional
+        Not negative.
+    method : str
+        ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
+    limits : Limits, optional
+        When to refuse.
+
+    Returns
+    -------
+    CenterEstimate
+        The same, to rounding, as a `RunningCircle` fed with these points gives.
+    """
+    p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    seen = seen_places(p)
+    w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
+    x = p if seen.all() else np.where(seen[:, None], p, 0.0)
+    empty = CircleMoments(*(0.0,) * 10)
+    m = moments_of_one(x, w) if w.any() else empty
+
+    def lagged(a: float, b: float, square: float) -> float:
+        d = x - np.array([m.x + a, m.y + b])
+        e = np.einsum("nc,nc->n", d, d) - square
+        pair = w[1:] * w[:-1]
+        return float((pair * e[1:]) @ e[:-1] / (4.0 * square * max(float(pair.sum()), 1e-300)))
+
+    return publish(m, lagged, method=method, frames=int(seen.sum()), limits=limits or Limits())
+
+
+def publish(
+    m: CircleMoments[float],
+    lagged: Callable[[float, float, float], float],
+    *,
+    method: Method,
+    frames: int,
+    limits: Limits,
+) -> CenterEstimate:
+    """Fit, judge and tell.
+
+    Parameters
+    ----------
+    m : CircleMoments
+        Of the points.
+    lagged : callable
+        Mean product of the radial residuals of neighbours in time, m², about the center (a, b) from
+        the centroid and for R²: what correlation is read from.
+    method : str
+        Of the circle.
+    frames : int
+        Points seen.
+    limits : Limits
+        When to refuse.
+    """
+    reason = _no_circle(m, frames)
+    if reason is not None:
+        return nothing(method, (m.x, m.y), frames, reason)
+    circle = circle_of(m, method)
+    if circle is None or not arc_shows(m, noise_of(m, *circle)[0]):
+        reason = "noise hides the arc: move the joint further, or bring the cameras closer"
+        return nothing(method, (m.x, m.y), frames, reason)
+    judged = judge(m, *circle)
+    wider = _persistence(lagged(*circle), judged.residual)
+    return _told(m, circle, judged, wider, method=method, frames=frames, limits=limits)
+
+
+def _told(
+    m: CircleMoments[float],
+    circle: tuple[float, float, float],
+    judged: Judged[float],
+    wider: float,
+    *,
+    method: Method,
+    frames: int,
+    limits: Limits,
+) -> CenterEstimate:
+    a, b, square = circle
+    cov = (wider * judged.xx, wider * judged.xy, wider * judged.yy)
+    largest = wider * judged.largest
+    T = sqrt(square / largest) if largest > 0.0 else inf
+    a, b, cov = temper(a, b, square, cov)
+    radius, arc = sqrt(square), arc_of_spread((m.xx + m.yy - 2.0 * judged.noise) / square)
+    effective = m.effective / wider
+    sd = sqrt(max(cov[0] + cov[2], 0.0))
+    return CenterEstimate(
+        method=method,
+        center=np.array([m.x + a, m.y + b]),
+        covariance=np.array([[cov[0], cov[1]], [cov[1], cov[2]]]),
+        noise=sqrt(judged.noise),
+        residual=sqrt(judged.residual),
+        radii=np.array([radius]),
+        arc=arc,
+        bound=sqrt(judged.bound),
+        conditioning=T,
+        frames=frames,
+        effective_frames=effective,
+        within95=ellipse_scale(m.effective, T),
+        refused=objection(radius, arc, T, sd, limits),
+    )
+
+
+def objection(radius: float, arc: float, T: float, sd: float, limits: Limits) -> str | None:
+    """Return why a circle that was found must not be used, with the remedy; None if it may."""
+    if not limits.reach[0] <= radius <= limits.reach[1]:
+        return (
+            f"the marker would be {radius:.2f} m from the center, not {limits.reach[0]:g} to "
+            f"{limits.reach[1]:g} m: check marker names, or move the joint further"
+        )
+    if arc < limits.arc:
+        return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
+    if limits.gate > T:
+        return (
+            f"ill-conditioned: the arc's curvature is {T:.1f} times its standard error, at least "
+            f"{limits.gate:g} are needed: move the joint further"
+        )
+    if sd > limits.sd:
+        return (
+            f"uncertain to {1000 * sd:.0f} mm, more than the {1000 * limits.sd:.0f} mm allowed: "
+            "move the joint further or for longer"
+        )
+    return None
+
+
+def nothing(
+    method: str, at: tuple[float, float], frames: int, reason: str, flags: tuple[str, ...] = ()
+) -> CenterEstimate:
+    """Return the estimate that says that there is none: every direction unseen."""
+    middle = np.array(at if isfinite(at[0]) and isfinite(at[1]) else (0.0, 0.0))
+    return CenterEstimate(
+        method=method,
+        center=middle,
+        covariance=np.zeros((2, 2)),
+        noise=0.0,
+        residual=0.0,
+        radii=np.zeros(0),
+        arc=0.0,
+        bound=inf,
+        conditioning=0.0,
+        frames=frames,
+        effective_frames=float(frames),
+        unseen=np.eye(2),
+        flags=flags,
+        refused=reason,
+    )
+
+
+def _no_circle(m: CircleMoments[float], frames: int) -> str | None:
+    spread = m.xx + m.yy
+    if frames == 0:
+        return "the marker was never seen: check its name, the cameras and what covers it"
+    if frames < 4 or m.effective <= 3.0:
+        return f"{frames} usable frames, at least 4 are needed: record for longer"
+    if spread < STILL_M**2:
+        return f"no motion: the marker moved {1000 * sqrt(spread):.1f} mm RMS: move the joint"
+    if m.xx * m.yy - m.xy**2 <= ROUNDING * spread**2:
+        return "the points are on a line, a straight path has no center: turn the joint"
+    return None
+
+
+def _persistence(product: float, residual: float) -> float:
+    rho = product / residual if residual > 0.0 else 0.0
+    rho = min(max(rho, 0.0), 0.99) if isfinite(rho) else 0.0
+    return (1.0 + rho) / (1.0 - rho)
+
+
+def arc_about(points: Array, center: Array) -> float:
+    """Return the angle between the outermost of the points about a center, rad, at most 2π."""
+    seen = points[np.isfinite(points).all(axis=-1)] - center
+    if len(seen) < 2 or not np.isfinite(center).all():
+        return 0.0
+    turn = np.sort(np.arctan2(seen[:, 1], seen[:, 0]))
+    gaps = np.diff(turn, append=turn[0] + 2.0 * pi)
+    widest = float(gaps.max())
+    # a full circle leaves gaps no wider than its frames are apart
+    return 2.0 * pi - widest if widest > 4.0 * pi / len(seen) else 2.0 * pi

@@ -1,0 +1,218 @@
+r"""Circles by least distance: the maximum-likelihood fit, for weights, outliers and known radii.
+
+Law: equal to Hyper on clean points; what it adds is Huber's loss, several markers that share one
+center, and a radius that is known.
+"""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation._path_statistics import lag_one_correlation
+from jointfit_daemon.center_of_rotation._result import CenterEstimate
+from jointfit_daemon.center_of_rotation.planar._circle_estimate import (
+    Limits,
+    arc_about,
+    nothing,
+    objection,
+)
+from jointfit_daemon.center_of_rotation.planar._circle_fit import fit_circles
+from jointfit_daemon.center_of_rotation.planar._moments import ROUNDING, ellipse_scale, seen_places
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+
+
+METHOD = "geometric"
+HUBER = 1.5
+_LEAST_SCALE_M = 1e-4
+_PASSES = 60
+
+
+def geometric_estimate(
+    points: ArrayLike,
+    *,
+    radii: ArrayLike | None = None,
+    robust: bool = True,
+    start: ArrayLike | None = None,
+    limits: Limits | None = None,
+) -> CenterEstimate:
+    r"""Estimate the center that one marker or several turn about, by Levenberg-Marquardt.
+
+    .. math:: \min_c \sum_{tk} \rho\left( |x_{tk} - c| - R_k \right)
+
+    with R_k the mean distance of marker k, or given. Several markers share the center; they gain
+    much more than √k where they sit at different angles round the joint, because each one's weak
+    direction points elsewhere. Residuals of neighboring frames that are alike (correlation r at one
+    frame) widen the covariance by (1 + r)/(1 - r), as of the other circles.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2) or (n, k, 2)
+        In the parent's coordinates, m; NaN where not seen.
+    radii : array_like, shape (k,), optional
+        Known distances, m.
+    robust : bool
+        Huber's loss at 1.5 standard deviations, taken from the median residual.
+    start : array_like, shape (2,), optional
+        Where to begin, m; Hyper of the marker that shows most if None.
+    limits : Limits, optional
+        When to refuse.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    p = p[:, None, :] if p.ndim == 2 else p
+    seen = seen_places(p)
+    frames = int(seen.any(axis=1).sum())
+    begin = _begin(p) if start is None else np.asarray(start, dtype=np.float64)
+    if seen.sum() < 2 + p.shape[1] + 1 or begin is None:
+        reason = "no marker shows an arc: too few frames, no motion, or a straight path; move more"
+        middle = p[seen].mean(axis=0) if seen.any() else np.zeros(2)
+        return nothing(METHOD, (float(middle[0]), float(middle[1])), frames, reason)
+    known = None if radii is None else np.asarray(radii, dtype=np.float64)
+    x = np.where(seen[..., None], p, 0.0)
+    c, weights = _descend(x, seen, begin, known, robust=robust)
+    return _told(x, seen, c, weights, known=known, limits=limits or Limits())
+
+
+def _begin(p: Array) -> Array | None:
+    """Return Hyper's center of the best conditioned marker."""
+    found = fit_circles(np.moveaxis(p, 1, 0))
+    best = int(np.argmax(found.conditioning)) if found.conditioning.size else 0
+    return found.center[best] if found.conditioning.size and found.valid[best] else None
+
+
+def _residual(x: Array, w: Array, c: Array, known: Array | None) -> tuple[Array, Array]:
+    """Return residuals (n, k), radii profiled out, and derivatives by the center (n, k, 2)."""
+    d = x - c
+    u = np.linalg.norm(d, axis=-1)
+    J = -d / np.maximum(u, 1e-9)[..., None]
+    if known is not None:
+        return u - known, J
+    total = np.maximum(w.sum(axis=0), 1e-12)
+    mean = (w * u).sum(axis=0) / total
+    return u - mean, J - (w[..., None] * J).sum(axis=0) / total[:, None]
+
+
+def _huber(e: Array, seen: NDArray[np.bool_]) -> Array:
+    scale = max(1.4826 * float(np.median(np.abs(e[seen]))), _LEAST_SCALE_M)
+    return np.where(seen, np.minimum(1.0, HUBER * scale / np.maximum(np.abs(e), 1e-12)), 0.0)
+
+
+def _descend(
+    x: Array, seen: NDArray[np.bool_], c: Array, known: Array | None, *, robust: bool
+) -> tuple[Array, Array]:
+    weights: Array = seen.astype(np.float64)
+    mu = 1e-3
+    for _ in range(_PASSES):
+        e, J = _residual(x, weights, c, known)
+        if robust:
+            weights = _huber(e, seen)
+            e, J = _residual(x, weights, c, known)
+        H = np.einsum("tk,tka,tkb->ab", weights, J, J)
+        g = np.einsum("tk,tka,tk->a", weights, J, e)
+        cost = float((weights * e**2).sum())
+        for _ in range(12):
+            step = -np.linalg.solve(H + mu * np.diag(np.diag(H)) + 1e-15 * np.eye(2), g)
+            tried = _residual(x, weights, c + step, known)[0]
+            if float((weights * tried**2).sum()) <= cost:
+                break
+            mu *= 5.0
+        else:
+            break
+        c, mu = c + step, max(0.2 * mu, 1e-12)
+        if float(np.linalg.norm(step)) < 1e-10:
+            break
+    return c, weights
+
+
+def _told(
+    x: Array,
+    seen: NDArray[np.bool_],
+    c: Array,
+    w: Array,
+    *,
+    known: Array | None,
+    limits: Limits,
+) -> CenterEstimate:
+    e, J = _residual(x, w, c, known)
+    count = int(seen.sum())
+    free = 2 + (x.shape[1] if known is None else 0)
+    # Huber's variance: mean of squared pull over squared share of points that pull freely
+    pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
+    variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
+    H = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
+    # noise turns directions, too: what it adds to H is no information
+    u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
+    across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
+        "tk,tka,tkb->ab", seen / u2**2, x - c, x - c
+    )
+    H -= variance * across
+    frames = int(seen.any(axis=1).sum())
+    least, most = np.linalg.eigvalsh(H)
+    if not least > ROUNDING * most:
+        reason = "noise hides the arc: move the joint further, or bring the cameras closer"
+        return nothing(METHOD, (float(c[0]), float(c[1])), frames, reason)
+    wider = _wider(lag_one_correlation(e, seen))
+    C = np.asarray(wider * variance * np.linalg.inv(H))
+    distance = np.linalg.norm(x - c, axis=-1)
+    R = np.array([float(distance[s, k].mean()) if s.any() else 0.0 for k, s in enumerate(seen.T)])
+    radius = float(np.median(R[R > 0.0]))
+    largest = float(np.linalg.eigvalsh(C)[-1])
+    T = radius / sqrt(largest) if largest > 0.0 else inf
+    shown = [arc_about(np.where(s[:, None], x[:, k], np.nan), c) for k, s in enumerate(seen.T)]
+    sd = sqrt(float(np.trace(C)))
+    return CenterEstimate(
+        method=METHOD,
+        center=c,
+        covariance=C,
+        noise=sqrt(variance),
+        residual=float(np.sqrt((e[seen] ** 2).mean())),
+        radii=R,
+        arc=max(shown),
+        bound=sd,
+        conditioning=T,
+        frames=frames,
+        effective_frames=frames / wider,
+        within95=ellipse_scale(float(count), T),
+        refused=objection(radius, max(shown), T, sd, limits),
+    )
+
+
+def _wider(alike: float) -> float:
+    """Return by how much a correlation from frame to frame widens: skin moves slowly."""
+    return (1.0 + alike) / (1.0 - alike)
+
+
+def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
+    r"""Combine centers of several markers by information, at no cost worth mentioning.
+
+    .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
+
+    Parameters
+    ----------
+    estimates : list of CenterEstimate
+        Of independent markers, in a plane or in space; those with unseen directions are passed
+        over.
+
+    Returns
+    -------
+    center, covariance : ndarray, shapes (d,) and (d, d)
+        m and m².
+
+    Raises
+    ------
+    ValueError
+        None of them shows the center.
+    """
+    usable = [e for e in estimates if len(e.unseen) == 0]
+    if not usable:
+        raise ValueError("no marker shows the center: there is nothing to combine")
+    information = [np.linalg.inv(e.covariance) for e in usable]
+    C = np.linalg.inv(np.sum(information, axis=0))
+    pulls = [W @ e.center for W, e in zip(information, usable, strict=True)]
+    return np.asarray(C @ np.sum(pulls, axis=0)), np.asarray(C)

@@ -1,0 +1,314 @@
+r"""The center from a marker's path and the child's angle together: errors in both.
+
+Law: the angle helps where the arc is short, and can do little harm: however wrong it is, the answer
+stays within a bounded number of standard errors of what the path alone says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf, radians, sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation.planar._circle_estimate import (
+    Limits,
+    arc_about,
+    circle_estimate,
+    nothing,
+    objection,
+)
+from jointfit_daemon.center_of_rotation.planar._circle_fit import Circles, fit_circles
+from jointfit_daemon.center_of_rotation.planar._moments import GATE, seen_places
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation._result import CenterEstimate
+
+
+METHOD = "oriented"
+MAX_FRAMES = 300
+INCONSISTENT = 13.8
+"""Squared distance of the two answers, in their own covariance, that one in a thousand passes."""
+_LEAST_NOISE_M = 1e-4
+_PASSES = 40
+_FAR_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class AngleNoise:
+    """How wrong the child's angle may be; rad unless said otherwise."""
+
+    slow: float = radians(1.5)
+    """Standard deviation of what wanders: soft tissue, heading."""
+    time: float = 1.0
+    """Over which it wanders, s."""
+    white: float = radians(1.0)
+    """Standard deviation of what is new in every frame."""
+    gain: float = 0.02
+    """Standard deviation of the scale, rad/rad."""
+
+    def covariance(self, times: Array, angles: Array) -> Array:
+        """Return Σ of these angles, without their own noise, at these times, rad², shape (n, n)."""
+        slow = self.slow**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
+        turned = angles - angles.mean()
+        return np.asarray(
+            slow + self.white**2 * np.eye(len(times)) + self.gain**2 * np.outer(turned, turned)
+        )
+
+
+class _Aided(NamedTuple):
+    """What the path and the angles say together."""
+
+    center: Array
+    covariance: Array
+    radius: float
+    residual: float
+
+
+def oriented_estimate(
+    points: ArrayLike,
+    angles: ArrayLike,
+    interval: float,
+    *,
+    noise: AngleNoise | None = None,
+    near: tuple[Array, float] | None = None,
+    limits: Limits | None = None,
+) -> CenterEstimate:
+    r"""Estimate the center of one marker whose segment's angle is measured, too.
+
+    .. math::
+        x_t &= c + \rho\, u(\theta_t + \beta + \delta_t) + \varepsilon_t \\
+        J &= \sum_t e_t^2/\sigma^2 + a^T M a - \sigma^2 \sum_t M_{tt} / q_t^2,
+            \qquad M = \left( (\sigma/\rho)^2 I + \Sigma_\theta \right)^{-1} \\
+        q_t &= |x_t - c|, \quad e_t = q_t - \rho, \quad a_t = \arg(x_t - c) - \theta_t - \beta
+
+    Plain least squares on the first line is attenuated by δ; the last term of J takes away what
+    marker noise adds to aᵀMa, which shrinks with distance and would drive c outward.
+
+    The guard is a limited translation (Efron and Morris 1971). With Δ = aided - circle, E its
+    covariance if the angles are as good as told, and s² = ΔᵀE⁻¹Δ, the answer is
+
+    .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
+              \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
+
+    so that an angle error of any size adds no more than λ²E to the mean square error. λ grows where
+    the circle's own error has a heavier tail than its covariance says.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 2)
+        Marker in the parent's coordinates, m; NaN where not seen. Over 300 frames are averaged.
+    angles : array_like, shape (n,)
+        Of the child about the joint's axis relative to the parent, rad, from any zero; NaN unknown.
+    interval : float
+        From frame to frame, s.
+    noise : AngleNoise, optional
+        How wrong the angles may be.
+    near : tuple of ndarray, shape (2,), and float, optional
+        A place the center is known to be near, m, and how near: standard deviation, m.
+    limits : Limits, optional
+        When to refuse. T is the radius over the combined center's largest standard error.
+
+    Returns
+    -------
+    CenterEstimate
+        Flagged ``orientation_inconsistent`` where path and angles contradict each other.
+    """
+    x, theta, times = _thin(points, angles, interval)
+    allowed = limits or Limits()
+    if len(x) < 4:
+        reason = f"{len(x)} frames with marker and angle, at least 4 are needed: record for longer"
+        return nothing(METHOD, (0.0, 0.0), len(x), reason)
+    if float(np.ptp(theta)) < allowed.arc:
+        turned = np.degrees(np.ptp(theta))
+        reason = f"the joint turned {turned:.0f}° only: move through at least 30°"
+        return nothing(METHOD, (0.0, 0.0), len(x), reason)
+    alone = circle_estimate(x, limits=Limits(0.0, (0.0, inf), 0.0, inf))
+    if alone.refused and "motion" in alone.refused:
+        return replace(alone, method=METHOD)
+    sigma = max(_path_noise(x), _LEAST_NOISE_M)
+    Sigma = (noise or AngleNoise()).covariance(times, _smooth(x, theta))
+    try:
+        aided = _solve(x, theta, sigma, Sigma, near)
+    except np.linalg.LinAlgError:  # no information in some direction at all
+        aided = None
+    if aided is None and alone.refused is None:
+        return replace(_path_alone(x, allowed), flags=("orientation_inconsistent",))
+    if aided is None:
+        reason = "path and angles do not fit one center: check the axis, or move the joint further"
+        return nothing(METHOD, (0.0, 0.0), len(x), reason)
+    held = guarded(aided.center, aided.covariance, fit_circles(x))
+    return _told(x, held, aided, sigma=sigma, limits=allowed, alone=alone)
+
+
+def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
+    """Hold an aided center near what the path alone says.
+
+    Parameters
+    ----------
+    center : ndarray, shape (2,)
+        With the angles, m.
+    C : ndarray, shape (2, 2)
+        Its covariance if the angles are as good as told, m².
+    circle : Circles
+        Without them; where it is not valid the path says nothing, and nothing is held.
+
+    Returns
+    -------
+    center, covariance, s2 : ndarray, ndarray, float
+        The covariance counts what was let through of a contradiction.
+    """
+    if not bool(circle.valid):
+        return center, C, 0.0
+    spread, axes = np.linalg.eigh(circle.covariance)
+    # E may come out thin or negative: then a quarter of the circle's own variance
+    apart = np.einsum("ai,ab,bi->i", axes, circle.covariance - C, axes)
+    apart = np.maximum(apart, 0.25 * np.maximum(spread, 1e-18))
+    delta = center - circle.center
+    s2 = float(((axes.T @ delta) ** 2 / apart).sum())
+    reach = 0.7 * (1.0 + 0.5 * (GATE / max(float(circle.conditioning), 1e-3)) ** 2)
+    kept = min(1.0, reach / sqrt(s2)) if s2 > 0.0 else 1.0
+    given = 1.0 - kept
+    E = (axes * apart) @ axes.T
+    covariance = C + given**2 * E + given * kept**2 * np.outer(delta, delta)
+    return circle.center + kept * delta, covariance, s2
+
+
+def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array, Array, Array]:
+    """Drop what was not seen; average to at most `MAX_FRAMES`."""
+    x = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    theta = np.asarray(angles, dtype=np.float64).ravel()
+    seen = seen_places(x) & np.isfinite(theta)
+    times = np.asarray(interval * np.flatnonzero(seen), dtype=np.float64)
+    x, theta = x[seen], np.asarray(np.unwrap(theta[seen]), dtype=np.float64)
+    if len(x) <= MAX_FRAMES:
+        return x, theta, times
+    parts = np.linspace(0, len(x), MAX_FRAMES + 1).astype(int)[:-1]
+    count = np.diff(parts, append=len(x))
+    averaged: Array = np.add.reduceat(np.column_stack((x, theta, times)), parts, axis=0)
+    averaged = averaged / count[:, None]
+    return averaged[:, :2], averaged[:, 2], averaged[:, 3]
+
+
+def _path_alone(x: Array, limits: Limits) -> CenterEstimate:
+    return replace(circle_estimate(x, limits=limits), method=METHOD)
+
+
+def _smooth(x: Array, theta: Array) -> Array:
+    """Return the angles as the path explains them, to second order.
+
+    The scale's covariance must not hold the noise of the angles: correlated with the residuals it
+    would pull the center, by δ²/var θ.
+    """
+    d = (x - x.mean(axis=0)) / max(float(x.std()), 1e-9)
+    one, u, v = np.ones(len(x)), d[:, 0], d[:, 1]
+    terms = np.column_stack((one, u, v, u * u, u * v, v * v))
+    return np.asarray(terms @ np.linalg.lstsq(terms, theta, rcond=None)[0])
+
+
+def _path_noise(x: Array) -> float:
+    circle = fit_circles(x)
+    if bool(circle.valid):
+        return float(circle.noise)
+    # no arc to speak of: across the straight line that the path then is, or a flat parabola
+    d = x - x.mean(axis=0)
+    along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
+    terms = np.column_stack((np.ones(len(x)), along, along**2))
+    return float(np.std(across - terms @ np.linalg.lstsq(terms, across, rcond=None)[0]))
+
+
+def _solve(
+    x: Array, theta: Array, sigma: float, Sigma: Array, near: tuple[Array, float] | None
+) -> _Aided | None:
+    """Minimize J by Gauss-Newton from plain least squares; None where it has no minimum."""
+    z, start = _least_squares(x, theta), x.mean(axis=0)
+    M: Array = np.eye(len(x))
+    rho0 = -1.0
+    prior = 0.0 if near is None else near[1] ** -2
+    H = np.eye(4)
+    for _ in range(_PASSES):
+        if not (np.isfinite(z).all() and 1e-3 < z[2] < 2.0 * _FAR_M):
+            return None
+        if abs(z[2] / rho0 - 1.0) > 0.02:
+            rho0 = float(z[2])
+            M = np.asarray(np.linalg.inv((sigma / rho0) ** 2 * np.eye(len(x)) + Sigma))
+        H, g = _normal(x, theta, z, M, sigma=sigma, rho0=rho0)
+        if near is not None:
+            H[:2, :2] += prior * np.eye(2)
+            g[:2] += prior * (z[:2] - near[0])
+        step = -np.linalg.solve(H, g)
+        step *= min(1.0, 0.3 * z[2] / max(float(np.hypot(step[0], step[1])), 1e-12))
+        z = z + step
+        if float(np.abs(step[:3]).max()) < 1e-8:
+            break
+    C = np.asarray(np.linalg.inv(H)[:2, :2])
+    if not (np.linalg.eigvalsh(C)[0] > 0.0 and np.linalg.norm(z[:2] - start) <= _FAR_M):
+        return None
+    e = np.linalg.norm(x - z[:2], axis=1) - z[2]
+    return _Aided(z[:2], C, float(z[2]), float(np.sqrt((e**2).mean())))
+
+
+def _least_squares(x: Array, theta: Array) -> Array:
+    """Return (c, ρ, β) of x = c + R(θ) p by linear least squares: attenuated, a place to begin."""
+    c, s, one, zero = np.cos(theta), np.sin(theta), np.ones_like(theta), np.zeros_like(theta)
+    A = np.concatenate((np.column_stack((one, zero, c, -s)), np.column_stack((zero, one, s, c))))
+    found = np.linalg.lstsq(A, x.T.ravel(), rcond=None)[0]
+    rho, beta = np.hypot(found[2], found[3]), np.arctan2(found[3], found[2])
+    return np.array([found[0], found[1], rho, beta])
+
+
+def _normal(
+    x: Array, theta: Array, z: Array, M: Array, *, sigma: float, rho0: float
+) -> tuple[Array, Array]:
+    """Return the Gauss-Newton matrix and half the gradient of J by (c, ρ, β)."""
+    d = x - z[:2]
+    q = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
+    e = q - z[2]
+    a = np.angle(np.exp(1j * (np.arctan2(d[:, 1], d[:, 0]) - theta - z[3])))
+    one, zero = np.ones_like(q), np.zeros_like(q)
+    Je = np.column_stack((-d / q[:, None], -one, zero))
+    Ja = np.column_stack((d[:, 1] / q**2, -d[:, 0] / q**2, zero, -one))
+    MJ = M @ Ja
+    H = Je.T @ Je / sigma**2 + Ja.T @ MJ
+    g = Je.T @ e / sigma**2 + MJ.T @ a
+    # capped from below: the compensation has no bound as a point comes to the center
+    counted = np.where(q > rho0 / 2, np.diag(M) / q**4, 0.0)
+    g[:2] -= sigma**2 * counted @ d
+    return H, g
+
+
+def _told(
+    x: Array,
+    held: tuple[Array, Array, float],
+    aided: _Aided,
+    *,
+    sigma: float,
+    limits: Limits,
+    alone: CenterEstimate,
+) -> CenterEstimate:
+    center, C, s2 = held
+    radius = float(np.linalg.norm(x - center, axis=1).mean())
+    largest = float(np.linalg.eigvalsh(C)[-1])
+    T = radius / sqrt(largest)
+    arc = arc_about(x, center)
+    sd = float(np.sqrt(np.trace(C)))
+    return replace(
+        alone,
+        method=METHOD,
+        center=center,
+        covariance=C,
+        noise=sigma,
+        residual=aided.residual,
+        radii=np.array([radius]),
+        arc=arc,
+        bound=min(alone.bound, sqrt(float(np.trace(aided.covariance)))),
+        conditioning=T,
+        unseen=np.zeros((0, 2)),
+        flags=("orientation_inconsistent",) if s2 > INCONSISTENT else (),
+        within95=None,
+        refused=objection(radius, arc, T, sd, limits),
+    )

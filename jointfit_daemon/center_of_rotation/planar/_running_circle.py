@@ -1,0 +1,316 @@
+r"""The center one marker turns about, one frame at a time, at a cost that does not grow.
+
+Law: ten sums hold all that a circle, its error and its residuals' correlation need; the answer
+equals that of all frames at once with the same weights. Plain floats: arrays of nine numbers cost
+more than the arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation.planar._circle_estimate import Limits, publish
+from jointfit_daemon.center_of_rotation.planar._circle_fit import Method, circle_of
+from jointfit_daemon.center_of_rotation.planar._moments import (
+    FARTHEST_M,
+    ROUNDING,
+    CircleMoments,
+    sum_of_squares,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.center_of_rotation._result import CenterEstimate
+
+Sums = tuple[float, float, float, float, float, float, float, float, float, float]
+Kept = tuple[float, float, float]
+
+_NONE: Sums = (0.0,) * 10
+_FAR_M = 1.0
+_RESUM_FRAMES = 1000
+_HUBER = 1.5
+_SETTLED_FRAMES = 30
+_LEAST_NOISE_M = 1e-4
+
+
+class RunningCircle:
+    """Circle through a stream of points.
+
+    Parameters
+    ----------
+    forgetting : float
+        What is left of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) forgets over τ.
+    window : int, optional
+        Only the last so many seen frames count. Not together with forgetting.
+    method : str
+        ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
+    robust : bool
+        Weigh a frame that leaves the circle found so far by Huber's 1.5 standard deviations.
+    limits : Limits, optional
+        When `estimate` refuses.
+
+    Raises
+    ------
+    ValueError
+        Forgetting outside (0, 1], a window under four frames, or both.
+    """
+
+    def __init__(
+        self,
+        *,
+        forgetting: float = 1.0,
+        window: int | None = None,
+        method: Method = "hyper",
+        robust: bool = False,
+        limits: Limits | None = None,
+    ) -> None:
+        if not 0.0 < forgetting <= 1.0:
+            raise ValueError(f"forgetting is {forgetting}: a factor in (0, 1] is needed")
+        if window is not None and (window < 4 or forgetting < 1.0):
+            raise ValueError("a window needs four frames or more and no forgetting beside it")
+        self._forgetting, self._method, self._robust = forgetting, method, robust
+        self._limits = limits or Limits()
+        self._window = window
+        self._kept: deque[Kept] = deque()
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._origin: tuple[float, float] | None = None
+        self._sums = self._lagged = _NONE
+        self._squares = 0.0
+        self._before: Kept = (0.0, 0.0, 0.0)
+        self._kept.clear()
+        self._circle: tuple[float, float, float] | None = None
+        self._noise = 0.0
+        self.frames = 0
+
+    def feed(self, x: float, y: float, weight: float = 1.0) -> None:
+        """Take one frame in the parent's coordinates, m; NaN is "not seen", and a gap in time.
+
+        So is a weight that is not above zero.
+        """
+        if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
+            self._pass()
+            return
+        if self._origin is None:
+            self._origin = (x, y)
+        if self._robust:
+            weight *= self._trust(x, y)
+        ox, oy = self._origin
+        x, y = x - ox, y - oy
+        if x * x + y * y > _FAR_M**2:
+            x, y = self._recenter(x, y)
+        self._add(x, y, weight)
+        self.frames += 1
+        if self._window is not None:
+            self._slide((x, y, weight))
+        if self._robust and self.frames >= _SETTLED_FRAMES:
+            self._look()
+
+    def _add(self, x: float, y: float, w: float) -> None:
+        mu = self._forgetting
+        a, b, c, d, e, f, g, h, i, j = self._sums
+        z = x * x + y * y
+        wx, wy, wz = w * x, w * y, w * z
+        self._sums = (
+            mu * a + wz * z,
+            mu * b + wz * x,
+            mu * c + wz * y,
+            mu * d + wz,
+            mu * e + wx * x,
+            mu * f + wx * y,
+            mu * g + wy * y,
+            mu * h + wx,
+            mu * i + wy,
+            mu * j + w,
+        )
+        self._squares = mu * mu * self._squares + w * w
+        self._lagged = _paired(self._lagged, mu * mu, (x, y, w), self._before)
+        self._before = (x, y, w)
+
+    def _pass(self) -> None:
+        """Let time go by with nothing seen."""
+        mu = self._forgetting
+        if mu < 1.0:
+            self._sums = _scaled(self._sums, mu)
+            self._lagged = _scaled(self._lagged, mu * mu)
+            self._squares *= mu * mu
+        self._before = (0.0, 0.0, 0.0)
+        if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
+            self._kept.append((0.0, 0.0, 0.0))  # weighs nothing, and parts its neighbours
+
+    def _slide(self, frame: Kept) -> None:
+        """Let the oldest frame go; rounding is swept out every so often."""
+        kept = self._kept
+        kept.append(frame)
+        if self.frames <= (self._window or 0):
+            return
+        x, y, w = kept.popleft()
+        z = x * x + y * y
+        gone = (z * z, z * x, z * y, z, x * x, x * y, y * y, x, y, 1.0)
+        a = self._sums
+        self._sums = tuple(s - w * g for s, g in zip(a, gone, strict=True))  # type: ignore[assignment]  # ten
+        self._squares -= w * w
+        self._lagged = _paired(self._lagged, 1.0, kept[0], (x, y, -w))
+        self.frames -= 1
+        while kept and kept[0][2] == 0.0:
+            kept.popleft()
+        self._aged += 1
+        if self._aged >= _RESUM_FRAMES:
+            self._resum()
+
+    _aged = 0
+
+    def _resum(self) -> None:
+        kept, frames = list(self._kept), self.frames
+        self._sums = self._lagged = _NONE
+        self._squares, self._before, self._aged = 0.0, (0.0, 0.0, 0.0), 0
+        for x, y, w in kept:
+            self._add(x, y, w)
+        self.frames = frames
+
+    def _recenter(self, x: float, y: float) -> tuple[float, float]:
+        """Move the origin to the mean where that is far: fourth powers lose digits there."""
+        weight = self._sums[9]
+        if weight <= 0.0 or self._origin is None:
+            return x, y
+        dx, dy = self._sums[7] / weight, self._sums[8] / weight
+        if dx * dx + dy * dy < (_FAR_M / 2) ** 2:
+            return x, y
+        self._sums, self._lagged = _moved(self._sums, dx, dy), _moved(self._lagged, dx, dy)
+        bx, by, bw = self._before
+        self._before = (bx - dx, by - dy, bw)
+        self._kept = deque((kx - dx, ky - dy, kw) for kx, ky, kw in self._kept)
+        self._origin = (self._origin[0] + dx, self._origin[1] + dy)
+        return x - dx, y - dy
+
+    def moments(self) -> CircleMoments[float]:
+        """Return the central moments of what was seen, forgotten and weighted."""
+        zz, zx, zy, _, xx, xy, yy, xb, yb, w = self._sums
+        if w <= 0.0 or self._origin is None:
+            return CircleMoments(*(0.0,) * 10)
+        i = 1.0 / w
+        zz, zx, zy, xx, xy, yy = zz * i, zx * i, zy * i, xx * i, xy * i, yy * i
+        xb, yb = xb * i, yb * i
+        beta, zeta = xb * xb + yb * yb, xx + yy
+        cxx, cxy, cyy = xx - xb * xb, xy - xb * yb, yy - yb * yb
+        return CircleMoments(
+            w,
+            w * w / self._squares if self._squares > 0.0 else 0.0,  # forgotten for too long
+            self._origin[0] + xb,
+            self._origin[1] + yb,
+            cxx,
+            cxy,
+            cyy,
+            zx - xb * zeta - 2.0 * (cxx * xb + cxy * yb),
+            zy - yb * zeta - 2.0 * (cxy * xb + cyy * yb),
+            zz
+            - 4.0 * (xb * zx + yb * zy)
+            + 4.0 * (xb * xb * xx + 2.0 * xb * yb * xy + yb * yb * yy)
+            + 2.0 * beta * zeta
+            - 3.0 * beta * beta,
+        )
+
+    def circle(self) -> tuple[float, float, float] | None:
+        """Return center and radius of the plain circle, m, unjudged; None if there is none."""
+        m = self.moments()
+        z = m.xx + m.yy
+        if m.effective <= 3.0 or m.xx * m.yy - m.xy * m.xy <= ROUNDING * z * z:
+            return None
+        found = circle_of(m, self._method)
+        if found is None:
+            return None
+        a, b, square = found
+        return m.x + a, m.y + b, sqrt(square)
+
+    def estimate(self) -> CenterEstimate:
+        """Return center, covariance, predicted error and verdict of all frames so far.
+
+        Never raises; refused, with cause and remedy, where there is no center to be had.
+        """
+        return publish(
+            self.moments(),
+            self._residual_product,
+            method=self._method,
+            frames=self.frames,
+            limits=self._limits,
+        )
+
+    def _residual_product(self, a: float, b: float, square: float) -> float:
+        """Return the mean product of neighbours' radial residuals about (a, b), m²."""
+        zz, zx, zy, z, xx, xy, yy, x, y, w = self._lagged
+        if w <= 0.0:
+            return 0.0
+        weight = self._sums[9]
+        a, b = a + self._sums[7] / weight, b + self._sums[8] / weight
+        c = a * a + b * b - square
+        total = (
+            zz
+            + 4.0 * (a * a * xx + 2.0 * a * b * xy + b * b * yy)
+            + c * c * w
+            - 4.0 * (a * zx + b * zy)
+            + 2.0 * c * (z - 2.0 * (a * x + b * y))
+        )
+        return total / (4.0 * square * w)
+
+    def _trust(self, x: float, y: float) -> float:
+        if self._circle is None:
+            return 1.0
+        cx, cy, radius = self._circle
+        off = abs(sqrt((x - cx) ** 2 + (y - cy) ** 2) - radius)
+        allowed = _HUBER * max(self._noise, _LEAST_NOISE_M)
+        return 1.0 if off <= allowed else allowed / off
+
+    def _look(self) -> None:
+        """Keep the circle and the noise found so far for the next frame to be judged by."""
+        found = self.circle()
+        if found is None:
+            return
+        m = self.moments()
+        square = found[2] * found[2]
+        rest = sum_of_squares(m, found[0] - m.x, found[1] - m.y, square) / (4.0 * square)
+        self._circle, self._noise = found, sqrt(max(rest, 0.0))
+
+
+def _scaled(sums: Sums, factor: float) -> Sums:
+    return tuple(factor * s for s in sums)  # type: ignore[return-value]  # ten in, ten out
+
+
+def _paired(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
+    """Return the sums of products of each frame with the one before it, both ways averaged."""
+    x, y, w = now
+    u, v, weight = before
+    a, b, c, d, e, f, g, h, i, j = sums
+    w *= weight
+    z, r = x * x + y * y, u * u + v * v
+    half = 0.5 * w
+    return (
+        mu * a + w * z * r,
+        mu * b + half * (z * u + r * x),
+        mu * c + half * (z * v + r * y),
+        mu * d + half * (z + r),
+        mu * e + w * x * u,
+        mu * f + half * (x * v + u * y),
+        mu * g + w * y * v,
+        mu * h + half * (x + u),
+        mu * i + half * (y + v),
+        mu * j + w,
+    )
+
+
+def _moved(sums: Sums, dx: float, dy: float) -> Sums:
+    """Return the sums about an origin moved by (dx, dy): products of (z, x, y, 1) are bilinear."""
+    zz, zx, zy, z, xx, xy, yy, x, y, w = sums
+    M = np.array([[zz, zx, zy, z], [zx, xx, xy, x], [zy, xy, yy, y], [z, x, y, w]])
+    T = np.eye(4)
+    T[0, 1:] = (-2.0 * dx, -2.0 * dy, dx * dx + dy * dy)
+    T[1, 3], T[2, 3] = -dx, -dy
+    N = T @ M @ T.T
+    rows, columns = np.triu_indices(4)
+    upper = {(int(r), int(c)): float(N[r, c]) for r, c in zip(rows, columns, strict=True)}
+    order = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3))
+    return tuple(upper[key] for key in order)  # type: ignore[return-value]  # ten

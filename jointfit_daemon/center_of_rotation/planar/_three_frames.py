@@ -1,0 +1,200 @@
+r"""The center of rotation from three frames: the circle through three points, in closed form.
+
+Law: three points are interpolated, not fitted: nothing is left to judge them by. So the answer is
+refused where the triangle is none, and its error is predicted from the triangle's sides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import inf, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation._result import CenterEstimate
+from jointfit_daemon.center_of_rotation.planar._moments import seen_places
+from jointfit_daemon.center_of_rotation.planar._plane import in_segment_plane
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+
+FLAT = 1e-9
+"""Twice the area over the longest side squared, below which three points are a line."""
+
+
+def three_frame_center(points: ArrayLike) -> Array:
+    r"""Return the center of the circle through three points, for any number of triples.
+
+    .. math::
+        D &= (x_2-x_1)(y_3-y_1) - (x_3-x_1)(y_2-y_1) \\
+        x_c &= x_1 + \left[ s_2 (y_3-y_1) - s_3 (y_2-y_1) \right] / 2D \\
+        y_c &= y_1 + \left[ s_3 (x_2-x_1) - s_2 (x_3-x_1) \right] / 2D,
+        \qquad s_i = |p_i - p_1|^2
+
+    Source: Akbarifar et al. 2021, equations 7 and 8, about the first point, which saves the digits
+    that squares of far coordinates lose.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3, 2)
+        One marker in three frames, in the parent's coordinates, m. Frames need not be neighbours:
+        the first, the middle and the last of an arc are best.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Centers, m; inf where the points are on a line or repeat, NaN only where a point is NaN.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    u, v, size = _sides(p)
+    offset, flat = _offset(u, v)
+    flat = (flat | np.isinf(size))[..., None]
+    return np.where(flat, inf, p[..., 0, :] + size[..., None] * offset)
+
+
+def _sides(p: Array) -> tuple[Array, Array, Array]:
+    """Return the sides from the first point over the largest of them, and that, m.
+
+    Squares of sides as they are would vanish or overflow for coordinates that are mistakes.
+    """
+    u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
+    size = np.maximum(np.abs(u).max(axis=-1), np.abs(v).max(axis=-1))
+    scale = np.where(size > 0.0, size, 1.0)[..., None]
+    return u / scale, v / scale, size
+
+
+def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the center from the first point, in the sides' unit, and where there is none."""
+    D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
+    s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
+    longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
+    flat = np.abs(D) <= FLAT * longest
+    safe = np.where(flat, 1.0, 2.0 * D)
+    x = (s2 * v[..., 1] - s3 * u[..., 1]) / safe
+    y = (s3 * u[..., 0] - s2 * v[..., 0]) / safe
+    return np.stack((x, y), axis=-1), flat
+
+
+def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
+    """Estimate a center from three points, with the error that noise of this size gives it.
+
+    Parameters
+    ----------
+    points : array_like, shape (3, 2)
+        One marker in three frames, m.
+    noise : float
+        Standard deviation of each coordinate, m: three points cannot show it themselves.
+
+    Returns
+    -------
+    CenterEstimate
+        The covariance is first-order noise through the closed form; refused where the points are
+        on a line, not seen, or closer to a line than the noise.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    if not seen_places(p).all():
+        return _refusal(p, noise, "a marker is not seen in one of the frames: choose other frames")
+    u, v, size = _sides(p)
+    offset, flat = _offset(u, v)
+    if flat or not np.isfinite(size):
+        reason = "the three points are on a line or repeat: choose frames further apart"
+        return _refusal(p, noise, reason)
+    spokes = np.stack((-offset, u - offset, v - offset))
+    covariance = _covariance(u, v, float(np.hypot(*offset)), noise)
+    error = sqrt(float(np.trace(covariance)))
+    radius = float(size * np.hypot(*offset))
+    # beyond it the smallest turn of the center is lost in noise and the error has no mean square
+    lost = f"noise of {1000 * noise:.1f} mm hides the arc: choose frames further apart"
+    turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
+    return CenterEstimate(
+        method="three_frames",
+        center=p[0] + size * offset,
+        covariance=covariance,
+        noise=noise,
+        residual=0.0,
+        radii=np.array([radius]),
+        arc=float(np.ptp(turned)),
+        bound=error,
+        conditioning=radius / error if error > 0.0 else inf,
+        frames=3,
+        effective_frames=3.0,
+        refused=lost if 6.0 * error > radius else None,
+    )
+
+
+def _covariance(u: Array, v: Array, radius: float, noise: float) -> Array:
+    r"""Return what noise along the spokes does to the center, m².
+
+    .. math:: C = σ^2 r^2 A^{-1} \begin{pmatrix} 2 & 1 \\ 1 & 2 \end{pmatrix} A^{-T},
+              \qquad A = (u\; v)^T
+
+    since each spoke's noise e gives u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁). Sides and radius in one
+    unit, which cancels.
+    """
+    moves = radius * np.linalg.inv(np.stack((u, v)))
+    return np.asarray(noise**2 * moves @ np.array([[2.0, 1.0], [1.0, 2.0]]) @ moves.T)
+
+
+def _refusal(points: Array, noise: float, reason: str) -> CenterEstimate:
+    seen = points[seen_places(points)]
+    return CenterEstimate(
+        method="three_frames",
+        center=seen.mean(axis=0) if len(seen) else np.zeros(2),
+        covariance=np.zeros((2, 2)),
+        noise=noise,
+        residual=0.0,
+        radii=np.zeros(0),
+        arc=0.0,
+        bound=inf,
+        conditioning=0.0,
+        frames=len(seen),
+        effective_frames=float(len(seen)),
+        unseen=np.eye(2),
+        refused=reason,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentMarkers:
+    """The planar minimal case: two markers fix a segment, one of them or both its neighbour."""
+
+    first: Array
+    """Where it was, m, shape (n, 2)."""
+    second: Array
+    """The other marker, m, shape (n, 2)."""
+
+
+def chain_centers(
+    segments: list[SegmentMarkers], noise: float, frames: tuple[int, int, int] | None = None
+) -> list[CenterEstimate]:
+    """Find every joint of a planar chain from two markers on each segment, three frames each.
+
+    Each joint is found in the coordinates of the segment before it (origin in the middle between
+    its markers, x from the first to the second), by the first marker of the segment after it: two
+    markers on the parent and one on the child.
+
+    Parameters
+    ----------
+    segments : list of SegmentMarkers
+        From the proximal one on; s of them have s - 1 joints between them.
+    noise : float
+        Standard deviation of each coordinate, m.
+    frames : tuple of int, optional
+        Which three; first, middle and last if None.
+
+    Returns
+    -------
+    list of CenterEstimate
+        One a joint, each in its parent's coordinates. The error counts the child's marker only;
+        the parent's own noise is added by ``parent_noise``.
+    """
+    found = []
+    for parent, child in pairwise(segments):
+        x = in_segment_plane(parent.first, parent.second, child.first)
+        chosen = list(frames or (0, (len(x) - 1) // 2, len(x) - 1))
+        found.append(three_frame_estimate(x[chosen], noise))
+    return found

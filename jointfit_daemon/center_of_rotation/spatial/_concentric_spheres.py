@@ -1,0 +1,170 @@
+r"""One center for the spheres (in a plane: circles) of several markers, from their sums.
+
+Law: the algebraic residual of marker j about its mean, F = |x|² - 2 a·x - mean|x|², is 2 R_j times
+the radial one, so that
+
+.. math:: \min_a \sum_j \frac{n_j}{R_j^2 s_j} \left( \mathrm{var} F_j - \eta\, E_j(a) \right)
+          = 0 \text{ at the smallest } \eta
+
+weighs all markers as a geometric fit does, and E_j, what unit noise adds to var F_j, takes the bias
+of short arcs out: for one marker in a plane the center is that of the hyper fit (Al-Sharadqah and
+Chernov 2009; Kanatani and Rangarajan 2011; for spheres, Halvorsen 2003 solved instead of iterated).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation.spatial._sphere_sums import SphereSums
+
+
+_STEPS = 40
+_REWEIGHED = 6
+_NOTHING_M2 = 1e-18
+"""Noise below a nanometer is rounding."""
+_REACH_M = 1e3
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """Central moments of k markers' paths in r directions."""
+
+    n: Array
+    """Effective frames, shape (k,)."""
+    mean: Array
+    """m, shape (k, r)."""
+    C: Array
+    """Covariance of the path, m², shape (k, r, r)."""
+    c: Array
+    """Covariance of x with |x|², m³, shape (k, r)."""
+    Z: Array
+    """Variance of |x|², m⁴, shape (k,)."""
+    S: Array
+    """What unit noise adds to C: shape (k, r, r); the identity for isotropic noise."""
+
+    def seen_along(self, basis: Array) -> Paths:
+        """Return the paths projected onto directions, the columns of `basis`, shape (r, s)."""
+        B = basis
+        return Paths(self.n, self.mean @ B, B.T @ self.C @ B, self.c @ B, self.Z, B.T @ self.S @ B)
+
+
+def paths_of(sums: SphereSums, shape: Array | None = None) -> Paths:
+    """Return the central moments of `sums`, which must be about each marker's mean.
+
+    Parameters
+    ----------
+    sums : SphereSums
+        Centered.
+    shape : ndarray, shape (k, d, d), optional
+        Covariance of each marker's noise relative to the common variance; the identity if None.
+    """
+    k, d = sums.origin.shape
+    own = np.einsum("jajb->jab", sums.M) / np.maximum(sums.weights, 1e-300)[:, None, None]
+    Z = np.maximum(own[:, 0, 0] - own[:, 0, -1] ** 2, 0.0)
+    S = np.tile(np.eye(d), (k, 1, 1)) if shape is None else np.asarray(shape, dtype=np.float64)
+    return Paths(sums.counts, sums.origin, own[:, 1:-1, 1:-1], own[:, 0, 1:-1], Z, S)
+
+
+@dataclass(frozen=True, slots=True)
+class Spheres:
+    """A center and what each marker's sphere about it looks like."""
+
+    center: Array
+    """m, shape (r,)."""
+    noise2: float
+    """Variance of a coordinate of a marker whose relative noise is one, m², unbiased."""
+    relative: Array
+    """Variance of each marker's noise over it, shape (k,)."""
+    radii2: Array
+    """m², shape (k,)."""
+    information: Array
+    """Mean-square change of direction summed over frames and markers, noise taken out, each
+    weighted by the common noise over its own: shape (r, r)."""
+    floor: Array
+    """What noise alone would add to it, shape (r, r)."""
+
+
+def common_center(paths: Paths) -> Spheres | None:
+    """Fit one center, each marker weighted by its own noise; None if the paths do not bend."""
+    k = len(paths.n)
+    relative = np.ones(k)
+    found = _smallest_root(paths, relative)
+    for _ in range(_REWEIGHED if k > 1 else 0):
+        if found is None:
+            return None
+        again = _shrunk(found[2] / np.maximum(relative * found[1], _NOTHING_M2) * relative, paths.n)
+        done = bool(np.allclose(again, relative, rtol=0.02))
+        relative = again
+        if done:
+            break
+        found = _smallest_root(paths, relative)
+    if found is None:
+        return None
+    m, eta, _, R2 = found
+    total = float(paths.n.sum())
+    noise2 = max(eta, _NOTHING_M2) * total / max(total - k - len(m), 1.0)
+    w = paths.n / (R2 * relative)
+    # of n frames, the path about its own mean holds 1 - 1/n of the noise
+    left = (1.0 - 1.0 / np.maximum(paths.n, 1.0)) * noise2 * relative
+    floor = np.einsum("j,jab->ab", w * left, paths.S)
+    information = np.einsum("j,jab->ab", w, paths.C) - floor
+    return Spheres(m, noise2, relative, R2, information, floor)
+
+
+def _shrunk(ratio: Array, n: Array) -> Array:
+    """Return how noisy markers are relative to each other, as far as chance does not explain it."""
+    ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
+    ratio = np.clip(ratio, 0.0, 1e6)
+    chance = 4.0 * 2.0 / np.maximum(n, 1.0)
+    excess = (ratio - 1.0) ** 2
+    trust = np.maximum(0.0, 1.0 - chance / np.maximum(excess, 1e-300))
+    return np.asarray(np.maximum(1.0 + trust * (ratio - 1.0), 0.05))
+
+
+def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, Array] | None:
+    """Return center, eta, each marker's radial variance and its squared radius.
+
+    Newton on G(η) det B(η), which has no other root below and reaches it from zero without passing
+    it; G alone is concave and would be overshot on short arcs, where B is nearly singular.
+    """
+    g = np.average(paths.mean, axis=0, weights=paths.n)
+    h = paths.mean - g
+    S = paths.S * relative[:, None, None]
+    trS, trSS = np.einsum("jaa->j", S), np.einsum("jab,jba->j", S, S)
+    trSC, z0 = np.einsum("jab,jba->j", S, paths.C), np.einsum("jaa->j", paths.C)
+    eta, R2 = 0.0, np.ones(len(h))
+    m, V, added = g, np.zeros(len(h)), np.ones(len(h))
+    for _ in range(_STEPS):
+        w = paths.n / (R2 * relative)
+        D = paths.C - eta * S
+        B = np.einsum("j,jab->ab", w, D)
+        try:
+            inverse = np.linalg.inv(B)
+        except np.linalg.LinAlgError:
+            return None
+        m = inverse @ (w @ (np.einsum("jab,jb->ja", D, h) + paths.c / 2.0))
+        a = m - h
+        q = np.einsum("ja,ja->j", a, a)
+        if not np.isfinite(q).all() or q.max() > _REACH_M**2:
+            return None
+        V = 4.0 * (np.einsum("ja,jab,jb->j", a, paths.C, a) - (a * paths.c).sum(axis=1)) + paths.Z
+        aSa = np.einsum("ja,jab,jb->j", a, S, a)
+        R2 = np.maximum(q + z0 - eta * trS, 1e-8)
+        added = 4.0 * (aSa + trSC) - 4.0 * eta * trSS
+        G = float(w @ (V - eta * (added + 2.0 * eta * trSS)))
+        slope = float(w @ added) + G * float(np.trace(inverse @ np.einsum("j,jab->ab", w, S)))
+        step = G / slope if slope > 0.0 else 0.0
+        eta += step
+        if abs(step) <= 1e-13 * eta + 1e-30:
+            break
+    return (
+        np.asarray(m + g),
+        max(eta, 0.0),
+        np.maximum(V, 0.0) / np.maximum(added, 1e-300) * relative,
+        R2,
+    )

@@ -1,0 +1,253 @@
+r"""The geometric fit of spheres about one center, robust against markers that jump.
+
+Law: directions that the movement does not show are left where the fit began; how far the answer may
+be believed is for the verdict, not for the fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import erf, exp, pi, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.center_of_rotation._path_statistics import arc_of, lag_one_correlation
+from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
+from jointfit_daemon.center_of_rotation.spatial._observability import MIN_CONDITIONING, Limits
+from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import STRAIGHT, objection
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
+Mask = NDArray[np.bool_]
+
+HUBER = 1.5
+NOISE_FACTOR = 6.0
+"""A direction is seen from this many times the turning that noise alone gives."""
+_PASSES = 30
+_ROUNDED = 1e-9
+_LONGEST_STEP_M = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class SphereOptions:
+    """How a geometric fit of spheres goes about it."""
+
+    huber: float = HUBER
+    """Residuals above so many scales lose weight; inf: plain least squares."""
+    smallest_scale: float = _ROUNDED
+    """m; on skin a tenth of a millimeter, so that good moments do not rule."""
+    start: Array | None = None
+    """Where to begin, and to stay along unseen directions, m, shape (3,)."""
+    hold: float = 0.0
+    """Noise, m, that may not pull the first guess from `start`."""
+    min_direction: float = 0.0
+    """RMS turning, rad, below which a direction is not seen whatever the noise."""
+    keep_one: bool = False
+    """Fit the best direction even where it does not pass for seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class SphereFit:
+    """A geometric fit with what is needed to judge it."""
+
+    center: Array
+    """m, shape (3,)."""
+    basis: Array
+    """Directions that were seen, the columns, shape (3, r)."""
+    residuals: Array
+    """Radial, m, shape (n, k); zero where not seen."""
+    seen: Mask
+    weights: Array
+    """Huber's, zero where not seen, shape (n, k)."""
+    turning: Array
+    """Derivatives of the residuals by the center, shape (n, k, 3)."""
+    radii: Array
+    """Mean distance of each marker, m, shape (k,)."""
+    resultant: Array
+    """Mean direction of each marker from the center, shape (k, 3)."""
+
+    @property
+    def information(self) -> Array:
+        """Return JᵀWJ in the seen directions, shape (r, r)."""
+        J = self.turning @ self.basis
+        return np.asarray(np.einsum("tj,tja,tjb->ab", self.weights, J, J))
+
+    @property
+    def unseen(self) -> Array:
+        """Return the other directions, the rows, shape (3 - r, 3)."""
+        return np.asarray(np.linalg.svd(self.basis)[0][:, self.basis.shape[1] :].T)
+
+
+def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
+    """Fit spheres about one center by Gauss-Newton with Huber weights, radii profiled out.
+
+    Directions that the movement does not show are left at the start: noise would pull the center
+    to the markers' own plane with false confidence. Halvorsen 2003; Chang and Pollard 2007.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, 3)
+        m; NaN where not seen; every marker seen at least twice.
+    options : SphereOptions
+        Start, robustness.
+    """
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    v = np.where(seen[..., None], points, 0.0)
+    w = seen.astype(np.float64)
+    start = v.sum(axis=(0, 1)) / w.sum() if options.start is None else options.start
+    start = np.asarray(start, dtype=np.float64)
+    m = _begin(v, w, start, options)
+    basis: Array = np.eye(3)
+    for _ in range(_PASSES):
+        e, _ = radial_residuals(v, m, w)
+        scale = max(1.4826 * float(np.median(np.abs(e[seen]))), options.smallest_scale)
+        huber = np.minimum(1.0, options.huber * scale / np.maximum(np.abs(e), 1e-12))
+        w = np.where(seen, huber, 0.0)
+        e, J = radial_residuals(v, m, w)
+        basis = _observed(v, w, m, scale, options)
+        if basis.shape[1] == 0:
+            break
+        Jb = J @ basis
+        H = np.einsum("tj,tja,tjb->ab", w, Jb, Jb)
+        if not np.trace(H) > 0.0:  # nothing moved at all
+            basis = np.zeros((3, 0))
+            break
+        g = np.einsum("tj,tja,tj->a", w, Jb, e)
+        # far from the answer the radii are wrong and full steps overshoot
+        step = basis @ np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(len(H)), -g)
+        step *= min(1.0, _LONGEST_STEP_M / max(float(np.linalg.norm(step)), 1e-12))
+        m = start + basis @ (basis.T @ (m + step - start))
+        if np.linalg.norm(step) < 1e-9:
+            break
+    return _at(points, m, w, basis)
+
+
+def _at(points: Array, m: Array, w: Array, basis: Array) -> SphereFit:
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    v = np.where(seen[..., None], points, 0.0)
+    e, J = radial_residuals(v, m, w)
+    u = np.linalg.norm(v - m, axis=-1)
+    radii = (w * u).sum(axis=0) / np.maximum(w.sum(axis=0), 1e-12)
+    resultant = np.einsum("tj,tja->ja", w, (v - m) / np.maximum(u, 1e-9)[..., None])
+    resultant /= np.maximum(w.sum(axis=0), 1e-12)[:, None]
+    return SphereFit(m, basis, np.where(seen, e, 0.0), seen, w, J, radii, resultant)
+
+
+def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
+    """Return Gamage and Lasenby's center, held to `start` where `hold` of noise would rule."""
+    total = np.maximum(w.sum(axis=0), 1e-12)
+    d = v - start
+    d = d - (w[..., None] * d).sum(axis=0) / total[:, None]
+    square = ((v - start) ** 2).sum(axis=-1)
+    square = square - (w * square).sum(axis=0) / total
+    A = 2.0 * np.einsum("tj,tja,tjb->ab", w / total, d, d)
+    b = np.einsum("tj,tja,tj->a", w / total, d, square)
+    # a millionth of the path keeps a plane from being singular
+    least = max(options.hold**2, 1e-6 * float(np.trace(A)) / len(total))
+    return np.asarray(start + np.linalg.solve(A + 2.0 * len(total) * least * np.eye(3), b))
+
+
+def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
+    """Return radial residuals (n, k) and their derivatives by the center (n, k, 3)."""
+    d = v - m
+    u = np.linalg.norm(d, axis=-1)
+    total = np.maximum(w.sum(axis=0), 1e-12)
+    e = u - np.where(w > 0.0, w * u, 0.0).sum(axis=0) / total
+    direction = d / np.maximum(u, 1e-9)[..., None]
+    mean = np.where(w[..., None] > 0.0, w[..., None] * direction, 0.0).sum(axis=0) / total[:, None]
+    return e, mean - direction
+
+
+def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
+    """Return an orthonormal basis (3, r) of the directions the movement shows.
+
+    Noise turns a marker's direction across its own line of sight only, so the floor of each
+    direction b is scaled by the mean of 1 - (b·u)².
+    """
+    _, J = radial_residuals(v, m, w)
+    total = w.sum()
+    spread, axes = np.linalg.eigh(np.einsum("tj,tja,tjb->ab", w, J, J) / total)
+    d = v - m
+    u2 = np.maximum((d**2).sum(axis=-1), 1e-4)
+    along = np.einsum("tj,tja,tjb->ab", w / u2, d, d) / total
+    across = np.maximum(1.0 - np.einsum("ai,ab,bi->i", axes, along, axes), 0.0)
+    noise = scale**2 * float((w / u2).sum() / total)
+    if options.keep_one:  # skin: a fixed multiple of its motion
+        keep = spread >= max(options.min_direction**2, NOISE_FACTOR * noise) * across
+        keep[-1] = True
+        return np.asarray(axes[:, keep])
+    left = spread - noise * across
+    chance = np.array([7.0, 0.0, 0.0]) * noise * np.sqrt(2.0 / total) * across
+    sharp = MIN_CONDITIONING**2 * noise / total
+    third = np.array([options.min_direction**2, 0.0, 0.0])
+    keep = left > np.maximum(np.maximum(third, chance), sharp)
+    return np.asarray(axes[:, keep])
+
+
+def judge_sphere(
+    fit: SphereFit, method: str, frames: int, limits: Limits, options: SphereOptions
+) -> CenterEstimate:
+    r"""Return a fit with its covariance, or the reason not to use it.
+
+    .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{noise's part}
+              \Big)^{-1} \frac{1+\rho}{1-\rho}
+
+    ψ the residuals cut off at Huber's bound, p the share that is not cut, ρ the correlation of
+    the residuals from one frame to the next (Huber 1964; of a smooth disturbance it is all that
+    separates many frames from much knowledge).
+    """
+    n, k = int(fit.seen.sum()), fit.seen.shape[1]
+    rank = fit.basis.shape[1]
+    if rank == 0 or (rank == 1 and not options.keep_one):
+        return refusal(method, 3, frames, STRAIGHT)
+    free = max(n - k - rank, 1)
+    cut = fit.weights * fit.residuals
+    share = float(np.count_nonzero(fit.weights[fit.seen] >= 1.0 - 1e-12)) / n
+    psi2 = max(float((cut**2).sum()) / free, 1e-18)
+    noise2 = psi2 / kept_by_huber(options.huber)
+    rho = lag_one_correlation(fit.residuals, fit.seen)
+    J = fit.turning @ fit.basis
+    H = np.einsum("tj,tja,tjb->ab", fit.seen.astype(np.float64), J, J)
+    per_turn = fit.seen.sum(axis=0) * noise2 / np.maximum(fit.radii, 1e-3) ** 2
+    across = np.eye(rank) * per_turn.sum() - np.einsum(
+        "j,ja,jb->ab", per_turn, fit.resultant @ fit.basis, fit.resultant @ fit.basis
+    )
+    exact = H - across
+    H = exact if np.linalg.eigvalsh(exact)[0] > 0.1 * np.linalg.eigvalsh(H)[0] else H
+    bread = np.linalg.inv(H)
+    shown = bread * psi2 / max(share, 0.25) ** 2 * (1.0 + rho) / (1.0 - rho)
+    radius = float(np.median(fit.radii))
+    conditioning = radius / float(np.sqrt(np.linalg.norm(shown, 2)))
+    unseen = fit.unseen
+    # obliquely seen markers turn less: the one that turned most knows the arc
+    inside = np.linalg.norm(fit.resultant @ fit.basis, axis=1)
+    off = np.linalg.norm(fit.resultant @ unseen.T, axis=1) if len(unseen) else 0.0 * inside
+    arc = arc_of(float((inside / np.sqrt(np.maximum(1.0 - off**2, 1e-12))).min()))
+    return CenterEstimate(
+        method=method,
+        center=fit.center,
+        covariance=fit.basis @ shown @ fit.basis.T,
+        noise=float(np.sqrt(noise2)),
+        residual=float(np.sqrt((fit.residuals[fit.seen] ** 2).mean())),
+        radii=fit.radii,
+        arc=arc,
+        bound=float(np.sqrt(np.trace(bread) * noise2)) if rank == 3 else np.inf,
+        conditioning=conditioning,
+        frames=frames,
+        effective_frames=frames * (1.0 - rho) / (1.0 + rho),
+        unseen=unseen,
+        axis=unseen[0] if rank == 2 else None,
+        flags=(("hinge",) if rank == 2 else ()) + (("residuals_persist",) if rho > 0.5 else ()),
+        refused=objection(arc, radius, conditioning, limits),
+    )
+
+
+def kept_by_huber(k: float) -> float:
+    """Return the variance that is left of a standard normal residual cut off at k."""
+    if not np.isfinite(k):
+        return 1.0
+    inside = erf(k / sqrt(2.0))
+    return inside - 2.0 * k * exp(-k * k / 2.0) / sqrt(2.0 * pi) + k * k * (1.0 - inside)

@@ -1,0 +1,269 @@
+"""The center that several markers turn about, one frame at a time, at constant cost.
+
+Law: a frame costs the same whether it is the first or the millionth; the answer equals that of all
+frames at once with the same weights.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation.spatial._observability import Limits
+from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import (
+    center_and_spheres,
+    center_of,
+)
+from jointfit_daemon.center_of_rotation.spatial._sphere_sums import (
+    LAGS,
+    SphereSums,
+    centered,
+    sum_up,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation._result import CenterEstimate
+    from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import Spheres
+
+
+OUTLIER = 3.0
+"""Residuals above so many standard deviations lose weight. Not Huber's 1.5: a frame is weighted
+once and for good, and the noise must not shrink by it."""
+OFF = 8.0
+"""Standard deviations, and at least `OFF_M`, from which a marker is not where it belongs."""
+OFF_M = 0.01
+STAYED_OFF = 25
+"""Frames in a row that a marker must be off for it to begin anew where it is."""
+_FAR_M = 2.0
+"""Fourth powers lose their digits farther from the fixed point."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """Where the last estimate expects the markers."""
+
+    f: Array
+    """Radial residual of a marker is f·φ, m, shape (k, e); zero where nothing is known."""
+    noise: Array
+    """m, shape (k,); inf where nothing is known."""
+    mean: Array
+    """Of each marker's path, from its fixed point, m, shape (k, d)."""
+    unsure: Array
+    """Covariance of the center over each squared radius, shape (k, d, d)."""
+
+
+class RunningSphere:
+    """Center of rotation of several markers, fed frame by frame.
+
+    Parameters
+    ----------
+    markers : int
+        How many markers a frame has, k.
+    forgetting : float
+        What is left of a frame's weight one frame later, in (0, 1]; 1 keeps all.
+    dimension : int
+        3, or 2 for points in a plane.
+    near : ndarray, shape (dimension,), optional
+        Where to stay along directions the movement does not show, m.
+    robust : bool
+        Weigh down markers that leave the sphere found so far, as skin and swapped names do, and
+        begin anew with one that stays away. Works from the last `estimate`.
+    limits : Limits, optional
+        When to refuse. If None, residuals that last are not counted as going with posture: live,
+        skin is added by who asks, see ``skin`` (give ``Limits()`` to have it counted).
+    shape : ndarray, shape (k, d, d), optional
+        Covariance of each marker's noise relative to the common variance, see ``parent_noise``.
+
+    Raises
+    ------
+    ValueError
+        No markers, or forgetting outside (0, 1].
+    """
+
+    def __init__(
+        self,
+        markers: int,
+        *,
+        forgetting: float = 1.0,
+        dimension: int = 3,
+        near: Array | None = None,
+        robust: bool = True,
+        limits: Limits | None = None,
+        shape: Array | None = None,
+    ) -> None:
+        if markers < 1 or not 0.0 < forgetting <= 1.0 or dimension not in {2, 3}:
+            raise ValueError(
+                f"markers {markers}, forgetting {forgetting}, dimension {dimension}: at least one "
+                "marker, forgetting above 0 and at most 1, in a plane or in space"
+            )
+        e = dimension + 2
+        self._near, self._robust, self._shape = near, robust, shape
+        self._limits = limits or Limits(posture=False)
+        self._forgetting = forgetting
+        self._origin = np.full((markers, dimension), np.nan)
+        self._M = np.zeros((markers * e, markers * e))
+        self._L = np.zeros((len(LAGS), markers, e, e))
+        self._squares = np.zeros(markers)
+        self._phi = np.zeros((markers, e))
+        self._phi[:, -1] = 1.0
+        self._past = deque((np.zeros((markers, e)) for _ in range(LAGS[-1])), maxlen=LAGS[-1])
+        self._frames = 0
+        self._placed = False
+        self._expected: _Expected | None = None
+        self._off = np.zeros(markers, dtype=np.int64)
+        self._restarted: set[int] = set()
+
+    def feed(self, points: Array, weights: Array | None = None) -> None:
+        """Take one frame, m, shape (k, d), in the parent's coordinates; NaN where not seen.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            m.
+        weights : ndarray, shape (k,), optional
+            Non-negative; one if None.
+        """
+        if not self._placed:
+            self._place(points)
+        phi = self._phi
+        p = phi[:, 1:-1]
+        np.subtract(points, self._origin, out=p)
+        np.einsum("ja,ja->j", p, p, out=phi[:, 0])
+        w = self._weights(weights)
+        if w is not None:
+            phi = np.where(w[:, None] > 0.0, phi, 0.0) * np.sqrt(w)[:, None]
+        flat = phi.reshape(-1)
+        if self._forgetting < 1.0:
+            self._M *= self._forgetting
+            self._L *= self._forgetting
+            self._squares *= self._forgetting**2
+        self._M += flat[:, None] * flat
+        for g, lag in enumerate(LAGS):
+            self._L[g] += phi[:, :, None] * self._past[-lag][:, None, :]
+        self._squares += 1.0 if w is None else w * w
+        self._past.append(phi.copy())
+        self._frames += 1 if w is None else int(w.any())
+
+    def sums(self) -> SphereSums:
+        """Return what all frames so far come to."""
+        k, e = self._phi.shape
+        origin = np.where(np.isfinite(self._origin), self._origin, 0.0)
+        M = self._M.reshape(k, e, k, e).copy()
+        return SphereSums(origin, M, self._L.copy(), self._squares.copy(), self._frames)
+
+    def estimate(self) -> CenterEstimate:
+        """Return center, covariance and predicted error of all frames so far; never raises.
+
+        Costs more than `feed`: ask when it is to be published, not every frame.
+        """
+        sums = self.sums()
+        found, spheres = center_and_spheres(
+            sums, near=self._near, shape=self._shape, limits=self._limits
+        )
+        if self._robust:
+            known = spheres is not None and found.refused is None
+            self._expected = _expected(sums, found, spheres) if known and spheres else None
+        flags = tuple(f"marker_moved:{j}" for j in sorted(self._restarted))
+        return replace(found, flags=found.flags + flags) if flags else found
+
+    def _place(self, points: Array) -> None:
+        """Give every marker seen for the first time a fixed point: where it is."""
+        first = np.isnan(self._origin[:, 0]) & np.isfinite(points).all(axis=1)
+        self._origin[first] = points[first]
+        self._placed = bool(np.isfinite(self._origin).all())
+
+    def _weights(self, given: Array | None) -> Array | None:
+        """Return the weights of the frame in `_phi`; None if all are one."""
+        phi, expected = self._phi, self._expected
+        near = phi[:, 0] < _FAR_M**2  # not for NaN, either
+        if expected is None:
+            if given is None and near.all():
+                return None
+            w = np.where(near, 1.0 if given is None else given, 0.0)
+            return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
+        residual = np.abs(np.einsum("ja,ja->j", expected.f, phi))
+        fine = residual <= OUTLIER * expected.noise
+        if given is None and (fine & near).all():
+            self._off[:] = 0
+            return None
+        w = np.where(near, 1.0 if given is None else given, 0.0)
+        if fine.all():
+            return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
+        # the center's own uncertainty excuses a marker that goes where it never was
+        way = np.where(near[:, None], phi[:, 1:-1] - expected.mean, 0.0)
+        excused = np.einsum("ja,jab,jb->j", way, expected.unsure, way)
+        scale = np.sqrt(expected.noise**2 + np.maximum(excused, 0.0))
+        residual = np.where(near, residual, 0.0)
+        w = w * np.minimum(1.0, OUTLIER * scale / np.maximum(residual, 1e-300))
+        off = near & (residual > np.maximum(OFF * scale, OFF_M))
+        return self._restart(w, off | (np.isfinite(phi[:, 0]) & ~near))
+
+    def _restart(self, w: Array, off: NDArray[np.bool_]) -> Array:
+        """Begin anew with markers that stayed off: on skin or by a new name they are others now."""
+        self._off = np.where(off, self._off + 1, np.where(w > 0.0, 0, self._off))
+        k, e = self._phi.shape
+        for j in np.flatnonzero(self._off >= STAYED_OFF):
+            M = self._M.reshape(k, e, k, e)
+            M[j] = 0.0
+            M[:, :, j] = 0.0
+            self._L[:, j] = 0.0
+            for past in self._past:
+                past[j] = 0.0
+            self._squares[j] = 0.0
+            self._off[j] = 0
+            self._origin[j] = np.nan
+            self._placed = False
+            self._restarted.add(int(j))
+            if self._expected is not None:
+                self._expected.f[j] = 0.0
+                self._expected.noise[j] = np.inf
+            w = np.where(np.arange(k) == j, 0.0, w)
+        return w
+
+
+def _expected(sums: SphereSums, found: CenterEstimate, spheres: Spheres) -> _Expected:
+    k, d = sums.origin.shape
+    used = np.isfinite(found.radii)
+    at = centered(sums)
+    mean = np.where(used[:, None], at.origin - sums.origin, 0.0)
+    across = np.eye(d) - found.unseen.T @ found.unseen
+    a = (found.center - at.origin) @ across
+    radii = np.where(used, found.radii, np.inf)
+    z0 = np.einsum("jaa->j", at.M[:, 1:-1, :, 1:-1].diagonal(0, 0, 2).transpose(2, 0, 1))
+    z0 = z0 / np.maximum(sums.weights, 1e-300)
+    f = np.ones((k, d + 2))
+    f[:, 1:-1] = -2.0 * (mean + a)
+    f[:, -1] = (mean**2).sum(axis=1) + 2.0 * (a * mean).sum(axis=1) - z0
+    noise = np.full(k, np.inf)
+    noise[used] = np.sqrt(spheres.noise2 * spheres.relative)
+    f = np.where(used[:, None], f / (2.0 * radii)[:, None], 0.0)
+    return _Expected(f, noise, mean, found.covariance / (radii**2)[:, None, None])
+
+
+def fit_running(
+    points: Array,
+    weights: Array | None = None,
+    *,
+    near: Array | None = None,
+    limits: Limits | None = None,
+    shape: Array | None = None,
+) -> CenterEstimate:
+    """Return what `RunningSphere` says of all frames at once, plainly weighted.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, d)
+        m; NaN where not seen.
+    weights : ndarray, shape (n, k), optional
+        Non-negative, as a forgetting stream would weigh them in the end; one if None.
+    near, limits, shape
+        As for `RunningSphere`.
+    """
+    limits = limits or Limits(posture=False)
+    return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)

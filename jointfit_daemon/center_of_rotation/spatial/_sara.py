@@ -1,0 +1,71 @@
+"""The axis of a hinge from two moving bodies (SARA).
+
+Law: an axis is what the movement shows; a point on it is a choice, told by infinite variance along
+the axis. A movement about two axes is no hinge's, and is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.center_of_rotation._result import refusal
+from jointfit_daemon.center_of_rotation.spatial._score import (
+    FEW,
+    HINGE_RATIO,
+    MIN_TURN_RAD,
+    solve_two_sided,
+    two_sided_estimate,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation._movement import BodyPoses
+    from jointfit_daemon.center_of_rotation._result import CenterEstimate
+
+
+def fit_axis(
+    parent: BodyPoses,
+    child: BodyPoses,
+    *,
+    near: Array | None = None,
+    toward: Array | None = None,
+    robust: bool = True,
+) -> CenterEstimate:
+    """Estimate the axis of a hinge and the point on it nearest to `near`.
+
+    Ehrig et al. 2007: the right singular vector of [R₁, -R₂] with the least singular value.
+
+    Parameters
+    ----------
+    parent, child : BodyPoses
+        In one world.
+    near : ndarray, shape (3,), optional
+        Where to come to along the axis, in the parent, m; None: nearest the parent's origin.
+    toward : ndarray, shape (3,), optional
+        The axis is turned to have a positive component along it, as to the subject's right.
+    robust : bool
+        Huber weights on the gap between the two sides.
+
+    Returns
+    -------
+    CenterEstimate
+        `axis` in the parent; refused where the movement went about more than one axis.
+    """
+    found = solve_two_sided(parent, child, hinge=True, robust=robust)
+    if found is None:
+        return refusal("sara", 3, 0, FEW)
+    if found.ratio >= HINGE_RATIO and found.turn >= MIN_TURN_RAD:
+        return refusal(
+            "sara",
+            3,
+            found.frames,
+            f"the joint turned about more than one axis (σ₆/σ₅ "
+            f"{found.ratio:.2f}, a hinge has less than {HINGE_RATIO}): use score or sphere, or "
+            "move about one axis only",
+        )
+    estimate = two_sided_estimate(found, child, parent, "sara", near)
+    axis = estimate.axis
+    if axis is None or toward is None or float(axis @ toward) >= 0.0:
+        return estimate
+    return replace(estimate, axis=-axis, unseen=-estimate.unseen)

@@ -1,0 +1,192 @@
+"""The answer that sums of spheres give: center, covariance, refusal with its remedy.
+
+Law: a hinge shows two directions and its axis, and that is a good answer; a line or a rest shows
+nothing, and that is said. Where to stay along an unseen direction is the caller's knowledge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import degrees, inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation._path_statistics import arc_of
+from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
+from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import paths_of
+from jointfit_daemon.center_of_rotation.spatial._observability import (
+    MIN_CONDITIONING,
+    Limits,
+    moved,
+    observe,
+)
+from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import Paths, Spheres
+    from jointfit_daemon.center_of_rotation.spatial._observability import Seen
+    from jointfit_daemon.center_of_rotation.spatial._sphere_sums import SphereSums
+
+
+MIN_FRAMES = 15
+"""Effective frames a marker must be seen in."""
+LOUD = 9.0
+"""Variance of a marker over that of the others from which it is named."""
+PERSISTENT = 0.5
+"""Correlation of residuals from frame to frame from which it is flagged."""
+STRAIGHT = "the markers' paths show no bend: move the joint further, at least 30° each way"
+FURTHER = ": move this joint further"
+SKIN = (
+    ", since markers leave their spheres as the posture goes, as on skin: move further and in more "
+    "directions, slowly, or put the markers where skin slides least; of a hinge sara shows the axis"
+)
+STILL = "the markers stood still in the parent: move the joint, at least 30° each way"
+
+
+def center_of(
+    sums: SphereSums,
+    *,
+    method: str = "running_sphere",
+    near: Array | None = None,
+    shape: Array | None = None,
+    limits: Limits | None = None,
+) -> CenterEstimate:
+    """Judge the center that sums over frames show.
+
+    Parameters
+    ----------
+    sums : SphereSums
+        Of any number of frames, about any fixed points.
+    method : str
+        Name to sign with.
+    near : ndarray, shape (d,), optional
+        Where to stay along unseen directions, m; None: beside the markers' mean.
+    shape : ndarray, shape (k, d, d), optional
+        Covariance of each marker's noise relative to the common variance, as
+        ``parent_noise.relative`` gives it for a moving parent; None: isotropic.
+    limits : Limits, optional
+        When to refuse.
+
+    Returns
+    -------
+    CenterEstimate
+        NaN only in the center of a refusal that has none, and in the radii of markers that were
+        not seen often enough to be used.
+    """
+    return center_and_spheres(sums, method=method, near=near, shape=shape, limits=limits)[0]
+
+
+def center_and_spheres(
+    sums: SphereSums,
+    *,
+    method: str = "running_sphere",
+    near: Array | None = None,
+    shape: Array | None = None,
+    limits: Limits | None = None,
+) -> tuple[CenterEstimate, Spheres | None]:
+    """Return `center_of` and the markers' spheres; None where they are about no such center."""
+    limits = limits or Limits()
+    d = sums.origin.shape[1]
+    usable = sums.counts >= MIN_FRAMES
+    if not usable.any():
+        reason = f"{sums.frames} usable frames, at least {MIN_FRAMES} are needed"
+        return refusal(method, d, sums.frames, f"{reason}: keep the markers in view"), None
+    sums = centered(sums.only(usable))
+    paths = paths_of(sums, None if shape is None else shape[usable])
+    basis = moved(paths)
+    if basis.shape[1] == 0:
+        return refusal(method, d, sums.frames, STILL), None
+    seen = observe(sums, paths, basis, limits)
+    if seen is None:
+        return refusal(method, d, sums.frames, STRAIGHT), None
+    found = _answer(sums, paths, seen, near, limits)
+    radii = np.full(len(usable), np.nan)
+    radii[usable] = found.radii
+    whole = seen.shown.shape[0] == seen.shown.shape[1]
+    return replace(found, method=method, radii=radii), seen.found if whole else None
+
+
+def _answer(
+    sums: SphereSums, paths: Paths, seen: Seen, near: Array | None, limits: Limits
+) -> CenterEstimate:
+    basis, found = seen.basis @ seen.shown, seen.found
+    middle = np.average(paths.mean, axis=0, weights=paths.n)
+    unseen = np.asarray(np.linalg.svd(basis)[0][:, basis.shape[1] :].T)
+    stay = middle if near is None else np.asarray(near, dtype=np.float64)
+    center, spread = drawn_in(seen, middle @ seen.basis)
+    fitted = seen.basis @ center
+    hidden = unseen @ seen.basis @ seen.basis.T  # in the fit, but not in the answer
+    lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
+    spread = seen.shown.T @ spread @ seen.shown
+    C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
+    radii, arc = _round(seen)
+    radius = float(np.median(radii))
+    conditioning = radius / float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 1e-300)))
+    relative, rho = found.relative, seen.left.persistence
+    residual2 = np.maximum(np.diagonal(seen.left.together), 0.0)
+    return CenterEstimate(
+        method="",
+        center=basis @ (basis.T @ fitted) + unseen.T @ (unseen @ stay),
+        covariance=(C + C.T) / 2.0,
+        noise=float(np.sqrt(found.noise2 * np.median(relative))),
+        residual=float(np.sqrt(np.average(residual2, weights=paths.n))),
+        radii=radii,
+        arc=arc,
+        bound=float(np.sqrt(seen.bound2)) if len(unseen) == 0 else inf,
+        conditioning=conditioning,
+        frames=sums.frames,
+        effective_frames=float(paths.n.mean()) * (1 - rho) / (1 + rho),
+        unseen=unseen,
+        axis=unseen[0] if len(unseen) == 1 and len(basis) == 3 else None,
+        flags=_flags(seen, len(unseen)),
+        within95=seen.within95,
+        refused=objection(arc, radius, conditioning, limits, skin=seen.left.posture > 0.0),
+    )
+
+
+def _round(seen: Seen) -> tuple[Array, float]:
+    """Return the radii, m, and the arc, rad, about what is shown of the center."""
+    away = seen.found.center - seen.paths.mean
+    inside = away @ seen.shown
+    aside2 = np.maximum((away**2).sum(axis=1) - (inside**2).sum(axis=1), 0.0)
+    radii = np.sqrt(np.maximum(seen.found.radii2 - aside2, 1e-8))
+    return radii, arc_of(float((np.linalg.norm(inside, axis=1) / radii).min()))
+
+
+def drawn_in(seen: Seen, middle: Array) -> tuple[Array, Array]:
+    r"""Return the center drawn in by what its uncertainty biases it outward, and its covariance.
+
+    .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
+
+    for the center d from the markers' mean. The data show a curvature whose error is nearly normal;
+    its inverse is too far on average. This is Zellner's minimum expected loss estimator of an
+    inverse (1978), as in the plane. On long arcs S is the identity.
+    """
+    R2 = float(np.median(seen.found.radii2))
+    S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)
+    return middle + S @ (seen.found.center - middle), S @ seen.spread @ S.T
+
+
+def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
+    flags = ["hinge"] if unseen else []
+    if seen.left.persistence > PERSISTENT:
+        flags.append("residuals_persist")
+    if seen.left.posture > 0.0:
+        flags.append("residuals_repeat")
+    loud = np.flatnonzero(seen.found.relative > LOUD * np.median(seen.found.relative))
+    return (*flags, *(f"noisy_marker:{j}" for j in loud))
+
+
+def objection(
+    arc: float, radius: float, conditioning: float, limits: Limits, *, skin: bool = False
+) -> str | None:
+    """Say why a center is not to be used and what to do; None if it may."""
+    if arc < limits.min_arc:
+        return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
+    if not limits.reach[0] <= radius <= limits.reach[1]:
+        return f"the markers would be {radius:.2f} m from the center: check marker names"
+    if conditioning < MIN_CONDITIONING:
+        return f"uncertain to {1000 * radius / conditioning:.0f} mm{SKIN if skin else FURTHER}"
+    return None

@@ -1,0 +1,148 @@
+r"""Centers of spheres in space from all frames at once.
+
+Law: points in, one `CenterEstimate` out, judged as a stream of the same frames is. The linear fits
+are kept for comparison; the one to use is `fit_sphere`, robust against what leaves its sphere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation._result import refusal
+from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import paths_of
+from jointfit_daemon.center_of_rotation.spatial._geometric_solver import (
+    SphereOptions,
+    radial_residuals,
+    solve_sphere,
+)
+from jointfit_daemon.center_of_rotation.spatial._observability import Limits
+from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import relative
+from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import MIN_FRAMES, center_of
+from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered, sum_up
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation._result import CenterEstimate
+
+
+OUTLIER = 3.0
+"""Residuals above so many standard deviations lose weight in the verdict: beyond, noise hardly
+goes, so that it is not made smaller than it is."""
+STILL_M = 1e-6
+_HALVORSEN_STEPS = 20
+
+
+def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
+    r"""Solve for the center in which the spread of squared distances is least.
+
+    .. math:: 2 \sum_j \left(\overline{vv^T} - \bar v \bar v^T\right) m
+              = \sum_j \left(\overline{v|v|^2} - \bar v\, \overline{|v|^2}\right)
+
+    Biased towards the markers on short arcs, as Kåsa's circle is. Gamage and Lasenby 2002.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, 3)
+        Markers of the child in the parent's coordinates, m; NaN where not seen.
+    min_direction : float
+        RMS turning, rad, below which a direction is not seen: then refused.
+    """
+    return _linear(points, "gamage_lasenby", 0, min_direction)
+
+
+def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
+    r"""Take the bias out of `gamage_lasenby` by the noise found, twenty times over.
+
+    .. math:: A m = b - 2 σ^2 \sum_j (\bar v_j - m), \qquad
+              σ^2 = \frac{\sum (u - \bar u_j)^2}{nk - k - 3}, \quad u = |v - m|
+
+    Halvorsen 2003. Parameters as in `gamage_lasenby`.
+    """
+    return _linear(points, "halvorsen", _HALVORSEN_STEPS, min_direction)
+
+
+FLAT = (
+    "the markers moved about one axis or not at all, which shows this method no center: move in "
+    "other directions, too, or use sphere, which finds a hinge"
+)
+
+
+def _linear(points: Array, method: str, steps: int, min_direction: float) -> CenterEstimate:
+    judged = center_of(sum_up(points), method=method, limits=Limits(min_direction=min_direction))
+    if len(judged.unseen) > 0:
+        why = FLAT if judged.refused is None else judged.refused
+        return refusal(method, 3, judged.frames, why)
+    used = np.isfinite(judged.radii)
+    points = points[:, used]
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    paths = paths_of(centered(sum_up(points)))
+    A = paths.C.sum(axis=0)
+    b = np.einsum("jab,jb->a", paths.C, paths.mean) + paths.c.sum(axis=0) / 2.0
+    m = np.linalg.solve(A, b)
+    for _ in range(steps):
+        e, _ = radial_residuals(points, m, seen.astype(np.float64))
+        noise2 = float((e[seen] ** 2).sum()) / max(int(seen.sum()) - len(paths.n) - 3, 1)
+        m = np.linalg.solve(A, b - noise2 * (paths.mean - m).sum(axis=0))
+    flags = judged.flags if steps else (*judged.flags, "biased_on_short_arcs")
+    return replace(judged, center=m, flags=flags)
+
+
+def fit_sphere(
+    points: Array,
+    options: SphereOptions | None = None,
+    limits: Limits | None = None,
+    parent: Array | None = None,
+) -> CenterEstimate:
+    r"""Fit the point that each marker keeps its own distance from.
+
+    .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
+              \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
+
+    finds what leaves its sphere; the center and its error are those of the other frames' sums.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, 3)
+        Markers of the child in the parent's coordinates, m; NaN where not seen.
+    options : SphereOptions, optional
+        Start, robustness.
+    limits : Limits, optional
+        When to refuse.
+    parent : ndarray, shape (m, 3), optional
+        The parent's own markers in its coordinates, m: their noise, which all markers of the child
+        share, is told from theirs.
+
+    Returns
+    -------
+    CenterEstimate
+        `unseen` holds the directions the movement does not show (a hinge's axis); the center stays
+        there where `options.start` is, or beside the markers' mean.
+    """
+    options = options or SphereOptions()
+    weights = _weights(points, options)
+    sums, near = sum_up(points, weights), options.start
+    found = center_of(sums, method="sphere", near=near, limits=limits)
+    if parent is None or not np.isfinite(found.center).all():
+        return found
+    shape = relative(points, parent, found.center)
+    return center_of(sums, method="sphere", near=near, shape=shape, limits=limits)
+
+
+def _weights(points: Array, options: SphereOptions) -> Array | None:
+    """Return the weight of each marker in each frame, shape (n, k); None where all are one."""
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    enough = seen.sum(axis=0) >= MIN_FRAMES
+    still = not enough.any() or float(np.nanstd(points[:, enough], axis=0).max()) < STILL_M
+    if still or not np.isfinite(options.huber):
+        return None
+    fit = solve_sphere(points[:, enough], options)
+    if fit.basis.shape[1] < 2:
+        return None
+    e = np.abs(fit.residuals)
+    scale = max(1.4826 * float(np.median(e[fit.seen])), options.smallest_scale)
+    weights = np.ones(seen.shape)
+    weights[:, enough] = np.minimum(1.0, OUTLIER * scale / np.maximum(e, 1e-12))
+    return weights

@@ -1,0 +1,188 @@
+r"""The numerical experiment on circle fits: maps of the error over arc, noise and radius.
+
+Law: everything random comes from one seeded generator; all runs of a cell are computed at once.
+
+A marker at distance r from the center stands at the angles 0, α and 2α; each coordinate carries
+independent noise of standard deviation σ. Two of (r, σ, α) vary over a map, the third is fixed. On
+every cell stand the RMS errors of the methods over many runs, the error predicted for three frames
+
+.. math:: F = \sigma \sqrt{\frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}}
+
+and, for many frames spread evenly over the same arc 0 … 2α, the Cramér-Rao bound. Source: Akbarifar
+et al., section 2-2-3, figure 2 and table 1, whose setup is only partly printed: `StudySetup` says
+how it is read here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation._bounds import uniform_arc_rms
+from jointfit_daemon.center_of_rotation.planar import (
+    GATE,
+    Grid,
+    equal_step_error,
+    fit_circles,
+    grid_center,
+    three_frame_center,
+)
+from jointfit_daemon.center_of_rotation.study._oriented_batch import oriented_centers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from jointfit_daemon.arrays import Array
+
+
+CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
+"""Both maps of a correlation are cut off there, m; None: as they are."""
+PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
+"""The source's table 1 as its digits are read: analytic against prediction, against grid."""
+
+
+@dataclass(frozen=True, slots=True)
+class StudySetup:
+    """What is varied, what is fixed, how often; SI. Defaults reproduce the source's figure 2."""
+
+    radii: Array = field(default_factory=lambda: np.linspace(0.1, 0.6, 11))
+    noises: Array = field(default_factory=lambda: 0.0005 * np.arange(11.0))
+    steps: Array = field(default_factory=lambda: np.arange(5.0, 176.0, 5.0) * (np.pi / 180.0))
+    """α, the angle from one of the three frames to the next; its poles 0 and π are left out."""
+    radius: float = 0.6
+    """r of the map that does not vary it."""
+    noise: float = 0.001
+    step: float = np.pi / 3.0
+    repeats: int = 1000
+    """Runs a cell of the three-frame solution."""
+    grid_repeats: int = 150
+    """... of the grid searches, the first of the same runs."""
+    box: float = 0.05
+    """The grid spans ± this about the true center, m."""
+    node: float = 0.005
+    """From node to node, m."""
+    frames: int = 100
+    """Evenly over the same arc, for the estimators that use all frames."""
+    frames_repeats: int = 30
+    orientation_noise: float = float(np.deg2rad(1.0))
+    """White error of the angle that the orientation-aided estimator is given, rad."""
+    seed: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PairMaps:
+    """The maps of one pair of quantities."""
+
+    name: str
+    """``α–σ``, ``r–σ`` or ``r–α``: rows first."""
+    rows: Array
+    """Values of the first quantity, SI."""
+    columns: Array
+    maps: Mapping[str, Array]
+    """RMS error, m, shape (len(rows), len(columns)), by method: ``predicted``, ``three frames``,
+    ``grid``, ``shifted grid`` for three frames; ``bound``, ``hyper``, ``oriented`` for all."""
+    refused: Array
+    """Share of runs in which the hyper fit says of itself that it is not usable (T < 6)."""
+
+
+def correlation(a: Array, b: Array, clip: float | None = None) -> float:
+    """Return Pearson's correlation of two maps, both cut off at `clip`; 0 if one is constant."""
+    x, y = (np.minimum(m, np.inf if clip is None else clip).ravel() for m in (a, b))
+    x, y = x - x.mean(), y - y.mean()
+    scale = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y) / scale if scale > 0.0 else 0.0
+
+
+def run_study(setup: StudySetup, told: Callable[[float], None] | None = None) -> list[PairMaps]:
+    """Compute all maps.
+
+    Parameters
+    ----------
+    setup : StudySetup
+    told : callable, optional
+        Is told the share done, 0 to 1, after every row of cells.
+
+    Returns
+    -------
+    list of PairMaps
+        α–σ, r–σ, r–α.
+    """
+    r, s, a = setup.radii, setup.noises, setup.steps
+    fixed = np.array([setup.radius]), np.array([setup.noise]), np.array([setup.step])
+    pairs = (
+        ("α–σ", a, s, lambda row: (fixed[0], s, np.array([row]))),
+        ("r–σ", r, s, lambda row: (np.array([row]), s, fixed[2])),
+        ("r–α", r, a, lambda row: (np.array([row]), fixed[1], a)),
+    )
+    rng = np.random.default_rng(setup.seed)
+    total, done = sum(len(rows) for _, rows, _, _ in pairs), 0
+    found: list[PairMaps] = []
+    for name, rows, columns, cells in pairs:
+        lines = []
+        for row in rows:
+            radius, noise, step = np.broadcast_arrays(*cells(float(row)))
+            lines.append(_line(setup, rng, radius, noise, step))
+            done += 1
+            if told is not None:
+                told(done / total)
+        maps = {key: np.array([line[key] for line in lines]) for key in lines[0]}
+        refused = maps.pop("refused")
+        found.append(PairMaps(name, rows, columns, maps, refused))
+    return found
+
+
+def _line(
+    setup: StudySetup, rng: np.random.Generator, radius: Array, noise: Array, step: Array
+) -> dict[str, Array]:
+    """Return all figures of one row of cells, each of shape (cells,)."""
+    three = _noisy(rng, radius, noise, step[:, None] * np.arange(3.0), setup.repeats)
+    few = three[:, : setup.grid_repeats]
+    line = {
+        "predicted": equal_step_error(step, noise),
+        "three frames": _rms(three_frame_center(three)),
+    }
+    for key, offset in (("grid", 0.0), ("shifted grid", 0.5 * setup.node)):
+        nodes = Grid((offset, offset), setup.box, setup.node)
+        line[key] = _rms(grid_center(few, nodes))
+    return line | _all_frames(setup, rng, radius, noise, step)
+
+
+def _all_frames(
+    setup: StudySetup, rng: np.random.Generator, radius: Array, noise: Array, step: Array
+) -> dict[str, Array]:
+    arc = 2.0 * step
+    angles = arc[:, None] * np.linspace(0.0, 1.0, setup.frames)
+    many = _noisy(rng, radius, noise, angles, setup.frames_repeats)
+    circles = fit_circles(many)
+    accepted = circles.valid & (circles.conditioning >= GATE)
+    drawn = rng.normal(0.0, setup.orientation_noise, many.shape[:-1])
+    aided = oriented_centers(many, angles[:, None] + drawn)
+    least = [
+        uniform_arc_rms(float(a), setup.frames, float(s)) for a, s in zip(arc, noise, strict=True)
+    ]
+    return {
+        "bound": np.array(least),
+        "hyper": _rms(np.where(accepted[..., None], circles.center, np.nan)),
+        "oriented": _rms(aided),
+        "refused": np.asarray((~accepted).mean(axis=-1)),
+    }
+
+
+def _noisy(
+    rng: np.random.Generator, radius: Array, noise: Array, angles: Array, repeats: int
+) -> Array:
+    """Return measured points about the origin, shape (cells, repeats, frames, 2)."""
+    true = radius[:, None, None] * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    drawn = rng.normal(size=(len(radius), repeats, *true.shape[1:]))
+    return np.asarray(true[:, None] + noise[:, None, None, None] * drawn)
+
+
+def _rms(centers: Array) -> Array:
+    """Return the RMS distance from the origin over the answered runs, (cells,); NaN if none."""
+    squares = (centers**2).sum(axis=-1)
+    answered = np.isfinite(squares)
+    total = np.where(answered, squares, 0.0).sum(axis=-1)
+    count = answered.sum(axis=-1)
+    return np.asarray(np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan)))

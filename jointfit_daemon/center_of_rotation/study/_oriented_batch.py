@@ -1,0 +1,182 @@
+r"""The orientation-aided center for many runs at once, as the numerical experiment needs it.
+
+Law: the cost function, the start and the guard are those of ``oriented``; only the arithmetic is
+arranged for thousands of short movements, all with the same number of frames and turning evenly.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jointfit_daemon.center_of_rotation.planar import GATE, AngleNoise, Circles, fit_circles
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
+Complex = NDArray[np.complex128]
+
+_TOLD = AngleNoise()
+_STEPS = 12
+_LEAST_NOISE_M = 1e-6
+_STUCK = 1e3
+"""Damping at which a run is at its end."""
+
+
+class _Weights(NamedTuple):
+    """M = U diag(d) Uᵀ - h hᵀ of every run, M being the inverse covariance of the angles."""
+
+    U: Array
+    """Shape (n, n)."""
+    d: Array
+    """Shape (runs, n)."""
+    h: Array
+    """Shape (runs, n)."""
+
+    def times(self, a: Array) -> Array:
+        """Return M a of every run, shape (runs, n) or, for k vectors a run, (runs, k, n)."""
+        d, h = (self.d, self.h) if a.ndim == 2 else (self.d[:, None], self.h[:, None])
+        plain = ((a @ self.U) * d) @ self.U.T
+        return np.asarray(plain - (h * a).sum(axis=-1, keepdims=True) * h)
+
+    def diagonal(self) -> Array:
+        return np.asarray(self.d @ (self.U**2).T - self.h**2)
+
+
+def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Array:
+    """Return centers from points and the child's angles, m, shape (..., 2).
+
+    Parameters
+    ----------
+    points : ndarray, shape (..., n, 2)
+        m; no NaN.
+    angles : ndarray, shape (..., n)
+        Measured angle of the child relative to the parent, rad.
+    interval : float
+        From frame to frame, s.
+    """
+    shape, n = points.shape[:-2], points.shape[-2]
+    z: Complex = (points[..., 0] + 1j * points[..., 1]).reshape(-1, n)
+    theta = np.broadcast_to(angles, points.shape[:-1]).reshape(-1, n)
+    circles = fit_circles(points.reshape(-1, n, 2))
+    start = _linear_start(z, theta)
+    noise = np.where(
+        circles.valid, circles.noise, np.abs(z - start[:, :1] - 1j * start[:, 1:2]).std(-1)
+    )
+    noise = np.maximum(noise, _LEAST_NOISE_M)
+    found, H = start, np.zeros((len(z), 4, 4))
+    for _ in range(2):  # the angular noise is frozen at a radius: twice settles it
+        radius = np.maximum(found[:, 2], 0.01)
+        weights = _weights(theta, noise / radius, interval)
+        found, H = _descend(_Runs(z, theta, noise, weights, weights.diagonal(), radius), found)
+    return np.asarray(_guarded(found[:, :2], H, circles).reshape(*shape, 2))
+
+
+def _linear_start(z: Complex, theta: Array) -> Array:
+    """Return least squares of z = c + w exp(iθ) as (x, y, |w|, arg w), shape (runs, 4)."""
+    turn = np.exp(1j * theta)
+    away = turn - turn.mean(axis=-1, keepdims=True)
+    w = (z * away.conj()).sum(axis=-1) / (np.abs(away) ** 2).sum(axis=-1)
+    c = z.mean(axis=-1) - w * turn.mean(axis=-1)
+    return np.stack((c.real, c.imag, np.abs(w), np.angle(w)), axis=-1)
+
+
+@cache
+def _wandering(n: int, interval: float) -> tuple[Array, Array]:
+    """Return eigenvalues and -vectors of the angles' covariance, the scale's part left out."""
+    apart = interval * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
+    values, U = np.linalg.eigh(slow + _TOLD.white**2 * np.eye(n))
+    return values, U
+
+
+def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
+    n = theta.shape[-1]
+    values, U = _wandering(n, interval)
+    d = 1.0 / (values + relative_noise[:, None] ** 2)
+    # the scale's part without the noise of the angles: here they grow evenly from frame to frame
+    even = np.arange(n) - 0.5 * (n - 1)
+    g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
+    h = ((g @ U) * d) @ U.T
+    return _Weights(U, d, h / np.sqrt(1.0 + (g * h).sum(axis=-1, keepdims=True)))
+
+
+class _Runs(NamedTuple):
+    """What stays the same while the runs descend."""
+
+    z: Complex
+    theta: Array
+    noise: Array
+    weights: _Weights
+    diagonal: Array
+    """Of M, shape (runs, n)."""
+    rho0: Array
+    """The radius at which M is frozen, shape (runs,)."""
+
+    def only(self, i: NDArray[np.intp]) -> _Runs:
+        """Return some of the runs."""
+        U, d, h = self.weights
+        kept = _Weights(U, d[i], h[i])
+        return _Runs(self.z[i], self.theta[i], self.noise[i], kept, self.diagonal[i], self.rho0[i])
+
+
+def _descend(runs: _Runs, start: Array) -> tuple[Array, Array]:
+    """Levenberg-Marquardt of every run from (x, y, ρ, β); return them and their H."""
+    at, mu = start.copy(), np.full(len(start), 1e-3)
+    cost, g, H = _cost(runs, at)
+    moving = np.arange(len(start))
+    for _ in range(_STEPS):
+        damped = H[moving] * (1.0 + mu[moving, None, None] * np.eye(4))
+        tried = at[moving] - np.linalg.solve(damped, g[moving, :, None])[..., 0]
+        after, g_after, H_after = _cost(runs.only(moving), tried)
+        better = after < cost[moving]
+        fell = cost[moving] - after > 1e-9 * np.abs(cost[moving])
+        mu[moving] = np.where(better, np.maximum(0.2 * mu[moving], 1e-12), 5.0 * mu[moving])
+        taken = moving[better]
+        at[taken], cost[taken], g[taken], H[taken] = (
+            x[better] for x in (tried, after, g_after, H_after)
+        )
+        moving = moving[fell | ((mu[moving] < _STUCK) & ~better)]
+        if moving.size == 0:
+            break
+    return at, H
+
+
+def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
+    """Return the score, its half gradient (runs, 4) and Gauss-Newton matrix (runs, 4, 4)."""
+    z, theta, noise, weights, diagonal, rho0 = runs
+    d = z - (at[:, 0] + 1j * at[:, 1])[:, None]
+    q = np.maximum(np.abs(d), 1e-9)
+    e = (q - at[:, 2:3]) / noise[:, None]
+    a = np.angle(d * np.exp(-1j * (theta + at[:, 3:])))
+    Ma = weights.times(a)
+    least, variance = 0.5 * rho0[:, None], (noise**2)[:, None]
+    excess = (variance * diagonal / np.maximum(q, least) ** 2).sum(axis=-1)
+    cost = (e**2).sum(axis=-1) + (a * Ma).sum(axis=-1) - excess
+    one, zero = np.ones_like(q), np.zeros_like(q)
+    Je = np.stack((-d.real / q, -d.imag / q, -one, zero), axis=1) / noise[:, None, None]
+    Ja = np.stack((d.imag / q**2, -d.real / q**2, zero, -one), axis=1)
+    H = Je @ Je.swapaxes(1, 2) + Ja @ weights.times(Ja).swapaxes(1, 2)
+    g = (Je @ e[..., None] + Ja @ Ma[..., None])[..., 0]
+    pull = np.where(q > least, variance * diagonal / q**4, 0.0)
+    g[:, 0] -= (pull * d.real).sum(axis=-1)
+    g[:, 1] -= (pull * d.imag).sum(axis=-1)
+    return cost, g, H
+
+
+def _guarded(center: Array, H: Array, circles: Circles) -> Array:
+    """Hold aided centers near what the path alone says: ``oriented.guarded`` of many runs."""
+    C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
+    held = circles.valid & (circles.noise > _LEAST_NOISE_M)
+    of_circle = np.where(held[:, None, None], circles.covariance, np.eye(2))
+    spread, axes = np.linalg.eigh(of_circle)
+    apart = np.einsum("rai,rab,rbi->ri", axes, of_circle - C, axes)
+    apart = np.maximum(apart, 0.25 * spread)
+    delta = np.where(held[:, None], center - circles.center, 0.0)
+    s = np.sqrt((np.einsum("rai,ra->ri", axes, delta) ** 2 / apart).sum(axis=-1))
+    reach = 0.7 * (1.0 + 0.5 * (GATE / np.maximum(circles.conditioning, 1e-3)) ** 2)
+    kept = np.minimum(1.0, reach / np.maximum(s, 1e-12))
+    return np.asarray(np.where(held[:, None], center - (1.0 - kept)[:, None] * delta, center))

@@ -1,0 +1,197 @@
+"""Markers and poses solved together: against a chain whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jointfit_daemon.calibration.marker_refinement import (
+    MotionTrial,
+    RefinementSettings,
+    refine_markers,
+)
+from jointfit_daemon.calibration.marker_refinement._objective import Problem
+from jointfit_daemon.calibration.marker_refinement._simultaneous import errors, place, solve_jointly
+from jointfit_daemon.kinematics.chains import (
+    ChainModel,
+    ChainState,
+    Joint,
+    Marker,
+    Segment,
+    apply_step,
+    marker_positions,
+    rest_state,
+)
+from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
+
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration.marker_refinement import RefinementMethod
+
+LOCKED = (True, True, True)
+
+
+def limb() -> ChainModel:
+    """Return a pelvis, a thigh and a shank; what lies near bone is locked."""
+    rng = np.random.default_rng(3)
+    segments = (
+        Segment("pelvis"),
+        Segment("thigh", "pelvis", Joint("ball", (0.1, 0.0, -0.1))),
+        Segment("shank", "thigh", Joint("hinge", (0.0, 0.0, -0.4))),
+    )
+    middles = {"pelvis": (0.0, 0.0, 0.0), "thigh": (0.0, 0.0, -0.2), "shank": (0.0, 0.0, -0.2)}
+    markers = [
+        Marker(f"{name}{k}", name, tuple((rng.normal(0.0, 0.07, 3) + middle).tolist()))
+        for name, middle in middles.items()
+        for k in range(5)
+    ]
+    held = {f"{name}{k}": LOCKED for name in middles for k in range(2)}
+    held |= {f"pelvis{k}": LOCKED for k in range(5)}
+    return ChainModel(tuple(segments), tuple(markers)).with_locks(held)
+
+
+@cache
+def walk(frames: int = 60) -> ChainState:
+    model = limb()
+    t = np.linspace(0.0, 2 * np.pi, frames)[:, None]
+    phase = np.linspace(0.0, 3.0, model.nq)
+    swing = np.array([0.3] * 3 + [0.2] * 3 + [0.6] * 3 + [0.8])
+    return apply_step(model, rest_state(model, frames), swing * np.sin(t + phase))
+
+
+def seen(noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    clean = marker_positions(limb(), walk())
+    return clean + np.random.default_rng(seed).normal(0.0, noise, clean.shape)
+
+
+def misplaced(model: ChainModel, spread: float = 0.01) -> ChainModel:
+    off = np.random.default_rng(5).normal(0.0, spread, model.positions.shape)
+    return model.with_markers(model.positions + np.where(model.locked, 0.0, off))
+
+
+@pytest.mark.parametrize("method", ["joint", "block"])
+def test_without_noise_markers_are_found_where_they_are(method: RefinementMethod) -> None:
+    settings = RefinementSettings(method, prior=1e-6, huber_m=None, tolerance=1e-14)
+    trial = MotionTrial("walk", seen(), 100.0)
+    found = refine_markers(misplaced(limb()), [trial], settings)
+    tolerance = 1e-4 if method == "joint" else 1e-3  # descent in turns creeps at the end
+    np.testing.assert_allclose(found.model.positions, limb().positions, atol=tolerance)
+
+
+def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
+    """An oracle that eliminates nothing: scipy on poses and markers together."""
+    model, y = misplaced(limb()), seen(0.003)[::10]
+    weights, free = np.ones(y.shape[:2]), ~model.locked
+    problem = Problem(model, y, weights, free, 0.1, None)
+    start = place(problem, model.positions, solve_frames(model, y).state)
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        positions = model.positions.copy()
+        positions[free] += z[: free.sum()]
+        state = apply_step(model, start.state, z[free.sum() :].reshape(len(y), -1))
+        pull = np.sqrt(problem.pull) * (positions - model.positions)
+        return np.concatenate((errors(problem, positions, state).ravel(), pull.ravel()))
+
+    whole = least_squares(residuals, np.zeros(free.sum() + len(y) * model.nq), xtol=1e-12)
+    ended = solve_jointly(problem, start, tolerance=1e-12)[-1]
+    assert ended.cost == pytest.approx(whole.cost, rel=1e-6)
+    np.testing.assert_allclose(
+        ended.positions[free] - model.positions[free], whole.x[: free.sum()], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("method", ["joint", "block"])
+@pytest.mark.parametrize("huber", [None, 0.004])
+def test_what_is_minimized_never_rises(method: RefinementMethod, huber: float | None) -> None:
+    settings = RefinementSettings(method, huber_m=huber)
+    trial = MotionTrial("walk", seen(0.004), 100.0)
+    costs = refine_markers(misplaced(limb(), 0.015), [trial], settings).costs
+    assert len(costs) > 2
+    assert (np.diff(costs) < 0.0).all()
+
+
+def test_locked_coordinates_stay_to_the_last_digit() -> None:
+    model = misplaced(limb()).with_locks({"shank3": (False, True, False)})
+    found = refine_markers(model, [MotionTrial("walk", seen(0.002), 100.0)])
+    kept = found.model.locked
+    np.testing.assert_array_equal(found.model.positions[kept], model.positions[kept])
+    assert (found.model.positions[~kept] != model.positions[~kept]).all()
+
+
+def test_a_marker_gone_astray_moves_others_less_with_hubers_loss() -> None:
+    y = seen(0.001)
+    y[:20, 8] += 0.08  # thigh3 slips for a third of the trial
+    off = {}
+    for huber in (None, 0.01):
+        settings = RefinementSettings(prior=0.001, huber_m=huber)
+        found = refine_markers(limb(), [MotionTrial("walk", y, 100.0)], settings)
+        off[huber] = np.linalg.norm(found.model.positions - limb().positions, axis=-1).max()
+    assert off[0.01] < 0.5 * off[None]
+
+
+def test_joint_angles_come_nearer_to_the_truth_when_bone_is_locked() -> None:
+    found = refine_markers(misplaced(limb()), [MotionTrial("walk", seen(0.003), 100.0)])
+    truth = walk().rotations
+    off = [
+        np.abs(solve_frames(m, seen()).state.rotations - truth).mean()
+        for m in (misplaced(limb()), found.model)
+    ]
+    assert off[1] < 0.5 * off[0]
+    assert found.trials[0].after.rms < 0.6 * found.trials[0].before.rms
+
+
+def test_a_holdout_ends_the_work_and_gives_the_best_place_back() -> None:
+    trial = MotionTrial("walk", seen(0.004), 100.0)
+    settings = RefinementSettings(prior=1e-6, holdout_share=0.3)
+    found = refine_markers(misplaced(limb()), [trial], settings)
+    held = trial.split(0.3)[1]
+    assert len(held.targets) == 18
+    better = solve_frames(found.model, held.targets).residuals
+    worse = solve_frames(misplaced(limb()), held.targets).residuals
+    assert np.mean(better**2) < np.mean(worse**2)
+
+
+def clamped() -> ChainModel:
+    """Return the limb with a knee that its own walk overturns by up to 17 degrees."""
+    model = limb()
+    hip, knee = model.segments[1:]
+    short = replace(knee, joint=replace(knee.joint, limits=(-0.5, 1.0)))
+    return replace(model, segments=(model.segments[0], hip, short))
+
+
+def test_markers_suit_a_program_that_clamps_its_joints() -> None:
+    model, trial = clamped(), MotionTrial("walk", seen(0.002), 100.0)
+    model = model.with_locks(dict.fromkeys(model.marker_names[5:], (False,) * 3))
+    rms = {}
+    for limit in (0.0, 1.0):
+        found = refine_markers(model, [trial], RefinementSettings(limit_m2=limit))
+        hard = solve_frames(found.model, trial.targets, options=IkOptions(limit_m2=1.0))
+        rms[limit] = tracking_error(hard.residuals)
+        if limit:
+            assert found.trials[0].after.rms == pytest.approx(rms[limit], rel=0.01)
+    assert rms[1.0] < 0.8 * rms[0.0]
+
+
+def test_both_methods_find_the_same_within_limits() -> None:
+    trial, ends = MotionTrial("walk", seen(0.002), 100.0), []
+    methods: tuple[RefinementMethod, ...] = ("joint", "block")
+    for method in methods:
+        settings = RefinementSettings(method, tolerance=1e-7)
+        costs = refine_markers(clamped(), [trial], settings).costs
+        assert (np.diff(costs) < 0.0).all()
+        ends.append(costs[-1])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-3)
+
+
+def test_trials_are_thinned_evenly_and_split_in_two_runs_of_frames() -> None:
+    trial = MotionTrial("a", np.arange(100.0)[:, None, None] * np.ones((1, 2, 3)), 100.0)
+    thin = trial.thinned(30)
+    np.testing.assert_array_equal(thin.targets[:, 0, 0], np.arange(0.0, 100.0, 4.0))
+    assert thin.rate_hz == 25.0
+    first, last = trial.split(0.25)
+    np.testing.assert_array_equal(np.concatenate((first.targets, last.targets)), trial.targets)
+    assert len(last.targets) == 25

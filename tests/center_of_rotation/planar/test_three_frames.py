@@ -1,0 +1,230 @@
+"""Three frames: the closed form is interpolation, its error is told by angles, sides or bound."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from jointfit_daemon.center_of_rotation import circle_rms_bound
+from jointfit_daemon.center_of_rotation._bounds import (
+    circle_bound,
+    oriented_rms_bound,
+    uniform_arc_rms,
+)
+from jointfit_daemon.center_of_rotation.planar import (
+    Grid,
+    arbitrary_error,
+    equal_step_error,
+    grid_center,
+    plane_of,
+    three_frame_center,
+    three_frame_estimate,
+    triangle_error,
+)
+from jointfit_daemon.center_of_rotation.planar._error_prediction import (
+    component_errors,
+    needed_step,
+)
+from jointfit_daemon.center_of_rotation.planar._grid_search import grid_cost
+from jointfit_daemon.center_of_rotation.planar._plane import (
+    in_segment_plane,
+    parent_noise,
+    project,
+    radial_noise,
+)
+from jointfit_daemon.center_of_rotation.planar._three_frames import SegmentMarkers, chain_centers
+
+numbers = st.floats(-10.0, 10.0)
+anything = st.floats(allow_nan=True, allow_infinity=True)
+
+
+def on_circle(angles: Any, radius: Any = 0.3, center: tuple[float, float] = (0.0, 0.0)) -> Any:
+    t = np.asarray(angles)
+    return np.asarray(center) + radius * np.stack((np.cos(t), np.sin(t)), axis=-1)
+
+
+@given(numbers, numbers, st.floats(0.02, 1.0), st.floats(0.0, 6.0), st.floats(0.3, 2.0))
+def test_three_points_of_a_circle_give_its_center(
+    x: Any, y: Any, radius: Any, first: Any, step: Any
+) -> None:
+    points = on_circle([first, first + step, first + 2 * step], radius, (x, y))
+    assert np.abs(three_frame_center(points) - (x, y)).max() < 1e-11
+
+
+@given(st.lists(anything, min_size=6, max_size=6))
+@example([0.0, 0.0, 7e-155, 0.0, 0.0, 7e-155])  # squares that vanish
+@example([0.0, 0.0, 2e-162, 1e-162, 1e-162, 2e-162])
+@example([0.0, 0.0, 5e-324, 0.0, 0.0, 5e-324])
+@example([0.0, 0.0, 1e200, 0.0, 0.0, 1e200])  # squares that overflow
+@example([1e308, 0.0, -1e308, 0.0, 0.0, 1.0])
+@example([1.0, 1.0, 1.0, 1.0 + 2**-52, 1.0 + 2**-52, 1.0])  # a center that rounds to a point
+@example([0.0, 0.0, 1.0, 0.0, 2.0, 5e-9])  # nearly a line
+def test_any_three_points_give_a_center_or_a_reason_never_silent_nan(values: Any) -> None:
+    with np.errstate(all="ignore"):
+        found = three_frame_estimate(np.reshape(values, (3, 2)), 0.001)
+    assert np.isfinite(found.center).all()
+    assert np.isfinite(found.covariance).all()
+    assert not np.isnan([found.sd, found.arc, found.bound, found.conditioning]).any()
+    assert np.isfinite(found.radii).all()
+    if found.refused is not None:
+        assert ":" in found.refused  # cause: remedy
+
+
+def test_the_covariance_is_the_bound_of_three_points() -> None:
+    t = np.array([0.2, 0.9, 1.7])
+    found = three_frame_estimate(on_circle(t, center=(3.0, -2.0)), 0.001)
+    assert found.covariance == pytest.approx(circle_bound(t, 0.001)[:2, :2], rel=1e-9)
+    assert found.sd == pytest.approx(found.bound)
+
+
+@pytest.mark.parametrize("points", [[[0, 0], [1, 1], [2, 2]], [[0, 0], [0, 0], [1, 0]]])
+def test_points_on_a_line_are_infinitely_far_and_refused(points: Any) -> None:
+    assert (three_frame_center(points) == inf).all()
+    found = three_frame_estimate(points, 0.001)
+    assert found.refused is not None
+    assert "line" in found.refused
+    assert found.sd == inf
+
+
+def test_an_arc_that_noise_hides_is_refused() -> None:
+    found = three_frame_estimate(on_circle(np.deg2rad([0, 5, 10])), 0.001)
+    assert found.refused is not None
+    assert "noise" in found.refused
+    assert three_frame_estimate(on_circle(np.deg2rad([0, 60, 120])), 0.001).refused is None
+
+
+def test_the_three_forms_of_the_predicted_error_are_one() -> None:
+    t = np.array([0.2, 0.9, 1.7])
+    expected = circle_rms_bound(t, 0.001)
+    assert arbitrary_error(t, 0.001) == pytest.approx(expected, rel=1e-12)
+    assert triangle_error(on_circle(t), 0.001) == pytest.approx(expected, rel=1e-12)
+    x, y = component_errors(t, 0.001, 0.001)
+    assert np.hypot(x, y) == pytest.approx(expected, rel=1e-12)
+    assert (arbitrary_error(t, 1.0)) ** 2 == pytest.approx(22.1, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("step", "factor"), [(5, 322), (10, 80.7), (30, 9.25), (60, 2.58), (90, 1.414), (120, 1.155)]
+)
+def test_equal_steps_have_the_known_errors(step: Any, factor: Any) -> None:
+    found = float(equal_step_error(np.deg2rad(step), 1.0))
+    assert found == pytest.approx(factor, rel=2e-3)
+    angles = np.deg2rad(step) * np.arange(3)
+    assert found == pytest.approx(float(arbitrary_error(angles, 1.0)), rel=1e-12)
+
+
+def test_no_turn_and_half_turns_show_nothing() -> None:
+    assert equal_step_error(0.0, 0.001) == inf
+    assert equal_step_error(np.pi, 0.001) == inf
+    assert arbitrary_error([0.0, 0.0, 1.0], 0.001) == inf
+    assert triangle_error([[0, 0], [1, 1], [2, 2]], 0.001) == inf
+
+
+def test_noise_that_differs_between_axes_is_told_per_axis() -> None:
+    rng = np.random.default_rng(0)
+    t = np.array([0.0, 1.2, 2.0])
+    noisy = on_circle(t) + rng.normal(size=(100_000, 3, 2)) * (0.001, 0.0003)
+    rms = np.sqrt((three_frame_center(noisy) ** 2).mean(axis=0))
+    assert rms == pytest.approx(np.ravel(component_errors(t, 0.001, 0.0003)), rel=0.02)
+
+
+def test_the_needed_step_reaches_the_target() -> None:
+    step = needed_step(0.001, 0.006)
+    assert np.rad2deg(step) == pytest.approx(38, abs=1)
+    assert float(equal_step_error(step, 0.001)) == pytest.approx(0.006)
+    assert needed_step(0.01, 0.01) == inf
+
+
+def test_a_chain_is_found_joint_by_joint_in_its_parents_coordinates() -> None:
+    n, rng = 200, np.random.default_rng(2)
+    hip, knee = 0.4 * np.sin(np.linspace(0, 3, n)), np.linspace(0.1, 1.9, n)
+
+    def turn(angle: Any, at: Any) -> Any:
+        c, s = np.cos(angle), np.sin(angle)
+        return np.stack((c * at[0] - s * at[1], s * at[0] + c * at[1]), axis=-1)
+
+    joint = turn(hip, (0.4, 0.0))
+    thigh = SegmentMarkers(turn(hip, (0.1, 0.05)), turn(hip, (0.3, 0.05)))
+    shank = SegmentMarkers(joint + turn(hip + knee, (0.2, 0.0)), joint + turn(hip + knee, (0.3, 0)))
+    foot_joint = joint + turn(hip + knee, (0.45, 0.0))
+    foot = SegmentMarkers(foot_joint + turn(2 * knee, (0.1, 0)), foot_joint + turn(knee, (0.2, 0)))
+    shift = rng.normal(size=(n, 2))  # the whole body moves
+    moved = [SegmentMarkers(s.first + shift, s.second + shift) for s in (thigh, shank, foot)]
+    found = chain_centers(moved, 0.0005)
+    assert found[0].center == pytest.approx([0.2, -0.05], abs=1e-9)
+    assert found[1].center == pytest.approx([0.2, 0.0], abs=1e-9)
+    assert [f.refused for f in found] == [None, None]
+
+
+def test_a_parent_whose_markers_meet_has_no_plane_of_its_own() -> None:
+    here = np.zeros((1, 2))
+    assert np.isnan(in_segment_plane(here, here, np.ones((1, 2)))).all()
+    with pytest.raises(ValueError, match="axis"):
+        plane_of((0, 0, 0))
+
+
+@given(st.tuples(numbers, numbers, numbers).filter(lambda a: np.linalg.norm(a) > 0.1))
+def test_a_plane_is_across_its_axis_and_right_handed(axis: Any) -> None:
+    first, second = plane_of(axis).T
+    n = np.array(axis) / np.linalg.norm(axis)
+    assert np.cross(first, second) == pytest.approx(n, abs=1e-12)
+    assert np.abs(project(np.array(axis), axis)).max() < 1e-12
+    assert plane_of((1, 0, 0)) == pytest.approx(np.eye(3)[:, 1:])
+
+
+def test_the_parents_noise_is_turned_by_the_lever() -> None:
+    rng = np.random.default_rng(1)
+    n, noise, apart, at = 100_000, 0.001, 0.2, np.array([0.05, 0.3])
+    p, q, m = (v + rng.normal(0, noise, (n, 2)) for v in ((-apart / 2, 0), (apart / 2, 0), at))
+    expected = parent_noise(at, apart, noise)
+    assert np.cov(in_segment_plane(p, q, m).T) == pytest.approx(expected, rel=0.05, abs=2e-8)
+    sideways = radial_noise(at[None], (0.25, 0.3), apart, noise)
+    assert sideways == pytest.approx(np.sqrt(expected[0, 0]))
+
+
+def test_a_grid_finds_the_node_an_arc_is_round_about() -> None:
+    grid = Grid((0.0, 0.0), 0.05, 0.01)
+    points = on_circle(np.linspace(0, 4, 30), 0.2, (0.02, -0.03))
+    assert grid_center(points, grid) == pytest.approx([0.02, -0.03])
+    many = np.stack([points, points + np.array([0.01, 0.0])])
+    assert grid_center(many, grid) == pytest.approx(np.array([[0.02, -0.03], [0.03, -0.03]]))
+    assert grid_cost(points, grid.nodes()).min() == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arc", "free", "known"), [(10, 86.4, 1.97), (45, 4.34, 0.455), (90, 1.14, 0.258)]
+)
+def test_bounds_of_even_arcs_are_the_known_ones(arc: float, free: Any, known: Any) -> None:
+    phi, n = np.deg2rad(arc), 20_000
+    middles = (np.arange(n) + 0.5) / n * phi
+    scale = np.sqrt(n / 100)
+    for radius_known, expected in ((False, free), (True, known)):
+        ends = np.linspace(0.0, phi, 100)
+        table = circle_rms_bound(ends, 1.0, known_radius=radius_known)
+        assert table == pytest.approx(expected, rel=5e-3)
+        closed = uniform_arc_rms(phi, 100, 1.0, known_radius=radius_known)
+        exact = scale * circle_rms_bound(middles, 1.0, known_radius=radius_known)
+        assert exact == pytest.approx(closed, rel=1e-4)
+    assert uniform_arc_rms(1e-3, 100, 1.0) == pytest.approx(26.8 / 10 / 1e-6, rel=2e-3)
+
+
+def test_known_angles_leave_the_mean_to_be_found() -> None:
+    t = np.linspace(-0.5, 0.5, 101) * np.deg2rad(30)
+    z = np.exp(1j * t)
+    expected = np.sqrt(2 / (101 * (1 - abs(z.mean()) ** 2)))
+    assert oriented_rms_bound(t, 1.0) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("angles", [[], [0.3], [0.3, 0.3, 0.3], [0.0, np.pi]])
+def test_what_shows_no_center_has_an_infinite_bound(angles: Any) -> None:
+    assert circle_rms_bound(angles, 0.001) == inf
+    assert np.isinf(np.diag(circle_bound(angles, 0.001))).all()
+    assert oriented_rms_bound(angles[:1], 0.001) == inf
+    assert uniform_arc_rms(0.0, 10, 0.001) == inf
+    assert uniform_arc_rms(1e-100, 10, 0.001) == inf
+    assert uniform_arc_rms(1e-9, 10, 0.001, known_radius=True) == inf

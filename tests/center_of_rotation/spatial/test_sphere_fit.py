@@ -1,0 +1,144 @@
+"""What is no movement is refused; what goes with posture is not taken for knowledge."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.stats import f as fisher
+
+from bench.subjects.simulated_joints import CHILD, PARENT, ball_turns, hinge_turns, watched
+from jointfit_daemon.center_of_rotation import Movement, estimate_center
+from jointfit_daemon.center_of_rotation.spatial import Limits, fit_running, fit_sphere, turn_noise
+from jointfit_daemon.center_of_rotation.spatial._observability import of_posture, within95
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import rigid_fit
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
+AT_REST = np.tile(np.eye(3), (200, 1, 1))
+
+
+@pytest.mark.parametrize("noise", [1e-4, 5e-4, 2e-3])
+@pytest.mark.parametrize("name", ["sphere", "running_sphere", "halvorsen", "score", "sara"])
+def test_a_child_at_rest_in_a_noisy_parent_is_refused(name: str, noise: float) -> None:
+    for seed in range(12):
+        seen = watched(np.random.default_rng(seed), AT_REST, noise=noise)
+        found = estimate_center(Movement(seen.points, seen.parent, seen.child), name)
+        assert found.refused is not None
+        assert "move" in found.refused
+
+
+def test_turns_of_a_loose_parent_are_not_the_joints() -> None:
+    believed = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        loose = 0.3 * PARENT
+        seen = watched(rng, AT_REST, noise=4e-3, frame=loose)
+        told = Movement(seen.points, seen.parent, seen.child)
+        believed += estimate_center(told, "sphere").refused is None
+        known = Movement(seen.points, seen.parent, seen.child, loose)
+        found = estimate_center(known, "sphere")
+        assert found.refused is not None
+    assert believed >= 3, "the case has lost its point: points alone are refused anyway"
+
+
+def test_the_turn_of_a_parents_frame_agrees_with_simulation() -> None:
+    rng = np.random.default_rng(1)
+    seen = PARENT + rng.normal(0, 1e-3, (20_000, *PARENT.shape))
+    q = rigid_fit(PARENT, seen)[0]
+    turns = rotation.log(q)
+    loosest = float(np.sqrt(np.linalg.eigvalsh(np.cov(turns.T))[-1]))
+    assert turn_noise(PARENT, 1e-3) == pytest.approx(loosest, rel=0.03)
+
+
+def on_skin(seed: int, cycles: int = 4) -> Array:
+    """Return a knee's markers, each sliding with the flexion its own way; center at the origin."""
+    rng = np.random.default_rng(seed)
+    s = np.linspace(0.0, 2.0 * np.pi * cycles, 100 * cycles)
+    flexion = np.radians(35.0) * np.sin(s)
+    turns = rotation.to_matrix(rotation.exp(flexion[:, None] * np.array([1.0, 0.0, 0.0])))
+    ways = rng.normal(0, 0.004, (3, 4, 3))
+    waves = np.stack((np.sin(s), np.cos(2 * s), np.sin(3 * s)), axis=1)
+    slid = CHILD + np.einsum("tw,wkc->tkc", waves, ways)
+    points = np.einsum("tij,tkj->tki", turns, slid)
+    return np.asarray(points + rng.normal(0, 5e-4, points.shape))
+
+
+def test_a_direction_that_only_skin_shows_is_unseen() -> None:
+    misled = 0
+    for seed in range(12):
+        points = on_skin(seed)
+        trusting = fit_sphere(points, limits=Limits(posture=False))
+        misled += bool(trusting.sd < inf and np.linalg.norm(trusting.center) > 3.0 * trusting.sd)
+        found = fit_sphere(points)
+        assert found.refused is not None or found.sd == inf
+        assert "residuals_repeat" in found.flags
+    assert misled >= 6, "the case has lost its point: it misleads nobody"
+
+
+def test_the_error_told_on_skin_is_about_the_error_made() -> None:
+    squares = []
+    for seed in range(24):
+        found = fit_sphere(on_skin(seed))
+        across = np.linalg.svd(found.unseen)[2][len(found.unseen) :] if len(found.unseen) else None
+        if across is None or found.refused is not None:
+            continue
+        e = across @ found.center
+        C = across @ found.covariance @ across.T
+        squares.append(float(e @ np.linalg.solve(C, e)) / len(e))
+    assert len(squares) >= 12
+    assert 0.2 < np.mean(squares) < 2.0
+
+
+def test_a_refusal_for_skin_does_not_ask_for_a_longer_arc_alone() -> None:
+    told = [found.refused for seed in range(24) if (found := fit_sphere(on_skin(seed))).refused]
+    assert any("where skin slides least" in why for why in told)
+    clean = watched(np.random.default_rng(1), ball_turns(np.random.default_rng(1), 9.0))
+    why = fit_sphere(clean.points).refused
+    assert why is None or "skin" not in why
+
+
+def test_cycles_repeated_do_not_make_skin_known_better() -> None:
+    few, many = (fit_sphere(on_skin(3, cycles)) for cycles in (4, 40))
+    assert np.trace(many.covariance) == pytest.approx(np.trace(few.covariance), rel=0.2)
+
+
+def test_noise_that_fades_does_not_pass_for_skin() -> None:
+    rng = np.random.default_rng(2)
+    for rho in (0.0, 0.5):
+        for _ in range(10):
+            seen = watched(rng, ball_turns(rng, 45))
+            e = rng.normal(0, 1e-3, seen.points.shape)
+            for t in range(1, len(e)):
+                e[t] = rho * e[t - 1] + np.sqrt(1 - rho**2) * e[t]
+            assert "residuals_repeat" not in fit_sphere(seen.points + e).flags
+    assert of_posture(0.06, 1e6) == 0.0
+    assert of_posture(0.9, 100.0) == 0.9
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3])
+@pytest.mark.parametrize("freedom", [20.0, 100.0, 5000.0])
+def test_the_published_ellipse_has_the_quantile_of_its_freedom(rank: int, freedom: float) -> None:
+    exact = rank * float(fisher.ppf(0.95, rank, freedom))
+    assert within95(rank, freedom) == pytest.approx(exact, rel=0.02)
+
+
+def test_every_spatial_answer_says_how_large_its_ellipse_is() -> None:
+    rng = np.random.default_rng(4)
+    for turns in (ball_turns(rng, 45), hinge_turns(45.0, axis=0)):
+        seen = watched(rng, turns)
+        movement = Movement(seen.points, seen.parent, seen.child, PARENT)
+        for name in ("sphere", "running_sphere", "score"):
+            found = estimate_center(movement, name)
+            assert found.within95 is not None
+            assert found.within95 > within95(3 - len(found.unseen), inf)
+
+
+def test_a_stream_leaves_skin_to_who_asks_unless_told() -> None:
+    points = on_skin(5)
+    assert "residuals_repeat" not in fit_running(points).flags
+    assert "residuals_repeat" in fit_running(points, limits=Limits()).flags
