@@ -1,11 +1,11 @@
-"""``candump -L`` text as CAN chunks. Law: text in, records out, and every line is accounted for.
+"""``candump -L`` text as CAN chunks; every line is accounted for.
 
-    (1436509052.249713) can0 105#2A366C2B       eight digits of identifier: a 29-bit one; #R: remote
+    (1436509052.249713) can0 105#2A366C2B       eight identifier digits: 29 bits; #R: remote
 
-A record is what `jointfit_protocols.can._frame` defines (24 bytes: i64 time in ns, u32 identifier,
-u8 flags, u8 size, two zeros, eight data bytes). It is packed here once more because the daemon
-knows no wire format; a test holds the two together. A line that is no classic CAN frame becomes
-that format's note of bytes lost, so that whoever decodes the chunks counts it.
+A chunk is one record of `jointfit_protocols.can_frame` (24 bytes: i64 time in ns, u32 identifier,
+u8 flags, u8 size, two zeros, eight data bytes). The record is packed here again because the daemon
+does not import wire formats; a test compares the two. A line that is not a classic CAN frame
+becomes that format's record of lost bytes, so that the decoder counts it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 RECORD_BYTES = 24
+"""Size of a record, bytes."""
 
 _RECORD = struct.Struct("<qIBBxx8s")
 _EXTENDED, _REMOTE, _ERROR = 1, 2, 4
@@ -34,7 +35,7 @@ _LINE = re.compile(
 
 
 def is_candump(data: bytes) -> bool:
-    """Tell whether the first line that is neither empty nor a comment is one of ``candump -L``."""
+    """Return whether the first line other than blanks and comments is ``candump -L`` output."""
     for line in data[:4096].splitlines():
         text = line.strip()
         if text and not text.startswith(b"#"):
@@ -59,7 +60,7 @@ def read_candump(data: bytes) -> Iterator[Chunk]:
 
 
 def _record(line: bytes) -> tuple[int, bytes] | None:
-    """Return time and record of one line; None if it is no classic CAN frame."""
+    """Return time and record of one line; None if it is not a classic CAN frame."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None

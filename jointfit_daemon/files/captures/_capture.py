@@ -1,14 +1,14 @@
-"""Recorded bytes of any wire as chunks, for `jointfit decode`. Law: files in, chunks out.
+"""Recorded bytes of any wire as chunks, for `jointfit decode`.
 
-The kind of file is seen from its first bytes, never from its name:
+The file type is determined from the first bytes, not from the name:
 
 | file | wire | chunks |
 |---|---|---|
-| pcapng, pcap | datagram | one a UDP datagram, both directions, at the packet's own time |
-| ``candump -L`` text | can | one a line, a record of `jointfit_protocols.can._frame` |
+| pcapng, pcap | datagram | one per UDP datagram, both directions, at the packet's own time |
+| ``candump -L`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
 | raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
-| raw bytes | can | records of `jointfit_protocols.can._frame` back to back |
+| raw bytes | can | consecutive records of `jointfit_protocols.can_frame` |
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Wire
 
 PIECE = 4096
-"""Bytes in a chunk of a raw stream."""
+"""Bytes per chunk of a raw stream."""
 
 NS_PER_BYTE = 10 * 10**9 // 921_600
-"""Invented time of a raw stream: ten bits a byte at 921 600 baud."""
+"""Assumed duration of a byte in a raw stream, ns: ten bits at 921 600 baud."""
 
 
 class UnreadableCaptureError(ValueError):
-    """The file cannot be a capture of this wire: the message says what was found and expected."""
+    """File that is not a capture of this wire; the message names both types."""
 
 
 def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Chunk]:
@@ -46,14 +46,14 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
     path : Path
         pcapng, pcap, ``candump -L`` text or raw bytes.
     wire : {"stream", "datagram", "can"}
-        How the driver's chunks are cut.
+        Kind of the driver's chunks.
     port : int, optional
-        Keep only UDP datagrams from or to this port.
+        Select UDP datagrams from or to this port.
 
     Raises
     ------
     UnreadableCaptureError
-        The file holds another wire than the driver reads.
+        The file is a capture of another kind of wire.
     OSError
         The file cannot be read.
     """
@@ -101,7 +101,7 @@ def _pieces(data: bytes, size: int) -> Iterator[Chunk]:
 
 
 def _walk(data: bytes) -> Iterator[Chunk]:
-    """Cut messages of ``u16 id, u16 length`` if they fill the file exactly; else take it whole."""
+    """Yield messages ``u16 id, u16 length, …`` if they fill the file exactly; else all of it."""
     cuts = [0]
     while cuts[-1] + 4 <= len(data):
         (size,) = struct.unpack_from("<H", data, cuts[-1] + 2)

@@ -1,8 +1,8 @@
-"""UDP payloads out of pcapng and pcap files. Law: bytes in, datagrams out; a cut file ends early.
+"""UDP payloads from pcapng and pcap files; a truncated file ends early.
 
-Read: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
-stamps, Ethernet (with VLAN tags), Linux cooked and raw IP links, IPv4, fragments put together.
-Everything else in the file is passed over. Time is the packet's own, ns since 1970.
+Supported: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
+timestamps, Ethernet (with VLAN tags), Linux cooked and raw IP links, IPv4 with reassembly of
+fragments. Everything else in the file is skipped. Time is the packet's own, ns since 1970.
 
 Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791.
 """
@@ -22,13 +22,13 @@ PCAP_MAGICS = {
     b"\x4d\x3c\xb2\xa1": ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-"""First bytes of a pcap file: byte order, and nanoseconds a unit of its fraction."""
+"""First bytes of a pcap file: byte order, and nanoseconds per unit of its fraction."""
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _LITTLE_MAGIC = b"\x4d\x3c\x2b\x1a"
 _RESOLUTION, _OFFSET = 9, 14  # options if_tsresol, if_tsoffset
 _LINK_HEADS = {101: (0, None), 228: (0, None), 113: (16, 14), 276: (20, 0)}
-"""Link types: bytes before the IP header, and where their EtherType stands."""
+"""Link types: bytes before the IP header, and the offset of their EtherType."""
 _ETHERNET = 1
 _IPV4, _VLAN = 0x0800, (0x8100, 0x88A8)
 _UDP = 17
@@ -37,7 +37,7 @@ _UDP_HEAD = struct.Struct(">HHHH")
 _BLOCK_EDGES, _INTERFACE_HEAD, _PACKET_HEAD, _OFFSET_BYTES = 12, 8, 20, 8
 _PCAP_HEAD = 24
 _MAX_PENDING = 64
-"""Datagrams in fragments that may wait at once."""
+"""Most datagrams under reassembly at once."""
 
 
 class UdpPacket(NamedTuple):
@@ -129,7 +129,7 @@ def _read_pcap(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _ip_offset(frame: bytes, link: int) -> int | None:
-    """Return where the IPv4 header begins; None where there is none."""
+    """Return the offset of the IPv4 header, or None."""
     if link == _ETHERNET:
         at = 12
         while frame[at : at + 2] in {kind.to_bytes(2, "big") for kind in _VLAN}:
@@ -146,13 +146,13 @@ def _ip_offset(frame: bytes, link: int) -> int | None:
 
 
 class _Fragments:
-    """Puts the fragments of IPv4 datagrams together; what never completes is forgotten."""
+    """Reassembly of IPv4 fragments; incomplete datagrams are dropped."""
 
     def __init__(self) -> None:
         self._pending: dict[tuple[bytes, int], _Parts] = {}
 
     def segment(self, packet: bytes) -> bytes | None:
-        """Return the UDP segment that `packet` holds or completes, if any."""
+        """Return the UDP segment that `packet` contains or completes, if any."""
         if len(packet) < _IP_HEAD or packet[0] >> 4 != _IP_VERSION or packet[9] != _UDP:
             return None
         total, number, flags = struct.unpack_from(">HHH", packet, 2)
@@ -179,7 +179,7 @@ class _Parts:
         self._end: int | None = None
 
     def add(self, offset: int, body: bytes, *, more: bool) -> bool:
-        """Take a fragment; return whether as many bytes came as the datagram has."""
+        """Add a fragment; return whether the datagram has all its bytes."""
         self._held += len(body) - len(self._bodies.get(offset, b""))
         self._bodies[offset] = body
         if not more:
@@ -187,7 +187,7 @@ class _Parts:
         return self._end is not None and self._held >= self._end
 
     def join(self) -> bytes | None:
-        """Return the whole datagram; None if fragments overlap or do not meet."""
+        """Return the whole datagram; None if fragments overlap or leave gaps."""
         whole = bytearray()
         for offset, body in sorted(self._bodies.items()):
             if offset != len(whole):

@@ -1,8 +1,8 @@
-"""C3D, trials as most motion-capture programs keep them, through the optional package ``c3d``.
+"""C3D files: marker trials, read with the optional package ``c3d``.
 
-Law: positions are handed over in metres, in the file's own axes. A point is missing where its
-residual is negative, whatever its coordinates say (most writers put zeros there): it is NaN. Times
-follow the frame numbers: frame 1 is at 0 s, as in a TRC of the same trial.
+Positions are returned in metres, in the file's own axes. A point with a negative residual is
+missing (NaN), whatever its coordinates. Times follow the frame numbers: frame 1 is at 0 s, as in a
+TRC file of the same trial.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ if TYPE_CHECKING:
 
 
 class MissingPackageError(ImportError):
-    """The optional package that reads this kind of file is not installed; says how to get it."""
+    """The optional package for this file format is not installed; the message names it."""
 
 
 def read_c3d(path: Path) -> MarkerTrajectories:
-    """Return the points of a C3D file; analog channels are left where they are.
+    """Return the points of a C3D file; analog channels are ignored.
 
-    Labels are kept as written (``Subject:LASI``). Frame numbers and `t_s` come from the first frame
-    of the trial, which is rarely 1.
+    Labels are returned as written (``Subject:LASI``). Frame numbers and `t_s` start at the first
+    frame of the trial, which is rarely 1.
 
     Raises
     ------
     MissingPackageError
         The package ``c3d`` is not installed.
     MalformedFileError
-        Not a C3D file, a broken one, or one without points, or a unit that is no length.
+        Not a C3D file, damaged, without points, or with an unknown unit of length.
     """
     return _open(path)[0]
 
 
 def read_c3d_with_up(path: Path) -> tuple[MarkerTrajectories, str | None]:
-    """Return `read_c3d` and the axis that is up on the screen: "x", "y" or "z"; None if unsaid."""
+    """Return `read_c3d` and the vertical screen axis "x", "y" or "z"; None if not declared."""
     return _open(path)
 
 
@@ -57,7 +57,7 @@ def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
         ) from missing
     reject_device(path)
     with path.open("rb") as handle, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns of every file without analog channels
+        warnings.simplefilter("ignore")  # c3d warns of every file without analog channels
         try:
             return _read(path, c3d.Reader(handle))
         except MalformedFileError:
@@ -82,12 +82,14 @@ def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
     frames = [points[: len(names), :4].copy() for _, points, _ in reader.read_frames(copy=False)]
     if not frames:
         raise MalformedFileError(f"{path}: a header without frames: export the trial again")
+
     cells = np.array(frames, dtype=np.float64).reshape(-1, len(names), 4)
     first, rate_hz = int(reader.first_frame), float(reader.point_rate)
     if not 0.0 < rate_hz < math.inf:
         raise MalformedFileError(
             f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
         )
+
     numbers = np.arange(first, first + len(cells), dtype=np.int64)
     trajectories = MarkerTrajectories(
         names,
@@ -101,14 +103,14 @@ def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
 
 
 def _positions(cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions (n, k, 3) of x, y, z, residual (n, k, 4); NaN where there was no point."""
+    """Return positions (n, k, 3) from x, y, z, residual (n, k, 4); NaN where missing."""
     positions: NDArray[np.float64] = cells[..., :3].copy()
     positions[cells[..., 3] < 0.0] = np.nan
     return positions
 
 
 def _labels(reader: Any) -> Iterator[str]:
-    """Yield point labels; beyond 255 they go on in LABELS2, LABELS3 ..."""
+    """Yield point labels; more than 255 continue in LABELS2, LABELS3, ..."""
     for suffix in ("", *(str(i) for i in range(2, 257))):
         found = reader.get(f"POINT:LABELS{suffix}")
         if found is None:
@@ -127,4 +129,4 @@ def _text(reader: Any, key: str) -> str:
 
 
 def _doubts(counted: int, claimed: int) -> tuple[str, ...]:
-    return () if counted == claimed else (f"the header says {claimed} frames, counted {counted}",)
+    return () if counted == claimed else (f"header declares {claimed} frames, counted {counted}",)

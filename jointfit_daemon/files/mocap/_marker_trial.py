@@ -1,8 +1,8 @@
-"""Marker trials of either kind, TRC or C3D, as one thing: names, metres, z up.
+"""Marker trials from TRC or C3D files, in metres with z up.
 
-Law: what a file does not say is asked for or told, never guessed in silence. `up_axis` and whether
-the file said so are part of the answer. A marker exactly in the origin is missing (NaN): no real
-one ever is, and programs that have no other word for missing write it so.
+The source of the vertical axis (file, caller or convention of the format) is part of the result. A
+marker exactly at the origin is missing (NaN): programs without another representation of missing
+markers write it so.
 """
 
 from __future__ import annotations
@@ -28,28 +28,29 @@ _TO_Z_UP: dict[str, list[int]] = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]
 
 
 class UnknownMarkerError(ValueError):
-    """A marker that is not in the trial; the message names the nearest ones."""
+    """Marker that is not in the trial; the message lists similar names."""
 
 
 @dataclass(frozen=True, slots=True)
 class MarkerTrial:
-    """Markers over time in a world whose z is up."""
+    """Marker positions over time in a world with z up."""
 
     trajectories: MarkerTrajectories
-    """Positions turned to z up, m; NaN where missing."""
+    """Positions rotated to z up, m; NaN where missing."""
     up_axis: Axis
-    """The file's own axis that became z."""
+    """Vertical axis of the file, which became z."""
     up_said_by: Literal["file", "caller", "custom of the format"]
 
     def points(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return the trajectories of markers by name, m, shape (n, len(names), 3).
 
-        A subject's prefix may be left out where that is unambiguous: ``LASI`` finds ``Tom:LASI``.
+        The prefix of a subject may be omitted where that is unambiguous: ``LASI`` finds
+        ``Tom:LASI``.
 
         Raises
         ------
         UnknownMarkerError
-            All names that are not there, each with the nearest spelling.
+            All unknown names, each with similar ones.
         """
         wanted = [self._index(name) for name in names]
         unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
@@ -58,11 +59,11 @@ class MarkerTrial:
         return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
-        """Return one of the file's axes in the world whose z is up, shape (3,)."""
+        """Return an axis of the file in the world with z up, shape (3,)."""
         return np.asarray(np.eye(3)["xyz".index(axis)][_TO_Z_UP[self.up_axis]])
 
     def to_file(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take vectors (..., 3) back to the file's own axes."""
+        """Return vectors (..., 3) in the file's own axes."""
         return np.asarray(vectors[..., np.argsort(_TO_Z_UP[self.up_axis])])
 
     def _index(self, name: str) -> int | None:
@@ -93,20 +94,20 @@ def _bare(name: str) -> str:
 
 
 def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
-    """Return a trial by the ending of its name: ``.trc`` or ``.c3d``.
+    """Return the trial of a ``.trc`` or ``.c3d`` file.
 
     Parameters
     ----------
     path
-        Units are the file's: mm, cm and m are recognized.
+        File in mm, cm or m.
     up_axis
-        The file's axis that is up. None: what a C3D says of its screen, else z; for a TRC y, which
-        is OpenSim's custom.
+            Vertical axis of the file. Default: as declared in a C3D file, else z; for TRC y, the
+        convention of OpenSim.
 
     Raises
     ------
     MalformedFileError
-        Neither TRC nor C3D, or broken.
+        Neither TRC nor C3D, or damaged.
     MissingPackageError
         The optional C3D reader is not installed.
     """

@@ -1,7 +1,6 @@
-"""TRC, marker trajectories as motion-capture programs export them.
+"""TRC files: marker trajectories exported by motion-capture programs.
 
-Law: positions are handed over in metres, in the file's own axes; a missing marker is NaN. The
-rows::
+Positions are returned in metres, in the file's own axes; a missing marker is NaN. Rows::
 
     PathFileType  4  (X/Y/Z)  name
     DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 _HEADER_ROWS = 5
 _MOST_FRAMES = 2.0**53
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-"""Units of length that marker files use."""
+"""Metres per unit of length in marker files."""
 _KEYS = (
     "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
 )
@@ -48,7 +47,7 @@ _KEYS = (
 
 @dataclass(frozen=True, slots=True)
 class MarkerTrajectories:
-    """Markers over time."""
+    """Marker positions over time."""
 
     names: tuple[str, ...]
     t_s: NDArray[np.float64]
@@ -59,7 +58,7 @@ class MarkerTrajectories:
     """Positions in the file's axes, m, shape (n, len(names), 3); NaN where missing."""
     rate_hz: float
     warnings: tuple[str, ...] = ()
-    """What the header claims and the rows do not hold."""
+    """Contradictions between header and rows."""
 
 
 _MOST_FRAMES = 2.0**53
@@ -67,12 +66,12 @@ _MOST_FRAMES = 2.0**53
 
 
 def read_trc(path: Path) -> MarkerTrajectories:
-    """Return the trajectories of a TRC file; tab, comma or blanks between cells.
+    """Return the trajectories of a TRC file with tabs, commas or blanks between cells.
 
     Raises
     ------
     MalformedFileError
-        Not a TRC file, one without markers or rows, or a unit that is no length.
+        Not a TRC file, no markers, no rows, or an unknown unit of length.
     """
     lines = read_lines(path)
     if len(lines) < _HEADER_ROWS or not lines[0].startswith("PathFileType"):
@@ -86,11 +85,13 @@ def read_trc(path: Path) -> MarkerTrajectories:
         raise MalformedFileError(
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
         )
+
     body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)
     rows = rows_of_numbers(path, body, separator, 2 + 3 * len(names))
     unit = header.get("Units", "mm").lower()
     if unit not in METRES:
         raise MalformedFileError(f"{path}: Units is {unit!r}, expected one of {', '.join(METRES)}")
+
     require_times(path, rows[:, 1])
     if not (np.abs(rows[:, 0]) < _MOST_FRAMES).all():
         raise MalformedFileError(
@@ -122,18 +123,19 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, str], float]:
 def _doubts(header: dict[str, str], *, rows: int, markers: int) -> tuple[str, ...]:
     counted = {"NumFrames": rows, "NumMarkers": markers}
     return tuple(
-        f"{key} says {header.get(key, 'nothing')}, counted {count}"
+        f"header {key} is {header.get(key, 'missing')}, counted {count}"
         for key, count in counted.items()
         if header.get(key, "") != str(count)
     )
 
 
 def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
-    """Write a TRC file in metres: tab-separated, 8 significant digits, empty cells for missing."""
+    """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing."""
     count, markers = len(trajectories.t_s), len(trajectories.names)
     rate = written(trajectories.rate_hz)
     first = int(trajectories.frames[0]) if count else 1
     header = (rate, rate, count, markers, "m", rate, first, count)
+
     axes = (f"{axis}{i}" for i in range(1, markers + 1) for axis in "XYZ")
     rows = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",

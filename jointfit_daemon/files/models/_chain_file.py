@@ -1,7 +1,7 @@
-"""Chain models as small files: TOML to be written by hand, JSON for programs; the same keys.
+"""Chain models in TOML (for editing) and JSON (for programs), with the same keys.
 
-Law: metres and radians in the file as in the program, z up; whatever has a default may be left out.
-All that is wrong is told at once. docs/kinematics.md describes the format.
+Metres and radians, z up, as in the program; keys with a default may be omitted. All errors of a
+file are reported at once. The format is described in docs/kinematics.md.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ _SAMPLE = 8
 
 
 def read_model(path: Path) -> ChainModel:
-    """Return the chain of a ``.toml`` or ``.json`` file.
+    """Return the chain model of a ``.toml`` or ``.json`` file.
 
     Raises
     ------
     MalformedFileError
-        Broken, keys that are not known, values of the wrong kind, segments that make no chain,
-        lengths that cannot be metres.
+            Damaged file, unknown keys, values of the wrong type, segments that do not form a chain,
+        or lengths that cannot be metres.
     """
     data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
     wrong = _wrong(data)
@@ -69,7 +69,7 @@ def read_model(path: Path) -> ChainModel:
 
 
 def write_model(path: Path, model: ChainModel) -> None:
-    """Write a chain as TOML, or as JSON if the name ends so; `read_model` returns the same."""
+    """Write a chain model as TOML or JSON, by file extension; the inverse of `read_model`."""
     data = as_data(model)
     if path.suffix.lower() == ".json":
         text = json.dumps(data, indent=1, ensure_ascii=False) + "\n"
@@ -79,7 +79,7 @@ def write_model(path: Path, model: ChainModel) -> None:
 
 
 def as_data(model: ChainModel) -> dict[str, Any]:
-    """Return a chain as plain lists and dicts, defaults left out."""
+    """Return a chain model as lists and dicts, without default values."""
     return {
         "name": model.name,
         "segment": [_segment_data(s) for s in model.segments],
@@ -134,7 +134,7 @@ def _marker(data: dict[str, Any]) -> Marker:
 
 
 def _wrong(data: Any) -> list[str]:
-    """Return all that keeps `data` from being read."""
+    """Return all errors in `data`."""
     if not isinstance(data, dict):
         return ["expected a table with name, segment and marker"]
     wrong = _unknown("model", "the model", data)
@@ -222,5 +222,5 @@ def _value(value: Any) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a TOML basic string: JSON's escapes are TOML's, but for DEL."""
+    """Return a TOML basic string; its escapes are those of JSON, except for DEL."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

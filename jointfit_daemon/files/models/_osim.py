@@ -1,8 +1,9 @@
-"""OpenSim models as chains of ours: the joints of the chosen bodies, and their markers.
+"""OpenSim models as chain models: the joints of selected bodies, and their markers.
 
-Law: OpenSim's world and bodies have y up, x forward, z right; ours z up, y forward, x right. Every
-vector (x, y, z) becomes (z, x, y), axes of bodies included, so segments keep their meaning. What is
-not the same afterwards is in the remarks; what is not understood is refused.
+OpenSim's world and bodies have y up, x forward, z right; chain models have z up, y forward, x
+right. Every vector (x, y, z) becomes (z, x, y), axes of bodies included, so segment frames
+correspond. Differences between the models are reported as remarks; unsupported elements are
+rejected.
 """
 
 from __future__ import annotations
@@ -40,19 +41,19 @@ _TO_Z_UP = [2, 0, 1]
 
 @dataclass(frozen=True, slots=True)
 class ImportedModel:
-    """A chain and what became of the model it was made from."""
+    """Chain model with remarks on differences from the OpenSim model."""
 
     model: ChainModel
     remarks: tuple[str, ...]
 
 
 def to_z_up(vectors: Array) -> Array:
-    """Take vectors (..., 3) from OpenSim's axes to ours."""
+    """Return vectors (..., 3) in OpenSim's axes in those of chain models."""
     return np.asarray(np.asarray(vectors)[..., _TO_Z_UP])
 
 
 def to_y_up(vectors: Array) -> Array:
-    """Take vectors (..., 3) from our axes to OpenSim's."""
+    """Return vectors (..., 3) in the axes of chain models in those of OpenSim."""
     return np.asarray(np.asarray(vectors)[..., np.argsort(_TO_Z_UP)])
 
 
@@ -63,24 +64,24 @@ def read_osim(
     markers: Collection[str] | None = None,
     marker_set: Path | None = None,
 ) -> ImportedModel:
-    """Return the chain of an OpenSim 4 model.
+    """Return the chain model of an OpenSim 4 model.
 
     Parameters
     ----------
     path
-        ``.osim``.
+        ``.osim`` file.
     bodies
-        Only markers of these; bodies that no marker needs are left out. None: all.
+        Use only markers of these bodies; bodies that no marker needs are omitted. Default: all.
     markers
-        Only these markers. None: all.
+        Use only these markers. Default: all.
     marker_set
-        An XML file whose markers replace the model's.
+        XML file with markers that replace those of the model.
 
     Raises
     ------
     MalformedFileError
-        No OpenSim 4 model; joints or functions that are not known; names that are not there;
-        lengths that are not metres.
+            Not an OpenSim 4 model, unsupported joints or functions, unknown names, or lengths that
+        are not metres.
     """
     document = read_document(path)
     found = document.markers if marker_set is None else read_marker_set(marker_set)
@@ -89,6 +90,7 @@ def read_osim(
         tree = _Tree(document)
     except ValueError as error:
         raise MalformedFileError(f"{path}: {error}") from error
+
     chosen = [
         m
         for m in found
@@ -97,7 +99,8 @@ def read_osim(
     riders = [rider for m in chosen if (rider := tree.placed(m)) is not None]
     keep = tree.needed({m.segment for m in riders}) if riders else set(tree.segments)
     if not riders:
-        tree.remarks.append("no markers: all bodies are kept")
+        tree.remarks.append("no markers: all bodies are included")
+
     segments = tree.kept(keep)
     try:
         model = ChainModel(tuple(segments), tuple(riders), document.name)
@@ -130,7 +133,7 @@ def _check(
     unknown = [f"no body {b!r}" for b in bodies or () if b not in document.bodies]
     unknown += [f"no marker {m!r}" for m in markers or () if m not in names]
     unknown += [
-        f"marker {m.name!r} on {m.body!r}, which is no body"
+        f"marker {m.name!r} on unknown body {m.body!r}"
         for m in found
         if m.body not in document.bodies and m.body != GROUND
     ]
@@ -139,11 +142,11 @@ def _check(
 
 
 class _Tree:
-    """Bodies on joints, welded ones merged; parents first."""
+    """Bodies on joints, parents first; welded bodies are merged."""
 
     def __init__(self, document: OsimDocument) -> None:
         self.remarks = [
-            f"constraint {name} is not kept: what it couples moves on its own"
+            f"constraint {name} is ignored: its coordinates are independent"
             for name in document.constraints
         ]
         self.segments: dict[str, Segment] = {}
@@ -153,10 +156,10 @@ class _Tree:
         while waiting:
             ready = [j for j in waiting if j.parent.body in self._at]
             if not ready:
-                raise ValueError(f"joints in a circle: {', '.join(j.name for j in waiting)}")
+                raise ValueError(f"joints form a cycle: {', '.join(j.name for j in waiting)}")
             for joint in ready:
                 if joint.child.body in self._at:
-                    raise ValueError(f"body {joint.child.body!r} hangs on two joints")
+                    raise ValueError(f"body {joint.child.body!r} has two parent joints")
                 nearest = nearest_joint(joint)
                 self._add(joint.parent.body, joint.child.body, nearest)
             waiting = [j for j in waiting if j not in ready]
@@ -165,7 +168,7 @@ class _Tree:
             self._add(GROUND, body, None)
 
     def _add(self, parent_body: str, body: str, joint: NearestJoint | None) -> None:
-        """Hang a body on its parent; `joint` None: it moves freely."""
+        """Attach a body to its parent; without a `joint` it moves freely."""
         parent, placed = self._at[parent_body]
         if joint is not None and joint.kind is None:
             self._at[body] = (parent, placed @ joint.rest)
@@ -180,6 +183,7 @@ class _Tree:
                 self._told[body] += (f"{body} moves freely: its parent {parent} is left out",)
             self.segments[body] = Segment(body)
             return
+
         center = placed[:3, :3] @ joint.center_in_parent + placed[:3, 3]
         rest = rotation.from_matrix(placed[:3, :3] @ joint.rest[:3, :3])
         self.segments[body] = Segment(
@@ -207,7 +211,7 @@ class _Tree:
         return Marker(marker.name, segment, _vector(at), locked=(fixed, fixed, fixed))
 
     def needed(self, marked: set[str]) -> set[str]:
-        """Return the segments between the marked ones, those included."""
+        """Return the segments that connect the marked ones, including those."""
         paths = {name: self._path(name) for name in marked}
         keep = {above for path in paths.values() for above in path}
         for root in [name for name in keep if self.segments[name].parent is None]:
@@ -228,7 +232,7 @@ class _Tree:
         return path
 
     def kept(self, keep: set[str]) -> list[Segment]:
-        """Return these segments, roots whose parents are left out moving freely."""
+        """Return these segments; roots without their parents move freely."""
         left = [name for name in self.segments if name not in keep]
         if left:
             self.remarks.append(f"left out, no marker needs them: {', '.join(left)}")
@@ -247,7 +251,7 @@ def _vector(v: Array) -> Vector:
 
 
 def _path(path: Array, placed: Array) -> tuple[Sample, ...]:
-    """Return a coupled joint's samples in our axes, its parent part of another body."""
+    """Return the samples of a coupled joint in the axes of chain models."""
     turns = rotation.multiply(rotation.from_matrix(placed), path[:, 1:5])
     shifts = path[:, 5:] @ placed.T
     return tuple(

@@ -1,7 +1,7 @@
-"""What an OpenSim file says, as plain data in its own axes: bodies, joints, frames, markers.
+"""Content of an OpenSim file as plain data in its own axes: bodies, joints, frames, markers.
 
-Law: nothing is interpreted but names, numbers and frames. A document type declaration is refused
-before anything is expanded, so no entity can grow or reach elsewhere.
+Only names, numbers and frames are interpreted. A document type declaration is rejected before any
+expansion, so no entity can grow or refer to other files.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 LARGEST = 64 << 20
+"""Largest size of a model file, bytes."""
 GROUND = "ground"
 _METRES = "meters"
 
@@ -51,7 +52,7 @@ class OsimJoint:
 
     name: str
     kind: str
-    """The tag: CustomJoint, PinJoint, …"""
+    """XML tag: CustomJoint, PinJoint, …"""
     parent: OffsetFrame
     child: OffsetFrame
     coordinates: tuple[Coordinate, ...]
@@ -66,30 +67,30 @@ class OsimMarker:
     name: str
     body: str
     location: Array
-    """Axes of the body, m, shape (3,)."""
+    """Position in the axes of the body, m, shape (3,)."""
     fixed: bool
 
 
 @dataclass(frozen=True, slots=True)
 class OsimDocument:
-    """What a model file says."""
+    """Content of a model file."""
 
     name: str
     bodies: tuple[str, ...]
     joints: tuple[OsimJoint, ...]
     markers: tuple[OsimMarker, ...]
     constraints: tuple[str, ...]
-    """Constraints that are in force."""
+    """Names of the enforced constraints."""
 
 
 def read_document(path: Path) -> OsimDocument:
-    """Return what an ``.osim`` file of OpenSim 4 says.
+    """Return the content of an ``.osim`` file of OpenSim 4.
 
     Raises
     ------
     MalformedFileError
-        No OpenSim model of version 4, broken XML, XML with a document type, a file out of size,
-        another unit of length than metres.
+            Not an OpenSim 4 model, invalid XML, a document type declaration, an oversized file, or
+        a unit of length other than metres.
     """
     root = read_xml(path)
     model = root.find("Model")
@@ -158,7 +159,7 @@ def read_xml(path: Path) -> ET.Element:
 
 
 def text_of(element: ET.Element, tag: str, default: str = "") -> str:
-    """Return the stripped text of a child, or `default` if there is none."""
+    """Return the stripped text of a child element, or `default`."""
     return (element.findtext(tag) or default).strip()
 
 
@@ -168,7 +169,7 @@ def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array
         values = np.array([float(cell) for cell in text_of(element, tag).split()])
     except ValueError:
         values = np.array([np.nan])
-        count = count or 0  # what holds no numbers is wrong, however many were expected
+        count = count or 0  # text without numbers is an error, whatever count was expected
     if count is not None and (values.size != count or not np.isfinite(values).all()):
         name = element.get("name", element.tag)
         raise ValueError(f"{name}: {tag} is {text_of(element, tag)!r}, expected {count} numbers")
@@ -181,7 +182,7 @@ def body_of(socket: str) -> str:
 
 
 def fixed_xyz(angles: Array) -> Array:
-    """Return the matrix of turns about x, then the new y, then the new z; rad."""
+    """Return the matrix of rotations about x, then the new y, then the new z; rad."""
     turns = []
     for axis, angle in enumerate(angles):
         j, k = (axis + 1) % 3, (axis + 2) % 3
@@ -218,7 +219,7 @@ def _joint(joint: ET.Element) -> OsimJoint:
 
 def _frame(socket: str, frames: dict[str, ET.Element]) -> OffsetFrame:
     transform, name = np.eye(4), body_of(socket)
-    for _ in range(len(frames) + 1):  # a frame may stand on a frame, but not for ever
+    for _ in range(len(frames) + 1):  # frames may be nested, but not in a cycle
         if name not in frames:
             return OffsetFrame(name, transform)
         frame, step = frames[name], np.eye(4)
@@ -226,7 +227,7 @@ def _frame(socket: str, frames: dict[str, ET.Element]) -> OffsetFrame:
         step[:3, 3] = numbers_of(frame, "translation", 3)
         transform = step @ transform
         name = body_of(text_of(frame, "socket_parent"))
-    raise ValueError(f"frame {socket!r} stands on itself")
+    raise ValueError(f"frame {socket!r} is defined relative to itself")
 
 
 def _coordinate(coordinate: ET.Element) -> Coordinate:

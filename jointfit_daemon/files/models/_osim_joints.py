@@ -1,13 +1,13 @@
-r"""The nearest of our joints to one of OpenSim's.
+r"""Approximation of an OpenSim joint by a joint of the chain model.
 
-Law: what turns by one coordinate becomes a hinge if it is one, else a coupled joint on samples of
-its motion; what turns by two or three becomes a ball. Axis and centers are those that come nearest
-to the motion over the range of its coordinates:
+A rotation by one coordinate becomes a hinge if it has a fixed axis, else a coupled joint with
+samples of its motion. A rotation by two or three coordinates becomes a ball. Axis and centers
+minimize the error over the range of the coordinates:
 
 .. math:: A_i \approx A_{rest}\exp(a\varphi_i), \qquad
           \min_{c, C} \sum_i |t_i + A_i c - C|^2
 
-and how far the motion is from what it became is told.
+The remaining error is reported in a remark.
 """
 
 from __future__ import annotations
@@ -28,19 +28,23 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import JointKind
 
 _ALL = 3
+"""Number of axes in space."""
 _SAMPLES = 61
+"""Number of samples over the range of a coordinate."""
 _AT_HOME = 0.05
-"""Pull of a center to the joint's own frame: a centimetre away counts as half a millimetre off."""
+"""Regularization of a center toward the joint's own frame: 1 cm of distance counts as 0.5 mm of
+error.
+"""
 _WIDEST = np.pi / 2
-"""Coordinates with wider ranges are looked at this far to either side of their default."""
+"""Range evaluated to either side of the default of a coordinate with a wider range, rad."""
 _BEYOND = 0.3
-"""Samples of a coupled joint go on so far beyond its range, rad: not all programs clamp it."""
+"""Extension of the samples of a coupled joint beyond its range, rad: not all programs clamp it."""
 _TELL_M, _TELL_RAD = 1e-4, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class NearestJoint:
-    """One of our joints, or none (``weld``), in OpenSim's axes."""
+    """Joint of the chain model, or none (``weld``), in OpenSim's axes."""
 
     kind: JointKind | None
     rest: Array
@@ -51,26 +55,27 @@ class NearestJoint:
     limits: tuple[float, float] | None
     remarks: tuple[str, ...]
     path: Array | None = None
-    """Of a coupled joint: coordinate, quaternion, shift of its center; shape (n, 8)."""
+    """Samples of a coupled joint: coordinate, quaternion, shift of its center; shape (n, 8)."""
 
 
 def nearest_joint(joint: OsimJoint) -> NearestJoint:
-    """Return the nearest of our joints, and remarks where it is not the same.
+    """Return the approximating joint, with remarks on the differences.
 
     Raises
     ------
     ValueError
-        A kind of joint or function that is not known here.
+        Unsupported type of joint or function.
     """
     motion = JointMotion(joint)
     moving = [c for c in joint.coordinates if not c.locked]
     turning = [c for c in moving if c.name in motion.turning]
     shifting = [c for c in moving if c.name in motion.shifting and c not in turning]
+
     rest = _sampled(joint, motion, {})
     welded = NearestJoint(
         None, _transform(rest), rest[1][0], np.zeros(3), np.array([1.0, 0.0, 0.0]), None, ()
     )
-    remarks = [f"{joint.name}: {c.name} is locked and stays" for c in joint.coordinates if c.locked]
+    remarks = [f"{joint.name}: {c.name} is locked and fixed" for c in joint.coordinates if c.locked]
     if shifting and (joint.parent.body == GROUND or len(shifting) == _ALL):
         if len(moving) < 2 * _ALL:
             remarks.append(f"{joint.name}: moves freely, not only along {_names(moving)}")
@@ -118,14 +123,16 @@ def _transform(pose: tuple[Array, Array]) -> Array:
 
 
 def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Array, float]:
-    """Return the center in the parent and in the child, m, and the farthest it is missed by.
+    """Return the center in the parent and in the child, m, and the largest error.
 
-    Where the motion hardly cares (along an axis) it is the one nearest to the joint's own frame.
+    Where the motion does not determine it (along an axis), the center is nearest to the joint's own
+    frame.
     """
     own = joint.child.transform[:3, 3]
     seen = shifts + turns @ own
     middle = seen.mean(axis=0)
     fixed = np.broadcast_to(-np.eye(3), turns.shape)
+
     design = np.concatenate((turns, fixed), axis=-1).reshape(-1, 6)
     pull = _AT_HOME * np.sqrt(len(turns)) * np.eye(6)
     wanted = np.concatenate(((middle - seen).ravel(), np.zeros(6)))
@@ -145,10 +152,10 @@ def _ball(
     above, own, missed = _centers(joint, *_sampled(joint, motion, values))
     remarks = []
     if len(turning) < _ALL:
-        remarks.append(f"{joint.name}: turns about any axis, not only by {_names(turning)}")
+        remarks.append(f"{joint.name}: rotates about any axis, not only by {_names(turning)}")
     if missed > _TELL_M:
         remarks.append(
-            f"{joint.name}: its moving center became a fixed one, off by {1000 * missed:.1f} mm"
+            f"{joint.name}: moving center replaced by a fixed one, off by {1000 * missed:.1f} mm"
             " at most"
         )
     return replace(welded, kind="ball", center_in_parent=above, center=own, remarks=tuple(remarks))
@@ -157,7 +164,7 @@ def _ball(
 def _about_one(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return the hinge that a coordinate turns, or the curve on which it leads its segment."""
+    """Return the hinge of one coordinate, or the coupled joint if the axis is not fixed."""
     span = _span(coordinate)
     zero = min(max(0.0, span[0]), span[1])
     values = np.concatenate(([zero, *span], np.linspace(*span, _SAMPLES)))
@@ -166,6 +173,7 @@ def _about_one(
     above, own, missed = _centers(joint, turns[3:], shifts[3:])
     if missed > _TELL_M or bent > _TELL_RAD:
         return _coupled(joint, motion, coordinate, welded)
+
     ends = _turned_about(rotation.from_matrix(rest), rotation.from_matrix(turns[1:3]), axis)[1]
     limits = (min(ends[0], angles[1]), max(ends[1], angles[-1]))
     transform = np.eye(4)
@@ -184,7 +192,7 @@ def _about_one(
 def _coupled(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return the joint as samples of its motion, some beyond its range; both told apart."""
+    """Return the joint as samples of its motion, extended beyond its range, with its errors."""
     low, high = _span(coordinate)
     zero = min(max(0.0, low), high)
     values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)
@@ -193,7 +201,8 @@ def _coupled(
     seen = shifts + turns @ own
     above = seen[-1]
     path = np.column_stack((values, rotation.from_matrix(turns[:-1]), seen[:-1] - above))
-    # every second sample stands for all; those in between tell how well
+
+    # Every second sample defines the curve; those in between measure its error.
     turned, found = CoupledCurve.through(path[::2].tolist()).at(values)
     missed = float(np.linalg.norm(found[:, 1:4] - path[:, 5:], axis=1).max())
     bent = float(np.linalg.norm(turned - turns[:-1], axis=(1, 2)).max() / np.sqrt(2.0))
@@ -212,10 +221,11 @@ def _coupled(
 
 
 def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
-    """Return rest, axis, angles and the farthest turn beside the axis, of rotations (n, 3, 3).
+    """Return rest, axis, angles and largest deviation from the axis, of rotations (n, 3, 3).
 
-    Rest and axis in turns: the mean of what the hinge does not explain, then the first direction
-    of what turns from there. The angle of the first rotation is zero.
+    Rest and axis are computed alternately: the mean of the part that the hinge does not explain,
+    then the principal direction of the rotations from there. The angle of the first rotation is
+    zero.
     """
     q = rotation.from_matrix(turns)
     rest = q[0]
@@ -232,7 +242,7 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
 
 
 def _turned_about(rest: Array, q: Array, axis: Array | None = None) -> tuple[Array, Array]:
-    """Return `axis`, or the direction about which most turns from `rest`, and the turns, rad."""
+    """Return `axis`, or the principal axis of the rotations from `rest`, and the angles, rad."""
     v = rotation.log(rotation.multiply(rotation.conjugate(rest), q))
     if axis is None:
         axis = np.asarray(np.linalg.svd(v, full_matrices=False)[2][0])

@@ -1,6 +1,6 @@
-"""How OpenSim's joints move: their functions and transforms, evaluated.
+"""Motion of OpenSim joints: evaluation of their functions and transforms.
 
-Law: as OpenSim defines them; several values of the coordinates at once, one a row.
+As defined by OpenSim, for several coordinate values at once, one per row.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 _X, _Y, _Z = np.eye(3)
 _TURNING = 3
-"""The first transform axes turn; as many more shift."""
+"""Number of rotational transform axes; as many translational ones follow."""
 _CUBIC = 4
-"""Points that a cubic needs."""
+"""Least number of points of a cubic spline."""
 _TURNS: dict[str, list[Array]] = {
     "WeldJoint": [],
     "SliderJoint": [],
@@ -45,17 +45,17 @@ _SHIFTS: dict[str, list[Array]] = {
 
 
 class JointMotion:
-    """A joint's transform as a function of its coordinates.
+    """Transform of a joint as a function of its coordinates.
 
     Parameters
     ----------
     joint
-        As written.
+        Joint as written in the file.
 
     Raises
     ------
     ValueError
-        A kind of joint or function that is not known here.
+        Unsupported type of joint or function.
     """
 
     def __init__(self, joint: OsimJoint) -> None:
@@ -66,19 +66,19 @@ class JointMotion:
             vectors = [*_padded(_TURNS[joint.kind]), *_padded(_SHIFTS.get(joint.kind, []))]
             axes = _in_order(vectors, self.names)
         else:
-            raise ValueError(f"joint {joint.name}: {joint.kind} is not known here")
+            raise ValueError(f"joint {joint.name}: {joint.kind} is not supported")
         if len(axes) != 2 * _TURNING:
             raise ValueError(f"joint {joint.name}: {len(axes)} transform axes")
         self._axes = axes
 
     @property
     def turning(self) -> frozenset[str]:
-        """Coordinates that turn the child."""
+        """Coordinates that rotate the child."""
         return self._driving(self._axes[:_TURNING])
 
     @property
     def shifting(self) -> frozenset[str]:
-        """Coordinates that shift the child."""
+        """Coordinates that translate the child."""
         return self._driving(self._axes[_TURNING:])
 
     def _driving(self, axes: list[tuple[str, Array, Function]]) -> frozenset[str]:
@@ -91,7 +91,7 @@ class JointMotion:
         Parameters
         ----------
         values
-            Of each coordinate, shape (n,).
+            Values of each coordinate, shape (n,).
         """
         count = max((len(v) for v in values.values()), default=1)
         q = np.broadcast_to(rotation.IDENTITY, (count, 4))
@@ -149,7 +149,7 @@ def _function(element: Element) -> Function:
         return lambda q: np.asarray(np.polyval(coefficients, q))
     if kind in {"SimmSpline", "NaturalCubicSpline", "PiecewiseLinearFunction"}:
         return _through_points(element)
-    raise ValueError(f"function {kind} is not known here")
+    raise ValueError(f"function {kind} is not supported")
 
 
 def _scalar(element: Element, tag: str, default: float) -> float:
@@ -157,11 +157,11 @@ def _scalar(element: Element, tag: str, default: float) -> float:
 
 
 def _through_points(element: Element) -> Function:
-    """Return a curve through points, straight beyond them.
+    """Return a curve through points, extrapolated linearly.
 
-    A SimmSpline's ends follow the cubic through their four nearest points; here they follow the
-    cubic of the two nearest pieces, which differs in the end pieces only, by micrometres. Despite
-    its name OpenSim makes a SimmSpline of a NaturalCubicSpline.
+    The ends of a SimmSpline follow the cubic through their four nearest points; here they follow
+    the cubic of the two nearest pieces. The difference is micrometres, in the end pieces only.
+    OpenSim evaluates a NaturalCubicSpline as a SimmSpline, too.
     """
     x, y = numbers_of(element, "x"), numbers_of(element, "y")
     if x.size != y.size or x.size <= 1 or not (np.diff(x) > 0.0).all():

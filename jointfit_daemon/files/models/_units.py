@@ -1,8 +1,8 @@
-"""Whether a chain read from a file can be in metres.
+"""Plausibility check of lengths in model files.
 
-Law: files say millimetres and mean them, or say nothing; a chain a thousand times too large would
-still fit some movement. No part of a body is ten metres from its own segment, so such a file is
-refused.
+Files without a unit, or in millimetres despite one, would yield a chain a thousand times too large
+that still fits some motion. No point of a body is ten metres from its own segment, so such a file
+is rejected.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 FARTHEST_M = 10.0
+"""Largest distance of a point from the origin of its segment, m."""
 
 
 def require_metres(path: Path, model: ChainModel) -> ChainModel:
-    """Return the model.
+    """Return the model if its lengths are plausible in metres.
 
     Raises
     ------
     MalformedFileError
-        A marker or a joint center lies more than 10 m from its segment's origin.
+        A marker or a joint center is more than 10 m from its segment's origin.
     """
     points = {f"marker {m.name!r}": m.position for m in model.markers}
     for s in model.segments:

@@ -1,17 +1,17 @@
-"""NPZ, trials as arrays: orientations of sensors, and of bones where a reference knew them.
+"""NPZ files: orientations of sensors and, with a reference system, of bones.
 
-Law: handed over in the project's world (z up, x right, y forward) with segment frames likewise,
-whatever axes the file has. Arrays of a file, n instants::
+Returned in the project's world (z up, x right, y forward) with segment frames likewise, whatever
+the axes of the file. Arrays of a file with n instants::
 
     t        (n,)     seconds
     ID_quat  (n, 4)   orientation of sensor ID, (w, x, y, z), sensor to world
     q_BONE   (n, 4)   orientation of a bone, bone to world
     p_BONE   (n, 3)   its origin, m
-    up       ()       "y" or "z": the file's upward axis; left out it is y, with x forward (OpenSim)
+    up       ()       "y" or "z": the vertical axis; default y, with x forward (OpenSim)
 
-A y-up file is turned by the cyclic renaming of OpenSim's axes (x forward, y up, z right): a vector
-(x, y, z) becomes (z, x, y), a quaternion (w, x, y, z) becomes (w, z, x, y). That renames the
-segments' axes too, which are named like the world's.
+A y-up file is converted by cyclic renaming of OpenSim's axes (x forward, y up, z right): a vector
+(x, y, z) becomes (z, x, y), a quaternion (w, x, y, z) becomes (w, z, x, y). The segment axes, which
+are named like those of the world, are renamed as well.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
 
 _GIB = 1 << 30
 LARGEST = _GIB
-"""Bytes of all arrays of a file, unpacked: 15 hours of four sensors at 100 Hz."""
+"""Largest uncompressed size of all arrays of a file, bytes: 15 hours of four sensors at 100 Hz."""
 _KINDS = "biufU"
-"""Kinds of arrays that are read: truth values, numbers, text (``up``)."""
+"""Accepted kinds of arrays: booleans, numbers, text (``up``)."""
 _SENSOR = "_quat"
 _BONE, _ORIGIN = "q_", "p_"
 
 
 @dataclass(frozen=True, slots=True)
 class OrientationTrial:
-    """Sensors and bones over time, z up."""
+    """Orientations of sensors and bones over time, z up."""
 
     t_s: NDArray[np.float64]
-    """Shape (n,), s."""
+    """Times, s, shape (n,)."""
     sensors: Mapping[str, NDArray[np.float64]]
     """q_world_sensor by id, shape (n, 4), unit; NaN where missing."""
     bones: Mapping[str, NDArray[np.float64]]
@@ -55,12 +55,12 @@ class OrientationTrial:
 
 
 def vectors_z_up(vectors: ArrayLike) -> NDArray[np.float64]:
-    """Return vectors (x, y, z) of OpenSim's axes as (z, x, y), shape (..., 3)."""
+    """Return vectors (x, y, z) in OpenSim's axes as (z, x, y), shape (..., 3)."""
     return np.asarray(vectors, dtype=np.float64)[..., [2, 0, 1]]
 
 
 def quaternions_z_up(quaternions: ArrayLike) -> NDArray[np.float64]:
-    """Return quaternions (w, x, y, z) of OpenSim's axes as (w, z, x, y), unit, shape (..., 4)."""
+    """Return quaternions (w, x, y, z) in OpenSim's axes as (w, z, x, y), unit, shape (..., 4)."""
     turned = np.asarray(quaternions, dtype=np.float64)[..., [0, 3, 1, 2]]
     return _unit(turned)
 
@@ -71,7 +71,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     MalformedFileError
-        It is none, is cut off, unpacks to more than `LARGEST`, or holds Python objects.
+        Not an NPZ file, truncated, larger than `LARGEST` when unpacked, or with Python objects.
     """
     reject_device(path)
     with path.open("rb") as file:
@@ -80,14 +80,14 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 return _arrays(path, archive)
         except MalformedFileError:
             raise
-        except Exception as fault:  # zipfile and its codecs raise ten kinds for broken archives
+        except Exception as fault:  # zipfile and its codecs raise many types for damaged archives
             raise MalformedFileError(
                 f"{path}: not an NPZ file, or cut off: export it again"
             ) from fault
 
 
 def _arrays(path: Path, archive: ZipFile) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an archive; never reads a pickle, never more than the members hold."""
+    """Return the arrays of an archive; pickled objects are never read."""
     members = archive.infolist()
     unpacked = sum(member.file_size for member in members)
     if unpacked > LARGEST:
@@ -124,7 +124,7 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     Raises
     ------
     MalformedFileError
-        As `read_arrays`; no ``t``, or neither a sensor nor a bone.
+        As `read_arrays`; or without ``t``, or with neither a sensor nor a bone.
     """
     arrays = read_arrays(path)
     names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]

@@ -1,8 +1,8 @@
-"""STO and MOT, tables over time as OpenSim writes them; and STO tables of orientations.
+"""STO and MOT files: OpenSim's tables over time, and STO tables of orientations.
 
-Law: numbers are handed over as written, angles too: ``in_degrees`` says what they are. Free header
-lines and ``key=value`` lines up to ``endheader``, then the column names, then rows. In a table of
-orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body to world.
+Numbers are returned as written, angles included; ``in_degrees`` is their unit. A file has free
+header lines and ``key=value`` lines up to ``endheader``, then the column names, then rows. In a
+table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body to world.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 _ROW_KEYS = ("nrows", "datarows")
 _COLUMN_KEYS = ("ncolumns", "datacolumns")
 _QUATERNION = 4
-_SHOWN = 60  # characters of a cell in a message
+_SHOWN = 60
+"""Most characters of a cell quoted in a message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class TimeTable:
     columns: tuple[str, ...]
     """Names without ``time``."""
     t_s: NDArray[np.float64]
-    """Shape (n,), s."""
+    """Times, s, shape (n,)."""
     values: NDArray[np.float64]
     """As written, shape (n, len(columns)); NaN where missing."""
     in_degrees: bool
@@ -55,7 +56,7 @@ class TimeTable:
     warnings: tuple[str, ...] = ()
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Return one column, shape (n,); ValueError if there is none of that name."""
+        """Return one column, shape (n,); ValueError if there is no such column."""
         return self.values[:, self.columns.index(name)]
 
 
@@ -65,26 +66,26 @@ class OrientationTable:
 
     names: tuple[str, ...]
     t_s: NDArray[np.float64]
-    """Shape (n,), s."""
+    """Times, s, shape (n,)."""
     quaternions: NDArray[np.float64]
     """q_world_body in the file's axes, shape (n, len(names), 4); NaN where missing."""
     rate_hz: float | None = None
 
 
 def read_sto(path: Path) -> TimeTable:
-    """Return the table of a STO or MOT file; tab, comma or blanks between cells.
+    """Return the table of a STO or MOT file with tabs, commas or blanks between cells.
 
     Raises
     ------
     MalformedFileError
-        No ``endheader``, no column row, no rows of data, or a first column that is not time.
+        No ``endheader``, no column names, no rows, or a first column other than time.
     """
     name, header, columns, separator, body = _open(path)
     rows = rows_of_numbers(path, body, separator, len(columns))
     require_times(path, rows[:, 0])
     counted = {_ROW_KEYS: len(rows), _COLUMN_KEYS: len(columns)}
     doubts = tuple(
-        f"{key} says {header[key]}, counted {count}"
+        f"header {key} is {header[key]}, counted {count}"
         for keys, count in counted.items()
         for key in keys
         if key in header and header[key] != str(count)
@@ -99,7 +100,7 @@ def read_orientations_sto(path: Path) -> OrientationTable:
     Raises
     ------
     MalformedFileError
-        As `read_sto`, or cells that are not four numbers.
+        As `read_sto`, or a cell without four numbers.
     """
     _, header, columns, separator, body = _open(path)
     if header.get("datatype", "").lower() != "quaternion" or separator == ",":
@@ -151,11 +152,11 @@ def _quaternion(path: Path, at: int, cell: str) -> list[float]:
 def _open(
     path: Path,
 ) -> tuple[str, dict[str, str], tuple[str, ...], str | None, Iterator[tuple[int, str]]]:
-    """Return first line, header, column names, separator, and the numbered rows."""
+    """Return first line, header, column names, separator, and numbered rows."""
     lines = read_lines(path)
     header: dict[str, str] = {}
     end = 0
-    for end, line in enumerate(lines):  # noqa: B007 - the place is wanted after the loop
+    for end, line in enumerate(lines):  # noqa: B007 - the index is used after the loop
         plain = line.rstrip(", \t")
         if plain.lower() == "endheader":
             break

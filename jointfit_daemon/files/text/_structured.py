@@ -1,7 +1,7 @@
-"""TOML and JSON files from anywhere, read within bounds: every fault is `MalformedFileError`.
+"""TOML and JSON files from untrusted sources, read within bounds.
 
-Invariant: no content of a file raises anything but `MalformedFileError`, reads more than
-`most_bytes`, waits for a writer or exceeds the recursion limit of a later reader.
+Invariant: a file raises nothing but `MalformedFileError`. Reading is limited to `most_bytes`, never
+waits for a writer, and yields no value that exceeds the recursion limit of a later reader.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MOST_BYTES = 4 * 1024 * 1024
-"""Size of the largest TOML or JSON file written by hand, with a large margin."""
+"""Largest size of a TOML or JSON file, bytes; far above any file written by hand."""
 MAX_NESTING = 32
-"""Levels of nesting; no format of the project needs ten."""
+"""Largest nesting depth; no format of the project needs ten levels."""
 _MOST_BITS = 64
 _KINDS = {
     stat.S_IFDIR: "a directory",
@@ -45,19 +45,19 @@ def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     Raises
     ------
     MalformedFileError
-        It cannot be read, is no regular file, too large, not UTF-8 or not TOML.
+        Not readable, not a regular file, too large, not UTF-8, or not TOML.
     """
     table: dict[str, Any] = _parsed(path, "TOML", parse_toml, read_text(path, most_bytes))
     return table
 
 
 def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
-    """Return the value of a JSON file; NaN and infinity are refused, as in the standard.
+    """Return the value of a JSON file; NaN and infinity are rejected, as in the standard.
 
     Raises
     ------
     MalformedFileError
-        It cannot be read, is no regular file, too large, not UTF-8 or not JSON.
+        Not readable, not a regular file, too large, not UTF-8, or not JSON.
     """
     return _parsed(path, "JSON", parse_json, read_text(path, most_bytes))
 
@@ -68,7 +68,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     Raises
     ------
     MalformedFileError
-        It cannot be read, is no regular file, too large or not UTF-8.
+        Not readable, not a regular file, too large, or not UTF-8.
     """
     data = read_bounded(path, most_bytes)
     try:
@@ -87,7 +87,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     Raises
     ------
     MalformedFileError
-        It cannot be read, is no regular file or holds more than `most_bytes`.
+        Not readable, not a regular file, or larger than `most_bytes`.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
@@ -103,7 +103,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     except ValueError as error:  # a NUL in the name; or MalformedFileError, from above
         if isinstance(error, MalformedFileError):
             raise
-        raise MalformedFileError(f"{str(path)!r}: is no name of a file: {error}") from error
+        raise MalformedFileError(f"{str(path)!r}: not a valid file name: {error}") from error
     except OSError as error:
         raise MalformedFileError(f"{path}: cannot be read: {error.strerror or error}") from error
     if len(data) > most_bytes:
@@ -121,7 +121,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     RecursionError
         Nested too deeply.
     """
-    # tomllib needs time and memory that grow with the square of the parts of a dotted key.
+    # The time and memory of tomllib grow with the square of the number of parts of a dotted key.
     if _DEEP_KEY.search(text):
         raise RecursionError(f"a key of more than {MAX_NESTING} parts")
     return tomllib.loads(text)
@@ -157,10 +157,10 @@ def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> An
 
 
 def find_structure_fault(value: object) -> str | None:
-    """Return why a parsed value would make a later reader fail, or None.
+    """Return the reason why a parsed value would make a later reader fail, or None.
 
-    Checked are the depth and integers beyond 64 bits. Iterative, since the value may be deeper than
-    the stack.
+    Checks the nesting depth and integers beyond 64 bits. Iterative, since the value may be deeper
+    than the stack.
     """
     waiting: list[tuple[object, str, int]] = [(value, "", 0)]
     while waiting:

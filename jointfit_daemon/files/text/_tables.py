@@ -1,8 +1,8 @@
-"""Rows of numbers in text files, whoever wrote them: tab, comma or blanks between cells.
+"""Tables of numbers in text files, with cells separated by tab, comma or blanks.
 
-Invariants: every fault of a file is `MalformedFileError`; memory grows with the size of the file,
-whatever its header claims. An empty cell, or anything that spells "not a number", is missing (NaN).
-Declared counts are hints: real files carry wrong ones, so rows are counted, never believed.
+Invariants: every fault of a file raises `MalformedFileError`; memory grows with the size of the
+file, whatever its header declares. An empty cell and any spelling of NaN are missing values (NaN).
+Declared counts are often wrong in real files, so rows are counted.
 """
 
 from __future__ import annotations
@@ -19,28 +19,30 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _CELLS_PER_CHARACTER = 16
+"""Most table cells per character of the file."""
 _FEW_CELLS = 1_000_000
-"""Tables up to this size may have rows that are mostly missing; larger ones must hold data."""
-_SHOWN = 40  # characters of a cell in a message
+"""Cells up to which rows may be mostly missing; larger tables must contain data."""
+_SHOWN = 40
+"""Most characters of a cell quoted in a message."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 DIGITS = 8
-"""Significant digits of what is written."""
+"""Significant digits written."""
 
 
 class MalformedFileError(ValueError):
-    """A file that is not what its name says; the message names file, line and remedy."""
+    """File with invalid content; the message names the file, the line and the remedy."""
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file without their ends; bytes that are no UTF-8 are replaced.
+    """Return the lines of a text file without line ends or byte order mark.
 
-    A byte order mark is left out.
+    Bytes that are not UTF-8 are replaced.
 
     Raises
     ------
     MalformedFileError
-        A device instead of a file, or UTF-16.
+        The path is a device, or the text is UTF-16.
     """
     reject_device(path)
     data = path.read_bytes()
@@ -50,12 +52,12 @@ def read_lines(path: Path) -> list[str]:
 
 
 def reject_device(path: Path) -> None:
-    """Refuse devices and sockets, which may never end.
+    """Raise an error for devices and sockets, which may never end.
 
     Raises
     ------
     MalformedFileError
-        `path` is one.
+        `path` is a device or a socket.
     """
     if path.is_char_device() or path.is_block_device() or path.is_socket():
         raise MalformedFileError(
@@ -64,19 +66,19 @@ def reject_device(path: Path) -> None:
 
 
 def separator_of(line: str) -> str | None:
-    """Return what separates the cells of a row of column names; None is runs of blanks."""
+    """Return the separator of a row of column names; None for runs of blanks."""
     return "\t" if "\t" in line else "," if "," in line else None
 
 
 def cells_of(line: str, separator: str | None) -> list[str]:
-    """Return the cells of a row, stripped; trailing empty cells stay (they may be missing data)."""
+    """Return the stripped cells of a row; trailing empty cells remain (missing data)."""
     if separator is None:
         return line.split()
     return [cell.strip() for cell in line.split(separator)]
 
 
 def strip_trailing_empty(cells: Sequence[str]) -> list[str]:
-    """Return `cells` without the empty ones at the end: padding, not columns."""
+    """Return `cells` without empty ones at the end, which are padding."""
     end = len(cells)
     while end and not cells[end - 1]:
         end -= 1
@@ -84,12 +86,12 @@ def strip_trailing_empty(cells: Sequence[str]) -> list[str]:
 
 
 def number(path: Path, at: int, cell: str) -> float:
-    """Return the number in a cell of line `at`; NaN if it is empty or says so.
+    """Return the number in a cell of line `at`; NaN if the cell is empty or spells NaN.
 
     Raises
     ------
     MalformedFileError
-        It is none; a decimal comma is named as such.
+        The cell is not a number; the message identifies a decimal comma.
     """
     try:
         return float(cell) if cell else math.nan
@@ -98,7 +100,9 @@ def number(path: Path, at: int, cell: str) -> float:
         remedy = "correct the cell, or leave it empty"
         if "," in cell and _is_number(cell.replace(",", ".", 1)):
             remedy = "it has a decimal comma: export the table with decimal points"
-        raise MalformedFileError(f"{path}, line {at}: {shown!r} is no number: {remedy}") from None
+        raise MalformedFileError(
+            f"{path}, line {at}: {shown!r} is not a number: {remedy}"
+        ) from None
 
 
 def _is_number(cell: str) -> bool:
@@ -110,7 +114,7 @@ def _is_number(cell: str) -> bool:
 
 
 def reject_sparse_table(path: Path, *, rows: int, columns: int, characters: int) -> None:
-    """Refuse a table that would take far more memory than its file.
+    """Raise an error for a table that needs far more memory than its file.
 
     Raises
     ------
@@ -125,12 +129,12 @@ def reject_sparse_table(path: Path, *, rows: int, columns: int, characters: int)
 
 
 def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
-    """Refuse a table without rows, or with a time that is missing.
+    """Raise an error for a table without rows or with a missing time.
 
     Raises
     ------
     MalformedFileError
-        Either is so.
+        The table has no rows, or a time is missing.
     """
     if not len(t_s):
         raise MalformedFileError(f"{path}: a header without rows of data: export the trial again")
@@ -144,23 +148,23 @@ def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
 def rows_of_numbers(
     path: Path, lines: Iterable[tuple[int, str]], separator: str | None, width: int
 ) -> NDArray[np.float64]:
-    """Return the numbers of all rows, shape (n, width); short rows are filled with NaN.
+    """Return the numbers of all rows, shape (n, width); short rows are padded with NaN.
 
     Parameters
     ----------
     path
-        For messages.
+        File named in messages.
     lines
         Line numbers and lines; empty rows (only separators) are skipped.
     separator
-        As `separator_of` found it.
+        As returned by `separator_of`.
     width
-        Columns; further cells are padding and ignored.
+        Number of columns; further cells are padding and ignored.
 
     Raises
     ------
     MalformedFileError
-        A cell is neither empty nor a number; nearly all cells are missing.
+        A cell is neither empty nor a number, or nearly all cells are missing.
     """
     rows: list[list[float]] = []
     characters = 0
@@ -178,5 +182,5 @@ def rows_of_numbers(
 
 
 def written(value: float) -> str:
-    """Return a number as it is written: 8 significant digits, empty if missing."""
+    """Return a number as text: 8 significant digits, empty if missing."""
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"

@@ -57,7 +57,7 @@ def test_real_trc_files_hold_what_their_readmes_count(
 
 def test_a_trc_header_that_lies_is_counted_and_said(shared_data: Path) -> None:
     found = read_trc(shared_data / "mocap/c3d_trc_pyomeca/markers.trc")
-    assert found.warnings == ("NumFrames says 652, counted 93",)
+    assert found.warnings == ("header NumFrames is 652, counted 93",)
     assert found.names[0] == "ASISl"
     assert found.positions[0, 0] == pytest.approx([0.7337041, 0.0809832, 0.1918668], abs=1e-9)
     mean = found.positions.mean(axis=(0, 1))
@@ -81,7 +81,7 @@ def test_real_tables_hold_what_their_readme_counts(
     assert found.in_degrees is in_degrees
     first_and_mean = (found.values[0, 0], found.values[:, 0].mean())
     assert first_and_mean == pytest.approx(figures, abs=1e-9)
-    assert found.warnings == (f"nrows says 250, counted {rows}",)
+    assert found.warnings == (f"header nrows is 250, counted {rows}",)
 
 
 def test_opensim_kinematics_read_with_their_units(shared_data: Path) -> None:
