@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.subjects.model_joint_centers import ModelTrial, gait2354, opencap
 from jointfit_daemon.center_of_rotation import estimate_center
-from jointfit_daemon.tools.center.trial import Reduced, reduce
+from jointfit_daemon.tools.center.trial import ParentFrameMotion, reduce
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class Judged:
     """An estimate beside the model's center."""
 
     joint: Joint
-    reduced: Reduced
+    reduced: ParentFrameMotion
     model: NDArray[np.float64]
     """The model's center in the parent's coordinates, mean over its frames, m."""
     wander: float
@@ -73,7 +73,7 @@ class Judged:
         return float(np.sqrt(max(np.trace(spread), 0.0)))
 
 
-def hinge(reduced: Reduced) -> NDArray[np.float64]:
+def hinge(reduced: ParentFrameMotion) -> NDArray[np.float64]:
     """Return the direction about which the child turned most, in the parent's coordinates."""
     points = reduced.movement.points
     assert points is not None

@@ -1,4 +1,4 @@
-"""`jointfit check`: whether a rig.toml is right, and what the daemon would do with it."""
+"""Command `jointfit check`: validates a rig.toml and summarizes it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ MISUSE = 2
 
 
 def check(
-    config: Annotated[Path, typer.Argument(help="The rig.toml to check.")] = Path("rig.toml"),
+    config: Annotated[Path, typer.Argument(help="Configuration file to check.")] = Path("rig.toml"),
     *,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Check a rig.toml: all faults at once, or a summary of what it describes. Opens nothing."""
+    """Check a rig.toml: print all faults, or a summary. Opens no device or connection."""
     import orjson
     from rich.console import Console
 
@@ -45,18 +45,18 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
     from jointfit_daemon.config import headings
     from jointfit_daemon.driver import driver_names
 
-    table = Table(title=f"{config}: rig {rig.name!r} is right", title_justify="left")
-    for column in ("source", "driver", "on", "rate"):
+    table = Table(title=f"{config}: rig {rig.name!r} is valid", title_justify="left")
+    for column in ("source", "driver", "segment", "rate"):
         table.add_column(column)
     for source in rig.sources:
         table.add_row(source.id, source.driver, source.segment or "—", f"{source.rate_hz:g} Hz")
     if isinstance(console, Console):
         console.print(table)
         console.print(
-            f"chain {' – '.join(rig.chain.joints)}, {rig.output_rate_hz:g} Hz to "
+            f"joints {' – '.join(rig.chain.joints)}, {rig.output_rate_hz:g} Hz to "
             f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
-            f"{rig.calibration_store!r} by {rig.calibration.method}"
+            f"store {rig.calibration_store!r}, method {rig.calibration.method}"
         )
-        if (doubt := headings(rig.sources)) is not None:
-            console.print(f"[yellow]warning:[/] {doubt}")
-        console.print(f"drivers installed: {', '.join(driver_names())}")
+        if (warning := headings(rig.sources)) is not None:
+            console.print(f"[yellow]warning:[/] {warning}")
+        console.print(f"installed drivers: {', '.join(driver_names())}")

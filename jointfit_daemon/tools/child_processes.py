@@ -1,4 +1,4 @@
-"""The processes of a demo: virtual hardware and the real daemon. Law: starts, talks, stops."""
+"""Child processes of the demo and of system tests: the simulator and the daemon."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-READY_S = 30.0  # a Raspberry Pi imports scipy in ten
+READY_S = 30.0
+"""Time limit for a process to become ready, s; a Raspberry Pi needs 10 s to import SciPy."""
 STOP_S = 10.0
+"""Time limit for a process to end after SIGTERM, s; then it is killed."""
 
 
-class ProcessEnded(Exception):  # noqa: N818 - named for what happened
-    """A process of the demo ended on its own; the text is the end of what it said."""
+class ProcessExitedError(Exception):
+    """A child process exited unexpectedly; the message contains the end of its log."""
 
 
 class DemoTimeoutError(Exception):
-    """A step of the demo took too long; the message says which, and what to do."""
+    """A step of the demo exceeded its time limit; the message names the step."""
 
 
 @contextlib.asynccontextmanager
-async def finished_within(seconds: float, step: str) -> AsyncIterator[None]:
-    """Bound the time of a step.
+async def time_limit(seconds: float, step: str) -> AsyncIterator[None]:
+    """Limit the time of a step.
 
     Raises
     ------
@@ -42,32 +44,33 @@ async def finished_within(seconds: float, step: str) -> AsyncIterator[None]:
             yield
     except TimeoutError as late:
         raise DemoTimeoutError(
-            f"{step} took longer than {seconds:g} s: is the machine busy? Try again, or look into"
-            " the logs with --keep FOLDER"
+            f"{step} took longer than {seconds:g} s: check the load of this machine, or"
+            " keep the logs with --keep FOLDER"
         ) from late
 
 
 @dataclass(slots=True)
-class Child:
-    """One process, its words kept in a file."""
+class ChildProcess:
+    """Child process whose output is written to a log file in `folder`."""
 
     name: str
-    words: Sequence[str]
+    arguments: Sequence[str]
     folder: Path
     environment: dict[str, str]
     process: asyncio.subprocess.Process | None = None
 
     async def __aenter__(self) -> Self:
-        """Start it."""
+        """Start the process."""
         with (self.folder / f"{self.name}.log").open("wb") as log:
             self.process = await asyncio.create_subprocess_exec(
-                *self.words,
+                *self.arguments,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE if self.name == "simulator" else log,
                 stderr=log,
                 env=os.environ | self.environment,
                 limit=1 << 20,
             )
+
         return self
 
     async def __aexit__(
@@ -76,12 +79,14 @@ class Child:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Terminate it; kill it if it does not end."""
+        """Terminate the process; kill it after `STOP_S`."""
         process = self.process
         if process is None:
             return
+
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
+
         try:
             async with asyncio.timeout(STOP_S):
                 await process.wait()
@@ -90,39 +95,39 @@ class Child:
             await process.wait()
 
     def tail(self, lines: int = 12) -> str:
-        """Return the end of what it said."""
+        """Return the last lines of the log."""
         with contextlib.suppress(OSError):
             text = (self.folder / f"{self.name}.log").read_text("utf-8", "replace")
             return "\n".join(text.splitlines()[-lines:])
         return ""
 
     def check(self) -> None:
-        """Raise ProcessEnded if it is gone."""
+        """Raise `ProcessExitedError` if the process has exited."""
         if self.process is not None and self.process.returncode is not None:
-            message = f"the {self.name} ended with {self.process.returncode}:\n{self.tail()}"
-            raise ProcessEnded(message)
+            message = f"the {self.name} exited with code {self.process.returncode}:\n{self.tail()}"
+            raise ProcessExitedError(message)
 
 
-class Simulator(Child):
-    """``jointfit-sim play``: told what to do on its standard input, answers in JSON lines."""
+class Simulator(ChildProcess):
+    """``jointfit-sim play``: reads commands from standard input and replies in JSON lines."""
 
     async def ready(self) -> dict[str, Any]:
-        """Wait until the virtual hardware is there; return where it is."""
-        async with finished_within(READY_S, "the start of the simulator"):
+        """Wait until the simulated hardware is ready; return its description."""
+        async with time_limit(READY_S, "the start of the simulator"):
             while True:
                 line = await self.answer()
                 if line.get("ready"):
                     return line
 
     async def say(self, command: str) -> None:
-        """Give a command."""
+        """Send a command."""
         if self.process is None or self.process.stdin is None:
             return
         self.process.stdin.write(command.encode() + b"\n")
         await self.process.stdin.drain()
 
     async def answer(self) -> dict[str, Any]:
-        """Return its next line."""
+        """Return the next reply."""
         if self.process is None or self.process.stdout is None:
             return {}
         line = await self.process.stdout.readline()
@@ -133,9 +138,9 @@ class Simulator(Child):
         return answer
 
     async def quit(self) -> dict[str, Any]:
-        """Stop the streams; return what was sent."""
+        """Stop the streams; return the number of samples sent."""
         await self.say("quit")
-        async with finished_within(STOP_S, "the end of the simulator"):
+        async with time_limit(STOP_S, "the end of the simulator"):
             while True:
                 line = await self.answer()
                 if "sent" in line:
@@ -143,7 +148,7 @@ class Simulator(Child):
 
 
 def simulator(folder: Path, port: int, base: str, options: Sequence[str]) -> Simulator:
-    """Return the virtual hardware of the demo, not started yet."""
+    """Return the simulator process, not started yet."""
     words = [
         *(sys.executable, "-m", "jointfit_simulators", "play", "--directory", str(folder)),
         *("--mqtt-port", str(port), "--mqtt-base", base, *options),
@@ -151,8 +156,8 @@ def simulator(folder: Path, port: int, base: str, options: Sequence[str]) -> Sim
     return Simulator("simulator", words, folder, {})
 
 
-def daemon(folder: Path, rig: Path) -> Child:
-    """Return the real daemon on the rig that the simulator wrote, not started yet."""
+def daemon(folder: Path, rig: Path) -> ChildProcess:
+    """Return the daemon process for a rig written by the simulator, not started yet."""
     words = [sys.executable, "-m", "jointfit_daemon", "--config", str(rig)]
     state = {"STATE_DIRECTORY": str(folder / "state"), "OPENBLAS_NUM_THREADS": "1"}
-    return Child("daemon", words, folder, state)
+    return ChildProcess("daemon", words, folder, state)

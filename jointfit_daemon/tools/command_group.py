@@ -1,7 +1,7 @@
-"""How the `jointfit` commands fail: one line on standard error, and an exit code.
+"""Error handling of the `jointfit` commands: one line on standard error, and an exit code.
 
-Invariant: every command reports through `CommandGroup`. Exceptions that it does not know are bugs
-and keep their traceback.
+Invariant: every command reports errors through `CommandGroup`. Other exceptions are bugs and are
+shown with their traceback.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from typing_extensions import override
 
 EXIT_FAILED, EXIT_MISUSE, EXIT_INTERRUPTED = 1, 2, 130
 EXIT_CODES = (
-    "Exit codes: 0 done; 1 the work failed or its result was refused; 2 wrong options, or a file"
-    " that is missing or broken; 3 calibrate: the stored calibration is better and stays;"
-    " 128 + N stopped by signal N (130: Ctrl-C)."
+    "Exit codes: 0 success; 1 failure or refused result; 2 invalid options, or a missing or invalid"
+    " file; 3 calibrate: the stored calibration is better and remains active; 128 + N stopped by"
+    " signal N (130: Ctrl-C)."
 )
 _REMEDIES = {
     errno.ENOENT: "check the path",
     errno.EACCES: "change its permissions, or choose another path",
     errno.EPERM: "change its permissions, or choose another path",
-    errno.EISDIR: "expected a file: name one in that folder",
-    errno.ENOTDIR: "a part of the path is a file: check the path",
-    errno.EEXIST: "choose another path, or remove what is there",
+    errno.EISDIR: "expected a file, found a folder: add a file name",
+    errno.ENOTDIR: "a parent of the path is a file: check the path",
+    errno.EEXIST: "choose another path, or remove the existing file",
     errno.ENOSPC: "free some space, or choose another path",
     errno.EROFS: "choose a path on a writable file system",
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ELOOP: "the path is a circle of links: check it",
+    errno.ELOOP: "the path contains a loop of symbolic links: check the path",
 }
 
 
 class CommandGroup(TyperGroup):
-    """Runs a command and turns the errors that a user can act on into a message."""
+    """Runs a command and converts errors that a user can correct into a message."""
 
     @override
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command; exit with 1, 2 or 130 after a message where it fails."""
+        """Run the selected command; on failure print a message and exit with 1, 2 or 130."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -60,7 +60,7 @@ class CommandGroup(TyperGroup):
 
 
 def _drop_lost_output() -> None:
-    """Discard what an output that is gone did not take: Python would end with 120 for it."""
+    """Discard buffered output of a closed stream; otherwise Python exits with 120."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -71,7 +71,7 @@ def _drop_lost_output() -> None:
 
 def _known_error(error: Exception) -> tuple[int, str] | None:
     """Return exit code and message of an error that is not a bug."""
-    if isinstance(error, BrokenPipeError):  # `jointfit schema | head`: typer ends it quietly
+    if isinstance(error, BrokenPipeError):  # as in `jointfit schema | head`; typer is silent
         return None
     if isinstance(error, OSError) and error.filename is not None:
         return EXIT_MISUSE, os_error_text(error)
@@ -81,34 +81,38 @@ def _known_error(error: Exception) -> tuple[int, str] | None:
 
 
 def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
-    """Judge by the classes of modules that are loaded: what is not loaded raised nothing."""
+    """Return exit code and message for errors of modules that are imported on demand.
+
+    A module that is not loaded cannot have raised the error.
+    """
     for code, module, name in (
         (EXIT_MISUSE, "jointfit_daemon.config", "ConfigError"),
         (EXIT_MISUSE, "jointfit_daemon.calibration._errors", "CalibrationRefused"),
         (EXIT_MISUSE, "jointfit_daemon.files.mocap._c3d", "MissingPackageError"),
-        (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlotMissing"),
+        (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlottingUnavailableError"),
         (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriverError"),
         (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "BrokerLostError"),
         (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "NoAnswerError"),
-        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "PhaseAborted"),
-        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "RequestRefused"),
-        (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessEnded"),
+        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "PhaseAbortedError"),
+        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "RequestRefusedError"),
+        (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessExitedError"),
         (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "DemoTimeoutError"),
         (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
     ):
         loaded = sys.modules.get(module)
         if loaded is not None and isinstance(error, getattr(loaded, name)):
             return code, str(error)
+
     return None
 
 
 def _is_config_error(error: Exception) -> bool:
-    """Return whether the message already begins with the file's name, fault by fault."""
+    """Return whether each line of the message already begins with the file name."""
     loaded = sys.modules.get("jointfit_daemon.config")
     return loaded is not None and isinstance(error, loaded.ConfigError)
 
 
 def os_error_text(error: OSError) -> str:
-    """Return path, reason and remedy of an error of the operating system."""
+    """Return path, reason and remedy of an operating-system error."""
     remedy = _REMEDIES.get(error.errno or 0, "check the path and the disk")
     return f"{error.filename}: {error.strerror}: {remedy}"

@@ -1,4 +1,4 @@
-"""`jointfit decode`: what is in a capture, through the same decoder that the daemon uses."""
+"""Command `jointfit decode`: decodes a capture with the decoder that the daemon uses."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(slots=True)
-class Summary:
-    """Counts over one capture."""
+class CaptureSummary:
+    """Counts of one capture."""
 
     corrupt: int = 0
     quaternions: int = 0
@@ -62,16 +62,16 @@ class Summary:
 
 
 def decode(
-    protocol: Annotated[str, typer.Argument(help="Driver name: xbus, xcdi, natnet, or yours.")],
-    file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or a `candump -L` log.")],
+    protocol: Annotated[str, typer.Argument(help="Driver: xbus, xcdi, natnet, or another.")],
+    file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or `candump -L` log.")],
     *,
-    jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object a decoded item.")] = False,
-    summary: Annotated[bool, typer.Option("--summary", help="One JSON object of counts.")] = False,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object per item.")] = False,
+    summary: Annotated[bool, typer.Option("--summary", help="Print counts as JSON.")] = False,
     setting: Annotated[
-        list[str] | None, typer.Option("--set", help="A driver setting, KEY=VALUE (TOML value).")
+        list[str] | None, typer.Option("--set", help="Driver setting, KEY=VALUE (TOML).")
     ] = None,
 ) -> None:
-    """Decode a capture of any registered protocol: a table of counts, JSON lines or a summary."""
+    """Decode a capture of an installed driver: table of counts, JSON lines, or JSON summary."""
     import orjson
 
     from jointfit_daemon.driver import find_driver
@@ -80,7 +80,7 @@ def decode(
     driver = find_driver(protocol)
     decoder = driver(_settings(driver, protocol, setting or [])).decoder()
     chunks = read_capture(file, driver.wire)
-    counts = Summary()
+    counts = CaptureSummary()
     for item in _items(decoder, chunks):
         counts.add(item)
         if jsonl:
@@ -90,8 +90,8 @@ def decode(
         return
     if not decoder.messages and not summary:
         raise ValueError(
-            f"{file}: nothing in it is of the protocol {protocol}, or it is empty: name the driver"
-            " of the recorded device; CAN ids and other settings are given with --set"
+            f"{file}: no message of protocol {protocol} found: select the driver of the recorded"
+            " device, and set CAN identifiers and other settings with --set"
         )
     found = _found(decoder, counts)
     if summary:
@@ -103,8 +103,8 @@ def decode(
 def _print_table(found: Mapping[str, object], warnings: list[str]) -> None:
     for key, value in found.items():
         typer.echo(f"{key:18} {_cell(value)}")
-    if remark := _remark(found):
-        typer.echo(remark, err=True)
+    if explanation := _explanation(found):
+        typer.echo(explanation, err=True)
     for text in dict.fromkeys(warnings):
         typer.echo(f"warning: {text}", err=True)
 
@@ -115,10 +115,10 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-def _remark(found: Mapping[str, object]) -> str | None:
-    """Return what a table of zeros means."""
+def _explanation(found: Mapping[str, object]) -> str | None:
+    """Return an explanation if the capture has no orientation."""
     if not found["quaternions"]:
-        return "no message holds an orientation: the device was not set to send quaternions"
+        return "no orientation found: configure the device to send quaternions"
     return None
 
 
@@ -128,7 +128,7 @@ def _items(decoder: Decoder, chunks: Any) -> Iterator[Decoded]:
     yield from decoder.flush()
 
 
-def _found(decoder: Decoder, counts: Summary) -> dict[str, object]:
+def _found(decoder: Decoder, counts: CaptureSummary) -> dict[str, object]:
     found: dict[str, object] = {
         "messages": decoder.messages,
         "corrupt": counts.corrupt,
@@ -143,7 +143,7 @@ def _found(decoder: Decoder, counts: Summary) -> dict[str, object]:
 
 
 def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
-    """Return settings for a decoder alone: what only opening needs gets a placeholder."""
+    """Return driver settings for decoding; required keys of the connection get placeholders."""
     import tomllib
 
     from pydantic import ValidationError
@@ -158,7 +158,7 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
             raise ValueError(message)
         try:
             given |= tomllib.loads(f"{key} = {value}")
-        except (ValueError, RecursionError):  # a bare word is meant as text
+        except (ValueError, RecursionError):  # a bare word is text
             given[key] = value
     for key, info in driver.Settings.model_fields.items():
         if info.is_required() and key not in given:
@@ -197,10 +197,12 @@ def _row(item: Decoded) -> dict[str, object]:
                 )
             },
         }
+
     if isinstance(item, Corrupt):
         return {"type": "corrupt", "discarded": item.discarded, "reason": item.reason}
     if isinstance(item, ClockEcho):
         return {"type": "echo", "sent_ns": item.sent_ns, "ticks": item.ticks}
     if isinstance(item, SyncPulse):
         return {"type": "pulse", **item._asdict()}
+
     return {"type": item.kind, "text": item.text, "data": dict(item.data)}

@@ -1,7 +1,6 @@
-"""An MQTT broker inside pip, for the demo: MQTT 5, loopback only, its own process.
+"""MQTT 5 broker for the demo and for tests, listening on the loopback interface.
 
-Law: the only module that imports iotcore. It is young software: never the broker of a real
-installation (docs/mqtt.md says what to use there).
+Invariant: no other module imports iotcore. It is not meant for installations; see docs/mqtt.md.
 """
 
 from __future__ import annotations
@@ -17,9 +16,10 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 START_S = 10.0
+"""Time limit for the broker to listen, s."""
 
-# The keyword form of iotcore's Broker listens on every interface and speaks 3.1.1 only; a
-# configuration file does neither.
+# With keyword arguments instead of a file, iotcore listens on all interfaces and supports MQTT
+# 3.1.1 only.
 _CONFIG = """id = 0
 [router]
 id = 0
@@ -40,11 +40,11 @@ dynamic_filters = true
 
 
 class BrokerMissingError(ImportError):
-    """The embedded broker is not installed; the message says how to get it."""
+    """The broker package iotcore is not installed."""
 
 
 def free_port() -> int:
-    """Return a TCP port of the loopback that nobody listens on just now."""
+    """Return a TCP port of the loopback interface that is free now."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
@@ -52,20 +52,20 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def embedded_broker(folder: Path) -> Iterator[int]:
-    """Run a broker while the block runs; yield its port.
+    """Run a broker for the duration of the block; yield its port.
 
     Raises
     ------
     BrokerMissingError
-        iotcore is not installed: it comes with the extra ``demo``.
+        iotcore is not installed; it is part of the extra ``demo``.
     TimeoutError
-        It did not listen within ten seconds.
+        The broker did not listen within `START_S`.
     """
     try:
         from iotcore import Broker
     except ModuleNotFoundError as missing:
         raise BrokerMissingError(
-            "the demo needs a broker: pip install 'jointfitd[demo]'"
+            "the demo needs the package iotcore: pip install 'jointfitd[demo]'"
         ) from missing
 
     port = free_port()

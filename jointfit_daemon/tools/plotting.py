@@ -1,30 +1,31 @@
-"""Figures without a screen. Law: matplotlib is optional and slow to import: only on demand."""
+"""Figures for files. Matplotlib is optional and slow to import, so it is imported on demand."""
 
 from __future__ import annotations
 
 from typing import Any
 
 
-class PlotMissing(ImportError):  # noqa: N818 - named for what happened
-    """Matplotlib is not installed; the message says how to get it."""
+class PlottingUnavailableError(ImportError):
+    """Matplotlib is not installed."""
 
     def __init__(self) -> None:
-        super().__init__("drawing needs matplotlib: pip install 'jointfitd[plot]'")
+        super().__init__("plots need matplotlib: pip install 'jointfitd[plot]'")
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure, inches, that draws to files only.
+    """Return an empty figure of the given size, inches, without a display.
 
     Raises
     ------
-    PlotMissing
+    PlottingUnavailableError
         Matplotlib is not installed.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ModuleNotFoundError as missing:
-        raise PlotMissing from missing
+        raise PlottingUnavailableError from missing
+
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -1,4 +1,4 @@
-"""`jointfit sample`: small simulated trials for every command that reads files."""
+"""Command `jointfit sample`: writes simulated trials for all commands that read files."""
 
 from __future__ import annotations
 
@@ -11,17 +11,15 @@ import typer
 
 
 def sample(
-    folder: Annotated[Path, typer.Argument(help="Folder for the files; made when absent.")],
+    folder: Annotated[Path, typer.Argument(help="Output folder, created if missing.")],
     *,
-    seed: Annotated[int, typer.Option(help="Another seed is another wearer.")] = 1,
-    force: Annotated[
-        bool, typer.Option("--force", help="Write into a folder that is not empty.")
-    ] = False,
+    seed: Annotated[int, typer.Option(help="Random seed: selects the simulated subject.")] = 1,
+    force: Annotated[bool, typer.Option("--force", help="Write into a non-empty folder.")] = False,
 ) -> None:
     """Write sample data: short trials of a simulated leg, a chain model, captures and a rig."""
     import orjson
 
-    # the simulator is a program of its own: it shares no code with what is judged on its data
+    # The simulator is a separate program: it shares no code with the estimators.
     words = [sys.executable, "-m", "jointfit_simulators", "sample", str(folder)]
     words += ["--seed", str(seed), *(["--force"] if force else [])]
     done = subprocess.run(words, capture_output=True, check=False)  # noqa: S603 - our own program

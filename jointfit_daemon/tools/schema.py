@@ -1,4 +1,4 @@
-"""`jointfit schema`: every key of rig.toml, as JSON Schema."""
+"""Command `jointfit schema`: prints the JSON Schema of rig.toml."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import typer
 
 
 def schema() -> None:
-    """Print the JSON Schema of rig.toml: every key, its unit, its default, its meaning.
+    """Print the JSON Schema of rig.toml: all keys with unit, default and description.
 
-    Editors with a TOML language server complete and check rig.toml with it.
+    Editors with a TOML language server use it to complete and check rig.toml.
     """
     from jointfit_daemon.config import rig_schema
 

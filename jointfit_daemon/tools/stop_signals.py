@@ -1,6 +1,6 @@
-"""Signals that ask a command to stop, as a cancellation that the command can clean up after.
+"""Stop signals converted to a task cancellation, so that a command can clean up.
 
-Invariant: after the ``with`` block the signal handlers are as they were before it.
+Invariant: the ``with`` block restores the signal handlers.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, a service manager or `kill`, and a closed terminal."""
+"""Sent by Ctrl-C, by a service manager or `kill`, and by a closed terminal."""
 _EXIT_BASE = 128
-"""A process that ends because of signal N exits with 128 + N, as in a shell."""
+"""Exit code of a process stopped by signal N is 128 + N, the convention of shells."""
 
 
 @dataclass(slots=True)
 class StopRequest:
-    """The first stop signal that arrived, if any."""
+    """First stop signal received, if any."""
 
     number: signal.Signals | None = None
 
     @property
     def exit_code(self) -> int:
-        """Return the exit code of a command that was stopped."""
+        """Return the exit code of the stopped command."""
         return _EXIT_BASE + (self.number or signal.SIGINT)
 
     @property
@@ -41,7 +41,7 @@ class StopRequest:
 def cancel_on_signal() -> Iterator[StopRequest]:
     """Cancel the current task when a stop signal arrives.
 
-    A signal that the parent process set to be ignored stays ignored (``nohup``).
+    Signals that the parent process ignores remain ignored (``nohup``).
     """
     task, loop = asyncio.current_task(), asyncio.get_running_loop()
     request = StopRequest()

@@ -18,8 +18,8 @@ from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig
 from jointfit_daemon.outputs.mqtt import BrokerLostError, MqttClient
-from jointfit_daemon.tools.calibrate import CalibrationWatch
-from jointfit_daemon.tools.child_processes import Child, Simulator
+from jointfit_daemon.tools.calibrate import PhaseTracker
+from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
 from jointfit_daemon.tools.child_processes import daemon as daemon_child
 from jointfit_daemon.tools.child_processes import simulator as simulator_child
 
@@ -55,7 +55,7 @@ class Listener:
     """Newest payload by topic."""
     healths: int = 0
     client: MqttClient | None = None
-    calibration: CalibrationWatch = field(default_factory=lambda: CalibrationWatch(lambda *_: None))
+    calibration: PhaseTracker = field(default_factory=lambda: PhaseTracker(lambda *_: None))
 
     async def run(self) -> None:
         """Listen until cancelled."""
@@ -137,7 +137,7 @@ class Listener:
         answer = await self.client.request("calibrate", asked)
         assert answer["status"] == "accepted", answer
         async with asyncio.timeout(seconds + 30):
-            return await self.calibration.ended(name)
+            return await self.calibration.wait_for_end(name)
 
 
 def sensors_in(pose: dict[str, Any]) -> set[str]:
@@ -202,7 +202,7 @@ class Station:
             yield child
 
     @contextlib.asynccontextmanager
-    async def daemon(self) -> AsyncIterator[Child]:
+    async def daemon(self) -> AsyncIterator[ChildProcess]:
         """Yield the daemon's process."""
         async with daemon_child(self.folder, self.rig) as child:
             yield child
@@ -225,7 +225,7 @@ async def in_this_process(scene: Scene) -> AsyncIterator[None]:
 @contextlib.asynccontextmanager
 async def running(
     station: Station, within_s: float = 15.0
-) -> AsyncIterator[tuple[Simulator, Child, Listener]]:
+) -> AsyncIterator[tuple[Simulator, ChildProcess, Listener]]:
     """Yield simulator, daemon and listener, all sources online."""
     async with (
         station.simulator() as simulator,
@@ -237,7 +237,9 @@ async def running(
         yield simulator, daemon, listener
 
 
-async def stopped(daemon: Child, number: signal.Signals = signal.SIGTERM) -> tuple[int, float]:
+async def stopped(
+    daemon: ChildProcess, number: signal.Signals = signal.SIGTERM
+) -> tuple[int, float]:
     """Send a signal; return the exit code and how long it took, s."""
     assert daemon.process is not None
     began = time.monotonic()
@@ -253,7 +255,7 @@ def restore_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def hang_up(daemon: Child) -> None:
+def hang_up(daemon: ChildProcess) -> None:
     """Ask for a reload."""
     assert daemon.process is not None
     daemon.process.send_signal(signal.SIGHUP)

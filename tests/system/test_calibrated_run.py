@@ -22,7 +22,7 @@ from tests.system.station import SENSORS, Listener, Station, hang_up, running, s
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from jointfit_daemon.tools.child_processes import Child, Simulator
+    from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -114,7 +114,7 @@ async def reconnect(simulator: Simulator, listener: Listener, name: str) -> None
     await listener.more_poses(30)
 
 
-async def reload(station: Station, daemon: Child, listener: Listener) -> None:
+async def reload(station: Station, daemon: ChildProcess, listener: Listener) -> None:
     station.write_rig(
         ("output_rate_hz = 100", "output_rate_hz = 80"),
         ('id = "S3"\n', 'id = "S3"\nsilence_s = 0.8\n'),

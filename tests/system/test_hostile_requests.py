@@ -26,7 +26,7 @@ from tests.system.station import BASE, SENSORS, Listener, Station, listening, ru
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from jointfit_daemon.tools.child_processes import Child
+    from jointfit_daemon.tools.child_processes import ChildProcess
     from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.alone]
@@ -39,7 +39,7 @@ CASES = int(os.environ.get("JOINTFIT_FUZZ_CASES", "300"))
 MB = 1_000_000
 
 
-def rss_bytes(daemon: Child) -> int:
+def rss_bytes(daemon: ChildProcess) -> int:
     """Return the resident memory of the daemon."""
     assert daemon.process is not None
     pages = Path(f"/proc/{daemon.process.pid}/statm").read_text("ascii").split()[1]
@@ -55,7 +55,7 @@ def with_properties(**values: Any) -> Properties:
 
 
 @contextlib.asynccontextmanager
-async def unharmed(daemon: Child, listener: Listener) -> AsyncIterator[None]:
+async def unharmed(daemon: ChildProcess, listener: Listener) -> AsyncIterator[None]:
     """Require that the block stops no pose, costs no connection and little memory."""
     await listener.more_poses(20)
     rss, first = rss_bytes(daemon), len(listener.poses) - 1

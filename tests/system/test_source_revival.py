@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.tools.child_processes import Child, daemon
+from jointfit_daemon.tools.child_processes import ChildProcess, daemon
 from jointfit_simulators.contract_scene import orientation
 from jointfit_simulators.pty_line import PtyLine
 from jointfit_simulators.xbus_device import XbusDevice
@@ -45,7 +45,7 @@ base = "{base}"
 
 
 @contextlib.asynccontextmanager
-async def gateway(folder: Path, port: int) -> AsyncIterator[tuple[Child, Listener]]:
+async def gateway(folder: Path, port: int) -> AsyncIterator[tuple[ChildProcess, Listener]]:
     """Run a daemon with one sensor that is not there yet."""
     rig = folder / "rig.toml"
     rig.write_text(RIG.format(folder=folder, port=port, base=BASE), encoding="utf-8")

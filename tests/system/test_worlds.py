@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import orjson
 import pytest
 
-from jointfit_daemon.tools.demo._score import Score
+from jointfit_daemon.tools.demo._score import DemoScore
 from jointfit_daemon.tools.demo._truth import TruthReader
 from jointfit_simulators.programme import parse_programme
 from jointfit_simulators.rig_file import RigOptions
@@ -102,7 +102,7 @@ async def knee_error_deg(listener: Listener, folder: Path) -> float:
     """Return the RMS error of knee flexion over the next two seconds."""
     poses = await listener.more_poses(200)
     await asyncio.sleep(0.3)
-    score, truth = Score(), TruthReader(folder / "truth.jsonl")
+    score, truth = DemoScore(), TruthReader(folder / "truth.jsonl")
     truth.read()
     truth.close()
     offset_ns = time.time_ns() - time.monotonic_ns()

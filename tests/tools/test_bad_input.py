@@ -206,7 +206,7 @@ def test_output_files_are_checked_before_the_work(
 
     # Where they are used: a module imported meanwhile would keep the substitute for ever.
     for reader in ("jointfit_daemon.tools.markers._trials.read_marker_trial",
-                   "jointfit_daemon.tools.fuse._trial.read_table",
+                   "jointfit_daemon.tools.fuse._trial.read_recording",
                    "jointfit_daemon.files.mocap.read_marker_trial",
                    "jointfit_daemon.tools.demo._command._run"):  # fmt: skip
         monkeypatch.setattr(reader, work)
@@ -214,8 +214,8 @@ def test_output_files_are_checked_before_the_work(
     (tmp_path / f"folder{ending}").mkdir()
     words = OUTPUTS[command]
     assert "mkdir" in fault_of([*words, str(tmp_path / f"none/out{ending}")], "none")
-    assert "expected a name" in fault_of([*words, str(tmp_path / "out.xyz")], "out.xyz")
-    assert "is a folder" in fault_of([*words, str(tmp_path / f"folder{ending}")], "folder")
+    assert "expected a file name" in fault_of([*words, str(tmp_path / "out.xyz")], "out.xyz")
+    assert "found a folder" in fault_of([*words, str(tmp_path / f"folder{ending}")], "folder")
     if os.geteuid() != 0:
         (tmp_path / "locked").mkdir(mode=0o500)
         assert "permission" in fault_of([*words, str(tmp_path / f"locked/out{ending}")], "locked")

@@ -79,7 +79,7 @@ def test_a_result_that_is_not_taken_ends_with_3_and_the_reason(
     async def led(*_: object, **__: object) -> dict[str, object]:
         return {"text": "told", "kept": kept, "quality": {}}
 
-    monkeypatch.setattr("jointfit_daemon.tools.calibrate._command._lead", led)
+    monkeypatch.setattr("jointfit_daemon.tools.calibrate._command._guide_phases", led)
     result = run(app, ["calibrate", str(EXAMPLE), "--yes"])
     assert result.exit_code == code
     assert "told" in result.stdout

@@ -2,16 +2,16 @@
 
 from jointfit_daemon.tools.calibrate._command import calibrate
 from jointfit_daemon.tools.calibrate._phase_tracker import (
-    CalibrationWatch,
-    PhaseAborted,
-    RequestRefused,
+    PhaseAbortedError,
+    PhaseTracker,
+    RequestRefusedError,
 )
 from jointfit_daemon.tools.calibrate._report import movement_lines, report
 
 __all__ = [
-    "CalibrationWatch",
-    "PhaseAborted",
-    "RequestRefused",
+    "PhaseAbortedError",
+    "PhaseTracker",
+    "RequestRefusedError",
     "calibrate",
     "movement_lines",
     "report",

@@ -1,7 +1,8 @@
-"""`jointfit calibrate`: leads through a calibration of a running daemon, over MQTT.
+"""Command `jointfit calibrate`: requests calibration phases over MQTT and reports their result.
 
 Invariants: only the result goes to stdout; prompts, progress and warnings go to stderr. A phase
-that this command started does not outlive it, unless the broker or the daemon is gone.
+that this command started is aborted before the command ends, unless the broker or the daemon is
+unreachable.
 """
 
 from __future__ import annotations
@@ -24,39 +25,41 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import MqttClient
-    from jointfit_daemon.tools.calibrate._phase_tracker import CalibrationWatch
+    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker
     from jointfit_daemon.tools.stop_signals import StopRequest
 
-NOT_TAKEN = 3
+EXIT_REJECTED = 3
+"""Exit code if the new calibration is worse than the stored one."""
 ABORT_S = 2.0
-"""Time for the daemon to answer an abort before the command ends without it."""
+"""Longest wait for the daemon to answer an abort, s."""
 LONGEST_S = 600.0
+"""Longest phase that can be requested, s, as in the request's schema."""
 ORDER = ("align", "static", "functional")
-AT_ONCE = {
-    "abort": "aborted; in force: ",
-    "unlearn": "what was learned while running is taken back; in force: ",
+IMMEDIATE_REQUESTS = {
+    "abort": "aborted; current state: ",
+    "unlearn": "online learning reverted; current state: ",
 }
-SAYS = {
-    "align": "Fix all sensors on the plate and turn it by hand about all axes.",
-    "static": "Put everything on. Stand still and upright.",
+INSTRUCTIONS = {
+    "align": "Fix all sensors to the plate and rotate the plate by hand about all three axes.",
+    "static": "Put on all sensors and markers. Stand upright and still.",
     "functional": "Move every joint: walk, squat, sit down and stand up, circle the hip.",
 }
 TOPICS = ("calibration", "calibration/progress", "bridge/event", "bridge/state")
 
 
-class NobodyThere(ValueError):  # noqa: N818 - named for what happened
-    """Standard input has ended: nobody can press Enter."""
+class StandardInputClosedError(ValueError):
+    """Standard input is closed, so the prompt before a phase cannot be answered."""
 
     def __init__(self) -> None:
-        super().__init__("nobody can press Enter here: use --yes")
+        super().__init__("standard input is closed, expected a terminal for the prompts: use --yes")
 
 
 class OutputLostError(Exception):
-    """Standard error cannot be written any more: the terminal or the reader of the pipe is gone."""
+    """Standard error is closed, for example because the terminal was closed."""
 
 
 class StoppedError(Exception):
-    """A stop signal ended the command."""
+    """The command received a stop signal."""
 
     def __init__(self, request: StopRequest) -> None:
         super().__init__(f"stopped by {request.name}")
@@ -69,34 +72,35 @@ def calibrate(
     phase: Annotated[
         list[str] | None,
         typer.Option(
-            help="align, static, functional, abort or unlearn; may be given several times. "
-            "Default: static, then functional where there is motion capture."
+            help="align, static, functional, abort or unlearn; repeatable. Default: static, and"
+            " functional if rig.toml has a motion-capture source."
         ),
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Length of each phase, s; default: as in rig.toml.", max=LONGEST_S),
+        typer.Option(help="Duration of each phase, s. Default: from rig.toml.", max=LONGEST_S),
     ] = None,
-    abort: Annotated[
-        bool, typer.Option("--abort", help="End the phase that is running, whoever started it.")
-    ] = False,
+    abort: Annotated[bool, typer.Option("--abort", help="Abort the running phase.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace the stored calibration even by a worse one.")
+        bool,
+        typer.Option("--force", help="Accept a calibration that is worse than the stored one."),
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before each phase.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the last status as JSON.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Start each phase without a prompt.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the final status as JSON.")] = False,
 ) -> None:
-    """Lead through a calibration of the running daemon; Ctrl-C or SIGTERM aborts the phase.
+    """Calibrate the rig of a running daemon; Ctrl-C or SIGTERM aborts the phase.
 
-    Exit codes: 0 done; 1 no broker, no daemon, or a phase was refused or aborted; 2 wrong options
-    or rig.toml; 3 the result is worse than the stored one, which stays in force (--force replaces
-    it); 128 + N stopped by signal N, after the phase was aborted.
+    Exit codes: 0 success; 1 no broker, no daemon, or a phase was refused or aborted; 2 invalid
+    options or rig.toml; 3 the result is worse than the stored calibration, which remains active
+    (--force replaces it); 128 + N stopped by signal N after the phase was aborted.
     """
     from jointfit_daemon.config import load_rig
 
-    wrong = [name for name in phase or () if name not in (*ORDER, *AT_ONCE)]
+    wrong = [name for name in phase or () if name not in (*ORDER, *IMMEDIATE_REQUESTS)]
     if wrong:
-        raise ValueError(f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *AT_ONCE))}")
+        raise ValueError(
+            f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *IMMEDIATE_REQUESTS))}"
+        )
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
 
@@ -104,16 +108,16 @@ def calibrate(
     default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
     phases = ("abort",) if abort else phase or default
     try:
-        status = asyncio.run(_lead(rig, phases, seconds, config, force=force, ask=not yes))
+        status = asyncio.run(_guide_phases(rig, phases, seconds, config, force=force, ask=not yes))
     except StoppedError as stopped:
         raise typer.Exit(stopped.exit_code) from None
     except OutputLostError:
         raise typer.Exit(EXIT_FAILED) from None
-    _tell(status, json=json)
+    _print_status(status, json=json)
 
 
-def _tell(status: Mapping[str, Any], *, json: bool) -> None:
-    """Print the last status; end with `NOT_TAKEN` if its result was not."""
+def _print_status(status: Mapping[str, Any], *, json: bool) -> None:
+    """Print the final status; exit with `EXIT_REJECTED` if the calibration was rejected."""
     import orjson
 
     from jointfit_daemon.tools.calibrate._report import report
@@ -124,11 +128,11 @@ def _tell(status: Mapping[str, Any], *, json: bool) -> None:
         for line in (str(status.get("text", "done")), *report(status.get("quality") or {})):
             typer.echo(line)
     if status.get("kept") is not None:
-        typer.echo(f"jointfit calibrate: not taken: {status['kept']}", err=True)
-        raise typer.Exit(NOT_TAKEN)
+        typer.echo(f"jointfit calibrate: calibration rejected: {status['kept']}", err=True)
+        raise typer.Exit(EXIT_REJECTED)
 
 
-async def _lead(
+async def _guide_phases(
     rig: Rig,
     phases: Sequence[str],
     seconds: float | None,
@@ -149,85 +153,88 @@ async def _lead(
             async with MqttClient(rig.mqtt) as client:
                 await client.subscribe(*TOPICS)
                 for name in phases:
-                    if ask and name in SAYS:
-                        console.print(f"{SAYS[name]} Enter to begin: ", end="", soft_wrap=True)
-                        await _enter()
+                    if ask and name in INSTRUCTIONS:
+                        console.print(
+                            f"{INSTRUCTIONS[name]} Press Enter to begin: ", end="", soft_wrap=True
+                        )
+                        await _wait_for_enter()
                     arguments: dict[str, object] = {"phase": name, "force": force}
                     if seconds is not None:
                         arguments["seconds"] = seconds
-                    async with _watching(client, console) as watch:
-                        status = await _phase(client, watch, arguments, config)
+                    async with _track_progress(client, console) as tracker:
+                        status = await _run_phase(client, tracker, arguments, config)
         except asyncio.CancelledError:
             if stop.number is None:
                 raise
-            _note(f"jointfit calibrate: stopped by {stop.name}")
+            _print_note(f"jointfit calibrate: stopped by {stop.name}")
             raise StoppedError(stop) from None
     return status
 
 
-async def _phase(
-    client: MqttClient, watch: CalibrationWatch, arguments: dict[str, object], config: Path
+async def _run_phase(
+    client: MqttClient, tracker: PhaseTracker, arguments: dict[str, object], config: Path
 ) -> dict[str, Any]:
-    from jointfit_daemon.tools.calibrate._phase_tracker import RequestRefused
+    from jointfit_daemon.tools.calibrate._phase_tracker import RequestRefusedError
 
     name = str(arguments["phase"])
-    watch.begin()
-    # a task of its own: its answer is needed even if a signal cancels this one meanwhile
-    asked = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
+    tracker.begin()
+    # The request runs in its own task: its answer is needed even if a signal cancels this one.
+    request = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
     try:
-        answer = await asyncio.shield(asked)
+        answer = await asyncio.shield(request)
         if answer.get("status") == "error":
-            raise RequestRefused(str((answer.get("error") or {}).get("message")))
-        if name in AT_ONCE:
-            return {"text": AT_ONCE[name] + str(answer.get("data", {}).get("phase"))}
-        ended = await watch.ended(name)
+            raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
+        if name in IMMEDIATE_REQUESTS:
+            return {"text": IMMEDIATE_REQUESTS[name] + str(answer.get("data", {}).get("phase"))}
+        ended = await tracker.wait_for_end(name)
     except (asyncio.CancelledError, OutputLostError):
-        if name not in AT_ONCE:
-            await _abort_phase(client, name, asked, config)
+        if name not in IMMEDIATE_REQUESTS:
+            await _abort_phase(client, name, request, config)
         raise
     final = name == "align" or ended.get("kept") is not None
-    return dict(ended if final else await watch.stored(ended))
+    return dict(ended if final else await tracker.wait_for_store(ended))
 
 
 async def _abort_phase(
-    client: MqttClient, name: str, asked: asyncio.Task[dict[str, Any]], config: Path
+    client: MqttClient, name: str, request: asyncio.Task[dict[str, Any]], config: Path
 ) -> None:
-    """Abort the phase that this command started, and report the outcome; another's is left alone.
+    """Abort the phase that this command started and report the outcome.
 
-    Requests run as tasks of their own because this one is already cancelled.
+    A refused request started no phase, so the running phase belongs to another client and is not
+    aborted. The request runs in its own task because the current task is already cancelled.
     """
-    await asyncio.wait([asked], timeout=ABORT_S)
-    started = asked.done() and not asked.cancelled() and asked.exception() is None
-    if started and asked.result().get("status") == "error":
+    await asyncio.wait([request], timeout=ABORT_S)
+    started = request.done() and not request.cancelled() and request.exception() is None
+    if started and request.result().get("status") == "error":
         return
 
     ending = asyncio.create_task(client.request("calibrate", {"phase": "abort"}), name="abort")
     await asyncio.wait([ending], timeout=ABORT_S)
     if ending.done() and not ending.cancelled() and ending.exception() is None:
-        _note(f"{name}: aborted")
+        _print_note(f"{name}: aborted")
     else:
         ending.cancel()
-        _note(
-            f"{name}: the daemon did not answer the abort within {ABORT_S:g} s, so the phase may"
-            f" still be running. To end it: jointfit calibrate {config} --abort"
+        _print_note(
+            f"{name}: the daemon did not answer the abort within {ABORT_S:g} s; the phase may still"
+            f" be running. To stop it: jointfit calibrate {config} --abort"
         )
 
 
-def _note(text: str) -> None:
-    """Print a line on standard error, which may be gone."""
+def _print_note(text: str) -> None:
+    """Print a line on standard error; ignore a closed stream."""
     with suppress(OSError):
         typer.echo(text, err=True)
 
 
 @asynccontextmanager
-async def _watching(client: MqttClient, console: Console) -> AsyncIterator[CalibrationWatch]:
-    """Show the progress of the daemon: as a bar on a terminal, else as lines now and then."""
+async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator[PhaseTracker]:
+    """Track calibration messages: a progress bar on a terminal, periodic lines elsewhere."""
     from rich.console import Group
     from rich.live import Live
     from rich.progress import Progress
     from rich.text import Text
 
-    from jointfit_daemon.tools.calibrate._phase_tracker import CalibrationWatch
+    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker
     from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines
 
     bar, joints, lines = Progress(console=console), Text(), ProgressLines()
@@ -240,7 +247,7 @@ async def _watching(client: MqttClient, console: Console) -> AsyncIterator[Calib
             joints.plain = text
             lines.update(name, done, text)
 
-        def figures(data: Mapping[str, Any]) -> None:
+        def show_details(data: Mapping[str, Any]) -> None:
             if console.is_terminal:
                 joints.plain = "\n".join((joints.plain, *movement_lines(data)))
                 screen.refresh()
@@ -248,68 +255,74 @@ async def _watching(client: MqttClient, console: Console) -> AsyncIterator[Calib
             for line in lines.due(asyncio.get_running_loop().time(), data):
                 typer.echo(line, err=True)
 
-        watch = CalibrationWatch(show, figures)
-        listening = asyncio.create_task(_listen(client, watch, console), name="calibrate listener")
+        tracker = PhaseTracker(show, show_details)
+        listener = asyncio.create_task(_listen(client, tracker, console), name="calibrate listener")
         try:
-            yield watch
+            yield tracker
         finally:
-            listening.cancel()
-            await asyncio.wait([listening])
+            listener.cancel()
+            await asyncio.wait([listener])
 
 
-async def _listen(client: MqttClient, watch: CalibrationWatch, console: Console) -> None:
+async def _listen(client: MqttClient, tracker: PhaseTracker, console: Console) -> None:
     from jointfit_daemon.outputs.mqtt import BrokerLostError
 
     try:
         async for topic, payload in client.messages():
-            if isinstance(payload, dict) and (line := _heard(watch, topic, payload)):
+            if isinstance(payload, dict) and (line := _handle_message(tracker, topic, payload)):
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
     except BrokerLostError as lost:
-        watch.lose(lost)
-    except (OSError, SystemExit) as gone:  # rich turns a broken pipe into SystemExit
-        watch.lose(OutputLostError(str(gone)))
+        tracker.fail(lost)
+    except (OSError, SystemExit) as error:  # rich converts a broken pipe into SystemExit
+        tracker.fail(OutputLostError(str(error)))
 
 
-def _heard(watch: CalibrationWatch, topic: str, payload: dict[str, Any]) -> str | None:
-    """Tell `watch` what came; return what a person must read at once."""
-    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseAborted
+def _handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -> str | None:
+    """Pass a message to the tracker; return a line that must be shown at once, if any."""
+    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseAbortedError
 
     text = str(payload.get("text", ""))
     if topic == "calibration":
-        watch.on_status(payload)
+        tracker.on_status(payload)
         return None if sys.stderr.isatty() else f"{payload.get('phase')}: {text}"
     if topic == "calibration/progress":
-        watch.on_progress(payload)
+        tracker.on_progress(payload)
     elif topic == "bridge/state" and payload.get("state") != "online":
-        watch.lose(PhaseAborted("the daemon is not running, or lost its broker"))
-    elif topic == "bridge/event" and _matters(payload):
-        if text == watch.status.get("text") and not sys.stderr.isatty():
-            return None  # printed with the status
+        tracker.fail(
+            PhaseAbortedError(
+                "the daemon is offline: check that jointfitd runs and reaches the broker"
+            )
+        )
+    elif topic == "bridge/event" and _is_urgent(payload):
+        if text == tracker.status.get("text") and not sys.stderr.isatty():
+            return None  # the status line contains the same text
         return f"{payload.get('id')}: {text}"
     return None
 
 
-def _matters(event: dict[str, Any]) -> bool:
+def _is_urgent(event: dict[str, Any]) -> bool:
     level = ("warning", "error") if event.get("kind") == "device" else ("error",)
     return event.get("kind") in ("device", "calibration") and event.get("level") in level
 
 
-async def _enter() -> None:
-    """Wait for a line on standard input, in a way that Ctrl-C can end.
+async def _wait_for_enter() -> None:
+    """Wait for a line on standard input; cancellation ends the wait.
 
     Raises
     ------
-    NobodyThere
-        Standard input is closed, or is nothing that can be waited for.
+    StandardInputClosedError
+        Standard input is closed or cannot be polled.
     """
     loop, pressed = asyncio.get_running_loop(), asyncio.Event()
     try:
         loop.add_reader(sys.stdin, pressed.set)
-    except (OSError, ValueError) as nobody:
-        raise NobodyThere from nobody
+    except (OSError, ValueError) as error:
+        raise StandardInputClosedError from error
+
     try:
         await pressed.wait()
     finally:
         loop.remove_reader(sys.stdin)
+
     if not sys.stdin.readline():
-        raise NobodyThere
+        raise StandardInputClosedError

@@ -1,6 +1,6 @@
-"""Walks a calibration through its phases over MQTT. Law: a client like any other; knows no device.
+"""Follows a calibration phase from its request to its stored result, from MQTT messages.
 
-``jointfit calibrate`` and the demo both lead with it: they differ in who moves.
+`jointfit calibrate` and `jointfit demo` both use it; the caller owns the MQTT client.
 """
 
 from __future__ import annotations
@@ -14,90 +14,90 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 STORING_S = 1.5
-"""A result is written to the store within this time, or it never will be."""
+"""Longest wait for the version number of a stored result, s."""
 
 
-class PhaseAborted(Exception):  # noqa: N818 - named for what happened
-    """The daemon gave the phase up; the text is its reason."""
+class PhaseAbortedError(Exception):
+    """The daemon aborted the phase, or cannot be reached; the message gives the reason."""
 
 
-class RequestRefused(Exception):  # noqa: N818 - named for what happened
-    """The daemon did not accept the request; the text is its reason."""
+class RequestRefusedError(Exception):
+    """The daemon rejected the request; the message gives the reason."""
 
 
 @dataclass(slots=True)
-class CalibrationWatch:
-    """What the daemon says about its calibration, newest first; wakes who waits for it."""
+class PhaseTracker:
+    """Collects calibration messages and lets a task wait for the end of a phase."""
 
     show: Callable[[str, float, str], None]
-    """Called with phase, progress 0 to 1, text."""
-    figures: Callable[[Mapping[str, Any]], None] | None = None
-    """Called with the figures of the progress, after `show`."""
+    """Callback for phase, progress (0 to 1) and text of each progress message."""
+    show_details: Callable[[Mapping[str, Any]], None] | None = None
+    """Callback for the ``data`` of each progress message, called after `show`."""
     status: Mapping[str, Any] = field(default_factory=dict)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
-    _seen: list[Mapping[str, Any]] = field(default_factory=list)
-    _lost: Exception | None = None
+    _unread: list[Mapping[str, Any]] = field(default_factory=list)
+    _failure: Exception | None = None
 
     def on_status(self, payload: Mapping[str, Any]) -> None:
-        """Take a message of topic ``calibration``."""
+        """Process a message of topic ``calibration``."""
         self.status = payload
-        self._seen.append(payload)
+        self._unread.append(payload)
         self._changed.set()
 
     def on_progress(self, payload: Mapping[str, Any]) -> None:
-        """Take a message of topic ``calibration/progress``."""
+        """Process a message of topic ``calibration/progress``."""
         done = payload.get("progress") or 0.0
         self.show(str(payload.get("phase", "")), float(done), str(payload.get("text", "")))
-        if self.figures is not None:
-            self.figures(payload.get("data") or {})
+        if self.show_details is not None:
+            self.show_details(payload.get("data") or {})
 
-    def lose(self, why: Exception) -> None:
-        """Take that nothing more will come; who waits gets `why`."""
-        self._lost = why
+    def fail(self, error: Exception) -> None:
+        """Report that no further messages will arrive; waiting tasks raise `error`."""
+        self._failure = error
         self._changed.set()
 
     def begin(self) -> None:
-        """Forget what was said before."""
-        self._seen.clear()
+        """Discard the messages received so far."""
+        self._unread.clear()
         self._changed.clear()
 
-    async def ended(self, phase: str) -> Mapping[str, Any]:
-        """Wait until `phase` began and ended; return the status that ended it.
+    async def wait_for_end(self, phase: str) -> Mapping[str, Any]:
+        """Wait until `phase` has begun and ended; return the status message that ended it.
 
-        A retained status of earlier may come late: nothing counts before `phase` itself was told.
+        Messages before the first one of `phase` are ignored: a retained status may arrive late.
 
         Raises
         ------
-        PhaseAborted
-            The daemon gave up; the reason is its text.
+        PhaseAbortedError
+            The daemon aborted the phase; the message gives its reason.
         """
         began = False
         while True:
-            for status in self._seen:
-                told = status.get("phase")
-                if told == phase:
+            for status in self._unread:
+                current = status.get("phase")
+                if current == phase:
                     began = True
-                elif began and told == "aborted":
+                elif began and current == "aborted":
                     why = status.get("text", "no reason given")
-                    raise PhaseAborted(f"{phase} was aborted: {why}")
-                elif began and told != "fitting":
+                    raise PhaseAbortedError(f"{phase} was aborted: {why}")
+                elif began and current != "fitting":
                     return status
-            self._seen.clear()
-            await self._news()
+            self._unread.clear()
+            await self._next_message()
 
-    async def stored(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the status that names the version in the store; `ended` if none was written."""
+    async def wait_for_store(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the status with the stored version; `ended` if nothing is stored in time."""
         with suppress(TimeoutError):
             async with asyncio.timeout(STORING_S):
                 while self.status.get("version") == ended.get("version"):
-                    await self._news()
+                    await self._next_message()
                 return self.status
         return ended
 
-    async def _news(self) -> None:
-        if self._lost is not None:
-            raise self._lost
+    async def _next_message(self) -> None:
+        if self._failure is not None:
+            raise self._failure
         self._changed.clear()
         await self._changed.wait()
-        if self._lost is not None:
-            raise self._lost
+        if self._failure is not None:
+            raise self._failure

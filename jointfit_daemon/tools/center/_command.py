@@ -1,4 +1,4 @@
-"""`jointfit center`: the center of rotation of a joint from a marker trial, C3D or TRC."""
+"""Command `jointfit center`: centre of rotation of a joint from a marker trial (C3D or TRC)."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.files.mocap import Axis, MarkerTrial
-    from jointfit_daemon.tools.center.trial import Answer, Reduced
+    from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 
 def center(
     trial: Annotated[Path, typer.Argument(help="Marker trial, .c3d or .trc.")],
     *,
     parent: Annotated[
-        str, typer.Option("--parent", help="Markers of the parent, M1,M2,M3: 3, or 2 with --plane.")
+        str, typer.Option("--parent", help="Parent markers M1,M2,M3; M1,M2 with --plane.")
     ],
-    markers: Annotated[str, typer.Option("--markers", help="Markers of the child: M4,M5,...")],
+    markers: Annotated[str, typer.Option("--markers", help="Child markers M4,M5,...")],
     method: Annotated[
         str,
         typer.Option(
             "--method",
             help="sphere, score, sara, halvorsen, ...; with --plane hyper, pratt, taubin, kasa, "
-            "geometric, ...; auto chooses.",
+            "geometric, ...; auto selects one.",
         ),
     ] = "auto",
     plane: Annotated[
         str | None,
-        typer.Option("--plane", help="The movement is in a plane: the file's axis across it."),
+        typer.Option("--plane", help="Planar movement: the file's axis normal to the plane."),
     ] = None,
     window: Annotated[
-        float | None, typer.Option("--window", min=0.05, help="One answer every so many seconds.")
+        float | None, typer.Option("--window", min=0.05, help="Estimate per window of SECONDS.")
     ] = None,
     up: Annotated[
-        str | None, typer.Option("--up", help="The file's axis that is up, if it does not say.")
+        str | None, typer.Option("--up", help="Vertical axis, if the file does not define it.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object in SI units.")] = False,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw markers and center: .png, .svg or .pdf.")
+        Path | None, typer.Option("--plot", help="Plot markers and centre: .png, .svg or .pdf.")
     ] = None,
 ) -> None:
-    """Find where a joint turns, and how far off that may be.
+    """Estimate the centre of rotation of a joint, with its uncertainty.
 
-    The parent's markers give the coordinates; the child's move about the center. Ends with 1 where
-    every answer had to be refused.
+    The centre is given in the frame of the parent's markers. Exits with 1 if every estimate is
+    refused.
     """
     from jointfit_daemon.tools.output_files import check_plot
 
@@ -83,14 +83,14 @@ def _found(
     plane: str | None,
     window: float | None,
     up: str | None,
-) -> tuple[MarkerTrial, Reduced, list[Answer]]:
+) -> tuple[MarkerTrial, ParentFrameMotion, list[WindowEstimate]]:
     from typing import cast
 
     from jointfit_daemon.files.mocap import read_marker_trial
     from jointfit_daemon.tools.center.trial import answers, reduce
 
     trial = read_marker_trial(path, cast("Axis | None", up))
-    trial.points([*asked[0], *asked[1]])  # all unknown names at once, whoever's they are
+    trial.points([*asked[0], *asked[1]])  # reports all unknown names at once
     reduced = reduce(trial, *asked, cast("Axis | None", plane))
     return trial, reduced, list(answers(trial, reduced, method, window))
 
@@ -98,8 +98,8 @@ def _found(
 def _print(
     trial: MarkerTrial,
     asked: tuple[list[str], list[str]],
-    reduced: Reduced,
-    found: Sequence[Answer],
+    reduced: ParentFrameMotion,
+    found: Sequence[WindowEstimate],
     *,
     as_table: bool,
     as_json: bool,
@@ -120,7 +120,11 @@ def _print(
 
 
 def _draw(
-    plot: Path, trial: Path, reduced: Reduced, markers: Sequence[str], found: Sequence[Answer]
+    plot: Path,
+    trial: Path,
+    reduced: ParentFrameMotion,
+    markers: Sequence[str],
+    found: Sequence[WindowEstimate],
 ) -> None:
     from jointfit_daemon.tools.center._plot import draw_center
 

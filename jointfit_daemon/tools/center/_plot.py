@@ -1,7 +1,7 @@
-"""Markers in the parent's coordinates with the center they turn about, seen from three sides.
+"""Plot of child markers in the parent frame with the estimated centre, in three projections.
 
-Law: equal scales, so that a circle is a circle; the 95 % ellipse is drawn as it is, never enlarged.
-Where the place along an axis is not known the axis is drawn, and the ellipse is of what is across.
+Both axes have equal scales, and the 95 % ellipse is drawn to scale. If the position along a
+direction is unobservable, the direction is drawn as a line and the ellipse covers the rest.
 """
 
 from __future__ import annotations
@@ -19,25 +19,33 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.tools.center.trial import Answer, Reduced
+    from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 _MM = 1000.0
 _MOST_POINTS = 600
+"""Plotted samples of a marker at most, to keep vector graphics small."""
 _END_ON = 0.1
+"""Length of a projected unit direction below which the direction is seen end-on."""
 
 
 def draw_center(
-    path: Path, reduced: Reduced, markers: Sequence[str], found: Sequence[Answer], title: str
+    path: Path,
+    reduced: ParentFrameMotion,
+    markers: Sequence[str],
+    found: Sequence[WindowEstimate],
+    title: str,
 ) -> None:
-    """Write one figure; its format is the ending of the name."""
+    """Write one figure; the file extension selects the format."""
     points = reduced.movement.points
     if points is None:
         return
+
     sides = ((0, 1),) if points.shape[-1] == len("xy") else ((0, 1), (1, 2), (0, 2))
     figure = new_figure(4.8 * len(sides) + 1.6, 5.2)
     figure.suptitle(title)
     for axes, side in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides, strict=True):
         _side(axes, points, markers, found, side)
+
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=120)
@@ -47,39 +55,44 @@ def _side(
     axes: Any,
     points: NDArray[np.float64],
     markers: Sequence[str],
-    found: Sequence[Answer],
+    found: Sequence[WindowEstimate],
     side: tuple[int, int],
 ) -> None:
     step = max(1, len(points) // _MOST_POINTS)
     for k, name in enumerate(markers):
         x, y = _MM * points[::step, k, side[0]], _MM * points[::step, k, side[1]]
         axes.plot(x, y, ".", markersize=2.5, label=name)
+
     for number, answer in enumerate(found):
         _center(axes, answer, side, labelled=number == 0)
+
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{'xyz'[side[0]]} of the parent, mm")
     axes.set_ylabel(f"{'xyz'[side[1]]} of the parent, mm")
     axes.grid(alpha=0.3)
 
 
-def _center(axes: Any, answer: Answer, side: tuple[int, int], *, labelled: bool) -> None:
+def _center(axes: Any, answer: WindowEstimate, side: tuple[int, int], *, labelled: bool) -> None:
     e = answer.estimate
     if not np.isfinite(e.center).all():
         return
+
     at = _MM * e.center[list(side)]
     refused = e.refused is not None
-    label = ("center, refused" if refused else "center, 95 % ellipse") if labelled else None
+    label = ("centre, refused" if refused else "centre, 95 % ellipse") if labelled else None
     axes.plot(*at, "kx" if refused else "k+", markersize=9, label=label)
     if refused:
         return
+
     for direction in e.unseen[:, list(side)]:
-        if np.hypot(*direction) > _END_ON:  # else it is seen from its end
+        if np.hypot(*direction) > _END_ON:
             along = "unknown along this line" if labelled else None
             axes.axline(at, at + direction, color="k", ls="--", linewidth=0.8, label=along)
+
     values, vectors = np.linalg.eigh(e.covariance[np.ix_(side, side)])
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     rank = len(e.center) - len(e.unseen)
-    told = 1.0 if e.within95 is None or rank < 1 else e.within95 / CHI2_95[rank]
-    lengths = _MM * np.sqrt(told * CHI2_95[2] * np.maximum(values, 0.0))
+    scale = 1.0 if e.within95 is None or rank < 1 else e.within95 / CHI2_95[rank]
+    lengths = _MM * np.sqrt(scale * CHI2_95[2] * np.maximum(values, 0.0))
     outline = vectors @ (lengths[:, None] * np.stack((np.cos(turn), np.sin(turn))))
     axes.plot(at[0] + outline[0], at[1] + outline[1], "k-", linewidth=0.8)

@@ -1,4 +1,4 @@
-"""Centers of rotation as text and JSON. Law: pure; millimetres and degrees for people only."""
+"""Centres of rotation as text (mm, degrees) and as JSON (SI units)."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.files.mocap import MarkerTrial
-    from jointfit_daemon.tools.center.trial import Answer, Reduced
+    from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 _MM = 1000.0
 _FLAGS = {
-    "orientation_inconsistent": "the angles contradict the circle, which was used instead",
-    "residuals_persist": "residuals last from frame to frame: frames are not independent",
-    "residuals_repeat": "residuals go with posture, as skin does: counted as seen once, however"
-    " long the trial",
-    "hinge": "the joint turned about one axis: the center's place along it is not shown",
+    "orientation_inconsistent": "inertial angles disagree with the circle fit, which was used",
+    "residuals_persist": "residuals are correlated over time: frames are not independent",
+    "residuals_repeat": "residuals repeat with posture, as soft-tissue artefact does: repetitions"
+    " of the movement are counted once",
+    "hinge": "rotation about one axis: the position of the centre along it is unobservable",
 }
 _WINDOW_HEAD = (
     "window, s",
@@ -37,17 +37,17 @@ _WINDOW_HEAD = (
 
 
 def head(
-    trial: MarkerTrial, parent: Sequence[str], markers: Sequence[str], reduced: Reduced
+    trial: MarkerTrial, parent: Sequence[str], markers: Sequence[str], reduced: ParentFrameMotion
 ) -> str:
-    """Return what was read, how much of it was seen, and where x, y, z point."""
+    """Return trial, visibility of the markers, and the definition of the parent frame."""
     data = trial.trajectories
     seen = np.isfinite(trial.points(markers)).all(axis=-1).mean(axis=0)
     whole = np.isfinite(reduced.poses.q).all(axis=-1).mean()
     lines = [
         f"trial     {len(data.t_s)} frames at {data.rate_hz:g} Hz,"
-        f" {len(data.t_s) / data.rate_hz:.2f} s; {trial.up_axis} is up, by {trial.up_said_by}",
-        f"parent    {', '.join(parent)}: known in {100 * whole:.0f} % of the frames, rigid to"
-        f" {_MM * reduced.rms:.1f} mm RMS",
+        f" {len(data.t_s) / data.rate_hz:.2f} s; {trial.up_axis} is up ({trial.up_said_by})",
+        f"parent    {', '.join(parent)}: tracked in {100 * whole:.0f} % of the frames, rigid-fit"
+        f" residual {_MM * reduced.rms:.1f} mm RMS",
         "markers   "
         + ", ".join(f"{m} ({100 * s:.0f} %)" for m, s in zip(markers, seen, strict=True)),
         "axes      " + _axes(parent, planar=reduced.basis.shape[1] == len("xy")),
@@ -56,60 +56,62 @@ def head(
 
 
 def _axes(parent: Sequence[str], *, planar: bool) -> str:
-    first = f"of the parent: origin amid its markers, x from {parent[0]} to {parent[1]}"
+    first = f"parent frame: origin at the mean of its markers, x from {parent[0]} to {parent[1]}"
     if planar:
-        return f"{first}, y across x in the plane"
-    return f"{first}, z across the plane of {', '.join(parent[:3])}"
+        return f"{first}, y in the plane, normal to x"
+    return f"{first}, z normal to the plane of {', '.join(parent[:3])}"
 
 
-def details(answer: Answer) -> str:
-    """Return one answer, one finding a line."""
+def details(answer: WindowEstimate) -> str:
+    """Return one estimate as lines of text."""
     e = answer.estimate
     lines = [f"method    {e.method}"]
     if e.refused is not None:
         lines.append(f"REFUSED   {e.refused}")
         if not np.isfinite(e.center).all():
             return "\n".join(lines)
-        lines.append("          what follows is not to be used")
+        lines.append("          do not use the following values")
+
     lines += [
         f"center    in the parent  {_point(e.center)} mm",
-        f"          in the world   {_point(answer.world)} mm, at the parent's mean pose, in the"
-        " file's axes",
+        f"          in the world   {_point(answer.world)} mm, at the mean parent pose, in the"
+        " axes of the file",
         _error(answer),
         f"          95 % ellipsoid: semi-axes {_semi_axes(answer)} mm",
         f"arc       {degrees(e.arc):.0f}°",
-        f"residual  {_mm(e.residual)} mm RMS; noise of a marker {_mm(e.noise)} mm a coordinate",
-        f"radius    {', '.join(_mm(r) for r in e.radii)} mm, marker by marker",
+        f"residual  {_mm(e.residual)} mm RMS; marker noise {_mm(e.noise)} mm per coordinate",
+        f"radius    {', '.join(_mm(r) for r in e.radii)} mm, one value per marker",
         f"T         {_number(e.conditioning)} (6 or more is usable)",
-        f"frames    {e.frames} used, worth {e.effective_frames:.0f} independent ones",
+        f"frames    {e.frames} used, equivalent to {e.effective_frames:.0f} independent frames",
     ]
-    lines += [f"unseen    nothing is known along {_direction(u)} of the parent" for u in e.unseen]
+    lines += [f"unseen    unobservable along {_direction(u)} of the parent" for u in e.unseen]
     if e.axis is not None:
-        lines.append(f"axis      {_direction(e.axis)} of the parent: a hinge")
+        lines.append(f"axis      {_direction(e.axis)} of the parent: hinge joint")
+
     lines += [f"note      {_FLAGS.get(flag, flag.replace('_', ' '))}" for flag in e.flags]
     return "\n".join(lines)
 
 
-def _error(answer: Answer) -> str:
+def _error(answer: WindowEstimate) -> str:
     e = answer.estimate
     if len(e.unseen) == 0:
-        least = f"no method can be below {_mm(e.bound)} mm on this movement"
+        least = f"lower bound for any method on this movement: {_mm(e.bound)} mm"
         return f"error     {_mm(e.sd)} mm RMS predicted; {least}"
-    seen = f"; {_mm(_sd_seen(answer))} mm RMS predicted across that"
+    seen = f"; {_mm(_sd_seen(answer))} mm RMS predicted in the other directions"
     known = len(e.unseen) < len(e.center)
-    return f"error     unknown along what is unseen{seen if known else ''}"
+    return f"error     unknown along the unobservable directions{seen if known else ''}"
 
 
-def _sd_seen(answer: Answer) -> float:
-    """Return the predicted RMS error in the directions that the movement showed, m."""
+def _sd_seen(answer: WindowEstimate) -> float:
+    """Return the predicted RMS error in the observable directions, m."""
     e = answer.estimate
     if len(e.unseen) >= len(e.center):
         return inf
     return sqrt(max(float(np.trace(e.covariance)), 0.0))
 
 
-def windows(found: Sequence[Answer]) -> str:
-    """Return one line an answer, as a table."""
+def windows(found: Sequence[WindowEstimate]) -> str:
+    """Return a table with one line per window."""
     rows: list[tuple[str, ...]] = [_WINDOW_HEAD]
     for answer in found:
         e = answer.estimate
@@ -126,6 +128,7 @@ def windows(found: Sequence[Answer]) -> str:
                 "" if e.refused is None else f"REFUSED: {e.refused}",
             )
         )
+
     widths = [max(len(row[i]) for row in rows) for i in range(len(_WINDOW_HEAD) - 1)]
     return "\n".join(_aligned(row, widths) for row in rows)
 
@@ -145,7 +148,7 @@ def _direction(u: NDArray[np.float64]) -> str:
     return "(" + ", ".join(f"{value:+.2f}" for value in u) + ")"
 
 
-def _semi_axes(answer: Answer) -> str:
+def _semi_axes(answer: WindowEstimate) -> str:
     return " × ".join(_mm(length) for length in answer.semi_axes)
 
 
@@ -164,10 +167,10 @@ def as_json(
     trial: MarkerTrial,
     parent: Sequence[str],
     markers: Sequence[str],
-    reduced: Reduced,
-    found: Sequence[Answer],
+    reduced: ParentFrameMotion,
+    found: Sequence[WindowEstimate],
 ) -> dict[str, Any]:
-    """Return everything for programs, SI; null is unknown or infinite."""
+    """Return all results in SI units; null means unknown or infinite."""
     return {
         "frames": len(trial.trajectories.t_s),
         "rate_hz": trial.trajectories.rate_hz,
@@ -179,7 +182,7 @@ def as_json(
     }
 
 
-def _answer(answer: Answer) -> dict[str, Any]:
+def _answer(answer: WindowEstimate) -> dict[str, Any]:
     e = answer.estimate
     return {
         "start_s": answer.start_s,

@@ -1,4 +1,4 @@
-"""`jointfit demo`: the main job on virtual hardware, judged against bones that only it knows."""
+"""Command `jointfit demo`: runs the daemon on simulated hardware and checks its joint angles."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.tools.stop_signals import StopRequest
 
-BOUNDS = {"knee_flexion_rmse_deg": 3.0, "unaccounted": 0, "latency_p99_ms": 60.0}
-"""What the demo promises; docs/simulator.md says with which imperfections."""
+TARGETS = {"knee_flexion_rmse_deg": 3.0, "unaccounted": 0, "latency_p99_ms": 60.0}
+"""Largest accepted values; docs/simulator.md lists the simulated imperfections."""
 BASE = "jointfit/demo"
-NOTHING_MEASURED: dict[str, Any] = {
+"""Topic prefix of the demo."""
+NO_RESULT: dict[str, Any] = {
     "knee_flexion_rmse_deg": None,
     "frames": 0,
     "joint_center_error_mm": None,
@@ -30,32 +31,30 @@ NOTHING_MEASURED: dict[str, Any] = {
     "unaccounted": None,
     "corrupt": 0,
 }
-"""Figures of a run that was interrupted before the daemon was there."""
+"""Result of a run that was interrupted before the daemon started."""
 
 
 def demo(
     *,
     seconds: Annotated[float, typer.Option(help="Live time after the calibration, s.")] = 30.0,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No display; one JSON object as the last line.")
+        bool, typer.Option("--headless", help="No display; print the result as one JSON line.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Another seed is another wearer.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed: selects the simulated subject.")] = 1,
     knob: Annotated[
-        list[str] | None, typer.Option("--set", help="A knob of the simulator, NAME=VALUE.")
+        list[str] | None, typer.Option("--set", help="Simulator setting, NAME=VALUE; repeatable.")
     ] = None,
     keep: Annotated[
-        Path | None, typer.Option(help="Keep rig, logs, calibration and truth in this folder.")
+        Path | None, typer.Option(help="Folder for rig, logs, calibration and ground truth.")
     ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Save the last state of the display as SVG.")
-    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Save the final display as SVG.")] = None,
 ) -> None:
-    """Show the main job on simulated hardware: no device, no broker, no root needed.
+    """Run the daemon on simulated hardware; needs no device, broker or root access.
 
-    Starts an embedded broker, two IMUs on ptys, two on a CAN adapter, a motion-capture server and
-    the real daemon; calibrates; then shows joint angles beside the true ones. Exits with 1 when a
-    bound is missed: knee flexion within 3 degrees RMS, every sample accounted for, 99 % of frames
-    received within 60 ms. Ctrl-C, SIGTERM and SIGHUP end it early, with the figures so far.
+    Starts a broker, two IMUs on pseudo-terminals, two on a CAN adapter, a motion-capture server and
+    the daemon, calibrates, and compares the joint angles with ground truth. Exits with 1 if a
+    target is missed: knee flexion error 3 degrees RMS, all samples accounted for, 99 % of frames
+    received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the results so far.
     """
     import orjson
 
@@ -71,11 +70,11 @@ def demo(
         run = _run(folder.resolve(), seconds, options, headless=headless, picture=picture)
         figures, stopped = asyncio.run(run)
 
-    missed = missed_bounds(figures)
+    missed = missed_targets(figures)
     if stopped is not None:
         outcome = f"interrupted by {stopped.name}"
     else:
-        outcome = "missed a bound" if missed else "passed"
+        outcome = "missed a target" if missed else "passed"
         figures["missed"] = missed
     typer.echo(result_line(outcome, figures), err=headless)
     if stopped is not None:
@@ -89,65 +88,65 @@ def demo(
 
 
 def result_line(outcome: str, figures: Mapping[str, Any]) -> str:
-    """Return the outcome, the errors, the latency and the samples in one line."""
+    """Return outcome, errors, latency and sample counts in one line."""
     latency, samples = figures["latency_ms"], figures["samples"]
 
     def known(value: object, unit: str) -> str:
         return "unknown" if value is None else f"{value}{unit}"
 
     return (
-        f"result: {outcome}; knee flexion {known(figures['knee_flexion_rmse_deg'], '°')} RMS off"
-        f" over {figures['frames']} frames; joint centers"
-        f" {known(figures['joint_center_error_mm'], ' mm')} off; latency"
+        f"result: {outcome}; knee flexion error"
+        f" {known(figures['knee_flexion_rmse_deg'], '°')} RMS over {figures['frames']} frames;"
+        f" joint center error {known(figures['joint_center_error_mm'], ' mm')}; latency"
         f" {known(latency['p50'], ' ms')} median, {known(latency['p99'], ' ms')} p99; samples:"
         f" {known(figures['sent'], '')} sent, {samples['received']} received,"
         f" {known(figures['unaccounted'], '')} unaccounted for, {figures['corrupt']} corrupt"
     )
 
 
-HINTS = {"latency_p99_ms": ": did other programs keep this machine busy?"}
+HINTS = {"latency_p99_ms": ": check the load of this machine"}
 
 
-def missed_bounds(figures: dict[str, Any]) -> list[str]:
-    """Return the promises that these figures break, in words."""
+def missed_targets(figures: dict[str, Any]) -> list[str]:
+    """Return one line for each target that the result misses."""
     values = {**figures, "latency_p99_ms": figures["latency_ms"]["p99"]}
     return [
-        f"{name} is {values[name]}, promised at most {bound:g}{HINTS.get(name, '')}"
-        for name, bound in BOUNDS.items()
-        if values.get(name) is None or not values[name] <= bound
+        f"{name} is {values[name]}, expected at most {target:g}{HINTS.get(name, '')}"
+        for name, target in TARGETS.items()
+        if values.get(name) is None or not values[name] <= target
     ]
 
 
 async def _run(
     folder: Path, seconds: float, options: list[str], *, headless: bool, picture: Path | None
 ) -> tuple[dict[str, Any], StopRequest | None]:
-    """Return the figures, and the signal that ended the run early, if one did."""
+    """Return the result, and the stop signal if one was received."""
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.child_processes import daemon, simulator
-    from jointfit_daemon.tools.demo._display import Display
-    from jointfit_daemon.tools.demo._run import Demo
+    from jointfit_daemon.tools.demo._display import DemoDisplay
+    from jointfit_daemon.tools.demo._run import DemoRun
     from jointfit_daemon.tools.demo._truth import TruthReader
     from jointfit_daemon.tools.embedded_broker import embedded_broker
     from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
     truth = TruthReader(folder / "truth.jsonl")
-    run: Demo | None = None
+    run: DemoRun | None = None
     with cancel_on_signal() as stop:
         try:
-            with embedded_broker(folder) as port, Display(headless=headless) as display:
+            with embedded_broker(folder) as port, DemoDisplay(headless=headless) as display:
                 display.step("connect", 0.0, "")
                 async with simulator(folder, port, BASE, options) as limb:
                     rig_file = Path((await limb.ready())["rig"])
                     rig = load_rig(rig_file)
                     async with daemon(folder, rig_file) as process:
-                        run = Demo(folder, rig, limb, process, truth, display)
+                        run = DemoRun(folder, rig, limb, process, truth, display)
                         await run.run(seconds)
                 if picture is not None:
                     display.save(picture)
-        except (asyncio.CancelledError, Exception):  # Ctrl-C ends broker and daemon as well
+        except (asyncio.CancelledError, Exception):  # Ctrl-C also stops broker and daemon
             if stop.number is None:
                 raise
         finally:
             truth.close()
     stopped = stop if stop.number is not None else None
-    return NOTHING_MEASURED if run is None else run.figures(), stopped
+    return NO_RESULT if run is None else run.figures(), stopped

@@ -1,7 +1,7 @@
-"""What the demo shows: the calibration as it goes, then the joint beside the truth.
+"""Terminal display of the demo: calibration progress, then joint angles with ground truth.
 
-Invariant: at 80 columns and 24 lines the picture is whole, curves included. It takes what it shows
-as arguments; on a terminal it redraws, elsewhere it prints a line a step.
+Invariant: the display fits into 80 columns and 24 lines. A terminal is redrawn; other outputs
+receive one line per step.
 """
 
 from __future__ import annotations
@@ -28,39 +28,40 @@ if TYPE_CHECKING:
 
     from rich.console import ConsoleOptions, RenderResult
 
-    from jointfit_daemon.tools.demo._score import Truth
+    from jointfit_daemon.tools.demo._score import TrueLimbState
 
 LONGEST_CURVE = 200
-"""Columns of the curves that are kept; a terminal shows as many of the newest as fit."""
+"""Stored points of each curve; a terminal shows as many of the newest as fit."""
 SPARSE = 10
-"""Frames from one column of the curves to the next: seven seconds of 100 Hz fill 70 columns."""
+"""Frames per column of the curves: 7 s at 100 Hz fill 70 columns."""
 _WIDE = 76
-"""Columns inside the frame from which on the steps have a bar."""
+"""Inner width, columns, from which the steps have a progress bar."""
 _STEP_COLUMNS = 12
+"""Width of the step names, columns."""
 _BARS = "▁▂▃▄▅▆▇█"
 STEPS = ("connect", "align", "static", "functional", "live")
-_SAYS = {
-    "connect": "virtual sensors, cameras and the daemon start",
-    "align": "all sensors on a plate, turned by hand",
-    "static": "worn; standing still",
-    "functional": "moving: walk, squat, sit down, circle the hip",
-    "live": "from the IMUs alone",
+_DESCRIPTIONS = {
+    "connect": "start simulated sensors, cameras and the daemon",
+    "align": "all sensors on one plate, rotated by hand",
+    "static": "sensors on the body, standing still",
+    "functional": "moving all joints: walk, squat, sit down, circle the hip",
+    "live": "joint angles from the IMUs only",
 }
 
 
-class Display:
-    """The face of the demo."""
+class DemoDisplay:
+    """Progress and joint angles of one demo run."""
 
     def __init__(self, *, headless: bool, console: Console | None = None) -> None:
         self._console = console or Console(stderr=headless)
         self._live = None if headless else Live(console=self._console, refresh_per_second=10)
         self._headless = headless
         self._step, self._done, self._text = "connect", 0.0, ""
-        self._said = ""
+        self._printed_step = ""
         self._joints: list[str] = []
         self._frame = 0
         self._pose: Mapping[str, Any] = {}
-        self._truth: Truth | None = None
+        self._truth: TrueLimbState | None = None
         self._figures: Mapping[str, object] = {}
         self._estimated: deque[float] = deque(maxlen=LONGEST_CURVE)
         self._true: deque[float] = deque(maxlen=LONGEST_CURVE)
@@ -75,29 +76,29 @@ class Display:
             self._live.update(self.render())
             self._live.stop()
             if not self._console.is_terminal:
-                self._console.print()  # rich leaves the cursor behind the picture there
+                self._console.print()  # rich leaves the cursor at the end of the last line
 
     def step(self, name: str, done: float, text: str) -> None:
-        """Show how far a step is."""
+        """Show the progress of a step, `done` from 0 to 1."""
         self._step, self._done, self._text = name, done, text
-        if self._headless and name != self._said:
-            self._said = name
+        if self._headless and name != self._printed_step:
+            self._printed_step = name
             for line in self._joints:
                 print(f"  {line}", file=sys.stderr)
             self._joints = []
-            print(f"{name}: {_SAYS.get(name, text)}", file=sys.stderr, flush=True)
+            print(f"{name}: {_DESCRIPTIONS.get(name, text)}", file=sys.stderr, flush=True)
         self._draw()
 
     def figures(self, data: Mapping[str, Any]) -> None:
-        """Show what a movement has told of the joints so far; nothing in other phases."""
+        """Show the joint-centre progress of the functional phase; other phases have none."""
         if self._step == "functional":
             self._joints = movement_lines(data)
             self._draw()
 
     def live(
-        self, pose: Mapping[str, Any], truth: Truth | None, figures: Mapping[str, object]
+        self, pose: Mapping[str, Any], truth: TrueLimbState | None, figures: Mapping[str, object]
     ) -> None:
-        """Show the newest pose beside the truth at its instant."""
+        """Show a pose with the ground truth at the same time."""
         self._pose, self._truth, self._figures = pose, truth, figures
         self._frame += 1
         flexion = _knee(pose).get("flexion_deg")
@@ -111,14 +112,14 @@ class Display:
             self._live.update(self.render())
 
     def save(self, path: Path) -> None:
-        """Write the picture as it is now to an SVG file."""
+        """Write the current display to an SVG file."""
         with open(os.devnull, "w", encoding="utf-8") as nowhere:  # noqa: PTH123 - no path
             console = Console(record=True, width=96, file=nowhere)
             console.print(self.render())
-            console.save_svg(str(path), title="make demo")
+            console.save_svg(str(path), title="jointfit demo")
 
     def render(self) -> Group:
-        """Return the whole picture."""
+        """Return the complete display."""
         return Group(self._steps(), self._knee_panel()) if self._pose else Group(self._steps())
 
     def _steps(self) -> Panel:
@@ -134,34 +135,38 @@ class Display:
         return Panel(shown, title="jointfit demo", title_align="left", border_style="cyan")
 
     def _step_table(self, now: int, *, bars: bool) -> Table:
-        """Return the steps, one a line whatever the width."""
+        """Return the steps, one per line at any width."""
         table = Table.grid(padding=(0, 2))
         table.add_column(no_wrap=True, min_width=_STEP_COLUMNS)
         if bars:
             table.add_column(no_wrap=True)
+
         table.add_column(no_wrap=True, overflow="ellipsis")
         for k, name in enumerate(STEPS):
             done = 1.0 if k < now else self._done if k == now else 0.0
             style = "bold cyan" if k == now else "green" if k < now else "dim"
             mark = "✔" if k < now else "▶" if k == now else " "
-            says = self._text if k == now and self._text else _SAYS[name]
+            text = self._text if k == now and self._text else _DESCRIPTIONS[name]
             bar = [ProgressBar(1.0, done, width=14)] if bars else []
-            table.add_row(Text(f"{mark} {name}", style=style), *bar, says)
+            table.add_row(Text(f"{mark} {name}", style=style), *bar, text)
+
         return table
 
     def _knee_panel(self) -> Panel:
         knee, truth = _knee(self._pose), self._truth
         table = Table(box=None, padding=(0, 1))
-        for column in ("knee", "daemon", "bones", "difference"):
+        for column in ("knee", "daemon", "truth", "difference"):
             table.add_column(column, justify="right" if column != "knee" else "left", no_wrap=True)
+
         flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
         true = None if truth is None else math.degrees(truth.flexion)
         difference = None if true is None or flexion is None else flexion - true
         table.add_row("flexion", f"{_deg(flexion)} ± {_deg(sd)}", _deg(true), _deg(difference, "+"))
         for name in ("adduction", "rotation", "inner"):
             table.add_row(name, _deg(knee.get(f"{name}_deg")), "", "")
+
         curves = Group(
-            _Curve("daemon", self._estimated, "cyan"), _Curve("bones", self._true, "green")
+            _Curve("daemon", self._estimated, "cyan"), _Curve("truth", self._true, "green")
         )
         figures = "   ".join(f"{key} {value}" for key, value in self._figures.items())
         motion = "" if truth is None else truth.motion
@@ -171,7 +176,7 @@ class Display:
 
 @dataclass(frozen=True, slots=True)
 class _FittedSteps:
-    """The steps with bars where there is room, else without."""
+    """Step table with progress bars if the width allows them."""
 
     wide: Table
     narrow: Table
@@ -182,7 +187,7 @@ class _FittedSteps:
 
 @dataclass(frozen=True, slots=True)
 class _Curve:
-    """One line: a name, and the newest values that fit beside it."""
+    """Labelled line of block characters for the newest values that fit."""
 
     name: str
     values: Iterable[float]

@@ -1,6 +1,6 @@
-"""The course of the demo: virtual hardware, the real daemon, a calibration, then joint angles.
+"""One demo run: connect, calibrate, evaluate live joint angles, count samples.
 
-Law: sees the daemon only as any client does, over MQTT, and the truth only in the simulator's log.
+Invariant: the daemon is observed over MQTT only, and ground truth comes from the simulator's log.
 """
 
 from __future__ import annotations
@@ -13,59 +13,62 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.outputs.mqtt import MqttClient
-from jointfit_daemon.tools.calibrate import CalibrationWatch, RequestRefused
-from jointfit_daemon.tools.child_processes import finished_within
-from jointfit_daemon.tools.demo._score import MeanSquare, Score, percentile
+from jointfit_daemon.tools.calibrate import PhaseTracker, RequestRefusedError
+from jointfit_daemon.tools.child_processes import time_limit
+from jointfit_daemon.tools.demo._score import DemoScore, RmsAccumulator, percentile
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.tools.child_processes import Child, Simulator
-    from jointfit_daemon.tools.demo._display import Display
+    from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
+    from jointfit_daemon.tools.demo._display import DemoDisplay
     from jointfit_daemon.tools.demo._truth import TruthReader
 
 TOPICS = ("pose", "calibration", "calibration/progress", "bridge/health", "device/+/availability")
 CONNECT_S, FINISH_S = 30.0, 15.0
+"""Time limits for connecting all sources and for counting the last samples, s."""
 SETTLE_S = 3.0
+"""Time for the device clocks to converge and for a new motion to begin, s."""
 PHASES = (
     ("align", (("plate", 20.0),)),
     ("static", (("stand", 5.0),)),
     ("functional", (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0))),
 )
-"""Phases, and what the wearer does in them for how long, s: what the daemon asks a person to do."""
+"""Calibration phases, each with the motions of the subject and their durations, s."""
 MOTIONS = ("walk", "squat", "sit_to_stand")
 MOTION_S = 8.0
+"""Duration of each motion in the live phase, s."""
 MATURE_NS = 300_000_000
-"""A pose is judged when its truth has been written for sure."""
+"""Age, ns, at which the ground truth of a pose is written and the pose is evaluated."""
 CALIBRATIONS = "state/calibrations"
-"""Where the demo's daemon keeps its calibrations, below the demo's folder."""
+"""Calibration store of the demo, relative to its folder."""
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 
 
 @dataclass(slots=True)
-class Demo:
-    """One run of the demo."""
+class DemoRun:
+    """State and results of one demo run."""
 
     folder: Path
     rig: Rig
     simulator: Simulator
-    daemon: Child
+    daemon: ChildProcess
     truth: TruthReader
-    display: Display
-    score: Score = field(default_factory=Score)
+    display: DemoDisplay
+    score: DemoScore = field(default_factory=DemoScore)
     latencies_ms: list[float] = field(default_factory=list)
     online: set[str] = field(default_factory=set)
     _health: dict[str, Any] = field(default_factory=dict)
     _healths: int = 0
     _poses: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
-    _judging: bool = False
+    _evaluating: bool = False
     _static_ns: int = 0
     _sent: dict[str, Any] | None = None
-    _watch: CalibrationWatch | None = None
+    _tracker: PhaseTracker | None = None
 
     async def run(self, seconds: float) -> None:
-        """Walk through it all; `figures` has the outcome, also of a run that was interrupted."""
+        """Run all steps; `figures` returns the results, also after an interruption."""
         async with MqttClient(self.rig.mqtt) as client:
             await client.subscribe(*TOPICS)
             listening = asyncio.create_task(self._listen(client), name="demo listener")
@@ -78,7 +81,7 @@ class Demo:
                 listening.cancel()
                 await asyncio.wait([listening])
 
-    # --- what the daemon says ----------------------------------------------------------------
+    # --- messages of the daemon --------------------------------------------------------------
 
     async def _listen(self, client: MqttClient) -> None:
         async for topic, payload in client.messages():
@@ -89,24 +92,24 @@ class Demo:
                 self._pose(payload, now_us)
             elif topic == "bridge/health":
                 self._health, self._healths = payload, self._healths + 1
-            elif topic == "calibration" and self._watch is not None:
-                self._watch.on_status(payload)
-            elif topic == "calibration/progress" and self._watch is not None:
-                self._watch.on_progress(payload)
+            elif topic == "calibration" and self._tracker is not None:
+                self._tracker.on_status(payload)
+            elif topic == "calibration/progress" and self._tracker is not None:
+                self._tracker.on_progress(payload)
             elif topic.endswith("/availability"):
                 device = topic.split("/")[1]
                 online = payload.get("state") == "online"
                 (self.online.add if online else self.online.discard)(device)
 
     def _pose(self, pose: dict[str, Any], now_us: int) -> None:
-        if not self._judging:
+        if not self._evaluating:
             return
         self.latencies_ms.append((now_us - pose["completed_us"]) / 1e3)
         t_ns = pose["t_us"] * 1000 - _unix_minus_monotonic_ns()
         self._poses.append((t_ns, pose))
 
-    def _judge(self) -> None:
-        """Compare the poses whose truth is known by now."""
+    def _evaluate(self) -> None:
+        """Compare the poses whose ground truth is available."""
         self.truth.read()
         mature = time.monotonic_ns() - MATURE_NS
         while self._poses and self._poses[0][0] < mature:
@@ -115,33 +118,33 @@ class Demo:
                 self.score.add(pose, truth, self.rig.chain.joints[1])
                 self.display.live(pose, truth, self._short())
 
-    # --- the course --------------------------------------------------------------------------
+    # --- steps -------------------------------------------------------------------------------
 
     async def _connect(self) -> None:
         wanted = {source.id for source in self.rig.sources}
-        async with finished_within(CONNECT_S, "connecting all sources"):
+        async with time_limit(CONNECT_S, "connecting all sources"):
             while not wanted <= self.online:
                 self.daemon.check()
                 self.simulator.check()
                 share = len(self.online & wanted) / len(wanted)
                 self.display.step("connect", share, f"{len(self.online)} of {len(wanted)} sources")
                 await asyncio.sleep(0.1)
-        await asyncio.sleep(SETTLE_S)  # clocks settle
+        await asyncio.sleep(SETTLE_S)  # device clocks converge
 
     async def _calibrate(self, client: MqttClient) -> None:
-        self._watch = CalibrationWatch(self.display.step, self.display.figures)
+        self._tracker = PhaseTracker(self.display.step, self.display.figures)
         for phase, motions in PHASES:
             await self.simulator.say(f"play {motions[0][0]}")
             await asyncio.sleep(SETTLE_S)
-            self._watch.begin()
+            self._tracker.begin()
             wanted_s = sum(seconds for _, seconds in motions)
             answer = await client.request("calibrate", {"phase": phase, "seconds": wanted_s})
             if answer.get("status") != "accepted":
-                raise RequestRefused(str((answer.get("error") or {}).get("message")))
+                raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
             self.display.step(phase, 0.0, "")
             moving = asyncio.create_task(self._move(motions), name="demo wearer")
             try:
-                await self._watch.ended(phase)
+                await self._tracker.wait_for_end(phase)
             finally:
                 moving.cancel()
                 await asyncio.wait([moving])
@@ -154,7 +157,7 @@ class Demo:
             await asyncio.sleep(seconds)
 
     async def _live(self, seconds: float) -> None:
-        self._judging = True
+        self._evaluating = True
         began = time.monotonic()
         played = -1
         while (elapsed := time.monotonic() - began) < seconds:
@@ -164,22 +167,23 @@ class Demo:
                 await self.simulator.say(f"play {MOTIONS[played % len(MOTIONS)]}")
             self.display.step("live", elapsed / seconds, f"{seconds - elapsed:.0f} s to go")
             await asyncio.sleep(0.1)
-            self._judge()
+            self._evaluate()
 
     async def _finish(self) -> dict[str, Any]:
-        """Stop the streams first, so that every sample on its way arrives and is counted."""
-        self._judge()
-        self._judging = False
-        said = await self.simulator.quit()
+        """Stop the simulator, then wait until all samples in transit are counted."""
+        self._evaluate()
+        self._evaluating = False
+        totals = await self.simulator.quit()
         wanted = {source.id for source in self.rig.sources}
         before = self._healths
-        async with finished_within(FINISH_S, "counting the last samples"):
+        async with time_limit(FINISH_S, "counting the last samples"):
             while self.online & wanted or self._healths < before + 2:  # noqa: ASYNC110 - two facts
                 await asyncio.sleep(0.1)
-        sent: dict[str, Any] = said["sent"]
+
+        sent: dict[str, Any] = totals["sent"]
         return sent
 
-    # --- figures -----------------------------------------------------------------------------
+    # --- results -----------------------------------------------------------------------------
 
     def _short(self) -> dict[str, object]:
         rms, p50 = self.score.flexion.rms, percentile(self.latencies_ms[-500:], 0.5)
@@ -190,7 +194,7 @@ class Demo:
         }
 
     def figures(self) -> dict[str, Any]:
-        """Return errors, latency and samples; None where the run ended before they were known."""
+        """Return errors, latency and sample counts; None where not yet known."""
         devices = self._health.get("devices", {})
         counts = {
             key: sum(int(device.get(key) or 0) for device in devices.values())
@@ -198,6 +202,7 @@ class Demo:
         }
         counts["dropped"] += counts.pop("pending")
         flexion = self.score.flexion.rms
+
         return {
             "frames": self.score.frames,
             "knee_flexion_rmse_deg": _rounded(flexion),
@@ -219,12 +224,12 @@ class Demo:
         }
 
     def _center_error_mm(self) -> float | None:
-        """RMS distance of the fitted joint centers from the true ones, in the static pose."""
+        """Return the RMS error of the fitted joint centres in the static pose, mm."""
         stored = CalibrationStore(self.folder / CALIBRATIONS, self.rig.calibration_store).latest()
         truth = self.truth.track.at(self._static_ns)
         if stored is None or truth is None:
             return None
-        error = MeanSquare()
+        error = RmsAccumulator()
         for name, joint in stored.calibration.joint.items():
             if joint.center is not None and joint.source == "fit" and name in truth.centers:
                 error.add(1e3 * math.dist(joint.center, truth.centers[name]))
@@ -232,7 +237,7 @@ class Demo:
 
 
 def _unaccounted(sent: dict[str, Any], devices: dict[str, Any]) -> int:
-    """Count samples without a verdict, and samples sent but not received, or the reverse."""
+    """Return the number of samples without an outcome, or sent but not received, or the reverse."""
     lost = 0
     for name, device in devices.items():
         received = int(device.get("received") or 0)

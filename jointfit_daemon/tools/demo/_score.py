@@ -1,7 +1,4 @@
-"""How far the daemon's limb is from the simulator's bones. Law: pure; numbers in, figures out.
-
-The truth is read from the simulator's log, never from anything the daemon saw.
-"""
+"""Errors of the published limb against ground truth from the log of the simulator."""
 
 from __future__ import annotations
 
@@ -19,8 +16,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
-    """The bones at one instant."""
+class TrueLimbState:
+    """Ground truth of the limb at one time."""
 
     t_ns: int
     motion: str
@@ -29,18 +26,18 @@ class Truth:
     centers: Mapping[str, Vector]
     """Joint centres in the optical world, m."""
     flexion: float
-    """Knee flexion, rad, positive heel back."""
+    """Knee flexion, rad; positive moves the heel backwards."""
 
 
 class TruthTrack:
-    """Truth over time, in order; interpolated between its rows."""
+    """Ground truth over time, interpolated between samples."""
 
     def __init__(self) -> None:
-        self._rows: list[Truth] = []
+        self._rows: list[TrueLimbState] = []
         self._times: list[int] = []
 
-    def add(self, row: Truth) -> None:
-        """Append a row; rows come in order of time."""
+    def add(self, row: TrueLimbState) -> None:
+        """Append a sample; times increase."""
         self._rows.append(row)
         self._times.append(row.t_ns)
 
@@ -48,18 +45,20 @@ class TruthTrack:
         return len(self._rows)
 
     @property
-    def last(self) -> Truth | None:
-        """Return the newest row."""
+    def last(self) -> TrueLimbState | None:
+        """Return the newest sample."""
         return self._rows[-1] if self._rows else None
 
-    def at(self, t_ns: int) -> Truth | None:
-        """Return the truth at an instant, or None outside what is known yet."""
+    def at(self, t_ns: int) -> TrueLimbState | None:
+        """Return the ground truth at `t_ns`, or None outside the recorded interval."""
         k = bisect.bisect_right(self._times, t_ns)
         if not 0 < k < len(self._rows):
             return None
+
         before, after = self._rows[k - 1], self._rows[k]
         share = (t_ns - before.t_ns) / (after.t_ns - before.t_ns)
-        return Truth(
+
+        return TrueLimbState(
             t_ns,
             before.motion,
             {
@@ -80,48 +79,50 @@ def _between(a: Vector, b: Vector, share: float) -> Vector:
 
 
 @dataclass(slots=True)
-class MeanSquare:
-    """Root of the mean of squares, one value at a time."""
+class RmsAccumulator:
+    """Running root mean square."""
 
     n: int = 0
     total: float = 0.0
 
     def add(self, value: float) -> None:
-        """Take one error."""
+        """Add one value."""
         self.n += 1
         self.total += value * value
 
     @property
     def rms(self) -> float | None:
-        """Return the RMS, None before the first value."""
+        """Return the RMS, or None without values."""
         return math.sqrt(self.total / self.n) if self.n else None
 
 
 @dataclass(slots=True)
-class Score:
-    """Errors of the published limb against the bones."""
+class DemoScore:
+    """Errors of published poses against ground truth."""
 
-    flexion: MeanSquare = field(default_factory=MeanSquare)
-    segments: dict[str, MeanSquare] = field(default_factory=dict)
+    flexion: RmsAccumulator = field(default_factory=RmsAccumulator)
+    segments: dict[str, RmsAccumulator] = field(default_factory=dict)
     frames: int = 0
     unknown: int = 0
-    """Frames whose knee the daemon did not know."""
+    """Frames without a knee flexion."""
     covered: int = 0
-    """Frames whose knee flexion error was within two of its own standard deviations."""
+    """Frames with a knee flexion error within two published standard deviations."""
 
-    def add(self, pose: Mapping[str, object], truth: Truth, joint: str) -> None:
-        """Compare one ``pose`` payload with the truth at its instant."""
+    def add(self, pose: Mapping[str, object], truth: TrueLimbState, joint: str) -> None:
+        """Compare one ``pose`` payload with the ground truth at its time."""
         self.frames += 1
         for name, segment in _table(pose, "segments").items():
             q = segment.get("q")
             if isinstance(q, list) and name in truth.orientations:
                 error = angle_between_one(_quaternion(q), truth.orientations[name])
-                self.segments.setdefault(name, MeanSquare()).add(math.degrees(error))
+                self.segments.setdefault(name, RmsAccumulator()).add(math.degrees(error))
+
         knee = _table(pose, "joints").get(joint, {})
         flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
         if not isinstance(flexion, int | float):
             self.unknown += 1
             return
+
         error_deg = flexion - math.degrees(truth.flexion)
         self.flexion.add(error_deg)
         self.covered += isinstance(sd, int | float) and abs(error_deg) <= 2 * sd
@@ -137,7 +138,7 @@ def _quaternion(q: Sequence[float]) -> Quaternion:
 
 
 def percentile(values: Sequence[float], share: float) -> float | None:
-    """Return the value below which `share` of the sorted values lie; None of nothing."""
+    """Return the `share` quantile (0 to 1) of the values, or None without values."""
     if not values:
         return None
     ordered = sorted(values)

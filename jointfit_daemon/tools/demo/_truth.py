@@ -1,4 +1,4 @@
-"""Reads the simulator's truth as it grows. Law: reads only; a line not finished yet waits."""
+"""Reader of the ground truth that the simulator writes while the demo runs."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import orjson
 
-from jointfit_daemon.tools.demo._score import Truth, TruthTrack
+from jointfit_daemon.tools.demo._score import TrueLimbState, TruthTrack
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
 class TruthReader:
-    """Follows ``truth.jsonl``."""
+    """Reads new complete lines of ``truth.jsonl``; a partial line is read with its rest."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -23,11 +23,12 @@ class TruthReader:
         self.track = TruthTrack()
 
     def read(self) -> None:
-        """Take what has been written since the last time."""
+        """Read the lines written since the last call."""
         if self._file is None:
             if not self._path.exists():
                 return
             self._file = self._path.open("rb")
+
         *lines, self._rest = (self._rest + self._file.read()).split(b"\n")
         for line in lines:
             row = orjson.loads(line)
@@ -42,17 +43,18 @@ class TruthReader:
             self._file.close()
 
 
-def _truth(row: dict[str, Any]) -> Truth:
+def _truth(row: dict[str, Any]) -> TrueLimbState:
     nan = float("nan")
     centers = {
         name: tuple(nan if x is None else x for x in center)
         for name, center in row["joint_m"].items()
     }
     flexion = row["knee"]["flexion"]
-    return Truth(
+
+    return TrueLimbState(
         row["t_ns"],
         row["motion"],
         {name: tuple(q) for name, q in row["q_world_segment"].items()},
-        centers,  # type: ignore[arg-type]  # three numbers by the log's contract
+        centers,  # type: ignore[arg-type]  # the log has three numbers per centre
         nan if flexion is None else flexion,
     )

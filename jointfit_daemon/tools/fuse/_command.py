@@ -1,6 +1,6 @@
-"""`jointfit fuse fit|apply|evaluate`: redundant sensors on a limb, from files.
+"""Commands `jointfit fuse fit|apply|evaluate`: fusion of redundant sensors on recorded trials.
 
-Law: a model file is the calibration of the daemon; applying it runs the daemon's own fusion.
+Invariant: a model file is a calibration of the daemon, and `apply` runs the daemon's fusion.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.phases import OfflineTrial
-    from jointfit_daemon.tools.fuse._trial import Limb
+    from jointfit_daemon.tools.fuse._trial import LimbDescription
 
-UNTAUGHT = ("mean", "single")
-"""Methods that need no movement."""
+METHODS_WITHOUT_MOTION = ("mean", "single")
+"""Methods that are fitted without movement."""
 
 app = typer.Typer(
     name="fuse",
-    help="Fit, judge and apply the fusion of redundant sensors on trials in files.",
+    help="Fit, evaluate and apply the fusion of redundant sensors on recorded trials.",
     no_args_is_help=True,
 )
 
@@ -31,36 +31,39 @@ Trials = Annotated[
     list[str],
     typer.Argument(
         metavar="SENSORS[=REFERENCE]...",
-        help="Sensors: .npz or .sto. Reference, if it is another file: .npz, .sto, .trc or .c3d.",
+        help="Sensor file (.npz, .sto) and, if separate, reference file (.npz, .sto, .trc, .c3d).",
     ),
 ]
 Segments = Annotated[
     list[str],
     typer.Option(
         "--segment",
-        help="NAME=SENSOR,SENSOR[:BONE], from proximal to distal; BONE is its name in the "
-        "reference, NAME by default.",
+        help="NAME=SENSOR,SENSOR[:BONE], from proximal to distal; BONE is the name of the"
+        " segment in the reference, NAME by default.",
     ),
 ]
 Joints = Annotated[
     str | None,
-    typer.Option("--joints", help="Names, one more than segments: hip,knee,ankle. A knee bends "
-    "back, so it pays to call it knee."),
-]  # fmt: skip
+    typer.Option(
+        "--joints",
+        help="Joint names, one more than segments: hip,knee,ankle. The name sets the sign: knee"
+        " flexion is positive backwards.",
+    ),
+]
 Static = Annotated[
     str | None,
     typer.Option(
         "--static",
-        help="Still trial SENSORS[=REFERENCE]; a .json of mounts may stand for SENSORS. Without it "
-        "mounts are learned from the movement.",
+        help="Static trial SENSORS[=REFERENCE]; a .json file of sensor alignments can replace"
+        " SENSORS. Default: alignments are estimated from the movement.",
     ),
 ]
 Markers = Annotated[
     list[str] | None,
-    typer.Option("--markers", help="NAME=M1,M2,M3: markers of a segment, for .trc and .c3d."),
+    typer.Option("--markers", help="NAME=M1,M2,M3: markers of a segment in .trc and .c3d files."),
 ]
-Up = Annotated[str, typer.Option("--up", help="Upward axis of .sto files: z, or y (OpenSim).")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
+Up = Annotated[str, typer.Option("--up", help="Vertical axis of .sto files: z, or y (OpenSim).")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object in SI units.")]
 
 
 @app.command()
@@ -73,14 +76,14 @@ def evaluate(
     markers: Markers = None,
     up: Up = "z",
     holdout: Annotated[
-        float, typer.Option("--holdout", min=0.1, max=0.9, help="Share judged, of a single trial.")
+        float, typer.Option("--holdout", min=0.1, max=0.9, help="Hold-out share of a single trial.")
     ] = 0.4,
     json: Json = False,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw all methods: .png, .svg or .pdf.")
+        Path | None, typer.Option("--plot", help="Plot all methods: .png, .svg or .pdf.")
     ] = None,
 ) -> None:
-    """Judge every method where it was not fitted: leave one trial out."""
+    """Evaluate all methods by leave-one-trial-out cross-validation."""
     from jointfit_daemon.calibration.phases import evaluate
     from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_plot
@@ -91,13 +94,13 @@ def evaluate(
     found = evaluate(limb.chain, read, mounts, holdout=holdout)
     _warn(doubts)
     if json:
-        _echo_json(_report.judgement_json(found) | {"notes": doubts})
+        _echo_json(_report.evaluation_json(found) | {"notes": doubts})
     else:
-        typer.echo(_report.judgement(found))
+        typer.echo(_report.evaluation_table(found))
     if plot is not None:
-        from jointfit_daemon.tools.fuse._plot import draw_judgement
+        from jointfit_daemon.tools.fuse._plot import draw_evaluation
 
-        draw_judgement(plot, found)
+        draw_evaluation(plot, found)
         typer.echo(f"wrote {plot}", err=True)
 
 
@@ -116,7 +119,7 @@ def fit(
     up: Up = "z",
     json: Json = False,
 ) -> None:
-    """Fit a model to all trials and write it: a calibration as the daemon keeps it."""
+    """Fit a model to all trials and write it as a calibration of the daemon."""
     from datetime import UTC, datetime
 
     from jointfit_daemon import __version__
@@ -127,7 +130,7 @@ def fit(
     check_output("--out", out, (".json",))
     chosen = _method(method)
     limb, read, mounts, doubts = _inputs(trials, segment, joints, static, markers=markers, up=up)
-    if chosen not in UNTAUGHT:
+    if chosen not in METHODS_WITHOUT_MOTION:
         _refuse_unmoved(limb, read)
     if mounts is None:
         mounts = {s: mean.q for s, mean in mounts_of(limb.chain, read).items()}
@@ -145,13 +148,13 @@ def fit(
     if json:
         _echo_json({"model": str(out), "frames": frames, "notes": doubts})
     else:
-        typer.echo(_report.fitted(calibration, frames))
+        typer.echo(_report.fit_summary(calibration, frames))
         typer.echo(f"wrote {out}", err=True)
 
 
 @app.command()
 def apply(
-    model: Annotated[Path, typer.Argument(help="Model file that `fit` wrote.")],
+    model: Annotated[Path, typer.Argument(help="Model file written by `fit`.")],
     sensors: Annotated[Path, typer.Argument(help="Sensors: .npz or .sto.")],
     *,
     out: Annotated[
@@ -159,29 +162,32 @@ def apply(
     ],
     without: Annotated[
         list[str] | None,
-        typer.Option("--without", help="A sensor not to use, as if it were unplugged."),
+        typer.Option("--without", help="Sensor to ignore; repeatable."),
     ] = None,
-    left: Annotated[bool, typer.Option("--left", help="A left limb: signs of two angles.")] = False,
+    left: Annotated[
+        bool,
+        typer.Option("--left", help="Left limb (signs of adduction, rotation)."),
+    ] = False,
     up: Up = "z",
     json: Json = False,
 ) -> None:
-    """Fuse the sensors of a trial as the daemon would live, with its uncertainty."""
+    """Fuse the sensors of a trial as the daemon does, with uncertainty."""
     from jointfit_daemon.tools.fuse import _output, _report
-    from jointfit_daemon.tools.fuse._trial import read_worn
+    from jointfit_daemon.tools.fuse._trial import read_available_sensors
     from jointfit_daemon.tools.output_files import check_output
 
     check_output("--out", out, _output.ENDINGS)
     axis = _axis(up)
     calibration = _read_model(model)
     chain = _output.chain_of(calibration, left=left)
-    table = read_worn(sensors, chain, axis, without or ())
+    table = read_available_sensors(sensors, chain, axis, without or ())
     found = _output.fuse_trial(calibration, table, left=left)
     files = _output.write_fused(out, found, table, axis)
     if json:
-        said = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
-        _echo_json(said | {"files": [str(file) for file in files]})
+        data = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
+        _echo_json(data | {"files": [str(file) for file in files]})
     else:
-        typer.echo(_report.applied(found))
+        typer.echo(_report.fusion_summary(found))
         typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
 
 
@@ -193,8 +199,8 @@ def _inputs(
     *,
     markers: Sequence[str] | None,
     up: str,
-) -> tuple[Limb, list[OfflineTrial], dict[str, Any] | None, list[str]]:
-    """Return limb, trials, mounts (None: to be learned) and what to doubt."""
+) -> tuple[LimbDescription, list[OfflineTrial], dict[str, Any] | None, list[str]]:
+    """Return limb, trials, sensor alignments (None: estimated later) and warnings."""
     from jointfit_daemon.calibration.phases import doubts
     from jointfit_daemon.tools.fuse import _trial
 
@@ -203,14 +209,14 @@ def _inputs(
     if static is not None:
         mounts, still = _trial.read_static(*_pair(static), limb)
     read = [_trial.read_trial(*_pair(text), limb, still) for text in trials]
-    read = _trial.told_apart(read, [_pair(text)[0] for text in trials])
-    told = doubts(limb.chain, read, mounts)
+    read = _trial.name_trials(read, [_pair(text)[0] for text in trials])
+    warnings = doubts(limb.chain, read, mounts)
     if mounts is None:
-        told.append(
-            "no --static: mounts are means over the movement and learn from the reference; "
-            "figures hold for this wearing only"
+        warnings.append(
+            "no --static: sensor alignments are estimated from the movement and the reference, so"
+            " results hold for this sensor placement only"
         )
-    return limb, read, mounts, told
+    return limb, read, mounts, warnings
 
 
 def _pair(text: str) -> tuple[Path, Path | None]:
@@ -237,26 +243,28 @@ def _read_model(path: Path) -> Any:
     from jointfit_daemon.files.text import read_json
     from jointfit_daemon.limb_model import Calibration, UnknownSchema
 
-    said = read_json(path, MOST_BYTES)
+    data = read_json(path, MOST_BYTES)
     try:
-        return Calibration.from_dict(said if isinstance(said, dict) else {})
+        return Calibration.from_dict(data if isinstance(data, dict) else {})
     except UnknownSchema as fault:
-        raise ValueError(f"{path}: not a model that `jointfit fuse fit` wrote: {fault}") from fault
+        raise ValueError(
+            f"{path}: expected a model written by `jointfit fuse fit`: {fault}"
+        ) from fault
 
 
-def _write_json(path: Path, said: dict[str, Any]) -> None:
+def _write_json(path: Path, data: dict[str, Any]) -> None:
     import orjson
 
-    path.write_bytes(orjson.dumps(said, option=orjson.OPT_INDENT_2) + b"\n")
+    path.write_bytes(orjson.dumps(data, option=orjson.OPT_INDENT_2) + b"\n")
 
 
-def _echo_json(said: dict[str, Any]) -> None:
+def _echo_json(data: dict[str, Any]) -> None:
     import orjson
 
-    typer.echo(orjson.dumps(said))
+    typer.echo(orjson.dumps(data))
 
 
-def _refuse_unmoved(limb: Limb, trials: Sequence[OfflineTrial]) -> None:
+def _refuse_unmoved(limb: LimbDescription, trials: Sequence[OfflineTrial]) -> None:
     from jointfit_daemon.calibration.phases import unmoved
 
     if why := unmoved(limb.chain, trials):

@@ -1,6 +1,6 @@
-"""Applying a model to sensors of a file, and writing what comes out.
+"""Applies a model to recorded sensors and writes orientations and joint angles.
 
-Law: the fusion of the daemon itself, frame by frame, so that a file says what the rig would have.
+Invariant: runs the fusion of the daemon frame by frame, so results equal those of a live rig.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.mocap import Axis
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
-    from jointfit_daemon.tools.fuse._tables import Table
+    from jointfit_daemon.tools.fuse._tables import OrientationRecording
 
 
 ANGLES = ("flexion", "adduction", "rotation")
@@ -42,7 +42,7 @@ _UNKNOWN = (float("nan"),) * 4
 
 @dataclass(frozen=True, slots=True)
 class FusedTrial:
-    """A limb over time."""
+    """Fused limb over time."""
 
     t_s: Array
     segments: Mapping[str, Array]
@@ -54,23 +54,23 @@ class FusedTrial:
     angle_sd: Mapping[str, Array]
     """Standard deviation of flexion, rad, shape (n,)."""
     flags: Mapping[str, float]
-    """Share of frames by flag."""
+    """Share of frames with each flag, 0 to 1."""
 
     @property
     def known(self) -> dict[str, float]:
-        """Share of frames in which each segment is known."""
+        """Return the share of frames with an orientation, by segment, 0 to 1."""
         return {s: float(visible(q).mean()) for s, q in self.segments.items()}
 
 
 def chain_of(calibration: Calibration, *, left: bool) -> Chain:
-    """Return the chain that a model was fitted for."""
+    """Return the kinematic chain of a calibration."""
     return Chain(
         calibration.joints, calibration.segments, calibration.chain_sensors, left_side=left
     )
 
 
-def fuse_trial(calibration: Calibration, table: Table, *, left: bool) -> FusedTrial:
-    """Run the daemon's fusion over the sensors of a file."""
+def fuse_trial(calibration: Calibration, table: OrientationRecording, *, left: bool) -> FusedTrial:
+    """Fuse recorded sensors frame by frame; NaN orientations count as missing sensors."""
     chain = chain_of(calibration, left=left)
     fuser = LimbFuser(chain, calibration)
     columns = {name: q.tolist() for name, q in table.q.items()}
@@ -80,6 +80,7 @@ def fuse_trial(calibration: Calibration, table: Table, *, left: bool) -> FusedTr
         alive = {name: tuple(columns[name][k]) for name in columns if seen[name][k]}
         t_ns = round(t_s * 1e9)
         states.append(fuser.fuse(t_ns, t_ns, k, alive))
+
     return _collected(chain, table.t_s, states)
 
 
@@ -87,6 +88,7 @@ def _collected(chain: Chain, t_s: Array, states: list[LimbState]) -> FusedTrial:
     nan = float("nan")
     flags = Counter(flag for state in states for flag in state.flags)
     inner = range(1, len(chain.joints) - 1)
+
     return FusedTrial(
         t_s,
         {
@@ -115,12 +117,12 @@ def _or(value: float | None, unknown: float) -> float:
     return unknown if value is None else value
 
 
-def write_fused(path: Path, found: FusedTrial, table: Table, up: Axis) -> list[Path]:
-    """Write a fused trial by the ending of the name; return the files written.
+def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: Axis) -> list[Path]:
+    """Write a fused trial in the format of the file extension; return the files written.
 
     ``.sto``: orientations, and joint angles in a second file ``NAME_angles.sto`` (degrees).
-    ``.npz``: as `read_orientations_npz` reads it, with ``angles_JOINT``, ``sd_SEGMENT`` (rad).
-    ``.csv``: all in one table.
+    ``.npz``: readable by `read_orientations_npz`, with ``angles_JOINT``, ``sd_SEGMENT`` (rad).
+    ``.csv``: all columns in one table.
     """
     kind = path.suffix.lower()
     if kind == ".npz":
@@ -129,6 +131,7 @@ def write_fused(path: Path, found: FusedTrial, table: Table, up: Axis) -> list[P
     if kind == ".csv":
         _write_csv(path, found)
         return [path]
+
     rate_hz = float(np.round(1.0 / np.median(np.diff(found.t_s)), 6))
     q = np.stack(list(found.segments.values()), axis=1)
     turned = q[..., [0, 2, 3, 1]] if up == "y" else q
@@ -142,7 +145,7 @@ def write_fused(path: Path, found: FusedTrial, table: Table, up: Axis) -> list[P
 
 
 def _angle_columns(found: FusedTrial) -> tuple[tuple[str, ...], Array]:
-    """Return names and degrees of all angles and standard deviations, shape (n, columns)."""
+    """Return column names and values of angles and standard deviations, deg, shape (n, columns)."""
     names, columns = [], []
     for joint, angles in found.angles.items():
         names += [f"{joint}_{angle}" for angle in ANGLES] + [f"{joint}_flexion_sd"]
@@ -153,7 +156,7 @@ def _angle_columns(found: FusedTrial) -> tuple[tuple[str, ...], Array]:
     return tuple(names), np.rad2deg(np.stack(columns, axis=1))
 
 
-def _write_npz(path: Path, found: FusedTrial, table: Table) -> None:
+def _write_npz(path: Path, found: FusedTrial, table: OrientationRecording) -> None:
     write_orientations_npz(path, OrientationTrial(found.t_s, table.q, found.segments, {}))
     with np.load(path, allow_pickle=False) as arrays:
         all_arrays = {name: arrays[name] for name in arrays.files}

@@ -1,4 +1,4 @@
-"""Flexion by every method beside the reference, and RMS errors. Law: draws, computes nothing."""
+"""Plot of an evaluation: flexion of each method with the reference, and RMS errors."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.phases import Judged, Judgement
 
 ROW_INCHES = 3.2
+"""Height of one row of plots, inches."""
 
 
-def draw_judgement(path: Path, found: Judgement) -> None:
-    """Write one figure, a row for each joint of each trial; its format is the name's ending."""
+def draw_evaluation(path: Path, found: Judgement) -> None:
+    """Write one figure with a row per joint and trial; the file extension selects the format."""
     joints = [*found.rows[0].joints] or [""]
     lines = [(trial, joint) for trial in found.reference for joint in joints]
     figure = new_figure(13.0, ROW_INCHES * len(lines) + 0.6)
-    figure.suptitle(f"judged on {found.held_out}")
+    figure.suptitle(f"hold-out: {found.held_out}")
     axes = figure.subplots(len(lines), 2, squeeze=False, width_ratios=(3, 2))
     for (left, right), (trial, joint) in zip(axes, lines, strict=True):
         rows = [row for row in found.rows if row.trial == trial]
         if joint:
             _flexions(left, found, rows, joint)
-        else:  # a lone segment has no joint between two
+        else:  # a single segment has no inner joint
             left.set_axis_off()
         if joint == joints[0]:
             _bars(right, rows)
         else:
             right.set_axis_off()
+
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=120)
@@ -47,6 +49,7 @@ def _flexions(axes: Any, found: Judgement, rows: Sequence[Judged], joint: str) -
         width, style = (0.6, ":") if alone else (0.9, "-")
         angle = np.rad2deg(row.flexion[joint])
         axes.plot(t_s, angle, style, linewidth=width, label=row.method)
+
     truth = np.rad2deg(found.reference[trial][joint])
     axes.plot(t_s, truth, "k", linewidth=1.2, label="reference")
     axes.set_title(f"{trial}: {joint} flexion", fontsize=10)
@@ -61,6 +64,7 @@ def _bars(axes: Any, rows: Sequence[Judged]) -> None:
     for k, name in enumerate(names):
         values = [np.rad2deg([*row.segments.values(), *row.joints.values()][k]) for row in rows]
         axes.barh(np.arange(len(rows)) + k * width, values, width, label=name)
+
     axes.set_yticks(
         np.arange(len(rows)) + 0.4 - width / 2, [row.method for row in rows], fontsize=7
     )

@@ -1,4 +1,4 @@
-"""Judgements and fused limbs as text and JSON. Law: pure; degrees for people only, JSON is SI."""
+"""Evaluations, fits and fused limbs as text (degrees) and as JSON (SI units)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.fuse._output import FusedTrial
 
 BASELINE = "mean"
+"""Method that the others are compared with."""
 _DIGITS = 2
-"""Of degrees shown; what looks alike is not called worse."""
+"""Decimals of displayed degrees; errors that are equal at this precision count as equal."""
 
 
-def judgement(found: Judgement) -> str:
-    """Return the table of all methods, and where a method is worse than the plain mean."""
+def evaluation_table(found: Judgement) -> str:
+    """Return the table of all methods, and the columns in which a method is worse than the mean."""
     first = found.rows[0]
     head = (
         "trial",
@@ -33,16 +34,17 @@ def judgement(found: Judgement) -> str:
         lead = (row.trial, str(row.frames)) if row.trial != last else ("", "")
         last = row.trial
         rows.append((*lead, row.method, *map(_deg, _figures(row))))
-    lines = [f"RMS error in degrees; judged on {found.held_out}", "", aligned(rows), ""]
-    return "\n".join(lines + _verdicts(found))
+
+    lines = [f"RMS error in degrees; hold-out: {found.held_out}", "", format_columns(rows), ""]
+    return "\n".join(lines + _comparisons(found))
 
 
 def _figures(row: Judged) -> list[float]:
     return [*row.segments.values(), *row.joints.values()]
 
 
-def _verdicts(found: Judgement) -> list[str]:
-    """Return, for each method that learns, the columns in which it does worse than the mean."""
+def _comparisons(found: Judgement) -> list[str]:
+    """Return one line per fitted method: the columns in which it is worse than the mean."""
     base = {row.trial: row for row in found.rows if row.method == BASELINE}
     worse: dict[str, list[str]] = {}
     for row in found.rows:
@@ -52,16 +54,17 @@ def _verdicts(found: Judgement) -> list[str]:
         pairs = zip(names, _figures(row), _figures(base[row.trial]), strict=True)
         lost = [n for n, mine, plain in pairs if _shown(mine) > _shown(plain)]
         worse.setdefault(row.method, []).extend(f"{n} in {row.trial}" for n in lost)
+
     return [
         f"{method} is worse than {BASELINE}: {', '.join(lost)}"
         if lost
-        else f"{method} is nowhere worse than {BASELINE}"
+        else f"{method} is not worse than {BASELINE} in any column"
         for method, lost in worse.items()
     ]
 
 
-def judgement_json(found: Judgement) -> dict[str, Any]:
-    """Return the same for programs, rad."""
+def evaluation_json(found: Judgement) -> dict[str, Any]:
+    """Return the evaluation in SI units (rad); null means unknown."""
     return {
         "judged_on": found.held_out,
         "unit": "rad",
@@ -78,20 +81,20 @@ def judgement_json(found: Judgement) -> dict[str, Any]:
     }
 
 
-def fitted(calibration: Calibration, frames: int) -> str:
-    """Return what was fitted: one line a segment, notes after."""
-    rows = [("segment", "sensors", "models", "left over, deg")]
+def fit_summary(calibration: Calibration, frames: int) -> str:
+    """Return a summary of the fit: one line per segment, then notes."""
+    rows = [("segment", "sensors", "models", "residual sd, deg")]
     for i, (name, segment) in enumerate(calibration.segment.items()):
         sensors = calibration.chain_sensors[i]
         whole = max(segment.models, key=len, default=None)
         left = "–" if whole is None else _deg(segment.models[whole].residual_sd)
         rows.append((name, ", ".join(sensors), str(len(segment.models)), left))
-    lines = [f"method {calibration.method}, {frames} frames", "", aligned(rows)]
+    lines = [f"method {calibration.method}, {frames} frames", "", format_columns(rows)]
     return "\n".join([*lines, *(f"note: {note}" for note in calibration.notes)])
 
 
-def applied(found: FusedTrial) -> str:
-    """Return how the limb was known over the trial: shares of frames by flag."""
+def fusion_summary(found: FusedTrial) -> str:
+    """Return the shares of frames with known segments and with each flag."""
     count = len(found.t_s)
     lines = [f"{count} frames, {found.t_s[-1] - found.t_s[0]:.2f} s"]
     for name, known in found.known.items():
@@ -100,8 +103,8 @@ def applied(found: FusedTrial) -> str:
     return "\n".join(lines)
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows as columns; what looks like a number stands to the right."""
+def format_columns(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows as aligned text columns; numeric columns are right-aligned."""
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     right = [all(_is_number(row[k]) for row in rows[1:]) for k in range(len(rows[0]))]
 

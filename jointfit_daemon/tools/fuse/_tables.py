@@ -1,7 +1,7 @@
-"""Tables of orientations from files, and what is wrong with them in words.
+"""Reads orientation recordings (NPZ, STO) and checks units, order and sampling times.
 
-Law: whatever the file's axes are, what leaves here has z up. What looks like other units, another
-order or another clock is refused with what to change, never converted on a guess.
+Invariants: returned orientations have z up. Implausible units, component order or times raise
+`UnusableInputError` and are never converted.
 """
 
 from __future__ import annotations
@@ -29,55 +29,58 @@ if TYPE_CHECKING:
 
 
 SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0
+"""Plausible sampling rates; others indicate times in another unit than seconds."""
 NORM_SLACK = 0.05
+"""Largest deviation of the median quaternion norm from 1."""
 FEWEST = 30
-"""Instants that sensors and reference must share."""
+"""Least number of common samples of sensors and reference."""
 
 
-class Unusable(ValueError):  # noqa: N818 - named for what happened
-    """A file that is not what was asked for; the message says what to change."""
+class UnusableInputError(ValueError):
+    """Input that cannot be used; the message names file, finding, expectation and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """Orientations over time by name, z up."""
+class OrientationRecording:
+    """Orientations over time by sensor and by bone, in a world with z up."""
 
     t_s: Array
     q: Mapping[str, Array]
     """q_world_sensor by sensor, shape (n, 4) each; NaN where missing."""
     bones: Mapping[str, Array]
-    """q_world_segment by bone, likewise; an STO file calls both alike."""
+    """q_world_segment by bone, shape (n, 4) each; equal to `q` for an STO file."""
 
 
-def read_table(path: Path, up: Axis) -> Table:
+def read_recording(path: Path, up: Axis) -> OrientationRecording:
     """Return all orientations of an NPZ or STO file, z up.
 
     Raises
     ------
-    Unusable
-        Another kind of file, or numbers that cannot be unit quaternions over seconds.
+    UnusableInputError
+        Unsupported file type, or values that are not unit quaternions over seconds.
     """
     kind = path.suffix.lower()
     if kind == ".npz":
-        refuse_odd_arrays(path)
+        check_arrays(path)
         trial = read_orientations_npz(path)
-        table = Table(trial.t_s, trial.sensors, trial.bones)
+        table = OrientationRecording(trial.t_s, trial.sensors, trial.bones)
     elif kind == ".sto":
-        said = read_orientations_sto(path)
-        columns = {name: said.quaternions[:, k] for k, name in enumerate(said.names)}
+        sto = read_orientations_sto(path)
+        columns = {name: sto.quaternions[:, k] for k, name in enumerate(sto.names)}
         for name, q in columns.items():
-            refuse_other_units(path, name, q)
+            check_unit_norm(path, name, q)
         turn = quaternions_z_up if up == "y" else rotation.normalize
         columns = {name: turn(q) for name, q in columns.items()}
-        table = Table(said.t_s, columns, columns)
+        table = OrientationRecording(sto.t_s, columns, columns)
     else:
-        raise Unusable(f"{path}: expected orientations in a file that ends in .npz or .sto")
-    _refuse_other_times(path, table.t_s)
+        raise UnusableInputError(f"{path}: expected orientations in an .npz or .sto file")
+
+    _check_times(path, table.t_s)
     return table
 
 
-def refuse_odd_arrays(path: Path) -> None:
-    """Refuse arrays of an NPZ file that are no unit quaternions, one a row of ``t``."""
+def check_arrays(path: Path) -> None:
+    """Check that all orientation arrays of an NPZ file hold one unit quaternion per time."""
     arrays = read_arrays(path)
     count = len(arrays["t"]) if "t" in arrays else None
     for name, array in arrays.items():
@@ -85,62 +88,72 @@ def refuse_odd_arrays(path: Path) -> None:
             continue
         q = np.asarray(array, dtype=np.float64)
         if count is not None and q.shape != (count, 4):
-            raise Unusable(
-                f"{path}: {name} has shape {q.shape}, expected {(count, 4)}: a quaternion "
-                f"w, x, y, z for each of the {count} instants of t; gaps are NaN"
+            raise UnusableInputError(
+                f"{path}: {name} has shape {q.shape}, expected {(count, 4)}: one quaternion "
+                f"(w, x, y, z) for each of the {count} values of t, NaN in gaps"
             )
-        refuse_other_units(path, name, q)
+        check_unit_norm(path, name, q)
 
 
-def refuse_other_units(path: Path, name: str, q: Array) -> None:
-    """Refuse what has not the length of unit quaternions."""
+def check_unit_norm(path: Path, name: str, q: Array) -> None:
+    """Check that the median norm is 1 within `NORM_SLACK`."""
     norms = np.linalg.norm(q, axis=-1)
     known = norms[np.isfinite(norms)]
     if known.size and abs(float(np.median(known)) - 1.0) > NORM_SLACK:
-        raise Unusable(
-            f"{path}: {name}: its four numbers have norm {float(np.median(known)):.3g}, not 1: "
-            "expected unit quaternions w, x, y, z, not angles in degrees or radians"
+        raise UnusableInputError(
+            f"{path}: {name}: median norm {float(np.median(known)):.3g}, expected 1: store unit "
+            "quaternions (w, x, y, z), not angles in degrees or radians"
         )
 
 
-def _refuse_other_times(path: Path, t_s: Array) -> None:
+def _check_times(path: Path, t_s: Array) -> None:
     if len(t_s) < FEWEST:
-        raise Unusable(f"{path}: {len(t_s)} rows, at least {FEWEST} are needed")
+        raise UnusableInputError(f"{path}: {len(t_s)} rows, expected at least {FEWEST}")
+
     steps = np.diff(t_s)
     if not (steps > 0.0).all():
         at = int(np.argmin(steps > 0.0)) + 1
-        raise Unusable(
-            f"{path}: times must grow from row to row, and row {at + 1} has {t_s[at]:g} s after "
-            f"{t_s[at - 1]:g} s: sort the rows and leave out repeated ones"
+        raise UnusableInputError(
+            f"{path}: row {at + 1} has time {t_s[at]:g} s after {t_s[at - 1]:g} s, expected "
+            "increasing times: sort the rows and remove repeated ones"
         )
+
     rate_hz = 1.0 / float(np.median(steps))
     if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-        raise Unusable(
-            f"{path}: times {float(np.median(steps)):g} apart would be {rate_hz:.3g} Hz: expected "
-            "seconds; are they milliseconds, or frame numbers?"
+        raise UnusableInputError(
+            f"{path}: median time step {float(np.median(steps)):g} s ({rate_hz:.3g} Hz): expected "
+            "times in seconds, not milliseconds or frame numbers"
         )
 
 
-def sensors_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Array]:
-    """Return the sensors of a table; `Unusable` names who is not there, or says nothing at all."""
+def select_sensors(
+    table: OrientationRecording, names: Sequence[str], path: Path
+) -> dict[str, Array]:
+    """Return the orientations of `names`; raise `UnusableInputError` for missing or empty ones."""
     if missing := [name for name in names if name not in table.q]:
         free = [name for name in table.q if name not in names]
-        said = "; ".join(unknown_name("sensor", name, table.q, candidates=free) for name in missing)
-        raise Unusable(f"{path}: {said}")
-    silent = [name for name in names if not np.isfinite(table.q[name]).all(axis=1).any()]
-    if silent:
-        raise Unusable(
-            f"{path}: {', '.join(silent)}: no orientation in the whole trial: was it plugged in? "
-            "Leave it out of --segment, or leave out the trial"
+        problems = "; ".join(
+            unknown_name("sensor", name, table.q, candidates=free) for name in missing
         )
+        raise UnusableInputError(f"{path}: {problems}")
+
+    empty = [name for name in names if not np.isfinite(table.q[name]).all(axis=1).any()]
+    if empty:
+        raise UnusableInputError(
+            f"{path}: {', '.join(empty)}: no orientation in the whole trial: omit the "
+            "sensor from --segment, or omit the trial"
+        )
+
     return {name: table.q[name] for name in names}
 
 
-def bones_of(table: Table, names: Sequence[str], path: Path) -> dict[str, Array]:
-    """Return the reference orientations of a table; `Unusable` names what is not there."""
+def select_references(
+    table: OrientationRecording, names: Sequence[str], path: Path
+) -> dict[str, Array]:
+    """Return the reference orientations of `names`; raise `UnusableInputError` for missing ones."""
     if missing := [name for name in names if name not in table.bones]:
         problems = [unknown_name("reference of segment", name, table.bones) for name in missing]
-        raise Unusable(
+        raise UnusableInputError(
             f"{path}: {'; '.join(problems)}; if another file has it, write SENSORS=REFERENCE; if"
             " its name differs, --segment NAME=SENSORS:BONE; if there is none, omit the trial"
         )

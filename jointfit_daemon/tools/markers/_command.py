@@ -1,4 +1,4 @@
-"""`jointfit markers`: where the markers really are on their segments, from moving trials."""
+"""Command `jointfit markers`: refines marker positions on their segments from motion trials."""
 
 from __future__ import annotations
 
@@ -18,55 +18,65 @@ if TYPE_CHECKING:
         RefinementSettings,
     )
     from jointfit_daemon.kinematics.chains import ChainModel
-    from jointfit_daemon.tools.markers._trials import Asked
+    from jointfit_daemon.tools.markers._trials import ModelRequest
 
-Trials = Annotated[list[Path], typer.Argument(help="Trials to learn from, .trc or .c3d.")]
-Model = Annotated[Path, typer.Option("--model", help="The chain: .toml, .json or OpenSim's .osim.")]
+Trials = Annotated[list[Path], typer.Argument(help="Training trials, .trc or .c3d.")]
+Model = Annotated[Path, typer.Option("--model", help="Chain model: .toml, .json, .osim.")]
 Lock = Annotated[
     list[str] | None,
-    typer.Option("--lock", help="Hold NAME, or one coordinate of it: NAME.x. Repeatable."),
+    typer.Option("--lock", help="Lock marker NAME, or one coordinate: NAME.x. Repeatable."),
 ]
 Unlock = Annotated[
     list[str] | None,
-    typer.Option("--unlock", help="Let go what the model holds; '*' is all. Repeatable."),
+    typer.Option("--unlock", help="Unlock marker NAME; '*' unlocks all. Repeatable."),
 ]
 Without = Annotated[
     list[str] | None,
-    typer.Option("--without", help="Do not track NAME, as computed points. Repeatable."),
+    typer.Option("--without", help="Ignore marker NAME, for example a computed point. Repeatable."),
 ]
 Validate = Annotated[
     list[Path] | None,
-    typer.Option("--validate", help="A trial that only judges. Repeatable."),
+    typer.Option("--validate", help="Validation trial, not used in the fit. Repeatable."),
 ]
 Method = Annotated[
-    str, typer.Option("--method", help="joint (fast), block, or search (as published, slow).")
+    str,
+    typer.Option("--method", help="joint (all at once), block, or search (slow)."),
 ]
 Prior = Annotated[
     float,
-    typer.Option("--prior", min=0.0, help="What moving a marker costs beside its error."),
+    typer.Option("--prior", min=0.0, help="Cost of displacement relative to tracking error."),
 ]
 Evenness = Annotated[
     float,
     typer.Option(
-        "--evenness", min=0.0, max=8.0, help="Trials weigh as this power of their error: 0 alike."
+        "--evenness",
+        min=0.0,
+        max=8.0,
+        help="Trial weight: this power of its error; 0: equal.",
     ),
 ]
 Holdout = Annotated[
     float,
-    typer.Option("--holdout", min=0.0, max=0.5, help="Last share of each trial: when to stop."),
+    typer.Option(
+        "--holdout",
+        min=0.0,
+        max=0.5,
+        help="Last share of each trial, for early stopping.",
+    ),
 ]
 Frames = Annotated[
-    int, typer.Option("--frames", min=10, help="Frames of a trial at most, evenly taken.")
+    int, typer.Option("--frames", min=10, help="Largest number of frames per trial, evenly spaced.")
 ]
 Up = Annotated[
-    str | None, typer.Option("--up", help="The trials' axis that is up, if they do not say.")
+    str | None,
+    typer.Option("--up", help="Vertical axis, if the files do not define it."),
 ]
 Out = Annotated[
     list[Path] | None,
     typer.Option("--out", help=".toml/.json model, .xml marker set, .trc offsets. Repeatable."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
-Plot = Annotated[Path | None, typer.Option("--plot", help="Draw it: .png, .svg or .pdf.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object in SI units.")]
+Plot = Annotated[Path | None, typer.Option("--plot", help="Plot the result: .png, .svg or .pdf.")]
 
 
 def markers(
@@ -87,12 +97,12 @@ def markers(
     json: Json = False,
     plot: Plot = None,
 ) -> None:
-    """Refine where markers are on their segments, and tell what that is worth.
+    """Refine marker positions on their segments and report the change of the tracking error.
 
-    Ends with 1 where model and trials do not belong together.
+    Exits with 1 if the trials do not fit the model.
     """
     from jointfit_daemon.calibration.marker_refinement import RefinementSettings, Unrefinable
-    from jointfit_daemon.tools.markers._trials import Asked
+    from jointfit_daemon.tools.markers._trials import ModelRequest
 
     _check(method=method, up=up, out=out or [], plot=plot)
     names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
@@ -105,7 +115,7 @@ def markers(
     )
     try:
         chain, remarks, found = _refined(
-            Asked(model, *names, up or None), (trials, validate or []), settings
+            ModelRequest(model, *names, up or None), (trials, validate or []), settings
         )
     except Unrefinable as refused:
         typer.echo(f"jointfit markers: refused: {refused}", err=True)
@@ -132,7 +142,7 @@ def _check(*, method: str, up: str | None, out: Sequence[Path], plot: Path | Non
 
 
 def _refined(
-    asked: Asked, trials: tuple[list[Path], list[Path]], settings: RefinementSettings
+    asked: ModelRequest, trials: tuple[list[Path], list[Path]], settings: RefinementSettings
 ) -> tuple[ChainModel, tuple[str, ...], Refinement]:
     from rich.console import Console
     from rich.progress import Progress, TextColumn
@@ -149,10 +159,10 @@ def _refined(
     ) as bar:
         task = bar.add_task("refining", total=1.0, error="")
 
-        def told(share: float, rms: float) -> None:
+        def show_progress(share: float, rms: float) -> None:
             bar.update(task, completed=share, error=f"{1000 * rms:.2f} mm")
 
-        return chain, remarks, refine_markers(chain, learned, settings, judged, told)
+        return chain, remarks, refine_markers(chain, learned, settings, judged, show_progress)
 
 
 def _print(

@@ -1,7 +1,7 @@
-"""Refined markers as files: a model of ours, OpenSim's marker set, offsets as TRC.
+"""Writes refined markers as a chain model, an OpenSim marker set, or offsets in a TRC file.
 
-Law: OpenSim's axes in OpenSim's file, ours in ours. A marker of a body that was welded to another
-is written on the body it is part of, which is the same place.
+OpenSim files use OpenSim axes (y up). Markers of a body that the import welded to its parent are
+written on the parent, which is the same position.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 ENDINGS = (".toml", ".json", ".xml", ".trc")
 _OPENSIM_VERSION = "40000"
+"""File format version of OpenSim 4.0."""
 
 
 def write_markers(path: Path, before: ChainModel, after: ChainModel) -> None:
-    """Write by the ending of the name."""
+    """Write the markers; the file extension selects the format."""
     kind = path.suffix.lower()
     if kind == ".xml":
         _write_marker_set(path, after)
@@ -43,13 +44,14 @@ def _write_marker_set(path: Path, model: ChainModel) -> None:
         ET.SubElement(one, "socket_parent_frame").text = f"/bodyset/{marker.segment}"
         ET.SubElement(one, "location").text = " ".join(f"{float(v):.9g}" for v in at)
         ET.SubElement(one, "fixed").text = str(all(marker.locked)).lower()
+
     ET.SubElement(whole, "groups")
     ET.indent(root)
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
 def _write_offsets(path: Path, before: ChainModel, after: ChainModel) -> None:
-    """Write one row: how far each marker moved, m, in its segment's axes."""
+    """Write one frame with the displacement of each marker, m, in segment axes."""
     moved = (after.positions - before.positions)[None]
     one = np.ones(1, dtype=np.int64)
     write_trc(path, MarkerTrajectories(after.marker_names, np.zeros(1), one, moved, 1.0))

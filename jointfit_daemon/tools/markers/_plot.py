@@ -1,4 +1,4 @@
-"""A refinement as a picture: what each marker was off by, how far it moved, each trial's error."""
+"""Plot of a refinement: residual and displacement of each marker, error of each trial."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BEFORE, _AFTER, _MOVED = "tab:gray", "tab:blue", "tab:orange"
 
 
 def draw_refinement(path: Path, found: Refinement) -> None:
-    """Write one figure; its format is the ending of the name."""
+    """Write one figure; the file extension selects the format."""
     figure = new_figure(11.0, max(4.0, 0.22 * len(found.markers) + 1.5))
     markers, trials = figure.subplots(1, 2, width_ratios=(2, 1))
     figure.suptitle(f"{found.model.name}: {found.method}")
@@ -35,7 +35,7 @@ def _draw_markers(axes: Any, found: Refinement) -> None:
     axes.hlines(places, before, after, color=_BEFORE, linewidth=1.0)
     axes.plot(before, places, "o", color=_BEFORE, label="residual before")
     axes.plot(after, places, "o", color=_AFTER, label="residual after")
-    axes.plot(moved, places, "|", color=_MOVED, markersize=9, label="moved by")
+    axes.plot(moved, places, "|", color=_MOVED, markersize=9, label="displacement")
     axes.set_yticks(places, [m.name for m in found.markers], fontsize=7)
     axes.invert_yaxis()
     axes.set_xlabel("mm")
@@ -47,7 +47,7 @@ def _draw_trials(axes: Any, found: Refinement) -> None:
     places = np.arange(len(found.trials))
     axes.barh(places - 0.2, [_MM * t.before.rms for t in found.trials], 0.4, color=_BEFORE)
     axes.barh(places + 0.2, [_MM * t.after.rms for t in found.trials], 0.4, color=_AFTER)
-    names = [f"{t.name}\n{'trained' if t.trained else 'unseen'}" for t in found.trials]
+    names = [f"{t.name}\n{'training' if t.trained else 'validation'}" for t in found.trials]
     axes.set_yticks(places, names, fontsize=8)
     axes.invert_yaxis()
     axes.set_xlabel("RMS tracking error, mm")

@@ -1,4 +1,4 @@
-"""Refinements as text and JSON. Law: pure; millimetres and degrees for people only."""
+"""Marker refinements as text (mm, degrees) and as JSON (SI units)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _MM2 = 1e6
-_MARKER_HEAD = ("marker", "segment", "moved, mm", "x, y, z", "held", "residual, mm")
-_TRIAL_HEAD = ("trial", "", "frames", "RMS, mm", "", "variance over time, mm²", "joints, °")
+_MARKER_HEAD = ("marker", "segment", "moved, mm", "x, y, z", "locked", "residual, mm")
+_TRIAL_HEAD = ("trial", "", "frames", "RMS, mm", "", "variance over time, mm²", "joint change, °")
 
 
 def as_text(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> str:
-    """Return markers, trials, and what to know about both."""
+    """Return the tables of markers and trials, and a summary."""
     lines = [
         f"model     {chain.name}: {len(chain.segments)} segments, {chain.nq} degrees of freedom,"
         f" {len(chain.markers)} markers",
@@ -57,7 +57,7 @@ def _trial(t: TrialOutcome) -> tuple[str, ...]:
     turned = max((most for _, most in t.angles.values()), default=float("nan"))
     return (
         t.name,
-        "trained" if t.trained else "unseen",
+        "training" if t.trained else "validation",
         f"{t.frames} at {t.rate_hz:g} Hz",
         f"{_mm(t.before.rms)} → {_mm(t.after.rms)}",
         _change(t.before.rms, t.after.rms),
@@ -68,26 +68,29 @@ def _trial(t: TrialOutcome) -> tuple[str, ...]:
 
 def _summary(found: Refinement) -> list[str]:
     rms, most = found.angle_change()
-    lines = [f"joints    turned by {degrees(rms):.1f}° RMS, {degrees(most):.1f}° at most"]
-    for trained, word in ((True, "trained"), (False, "unseen")):
+    lines = [f"joints    angles changed by {degrees(rms):.1f}° RMS, {degrees(most):.1f}° at most"]
+    for trained, word in ((True, "training"), (False, "validation")):
         before, after = found.variance_of_trials(trained=trained)
         if isfinite(before):
             lines.append(
                 f"variance  of RMS across {word} trials: {_mm2(before)} → {_mm2(after)} mm²"
             )
+
     gauge = found.gauge
     if gauge.free:
         held = {
-            "prior": "held by the prior alone",
-            "nothing": "HELD BY NOTHING: joint angles may be off at no cost; lock anatomical"
-            " markers or give a prior",
+            "prior": "determined by the prior only",
+            "nothing": "UNDETERMINED: joint angles are arbitrary there; lock anatomical"
+            " markers or set a prior",
         }[gauge.fixed_by]
         lines.append(
-            f"unseen    {gauge.free} ways to move markers and joints together change no error"
+            f"gauge     {gauge.free} motions of markers and angles leave the error unchanged"
             f" ({', '.join(gauge.involved)}): {held}"
         )
+
     if gauge.weak:
-        lines.append(f"weak      {gauge.weak} more ways hardly change it")
+        lines.append(f"weak      {gauge.weak} more hardly change it")
+
     return lines
 
 
@@ -112,7 +115,7 @@ def _change(before: float, after: float) -> str:
 
 
 def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dict[str, Any]:
-    """Return everything for programs, SI; null is unknown."""
+    """Return all results in SI units; null means unknown."""
     rms, most = found.angle_change()
     return {
         "model": chain.name,

@@ -1,6 +1,6 @@
-"""What `jointfit markers` works on: a chain, and trials in the order of its markers.
+"""Input of `jointfit markers`: a chain model, and trials with columns in its marker order.
 
-Law: a marker that a trial lacks is missing there, NaN; a name that nothing has is a fault.
+Markers that a trial lacks are NaN there. Unknown names in options raise `ValueError`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _ALL = "*"
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What the command line says of the model."""
+class ModelRequest:
+    """Model options of the command line."""
 
     model: Path
     lock: tuple[str, ...] = ()
@@ -37,9 +37,9 @@ class Asked:
 
 
 def load(
-    asked: Asked, trials: Sequence[Path], validation: Sequence[Path]
+    asked: ModelRequest, trials: Sequence[Path], validation: Sequence[Path]
 ) -> tuple[ChainModel, tuple[str, ...], list[MotionTrial], list[MotionTrial]]:
-    """Return the chain, remarks of its import, and both kinds of trials.
+    """Return the chain, remarks of its import, training trials and validation trials.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def load(
     return chain, remarks, learned, judged
 
 
-def _chain(asked: Asked) -> tuple[ChainModel, tuple[str, ...]]:
+def _chain(asked: ModelRequest) -> tuple[ChainModel, tuple[str, ...]]:
     """Return the chain and the remarks of its import."""
     from jointfit_daemon.files.models import read_model, read_osim
 
@@ -73,7 +73,7 @@ def _chain(asked: Asked) -> tuple[ChainModel, tuple[str, ...]]:
 
 
 def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainModel:
-    """Return the chain with locks set or taken off."""
+    """Return the chain with the named locks set (`hold`) or cleared."""
     locks = {m.name: list(m.locked) for m in chain.markers}
     for text in texts:
         if text == _ALL:
@@ -83,11 +83,12 @@ def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainMode
         _known(chain, name, "--lock" if hold else "--unlock")
         for at in range(3) if axis is None else (axis,):
             locks[name][at] = hold
+
     return chain.with_locks({name: (x, y, z) for name, (x, y, z) in locks.items()})
 
 
 def _split(chain: ChainModel, text: str) -> tuple[str, int | None]:
-    """Return marker and coordinate; names may have dots of their own, so a whole name wins."""
+    """Return marker and coordinate index; a full marker name with a dot takes precedence."""
     head, dot, tail = text.rpartition(".")
     if text not in chain.marker_names and dot and tail in tuple(_AXES):
         return head, _AXES.index(tail)
@@ -99,7 +100,7 @@ def _known(chain: ChainModel, name: str, option: str) -> None:
         return
     names = chain.marker_names
     hint = did_you_mean(name, names, count=3) or f"there are: {', '.join(names)}"
-    raise ValueError(f"{option} {name}: no such marker in the model; {hint}")
+    raise ValueError(f"{option} {name}: unknown marker; {hint}")
 
 
 def _motion(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:
@@ -109,5 +110,5 @@ def _motion(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:
         try:
             targets[:, at] = trial.points([marker])[:, 0]
         except UnknownMarkerError:
-            continue  # missing throughout; the refinement says so
+            continue  # the column remains NaN, which the refinement reports
     return MotionTrial(name, targets, trial.trajectories.rate_hz)

@@ -1,4 +1,4 @@
-"""`jointfit report`: published experiments, repeated and told with what they hide."""
+"""Command `jointfit report`: repeats published experiments and reports their limits."""
 
 from __future__ import annotations
 
@@ -20,28 +20,31 @@ def report(
     cor_study: Annotated[
         bool,
         typer.Option(
-            "--cor-study", help="Center of rotation: error over arc, noise and radius, nine maps."
+            "--cor-study", help="Centre of rotation: error over arc, noise and radius, nine maps."
         ),
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for figures (PNG, SVG) and the text.")
+        Path | None, typer.Option("--out", help="Folder for figures (PNG, SVG) and text.")
     ] = None,
     json: Annotated[
-        Path | None, typer.Option("--json", help="File for all figures, maps included.")
+        Path | None, typer.Option("--json", help="File for all results, including the maps.")
     ] = None,
     repeats: Annotated[
-        int, typer.Option("--repeats", min=2, help="Runs of every cell of a map.")
+        int, typer.Option("--repeats", min=2, help="Runs per cell of a map.")
     ] = 1000,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random numbers.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed.")] = 1,
 ) -> None:
     """Repeat a published experiment: tables on standard output, figures with --out."""
     if not cor_study:
-        raise ValueError("name the report: the only one is --cor-study")
+        raise ValueError("no report selected, expected --cor-study")
+
     for folder in (out, json.parent if json else None):
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
+
     if json is not None:
         check_output("--json", json, (json.suffix,))
+
     _cor_study(out, json, repeats, seed)
 
 
@@ -69,7 +72,7 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
 
 
 def _computed(setup: StudySetup) -> list[PairMaps]:
-    """Run the study, with a bar where somebody watches."""
+    """Run the study, with a progress bar on a terminal."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -82,11 +85,11 @@ def _computed(setup: StudySetup) -> list[PairMaps]:
 
 
 def _draw(study: Sequence[PairMaps], out: Path) -> None:
-    from jointfit_daemon.tools.plotting import PlotMissing
+    from jointfit_daemon.tools.plotting import PlottingUnavailableError
     from jointfit_daemon.tools.report._plot import draw_study
 
     try:
         for path in draw_study(study, out):
             typer.echo(f"wrote {path}", err=True)
-    except PlotMissing as missing:
+    except PlottingUnavailableError as missing:
         typer.echo(f"no figures: {missing}", err=True)

@@ -1,7 +1,7 @@
-"""The maps of the numerical experiment as figures.
+"""Maps of the numerical experiment as figures.
 
-Law: one color scale for all maps of a row, cut off where single outliers would rule it; what no
-method answered is hatched, never colored.
+All maps of a row share one colour scale, clipped so that outliers do not dominate it. Cells without
+an estimate are hatched.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _TOP_MM = {"α–σ": 50.0, "r–σ": 15.0, "r–α": 20.0}
-"""Where the color scale of each row ends."""
+"""Upper end of the colour scale of each row, mm."""
 _SOURCE = (
     ("predicted", "F  prediction (equation 15)"),
     ("three frames", "A  analytic, three frames"),
     ("grid", "G  grid, node on the truth"),
 )
 _OURS = (
-    ("shifted grid", "three frames, grid half a step off"),
+    ("shifted grid", "three frames, grid shifted by half a step"),
     ("bound", "Cramér-Rao bound, all frames"),
     ("hyper", "hyper, all frames"),
     ("oriented", "orientation-aided, all frames"),
@@ -40,20 +40,21 @@ _AXES = {
 
 
 def draw_study(study: Sequence[PairMaps], folder: Path) -> list[Path]:
-    """Write the source's figure 2 and the same maps of our estimators, PNG and SVG each."""
+    """Write figure 2 of the source and the maps of the other estimators, as PNG and SVG."""
     written: list[Path] = []
     for name, methods, title in (
         ("cor-study-figure-2", _SOURCE, "RMS error of the center, three frames"),
         (
             "cor-study-estimators",
             _OURS,
-            "RMS error of the center: a grid off the truth, and all frames of the same arcs",
+            "RMS error of the center: shifted grid, and all frames of the same arcs",
         ),
     ):
         figure = _figure(study, methods, title)
         for suffix in ("png", "svg"):
             written.append(folder / f"{name}.{suffix}")
             figure.savefig(written[-1], dpi=130)
+
     return written
 
 
@@ -69,11 +70,12 @@ def _figure(study: Sequence[PairMaps], methods: Sequence[tuple[str, str]], title
                 axes.set_title(label, fontsize=10)
         bar = figure.colorbar(last, ax=list(axes_row), extend="max", shrink=0.9)
         bar.set_label("mm")
+
     return figure
 
 
 def _map(axes: Any, pair: PairMaps, key: str) -> Any:
-    """Draw one map; rows upwards, as axes go."""
+    """Draw one map; rows increase upwards."""
     row_name, column_name = pair.name.split("–")
     (y_label, y_scale), (x_label, x_scale) = _AXES[row_name], _AXES[column_name]
     axes.set_facecolor("white")

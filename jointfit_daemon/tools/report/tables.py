@@ -1,4 +1,4 @@
-"""The numerical experiment as text and JSON. Law: pure; millimetres and degrees for people only."""
+"""Results of the numerical experiment as text (mm, degrees) and as JSON (SI units)."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
-"""The clip, m, at which each pair comes nearest to the printed table."""
+"""Clipping limit, m, with the correlations nearest to the printed table, by pair."""
 CAVEATS = (
-    "Three noisy points can lie on a line, so the error of the analytic solution has no finite mean"
-    " square: a raw correlation is decided by single outliers and changes with the seed. The"
-    " printed table therefore needs bounded errors and a small box.",
-    "Clips and box were scanned until the table came near (marked *): a fit, not a derivation."
-    " The printed setup names neither, nor the grid's region and step, and its digits are garbled.",
-    "The grid is better at small α because its box is centered on the truth and cannot be left: at"
-    " α = 5° its error is the box. With three points both methods have the same optimum.",
-    "On long arcs a grid with a node on the true center hits it; shifted by half a step it is off"
-    " by at least 0.71 steps. Both are shown.",
-    "Equations 14 and 15 of the source are mean squares: F is the root. F holds while"
-    " σ/r < (1 - cos α)/6.",
-    "The all-frames methods see 100 frames of the same arc, not three; hyper answers only where it"
-    " says it can (T ≥ 6), so that its RMS is over those runs, and being drawn in on short arcs it"
-    " may stay below the bound, which is for unbiased estimators.",
+    "Three noisy points can be collinear, so the error of the analytic solution has no finite"
+    " mean square: single outliers determine the raw correlation, which changes with the seed."
+    " The printed table therefore requires bounded errors and a small box.",
+    "Clipping limit and box were scanned to approach the printed table (marked *): a fit, not a"
+    " derivation. The source states neither, nor region and step of the grid, and some of its"
+    " digits are illegible.",
+    "The grid has smaller errors at small α because its box is centered on the true center and"
+    " limits the error: at α = 5° the error equals the box. With three points both methods have"
+    " the same optimum.",
+    "On long arcs a grid with a node on the true center finds it exactly; shifted by half a step"
+    " its error is at least 0.71 steps. Both are shown.",
+    "Equations 14 and 15 of the source are mean squares: F is the root. F holds while σ/r < (1 -"
+    " cos α)/6.",
+    "The all-frames methods use 100 frames of the same arc, not three. hyper refuses runs with T"
+    " < 6, so its RMS covers the other runs. It is biased on short arcs and can be below the"
+    " bound, which holds for unbiased estimators.",
 )
 _SHOWN_DEG = (5, 10, 20, 30, 45, 60, 90, 120, 150, 175)
 _MM = 1000.0
@@ -39,7 +41,7 @@ _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper
 
 
 def tables(setup: StudySetup, study: Sequence[PairMaps]) -> str:
-    """Return setup, correlations, errors over the arc and what to keep in mind."""
+    """Return setup, correlations, errors over the arc and limits of the comparison."""
     parts = [
         "Center of rotation from a marker on a circle: the numerical experiment of Akbarifar et al."
         " (2021), repeated",
@@ -50,7 +52,7 @@ def tables(setup: StudySetup, study: Sequence[PairMaps]) -> str:
         _aligned(_correlations(study, "shifted grid")),
         _errors_title(setup),
         _aligned(_errors(study)),
-        "Keep in mind",
+        "Limits",
         "\n".join(f"- {text}" for text in CAVEATS),
     ]
     return "\n\n".join(parts) + "\n"
@@ -94,7 +96,7 @@ def _pair_cell(pair: PairMaps, grid: str, clip: float | None) -> str:
 
 
 def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, float]:
-    """Return prediction–analytic and analytic–grid of one pair of quantities."""
+    """Return the correlations prediction–analytic and analytic–grid of one pair of quantities."""
     analytic = pair.maps["three frames"]
     return (
         correlation(pair.maps["predicted"], analytic, clip),
@@ -105,8 +107,7 @@ def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, 
 def _errors_title(setup: StudySetup) -> str:
     return (
         f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
-        f" σ = {_MM * setup.noise:g} mm; refused: share of runs in which hyper says it must not be"
-        " used"
+        f" σ = {_MM * setup.noise:g} mm; refused: share of runs that hyper refuses"
     )
 
 
@@ -135,7 +136,7 @@ def _line(row: Iterable[str], widths: Iterable[int]) -> str:
 
 
 def as_json(setup: StudySetup, study: Sequence[PairMaps]) -> dict[str, Any]:
-    """Return everything for programs: setup, correlations and whole maps, SI; null is unknown."""
+    """Return setup, correlations and maps in SI units; null means unknown."""
     return {
         "setup": {
             "radii_m": setup.radii.tolist(),

@@ -64,7 +64,7 @@ async def walking(folder: Path) -> AsyncIterator[tuple[Path, Listener]]:
 
 @pytest.mark.system
 @pytest.mark.timeout(90)
-async def test_a_signal_aborts_the_phase_that_the_command_started(tmp_path: Path) -> None:
+async def test_stop_signal_aborts_the_phase_of_the_command(tmp_path: Path) -> None:
     async with walking(tmp_path) as (rig, listener):
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             process = await calibrate(rig, *STATIC)
@@ -80,7 +80,7 @@ async def test_a_signal_aborts_the_phase_that_the_command_started(tmp_path: Path
 
 @pytest.mark.system
 @pytest.mark.timeout(90)
-async def test_a_lost_terminal_aborts_the_phase(tmp_path: Path) -> None:
+async def test_closed_terminal_aborts_the_phase(tmp_path: Path) -> None:
     async with walking(tmp_path) as (rig, listener):
         read_end, write_end = os.pipe()
         try:
@@ -100,7 +100,7 @@ async def test_a_lost_terminal_aborts_the_phase(tmp_path: Path) -> None:
 
 @pytest.mark.system
 @pytest.mark.timeout(60)
-async def test_a_running_phase_is_named_with_the_command_that_ends_it(tmp_path: Path) -> None:
+async def test_refused_request_suggests_the_abort_command(tmp_path: Path) -> None:
     async with walking(tmp_path) as (rig, listener):
         leading = await calibrate(rig, *STATIC)
         await line_with(leading, "static:")

@@ -1,4 +1,4 @@
-"""Leading a calibration: what counts as an answer, what does not, and what is told at the end."""
+"""Calibration phases followed over MQTT, and the lines printed for results and progress."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from jointfit_daemon.tools.calibrate import (
-    CalibrationWatch,
-    PhaseAborted,
+    PhaseAbortedError,
+    PhaseTracker,
     _command,
     _phase_tracker,
     movement_lines,
@@ -18,19 +18,19 @@ from jointfit_daemon.tools.calibrate import (
 )
 
 
-def watch(*phases: str) -> CalibrationWatch:
-    one = CalibrationWatch(lambda *_: None)
+def tracker_after(*phases: str) -> PhaseTracker:
+    one = PhaseTracker(lambda *_: None)
     one.begin()
     for phase in phases:
         one.on_status({"phase": phase, "text": f"it is {phase}", "version": 1})
     return one
 
 
-async def test_a_retained_status_of_earlier_is_not_the_answer() -> None:
-    one = watch("calibrated")
+async def test_retained_status_of_an_earlier_phase_does_not_end_the_wait() -> None:
+    one = tracker_after("calibrated")
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.05):
-            await one.ended("functional")
+            await one.wait_for_end("functional")
 
 
 @pytest.mark.parametrize(
@@ -38,36 +38,36 @@ async def test_a_retained_status_of_earlier_is_not_the_answer() -> None:
     [("align", "aligned"), ("static", "posed"), ("static", "calibrated"),
      ("functional", "calibrated"), ("functional", "uncalibrated")],
 )  # fmt: skip
-async def test_whatever_follows_the_phase_and_its_fit_ends_it(phase: str, end: str) -> None:
-    ended = await watch("aborted", phase, "fitting", end).ended(phase)
+async def test_first_state_after_phase_and_fit_ends_the_wait(phase: str, end: str) -> None:
+    ended = await tracker_after("aborted", phase, "fitting", end).wait_for_end(phase)
     assert ended["phase"] == end
 
 
-async def test_an_aborted_phase_is_told_with_its_reason() -> None:
-    with pytest.raises(PhaseAborted, match="it is aborted"):
-        await watch("static", "aborted").ended("static")
+async def test_aborted_phase_raises_its_reason() -> None:
+    with pytest.raises(PhaseAbortedError, match="it is aborted"):
+        await tracker_after("static", "aborted").wait_for_end("static")
 
 
-async def test_who_waits_is_told_that_the_daemon_is_gone() -> None:
-    one = watch("static")
-    asyncio.get_running_loop().call_later(0.01, one.lose, PhaseAborted("gone"))
-    with pytest.raises(PhaseAborted, match="gone"):
-        await one.ended("static")
+async def test_failure_is_raised_in_the_waiting_task() -> None:
+    one = tracker_after("static")
+    asyncio.get_running_loop().call_later(0.01, one.fail, PhaseAbortedError("gone"))
+    with pytest.raises(PhaseAbortedError, match="gone"):
+        await one.wait_for_end("static")
 
 
-async def test_the_version_of_the_store_is_waited_for_but_not_for_long(
+async def test_wait_for_store_returns_the_version_or_times_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(_phase_tracker, "STORING_S", 0.05)
-    one = watch("functional", "fitting", "calibrated")
-    ended = await one.ended("functional")
-    assert await one.stored(ended) is ended
+    one = tracker_after("functional", "fitting", "calibrated")
+    ended = await one.wait_for_end("functional")
+    assert await one.wait_for_store(ended) is ended
     stored = {"phase": "calibrated", "text": "stored as version 2", "version": 2}
     asyncio.get_running_loop().call_later(0.01, one.on_status, stored)
-    assert (await one.stored(ended))["version"] == 2
+    assert (await one.wait_for_store(ended))["version"] == 2
 
 
-def test_the_report_names_errors_centers_and_a_missing_align_phase() -> None:
+def test_report_contains_errors_centers_and_missing_align_phase() -> None:
     lines = report(
         {
             "alignment": None,
@@ -84,45 +84,45 @@ def test_the_report_names_errors_centers_and_a_missing_align_phase() -> None:
         }
     )
     assert lines == [
-        "thigh: orientation error 2.1°; the mean of the sensors has 4.1°",
+        "thigh: orientation error 2.1°; sensor mean 4.1°",
         "knee: flexion error unknown",
-        "knee: center by markers, sd 24 mm",
-        "thigh: 0.410 m long, by configured",
-        "no align phase: headings come from the static pose",
+        "knee: center from markers, sd 24 mm",
+        "thigh: 0.410 m long, from configured",
+        "no align phase: sensor headings are estimated from the static pose",
     ]
 
 
-def test_nothing_known_is_nothing_told() -> None:
+def test_report_of_empty_quality_is_empty() -> None:
     assert report({}) == []
 
 
-def test_a_movement_is_told_a_joint_a_line_and_what_is_unknown_is_said() -> None:
+def test_movement_lines_contain_one_line_per_joint() -> None:
     hip = {"met": True, "source": "markers", "predicted_error_mm": 16.66, "noise_error_mm": 2.11,
            "arc_deg": 64.2}  # fmt: skip
     knee = {"met": False, "source": "sensors", "predicted_error_mm": None, "bends": 3}
     assert movement_lines({"joints": {"hip": hip, "knee": knee}}) == [
-        "✔ hip: center ± 16.7 mm with skin, 2.1 mm by noise, 64° seen",
-        "… knee: center unknown, bent 3×, by sensors",
+        "✔ hip: center ± 16.7 mm, 2.1 mm from noise, 64° range",
+        "… knee: center unknown, 3 bends, from sensors",
     ]
     assert movement_lines({}) == []
 
 
-def test_figures_follow_the_progress_they_came_with() -> None:
+def test_details_are_shown_after_their_progress() -> None:
     told: list[object] = []
-    one = CalibrationWatch(lambda *said: told.append(said), told.append)
+    one = PhaseTracker(lambda *said: told.append(said), told.append)
     one.on_progress({"phase": "functional", "progress": 0.5, "text": "on", "data": {"joints": {}}})
     assert told == [("functional", 0.5, "on"), {"joints": {}}]
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_a_result_that_is_not_stored_is_printed_once(
+def test_result_that_is_not_stored_is_printed_once(
     monkeypatch: pytest.MonkeyPatch, terminal: bool
 ) -> None:
     monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: terminal))
-    one, text = watch(), "in force but not stored: no space left"
+    one, text = tracker_after(), "in force but not stored: no space left"
     event = {"kind": "calibration", "level": "error", "id": "bench", "text": text}
     printed = [
-        _command._heard(one, "calibration", {"phase": "calibrated", "text": text}),
-        _command._heard(one, "bridge/event", event),
+        _command._handle_message(one, "calibration", {"phase": "calibrated", "text": text}),
+        _command._handle_message(one, "bridge/event", event),
     ]
     assert sum(line is not None for line in printed) == 1

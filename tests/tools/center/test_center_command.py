@@ -170,11 +170,11 @@ def test_a_window_is_a_line(trc: Path) -> None:
     ]
 
 
-def test_standing_still_is_refused_with_a_remedy_and_exit_code_1(tmp_path: Path) -> None:
+def test_small_motion_is_refused_with_exit_code_1(tmp_path: Path) -> None:
     write_trc(tmp_path / "still.trc", ball_trial(span=0.0))
     result = run(app, ["center", str(tmp_path / "still.trc"), *OPTIONS])
     assert result.exit_code == 1
-    assert "REFUSED   the markers moved" in result.stdout
+    assert "REFUSED   child marker motion" in result.stdout
     assert "move the joint" in result.stdout
     assert "nan" not in result.stdout
 
@@ -183,15 +183,15 @@ def test_standing_still_is_refused_with_a_remedy_and_exit_code_1(tmp_path: Path)
     ("arguments", "words"),
     [
         (["--parent", "P1,P2,PP3", "--markers", "C1"], ["'PP3'", "P3"]),
-        (["--parent", "P1,P2", "--markers", "C1"], ["3 are needed", "--plane"]),
-        (["--parent", "P1,P2,C1", "--markers", "C1"], ["C1", "take out"]),
+        (["--parent", "P1,P2", "--markers", "C1"], ["expected at least 3", "--plane"]),
+        (["--parent", "P1,P2,C1", "--markers", "C1"], ["C1", "remove from one"]),
         ([*OPTIONS, "--method", "spheer"], ["did you mean 'sphere'", "score"]),
         ([*OPTIONS, "--method", "oriented"], ["inertial"]),
         (["--parent", "P1,P2,P3", "--markers", "C1,C2", "--method", "score"], ["three"]),
         ([*OPTIONS, "--up", "w"], ["--up", "x, y or z"]),
     ],
 )
-def test_a_wrong_question_is_answered_with_what_to_change(
+def test_invalid_options_are_rejected_with_a_remedy(
     trc: Path, arguments: list[str], words: list[str]
 ) -> None:
     result = run(app, ["center", str(trc), *arguments])
@@ -200,28 +200,26 @@ def test_a_wrong_question_is_answered_with_what_to_change(
         assert word in result.stderr
 
 
-def test_a_parent_on_a_line_or_never_whole_is_named(tmp_path: Path) -> None:
+def test_collinear_or_incomplete_parent_markers_are_rejected(tmp_path: Path) -> None:
     trial = ball_trial()
     trial.positions[:, 2] = 0.3 * trial.positions[:, 0] + 0.7 * trial.positions[:, 1]
     write_trc(tmp_path / "line.trc", trial)
     asked = ["--parent", "P1,P2,P3", "--markers", "C1,C2"]
     result = run(app, ["center", str(tmp_path / "line.trc"), *asked])
-    assert (result.exit_code, "on a line" in result.stderr) == (2, True)
+    assert (result.exit_code, "collinear" in result.stderr) == (2, True)
     trial.positions[::2, 0], trial.positions[1::2, 1] = np.nan, np.nan
     write_trc(tmp_path / "part.trc", trial)
     result = run(app, ["center", str(tmp_path / "part.trc"), *asked])
-    assert (result.exit_code, "leave out the one seen least" in result.stderr) == (2, True)
+    assert (result.exit_code, "omit the marker" in result.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_numbers_in_another_unit_than_the_file_states_are_told(
-    tmp_path: Path, factor: float
-) -> None:
+def test_implausible_marker_distances_are_rejected(tmp_path: Path, factor: float) -> None:
     trial = ball_trial()
     write_trc(tmp_path / "unit.trc", replace(trial, positions=factor * trial.positions))
     result = run(app, ["center", str(tmp_path / "unit.trc"), *OPTIONS])
     assert result.exit_code == 2
-    assert "unit that the file states" in result.stderr
+    assert "check the unit stated in the file" in result.stderr
 
 
 def test_all_markers_are_listed_once_however_many_names_are_wrong(trc: Path) -> None:
@@ -232,15 +230,15 @@ def test_all_markers_are_listed_once_however_many_names_are_wrong(trc: Path) -> 
     assert result.stderr.count("no marker") == 3
 
 
-def test_a_hinge_is_told_by_its_error_across_the_axis(tmp_path: Path) -> None:
+def test_hinge_reports_the_error_normal_to_its_axis(tmp_path: Path) -> None:
     write_trc(tmp_path / "hinge.trc", hinge_trial())
     asked = [str(tmp_path / "hinge.trc"), *OPTIONS]
     found = answer(*asked)
     assert found["sd_m"] is None
     assert 0.0 < found["sd_seen_m"] < 0.003
     told = run(app, ["center", *asked]).stdout
-    assert "error     unknown along what is unseen; " in told
-    assert "across that" in told
+    assert "error     unknown along the unobservable directions; " in told
+    assert "in the other directions" in told
 
 
 def test_a_missing_file_is_named() -> None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from rich.console import Console
 
-from jointfit_daemon.tools.demo._display import STEPS, Display
-from jointfit_daemon.tools.demo._score import Truth
+from jointfit_daemon.tools.demo._display import STEPS, DemoDisplay
+from jointfit_daemon.tools.demo._score import TrueLimbState
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,21 +27,21 @@ FIGURES = {"frames": 3000, "flexion RMSE": "1.20°", "latency": "3.2 ms"}
 
 
 def shown(width: int, *, height: int = 24, frames: int = 5000) -> list[str]:
-    """Return the lines of the fullest picture: live, all joints known, the curves full."""
+    """Return the lines of the largest display: live phase, all joints, full curves."""
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=False)
-    display = Display(headless=True, console=console)
+    display = DemoDisplay(headless=True, console=console)
     display.step("functional", 1.0, "")
     display.figures({"joints": {"hip": JOINT, "knee": JOINT, "ankle": JOINT}})
     display.step("live", 0.5, "15 s to go")
     for _ in range(frames):
-        display.live(POSE, Truth(1, "sit_to_stand", {}, {}, 0.5), FIGURES)
+        display.live(POSE, TrueLimbState(1, "sit_to_stand", {}, {}, 0.5), FIGURES)
     console.print(display.render())
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue().splitlines()
 
 
 @pytest.mark.parametrize("width", [200, 120, 80, 60, 50])
-def test_the_whole_picture_fits_twenty_four_lines(width: int) -> None:
+def test_display_fits_24_lines_at_any_width(width: int) -> None:
     lines = shown(width)
     assert len(lines) <= 23  # the cursor has the last one
     assert max(map(len, lines)) <= width
@@ -54,13 +54,13 @@ def test_the_whole_picture_fits_twenty_four_lines(width: int) -> None:
 @pytest.mark.parametrize("width", [120, 80, 60, 50])
 def test_each_curve_fills_one_line(width: int) -> None:
     curves = [line for line in shown(width) if any(bar in line for bar in "▁▂▃▄▅▆▇█")]
-    assert [line.split()[1] for line in curves] == ["daemon", "bones"]
+    assert [line.split()[1] for line in curves] == ["daemon", "truth"]
     for line in curves:
         assert sum(line.count(bar) for bar in "▁▂▃▄▅▆▇█") == width - len("│ daemon  │")
 
 
-def test_the_picture_is_saved_as_svg(tmp_path: Path) -> None:
-    display = Display(headless=True, console=Console(file=io.StringIO()))
+def test_display_is_saved_as_svg(tmp_path: Path) -> None:
+    display = DemoDisplay(headless=True, console=Console(file=io.StringIO()))
     display.live(POSE, None, FIGURES)
     display.save(tmp_path / "demo.svg")
     assert "<svg" in (tmp_path / "demo.svg").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""The result line of the demo: complete, partial, and after Ctrl-C."""
+"""Result line of the demo: complete, partial, and after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.demo._command import NOTHING_MEASURED, result_line
+from jointfit_daemon.tools.demo._command import NO_RESULT, result_line
 from tests.system.station import restore_signals
 
 if TYPE_CHECKING:
@@ -32,15 +32,15 @@ FIGURES: dict[str, Any] = {
 
 def test_the_result_line_has_errors_latency_and_samples() -> None:
     line = result_line("passed", FIGURES)
-    assert line.startswith("result: passed; knee flexion 1.83° RMS off over 3000 frames")
+    assert line.startswith("result: passed; knee flexion error 1.83° RMS over 3000 frames")
     for part in ("12.5 mm", "3.1 ms median", "9.8 ms p99", "24000 sent", "0 unaccounted for"):
         assert part in line
     assert "\n" not in line
 
 
-def test_what_was_not_measured_is_called_unknown() -> None:
-    line = result_line("interrupted by SIGINT", NOTHING_MEASURED)
-    assert "knee flexion unknown RMS" in line
+def test_result_line_marks_missing_values_as_unknown() -> None:
+    line = result_line("interrupted by SIGINT", NO_RESULT)
+    assert "knee flexion error unknown RMS" in line
     assert "None" not in line
 
 

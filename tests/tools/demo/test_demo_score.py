@@ -1,4 +1,4 @@
-"""The demo's judge: truth between its rows, errors against it, promises kept or missed."""
+"""Ground truth interpolation, errors against it, and targets of the demo."""
 
 from __future__ import annotations
 
@@ -9,17 +9,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.tools.demo._command import BOUNDS, missed_bounds
-from jointfit_daemon.tools.demo._score import MeanSquare, Score, Truth, TruthTrack, percentile
+from jointfit_daemon.tools.demo._command import TARGETS, missed_targets
+from jointfit_daemon.tools.demo._score import (
+    DemoScore,
+    RmsAccumulator,
+    TrueLimbState,
+    TruthTrack,
+    percentile,
+)
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
-def truth(t_ns: int, flexion: float) -> Truth:
+def truth(t_ns: int, flexion: float) -> TrueLimbState:
     half = flexion / 2
     shank = (math.cos(half), -math.sin(half), 0.0, 0.0)
     centers = {"knee": (0.0, 0.0, t_ns / 1e9)}
-    return Truth(t_ns, "walk", {"thigh": IDENTITY, "shank": shank}, centers, flexion)
+    return TrueLimbState(t_ns, "walk", {"thigh": IDENTITY, "shank": shank}, centers, flexion)
 
 
 def pose(flexion_deg: float | None, sd_deg: float = 1.0) -> dict[str, Any]:
@@ -43,7 +49,7 @@ def test_truth_is_interpolated_between_rows_and_unknown_outside() -> None:
 
 @given(st.lists(st.floats(-50, 50), min_size=1))
 def test_the_score_is_the_root_mean_square_of_the_flexion_errors(errors: list[float]) -> None:
-    score = Score()
+    score = DemoScore()
     for error in errors:
         score.add(pose(math.degrees(0.7) + error), truth(0, 0.7), "knee")
     expected = math.sqrt(sum(error**2 for error in errors) / len(errors))
@@ -51,7 +57,7 @@ def test_the_score_is_the_root_mean_square_of_the_flexion_errors(errors: list[fl
 
 
 def test_an_unknown_knee_is_counted_and_not_scored_as_zero() -> None:
-    score = Score()
+    score = DemoScore()
     score.add(pose(None), truth(0, 0.7), "knee")
     assert (score.unknown, score.flexion.n, score.frames) == (1, 0, 1)
 
@@ -62,13 +68,13 @@ def figures(**changed: object) -> dict[str, Any]:
 
 
 def test_figures_within_all_promises_miss_none() -> None:
-    assert missed_bounds(figures()) == []
+    assert missed_targets(figures()) == []
 
 
 @pytest.mark.parametrize(
     "worse",
     [
-        {"knee_flexion_rmse_deg": BOUNDS["knee_flexion_rmse_deg"] + 0.01},
+        {"knee_flexion_rmse_deg": TARGETS["knee_flexion_rmse_deg"] + 0.01},
         {"knee_flexion_rmse_deg": None},
         {"knee_flexion_rmse_deg": math.nan},
         {"unaccounted": 1},
@@ -77,10 +83,10 @@ def test_figures_within_all_promises_miss_none() -> None:
     ],
 )
 def test_a_promise_that_is_broken_or_unknown_is_named(worse: dict[str, object]) -> None:
-    assert len(missed_bounds(figures(**worse))) == 1
+    assert len(missed_targets(figures(**worse))) == 1
 
 
 def test_percentiles_of_nothing_are_unknown() -> None:
     assert percentile([], 0.5) is None
-    assert MeanSquare().rms is None
+    assert RmsAccumulator().rms is None
     assert percentile([3.0, 1.0, 2.0], 0.99) == 3.0

@@ -75,7 +75,7 @@ def answer(folder: Path, *options: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("method", ["joint", "block"])
-def test_trained_and_unseen_trials_are_told_apart(folder: Path, method: str) -> None:
+def test_training_and_validation_trials_are_reported_separately(folder: Path, method: str) -> None:
     found = answer(folder, "--validate", str(folder / "run.trc"), "--method", method)
     walk, ran = found["trials"]
     assert (walk["trained"], ran["trained"]) == (True, False)
@@ -90,14 +90,14 @@ def test_the_search_says_how_often_it_ran_inverse_kinematics(folder: Path) -> No
     assert found["trials"][0]["after"]["rms_m"] < found["trials"][0]["before"]["rms_m"]
 
 
-def test_a_person_reads_markers_trials_and_what_nothing_shows(folder: Path) -> None:
+def test_text_report_contains_markers_trials_and_gauge(folder: Path) -> None:
     result = run(app, asked(folder, "--lock", "P0", "--lock", "T3.x.z"))
     assert result.exit_code == 0, result.stderr
     lines = {line.split()[0]: line for line in result.stdout.splitlines() if line}
     assert " xyz " in lines["P0"]
     assert " z " in lines["T3.x"]
-    assert "trained" in lines["walk"]
-    assert "held by the prior alone" in lines["unseen"]
+    assert "training" in lines["walk"]
+    assert "determined by the prior only" in lines["gauge"]
     assert "nan" not in result.stdout
 
 
