@@ -1,14 +1,14 @@
-r"""Inverse kinematics one instant at a time, with the covariance of each pose.
+r"""Sequential inverse kinematics: one instant at a time, with the covariance of each pose.
 
-Law: an instant begins where the last one would have been led by its own motion and takes one or a
-few safeguarded Gauss-Newton steps; if its markers are then still far off, it begins anew from the
-markers alone. The covariance of a pose,
-in the columns of a step, is
+Each instant starts from the last pose extrapolated by its own motion and takes one or a few
+safeguarded Gauss-Newton steps. If the marker errors remain large, it restarts from the markers
+alone. The covariance of a pose, in the columns of a step, is
 
 .. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
 
-with :math:`\sigma` the error of a marker per axis, given or learnt from the residuals. What the
-markers leave open is held to the last instant, and :math:`\Sigma` is wide there, never infinite.
+with :math:`\sigma` the marker error per axis, given or estimated from the residuals. Degrees of
+freedom that the markers leave undetermined are held at the last instant; :math:`\Sigma` is large
+there, but finite.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _TRIES = 6
 _LAST_STEP = 3e-3
-"""rad, m: what a step below it leaves is below what markers can tell."""
+"""Step below which the remaining error is negligible, rad and m."""
 _DAMPING = 1e-2
 _RIDGE = 1e-9
 _ROUNDING = 1e-9
@@ -47,28 +47,30 @@ _OPEN_SLACK = 1e-2  # the hold may cost the markers a little
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _STRAIGHTEN = 32
-"""Instants after which what rounding bent is taken out of the rotations."""
+"""Instants between two re-orthonormalizations of the rotations."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """How to follow; the defaults are for markers on skin at 100 Hz."""
+    """Options of the sequential solver; the defaults are for skin-mounted markers at 100 Hz."""
 
     steps: int = 2
-    """Steps an instant at most; two are within a thousandth of the least error at 100 Hz."""
+    """Largest number of steps per instant; two are within 0.1 % of the minimum at 100 Hz."""
     huber_m: float | None = None
-    """Errors beyond weigh as c/|e|, m; None: plain least squares."""
+    """Huber threshold c of the marker error, m: larger errors have weight c/|e|; None: least
+    squares.
+    """
     hold_m2: float = 1e-4
-    """Weight, m^2/rad^2, that holds all turns to the last instant where markers leave one open."""
+    """Weight, m^2/rad^2, toward the last instant where the markers leave a joint undetermined."""
     marker_sd_m: float | None = None
-    """Error of a marker per axis, m; None: learnt from the residuals of the last 50 instants."""
+    """Marker error per axis, m; None: estimated from the residuals of the last 50 instants."""
     lost_m: float = 0.06
-    """Tracking error, m, above which an instant begins anew from the markers alone."""
+    """Tracking error, m, above which an instant restarts from the markers alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class LivePose:
-    """The chain at one instant."""
+    """Chain at one instant."""
 
     state: ChainState
     """Of length one."""
@@ -79,22 +81,22 @@ class LivePose:
     residuals: Array
     """Marker of the model minus measured, m, shape (M, 3); NaN where missing."""
     covariance: Array
-    """Of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
+    """Covariance of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
     underdetermined: bool
-    """The markers left something open, which was held to the last instant."""
+    """The markers left a degree of freedom undetermined, which was held at the last instant."""
     restarted: bool
-    """Did not begin where the last instant ended."""
+    """The instant did not start from the last one."""
 
 
 class LiveInverseKinematics:
-    """Follows a chain through its markers.
+    """Sequential inverse kinematics of a chain.
 
     Parameters
     ----------
     model
         The chain.
     options
-        `LiveOptions()` if None.
+        `LiveOptions()` by default.
     """
 
     def __init__(self, model: ChainModel, options: LiveOptions | None = None) -> None:

@@ -86,7 +86,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     assert np.mean(normalized) / model.nq == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_marker_error_that_is_told_sets_the_covariance() -> None:
+def test_a_configured_marker_error_scales_the_covariance() -> None:
     model = limb()
     y = noisy(model, swing(model))[:5]
     fine = followed(model, y, LiveOptions(marker_sd_m=0.001))[-1].covariance
@@ -94,7 +94,7 @@ def test_a_marker_error_that_is_told_sets_the_covariance() -> None:
     np.testing.assert_allclose(coarse, 16 * fine, rtol=1e-6)
 
 
-def test_open_joints_are_held_told_and_wide() -> None:
+def test_undetermined_joints_are_held_reported_and_uncertain() -> None:
     model = limb()
     truth = swing(model)
     y = marker_positions(model, truth)
@@ -118,7 +118,7 @@ def test_with_no_marker_at_all_the_last_pose_stays() -> None:
     assert not poses[13].underdetermined
 
 
-def test_whoever_comes_back_turned_round_is_found_anew() -> None:
+def test_a_subject_returning_rotated_is_found_again() -> None:
     model = limb()
     y = marker_positions(model, swing(model, 10))
     away = y[5:] @ np.diag([-1.0, -1.0, 1.0]) + (2.0, 1.0, 0.0)

@@ -268,7 +268,7 @@ def test_the_message_names_the_fault_and_the_remedy(
 
 
 @pytest.mark.parametrize("kind", ["trc", "sto", "orientations"])
-def test_a_byte_order_mark_is_no_obstacle(tmp_path: Path, kind: str) -> None:
+def test_a_byte_order_mark_is_skipped(tmp_path: Path, kind: str) -> None:
     suffix, write, read = READERS[kind]
     path = tmp_path / f"bom{suffix}"
     write(path)

@@ -170,7 +170,7 @@ def test_the_rates_matrix_is_the_derivative_of_the_rotation() -> None:
     assert np.allclose(rates_matrix(angles), np.column_stack(columns), atol=1e-5)
 
 
-def test_the_claimed_spread_of_angles_is_what_noisy_segments_show() -> None:
+def test_the_angle_covariance_matches_noisy_segments() -> None:
     rng = np.random.default_rng(5)
     proximal, distal = rot.exp([0.2, -0.3, 0.4]), rot.exp([-0.9, 0.1, 0.2])
     spread_p, spread_d = np.diag([0.02, 0.01, 0.03]) ** 2, np.diag([0.01, 0.02, 0.01]) ** 2

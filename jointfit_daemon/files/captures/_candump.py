@@ -50,6 +50,7 @@ def read_candump(data: bytes) -> Iterator[Chunk]:
         text = line.strip()
         if not text or text.startswith(b"#"):
             continue
+
         found = _record(text)
         if found is None:
             lost = len(line).to_bytes(8, "little")
@@ -71,6 +72,7 @@ def _record(line: bytes) -> tuple[int, bytes] | None:
     number &= ~_ERROR_BIT
     if number > (_EXTENDED_MAX if extended else _STANDARD_MAX):
         return None
+
     payload = bytes.fromhex((body or b"").decode())
     kind = _ERROR if error else _EXTENDED * extended
     flags = kind | _REMOTE * (remote is not None)

@@ -66,6 +66,7 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
                 " device that was recorded"
             )
         return _datagrams(data, port)
+
     if is_candump(data):
         if wire != "can":
             raise UnreadableCaptureError(
@@ -73,6 +74,7 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
                 " that was recorded"
             )
         return read_candump(data)
+
     return _raw(data, wire, path)
 
 

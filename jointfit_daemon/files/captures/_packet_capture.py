@@ -81,6 +81,7 @@ def _read_pcapng(data: bytes) -> Iterator[tuple[int, int, bytes]]:
         kind, size = struct.unpack_from(order + "II", data, at)
         if size < _BLOCK_EDGES or size % 4 or at + size > len(data):
             return
+
         body = data[at + 8 : at + size - 4]
         at += size
         if kind == _SECTION:
@@ -102,6 +103,7 @@ def _interface(body: bytes, order: str) -> _Interface:
         code, size = struct.unpack_from(order + "HH", body, at)
         value = body[at + 4 : at + 4 + size]
         at += 4 + (size + 3) // 4 * 4
+
         if code == _RESOLUTION and size == 1:
             power = value[0] & 0x7F
             ticks_per_s = 2**power if value[0] & 0x80 else 10**power
@@ -140,6 +142,7 @@ def _ip_offset(frame: bytes, link: int) -> int | None:
         if place is None:
             return head
         kind_at = place
+
     if kind_at < 0 or frame[kind_at : kind_at + 2] != _IPV4.to_bytes(2, "big"):
         return None
     return head
@@ -160,10 +163,12 @@ class _Fragments:
         more, offset = bool(flags & 0x2000), (flags & 0x1FFF) * 8
         if not more and not offset:
             return body
+
         key = (packet[12:20], number)
         parts = self._pending.setdefault(key, _Parts())
         if len(self._pending) > _MAX_PENDING:
             del self._pending[next(iter(self._pending))]
+
         if not parts.add(offset, body, more=more):
             return None
         self._pending.pop(key, None)

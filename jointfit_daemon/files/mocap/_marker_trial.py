@@ -75,7 +75,7 @@ class MarkerTrial:
     def _explain(self, unknown: Sequence[str], taken: set[str]) -> str:
         """Name the nearest of each, and all there are, once, where one has none near.
 
-        Markers that are asked for anyway (`taken`) are not what a misspelt name meant.
+        Requested markers (`taken`) are not candidates for a misspelt name.
         """
         free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
         spellings = [*free, *map(_bare, free)]
@@ -113,17 +113,18 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     """
     kind = path.suffix.lower()
     if kind == ".trc":
-        trajectories, said, custom = read_trc(path), None, "y"
+        trajectories, declared, custom = read_trc(path), None, "y"
     elif kind == ".c3d":
-        trajectories, said = read_c3d_with_up(path)
+        trajectories, declared = read_c3d_with_up(path)
         custom = "z"
     else:
         raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d")
-    up = up_axis or said or custom
+
+    up = up_axis or declared or custom
     turned = trajectories.positions[..., _TO_Z_UP[up]]
     turned[(turned == 0.0).all(axis=-1)] = np.nan
     return MarkerTrial(
         replace(trajectories, positions=turned),
         cast("Axis", up),
-        "caller" if up_axis else "file" if said else "custom of the format",
+        "caller" if up_axis else "file" if declared else "custom of the format",
     )

@@ -65,6 +65,7 @@ def read_model(path: Path) -> ChainModel:
         )
     except InvalidChainModelError as error:
         raise MalformedFileError(f"{path}: {error}") from error
+
     return require_metres(path, model)
 
 
@@ -140,6 +141,7 @@ def _wrong(data: Any) -> list[str]:
     wrong = _unknown("model", "the model", data)
     if not isinstance(data.get("name", ""), str):
         wrong.append(f"the model: name must be text, is {data['name']!r}")
+
     for what in ("segment", "marker"):
         rows = data.get(what, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
@@ -166,9 +168,11 @@ def _wrong_values(what: str, label: str, row: dict[str, Any]) -> list[str]:
         for key, count in _LENGTHS.items()
         if key in row and not _are_numbers(row[key], count)
     ]
+
     path = row.get("path", [])
     if not isinstance(path, list) or not all(_are_numbers(sample, _SAMPLE) for sample in path):
         wrong.append(f"{label}: path must be a list of samples, {_SAMPLE} numbers each")
+
     texts = {"name"} | ({"segment"} if what == "marker" else set())
     wrong += [f"{label}: needs a {key}" for key in sorted(texts) if key not in row]
     wrong += [
@@ -176,6 +180,7 @@ def _wrong_values(what: str, label: str, row: dict[str, Any]) -> list[str]:
         for key in ("name", "parent", "segment", "joint", "locked")
         if key in row and not isinstance(row[key], str)
     ]
+
     if what == "marker":
         wrong += _wrong_marker(label, row)
     elif isinstance(row.get("joint", "free"), str) and row.get("joint", "free") not in get_args(
@@ -205,6 +210,7 @@ def _are_numbers(value: Any, count: int) -> bool:
 
 def _toml(data: dict[str, Any]) -> str:
     lines = [f"name = {_quoted(data['name'])}"]
+
     for what in ("segment", "marker"):
         for row in data[what]:
             lines += ["", f"[[{what}]]", *(f"{key} = {_value(v)}" for key, v in row.items())]

@@ -152,6 +152,7 @@ class _Tree:
         self.segments: dict[str, Segment] = {}
         self._at: dict[str, tuple[str | None, Array]] = {GROUND: (None, np.eye(4))}
         self._told: dict[str, tuple[str, ...]] = {}
+
         waiting = list(document.joints)
         while waiting:
             ready = [j for j in waiting if j.parent.body in self._at]
@@ -163,6 +164,7 @@ class _Tree:
                 nearest = nearest_joint(joint)
                 self._add(joint.parent.body, joint.child.body, nearest)
             waiting = [j for j in waiting if j not in ready]
+
         loose = [b for b in document.bodies if b not in self._at]
         for body in loose:
             self._add(GROUND, body, None)

@@ -102,6 +102,7 @@ def read_document(path: Path) -> OsimDocument:
         raise MalformedFileError(
             f"{path}: written by OpenSim before 4.0; open it there once and save it again"
         )
+
     unit = text_of(model, "length_units", _METRES)
     if unit != _METRES:
         raise MalformedFileError(f"{path}: length_units is {unit!r}, expected {_METRES!r}")

@@ -149,6 +149,7 @@ def _ball(
         c.name: _span(c)[0] + drawn[:, i] * (_span(c)[1] - _span(c)[0])
         for i, c in enumerate(turning)
     }
+
     above, own, missed = _centers(joint, *_sampled(joint, motion, values))
     remarks = []
     if len(turning) < _ALL:
@@ -233,6 +234,8 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
     for _ in range(20):
         rest = rotation.average(rotation.multiply(q, rotation.exp(-angles[:, None] * axis)))
         axis, angles = _turned_about(rest, q)
+
+    # Positive direction: the angle increases with the coordinate.
     if angles[-1] < angles[1]:
         axis, angles = -axis, -angles
     rest = rotation.multiply(rest, rotation.exp(angles[0] * axis))

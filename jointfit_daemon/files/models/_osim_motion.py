@@ -122,9 +122,11 @@ def _custom(axis: Element) -> tuple[str, Array, Function]:
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise ValueError(f"{axis.get('name')}: its axis has no length")
+
     names = text_of(axis, "coordinates").split()
     if len(names) > 1:
         raise ValueError(f"{axis.get('name')}: a function of {len(names)} coordinates")
+
     written = [child for child in axis if child.tag not in {"coordinates", "axis"}]
     if len(written) == 1 and written[0].tag == "function":
         written = list(written[0])
@@ -147,6 +149,7 @@ def _function(element: Element) -> Function:
     if kind in {"LinearFunction", "PolynomialFunction"}:
         coefficients = numbers_of(element, "coefficients")
         return lambda q: np.asarray(np.polyval(coefficients, q))
+
     if kind in {"SimmSpline", "NaturalCubicSpline", "PiecewiseLinearFunction"}:
         return _through_points(element)
     raise ValueError(f"function {kind} is not supported")

@@ -36,6 +36,7 @@ def require_metres(path: Path, model: ChainModel) -> ChainModel:
         points[f"center of {s.name!r} in its parent"] = s.joint.center_in_parent
         for sample in s.joint.path:
             points[f"path of {s.name!r} at {sample[0]:g}"] = sample[5:]
+
     far = {what: float(np.abs(at).max()) for what, at in points.items()}
     what = max(far, key=lambda name: far[name])
     if far[what] > FARTHEST_M:

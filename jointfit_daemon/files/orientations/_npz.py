@@ -113,6 +113,7 @@ def _array(path: Path, archive: ZipFile, member: ZipInfo) -> NDArray[Any]:
                 f"{path}: array {member.filename} holds {dtype.name} values, expected numbers:"
                 " save it without Python objects"
             )
+
         data = file.read()
     flat = np.frombuffer(data, dtype=dtype)
     return flat.reshape(shape, order="F" if by_columns else "C").copy()

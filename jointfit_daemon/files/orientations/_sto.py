@@ -83,6 +83,7 @@ def read_sto(path: Path) -> TimeTable:
     name, header, columns, separator, body = _open(path)
     rows = rows_of_numbers(path, body, separator, len(columns))
     require_times(path, rows[:, 0])
+
     counted = {_ROW_KEYS: len(rows), _COLUMN_KEYS: len(columns)}
     doubts = tuple(
         f"header {key} is {header[key]}, counted {count}"
@@ -90,6 +91,7 @@ def read_sto(path: Path) -> TimeTable:
         for key in keys
         if key in header and header[key] != str(count)
     )
+
     in_degrees = header.get("indegrees", "no").lower() in {"yes", "true", "1"}
     return TimeTable(columns[1:], rows[:, 0], rows[:, 1:], in_degrees, name, header, doubts)
 
@@ -146,6 +148,7 @@ def _quaternion(path: Path, at: int, cell: str) -> list[float]:
             f"{path}, line {at}: {cell[:_SHOWN]!r} is not w,x,y,z: correct the cell, or leave it"
             " empty"
         )
+
     return [number(path, at, part) for part in parts]
 
 
@@ -190,6 +193,7 @@ def write_sto(path: Path, table: TimeTable) -> None:
         "endheader",
         "\t".join(("time", *table.columns)),
     ]
+
     for t_s, values in zip(table.t_s, table.values, strict=True):
         rows.append("\t".join(map(written, (t_s, *values))))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
@@ -205,6 +209,7 @@ def write_orientations_sto(path: Path, table: OrientationTable) -> None:
         "endheader",
         "\t".join(("time", *table.names)),
     ]
+
     for t_s, quaternions in zip(table.t_s, table.quaternions, strict=True):
         cells = ("" if np.isnan(q[0]) else ",".join(map(written, q)) for q in quaternions)
         rows.append("\t".join((written(t_s), *cells)))

@@ -163,10 +163,12 @@ def find_structure_fault(value: object) -> str | None:
     than the stack.
     """
     waiting: list[tuple[object, str, int]] = [(value, "", 0)]
+
     while waiting:
         here, key, depth = waiting.pop()
         if depth > MAX_NESTING:
             return f"{key[:60]}…: nested more than {MAX_NESTING} levels deep"
+
         if isinstance(here, dict):
             waiting += [
                 (inner, f"{key}.{name}" if key else str(name), depth + 1)

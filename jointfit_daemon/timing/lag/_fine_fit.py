@@ -188,12 +188,13 @@ def _best_clip(linear: _Linear) -> float:
     h is what a row may tell of the lag. Residuals are taken as they come, each for its own: that
     they are correlated is the same for all clips.
     """
-    norm, tells = np.linalg.norm(linear.r, axis=1), np.sum(linear.jtau**2, axis=1)
+    norm, information = np.linalg.norm(linear.r, axis=1), np.sum(linear.jtau**2, axis=1)
 
     def variance(clip: float) -> float:
         weight = _clipped(norm, clip)
         curve = weight * np.where(weight < 1.0, 2.0 / 3.0, 1.0)
-        return float(tells @ (weight * norm) ** 2) / float(tells @ curve + _TINY) ** 2
+        spread = float(information @ (weight * norm) ** 2)
+        return spread / float(information @ curve + _TINY) ** 2
 
     return min((huber * _scale(norm) for huber in HUBERS), key=variance)
 

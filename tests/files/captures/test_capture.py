@@ -101,7 +101,7 @@ def test_any_bytes_end_quietly(data: bytes, magic: bytes) -> None:
 
 
 @given(st.integers(0, 400))
-def test_a_file_that_a_crash_cut_off_gives_what_is_whole(cut: int) -> None:
+def test_a_truncated_file_yields_its_complete_records(cut: int) -> None:
     frames = [(n, ethernet(ip(udp(bytes([n]))))) for n in range(3)]
     for file in (pcap(frames), pcapng(frames, "<", 6)):
         payloads = [packet.payload for packet in read_udp(file[: max(4, len(file) - cut)])]
@@ -138,7 +138,7 @@ def test_candump_text_becomes_the_records_of_the_codec() -> None:
     "line",
     [b"(1.5) can0 105##1AABB\n", b"garbage\n", b"(1.5) can0 999#00\n", b"(1.5) can0 105#0\n"],
 )
-def test_a_line_that_is_no_frame_is_counted_by_its_length(line: bytes) -> None:
+def test_a_line_without_a_frame_is_counted_by_its_length(line: bytes) -> None:
     (wanted,) = parse_candump(line)
     assert isinstance(wanted, Corrupt)
     (chunk,) = read_candump(line)

@@ -1,4 +1,4 @@
-"""C3D and marker trials: what an independent reader says, what a written file holds, and faults."""
+"""C3D and marker trials: comparison with an independent reader, written files, and faults."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_gaps_are_where_the_recording_has_them(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize(("units", "scale"), [("mm", 1e-3), ("m", 1.0), ("cm", 1e-2)])
-def test_what_is_written_is_read_in_metres(
+def test_written_osim_is_read_in_metres(
     tmp_path: Path, positions: NDArray[np.float64], units: str, scale: float
 ) -> None:
     write_c3d(tmp_path / "trial.c3d", positions, units=units)
@@ -88,7 +88,7 @@ def test_what_is_written_is_read_in_metres(
     assert trial.names == NAMES
 
 
-def test_z_is_up_whatever_the_screen_was(tmp_path: Path, positions: NDArray[np.float64]) -> None:
+def test_z_is_up_for_any_screen_axis(tmp_path: Path, positions: NDArray[np.float64]) -> None:
     write_c3d(tmp_path / "trial.c3d", positions, X_SCREEN="+X", Y_SCREEN="+Y")
     trial = read_marker_trial(tmp_path / "trial.c3d")
     assert (trial.up_axis, trial.up_said_by) == ("y", "file")
@@ -128,7 +128,7 @@ def test_a_subjects_prefix_may_be_left_out_and_misspellings_are_met_halfway(
         trial.points(["LKNEE", "LASI", "XX"])
 
 
-def test_a_file_that_is_no_c3d_is_named(tmp_path: Path) -> None:
+def test_a_file_other_than_c3d_is_rejected(tmp_path: Path) -> None:
     for name, data in (("a.c3d", b"hello"), ("b.c3d", bytes(2048)), ("c.c3d", b"")):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(MalformedFileError, match=name):
@@ -152,7 +152,7 @@ def test_a_broken_c3d_is_named_never_a_traceback(
             read_c3d(tmp_path / "broken.c3d")
 
 
-def test_without_the_package_the_message_says_how_to_get_it(
+def test_a_missing_package_is_named_with_its_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "c3d", None)

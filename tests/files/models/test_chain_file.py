@@ -49,7 +49,7 @@ def models(draw: st.DrawFn) -> ChainModel:
 
 @given(model=models(), ending=st.sampled_from([".toml", ".json"]))
 @settings(max_examples=60)
-def test_what_is_written_is_read_again(
+def test_model_file_round_trip(
     tmp_path_factory: pytest.TempPathFactory, model: ChainModel, ending: str
 ) -> None:
     path = tmp_path_factory.mktemp("models") / f"model{ending}"
@@ -111,13 +111,13 @@ def test_a_model_is_short_by_hand(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_all_that_is_wrong_is_told(tmp_path: Path, text: str, said: str) -> None:
+def test_all_errors_are_reported(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "m.toml").write_text(text)
     with pytest.raises(MalformedFileError, match=said):
         read_model(tmp_path / "m.toml")
 
 
-def test_json_that_is_no_table_is_refused(tmp_path: Path) -> None:
+def test_json_other_than_a_table_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "m.json").write_text("[1, 2]")
     with pytest.raises(MalformedFileError, match="expected a table"):
         read_model(tmp_path / "m.json")

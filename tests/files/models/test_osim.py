@@ -197,7 +197,7 @@ def test_a_knee_of_functions_moves_as_opensim_moves_it(
     np.testing.assert_allclose(knee, values[:, 9], atol=1e-4)
 
 
-def test_what_samples_cannot_follow_is_told(tmp_path: Path) -> None:
+def test_approximation_errors_of_samples_are_reported(tmp_path: Path) -> None:
     knee = walker_knee("rolling")
     steps = "<PiecewiseLinearFunction name='function'><x>-2 -1 -0.9 0.1</x><y>0 0 0.2 0.2</y>"
     knee.axes[3] = ("knee", X, f"{steps}</PiecewiseLinearFunction>")
@@ -322,19 +322,19 @@ def model_of(text: str) -> str:
         ),
     ],
 )
-def test_what_is_not_understood_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
+def test_unsupported_elements_are_rejected_by_name(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "m.osim").write_text(text)
     with pytest.raises(MalformedFileError, match=said):
         read_osim(tmp_path / "m.osim")
 
 
-def test_names_that_are_not_there_are_told_together(tmp_path: Path) -> None:
+def test_unknown_names_are_reported_together(tmp_path: Path) -> None:
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
     with pytest.raises(MalformedFileError, match="no body 'shin'; no marker 'tibia9'"):
         read_osim(path, bodies=["shin"], markers=["tibia9"])
 
 
-def test_millimetres_are_refused_whether_they_are_told_or_not(tmp_path: Path) -> None:
+def test_millimetres_are_rejected_with_or_without_a_declared_unit(tmp_path: Path) -> None:
     large = [(name, body, tuple(1000 * np.array(at)), fixed) for name, body, at, fixed in MARKERS]
     path = write_osim(tmp_path / "mm.osim", [ROOT, HIP, KNEE], large)
     with pytest.raises(MalformedFileError, match="must be metres: is the file in millimetres"):

@@ -55,7 +55,7 @@ def test_real_trc_files_hold_what_their_readmes_count(
     assert np.nanmax(np.abs(found.positions)) < 5  # metres, whatever the file's unit
 
 
-def test_a_trc_header_that_lies_is_counted_and_said(shared_data: Path) -> None:
+def test_trc_header_contradictions_are_warnings(shared_data: Path) -> None:
     found = read_trc(shared_data / "mocap/c3d_trc_pyomeca/markers.trc")
     assert found.warnings == ("header NumFrames is 652, counted 93",)
     assert found.names[0] == "ASISl"
@@ -95,9 +95,7 @@ def test_opensim_kinematics_read_with_their_units(shared_data: Path) -> None:
 
 
 @given(tables)
-def test_what_is_written_as_trc_is_read_back(
-    tmp_path_factory: pytest.TempPathFactory, positions: np.ndarray
-) -> None:
+def test_trc_round_trip(tmp_path_factory: pytest.TempPathFactory, positions: np.ndarray) -> None:
     path = tmp_path_factory.mktemp("trc") / "a.trc"
     n = len(positions)
     wrote = MarkerTrajectories(
@@ -112,7 +110,7 @@ def test_what_is_written_as_trc_is_read_back(
 
 
 @given(tables, st.booleans())
-def test_what_is_written_as_sto_is_read_back(
+def test_sto_round_trip(
     tmp_path_factory: pytest.TempPathFactory, values: np.ndarray, in_degrees: bool
 ) -> None:
     path = tmp_path_factory.mktemp("sto") / "a.sto"
@@ -187,7 +185,7 @@ def test_real_orientation_trials_hold_what_their_readme_counts(
     assert lean.min() > 0.99
 
 
-def test_what_is_written_as_npz_is_read_back(tmp_path: Path) -> None:
+def test_npz_round_trip(tmp_path: Path) -> None:
     quaternions = Rotation.random(5, rng=1).as_quat(scalar_first=True)
     wrote = OrientationTrial(
         np.arange(5.0), {"S1": quaternions}, {"thigh": quaternions}, {"thigh": np.ones((5, 3))}

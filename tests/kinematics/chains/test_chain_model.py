@@ -1,4 +1,4 @@
-"""A chain of segments: what may be one, and how it moves."""
+"""Chain models: validation and motion."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_markers_moved_or_locked_are_another_model() -> None:
         ((Segment("a"),), (Marker("m", "a", (0.0, 0.0, 0.0), -1.0),), "weight -1.0"),
     ],
 )
-def test_what_makes_no_chain_is_refused_by_name(
+def test_invalid_chains_are_rejected_by_name(
     segments: tuple[Segment, ...], markers: tuple[Marker, ...], said: str
 ) -> None:
     with pytest.raises(InvalidChainModelError, match=said):

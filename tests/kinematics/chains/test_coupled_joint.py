@@ -1,4 +1,4 @@
-"""A joint that turns and shifts as one coordinate says."""
+"""Coupled joints: rotation and translation by one coordinate."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def squat(model: ChainModel, amounts: np.ndarray = BENT) -> np.ndarray:
     return step
 
 
-def test_a_curve_goes_through_its_samples_and_near_what_they_are_of() -> None:
+def test_a_curve_interpolates_its_samples() -> None:
     curve = CoupledCurve.through(samples())
     at = np.array([s[0] for s in samples()])
     R, found = curve.at(at)
@@ -93,7 +93,7 @@ def test_a_curve_goes_through_its_samples_and_near_what_they_are_of() -> None:
 
 @given(st.floats(-3.0, 5.0))
 @settings(max_examples=60)
-def test_what_a_curve_says_of_its_motion_is_its_slope(amount: float) -> None:
+def test_the_twist_of_a_curve_is_its_derivative(amount: float) -> None:
     curve, h = CoupledCurve.through(samples()), 1e-5
     R, found = curve.at(np.array([amount, amount - h, amount + h]))
     turned = Rotation.from_matrix(R[1].T @ R[2]).as_rotvec() / (2.0 * h)
@@ -124,7 +124,7 @@ def test_the_signs_of_quaternions_do_not_matter() -> None:
         np.testing.assert_allclose(mine, other, atol=1e-12)
 
 
-def test_markers_ride_on_the_joint_as_an_own_computation_says() -> None:
+def test_markers_follow_the_joint_as_in_an_independent_computation() -> None:
     model = leg()
     state = apply_step(model, rest_state(model, len(BENT)), squat(model))
     joint = model.segments[1].joint
@@ -172,7 +172,7 @@ def test_a_coordinate_stays_within_its_limits_where_they_count() -> None:
     )
 
 
-def test_limits_are_told_from_zero_though_the_samples_begin_above_it() -> None:
+def test_limits_count_from_zero_even_if_samples_start_above() -> None:
     model = leg()
     knee = replace(model.segments[1].joint, path=samples()[10:], limits=(0.5, 2.1))
     shank = replace(model.segments[1], joint=knee)
@@ -183,7 +183,7 @@ def test_limits_are_told_from_zero_though_the_samples_begin_above_it() -> None:
     assert coupled_coordinates(model, held)["shank"] == pytest.approx([0.5], abs=0.01)
 
 
-def test_what_no_marker_shows_is_held_to_the_instant_before() -> None:
+def test_an_undetermined_coordinate_is_held_at_the_instant_before() -> None:
     model = leg()
     truth = apply_step(model, rest_state(model, 5), squat(model, np.linspace(1.0, 1.1, 5)))
     y = marker_positions(model, truth)
@@ -227,7 +227,7 @@ def test_scaling_the_parent_stretches_the_way_of_the_center() -> None:
         (Joint("coupled", path=((-1, 1, 0, 0, 0, 0, 0, np.inf), *samples()[:3])), "not finite"),
     ],
 )
-def test_what_is_no_path_is_refused(joint: Joint, said: str) -> None:
+def test_invalid_paths_are_rejected(joint: Joint, said: str) -> None:
     with pytest.raises(InvalidChainModelError, match=said):
         ChainModel((Segment("thigh"), Segment("shank", "thigh", joint)), ())
 

@@ -1,4 +1,4 @@
-"""Trials that show too little: nothing is invented, and what is open is told."""
+"""Trials with too few markers: undetermined degrees of freedom are reported."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_model_with_one_marker_on_a_segment_is_followed_live_with_a_wide_covar
 
 
 @pytest.mark.parametrize("missing", [SHANK, [0, 1, 2, 3]])
-def test_a_segment_without_markers_in_a_whole_trial_is_told_and_stays(missing: list[int]) -> None:
+def test_a_segment_without_markers_is_reported_and_stays(missing: list[int]) -> None:
     model = leg()
     truth = bending(model)
     y = marker_positions(model, truth)

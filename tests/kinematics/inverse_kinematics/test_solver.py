@@ -140,7 +140,7 @@ def test_one_marker_missing_on_every_segment_changes_nothing() -> None:
     assert (found.weights[::2, 0] == 0.0).all()
 
 
-def test_open_instants_are_told_and_follow_the_one_before() -> None:
+def test_underdetermined_instants_follow_the_one_before() -> None:
     model = leg()
     truth = walk(model)
     y = marker_positions(model, truth)
@@ -164,7 +164,7 @@ def test_an_instant_without_any_marker_stays_where_the_last_one_was() -> None:
     assert np.isfinite(found.rotations).all()
 
 
-def test_no_marker_ever_is_no_error_but_open() -> None:
+def test_a_trial_without_markers_is_underdetermined() -> None:
     model = leg()
     found = solve_frames(model, np.full((3, 16, 3), np.nan))
     assert found.underdetermined.all()

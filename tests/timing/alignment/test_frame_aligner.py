@@ -128,7 +128,7 @@ def test_a_stream_that_becomes_late_is_waited_for_after_a_while() -> None:
     assert not any(f.extrapolated or f.missing for f in frames[200:390])
 
 
-def test_what_is_lacking_is_extrapolated_then_missing_then_not_waited_for() -> None:
+def test_absent_samples_are_extrapolated_then_missing_then_not_awaited() -> None:
     a = aligner(A=10 * MS, B=10 * MS)
     frames = play(a, stream("A", 10 * MS, 100) + stream("B", 10 * MS, 51, phase=0))
     of = {(f.t_ns - T0) // MS: f for f in frames}
@@ -328,7 +328,7 @@ def test_a_stream_stamped_seconds_late_does_not_hold_up_the_others() -> None:
     assert max(f.completed_ns - f.t_ns for f in lively[60:]) < 300 * MS
 
 
-def test_an_inactive_aligner_counts_what_comes_as_idle() -> None:
+def test_an_inactive_aligner_counts_samples_as_idle() -> None:
     a = aligner(A=10 * MS)
     play(a, stream("A", 10 * MS, 10))
     a.active = False
@@ -338,7 +338,7 @@ def test_an_inactive_aligner_counts_what_comes_as_idle() -> None:
     assert a.next_deadline_ns is None
 
 
-def test_what_nobody_fetches_is_dropped_in_the_end() -> None:
+def test_unfetched_samples_are_dropped_eventually() -> None:
     a = aligner(A=10 * MS)
     for k in range(5_000):
         a.push("A", T0 + k * 10 * MS, T0 + k * 10 * MS, IDENTITY)
@@ -372,7 +372,7 @@ actions = st.one_of(
 
 
 @given(st.lists(actions, max_size=80), st.sampled_from(["smooth", "fast"]))
-def test_whatever_comes_in_frames_are_in_order_and_samples_accounted(
+def test_frames_are_ordered_and_samples_accounted_for_any_input(
     script: list[tuple[str, int, int, int] | str], mode: str
 ) -> None:
     a = aligner(mode=mode, A=10 * MS, B=2_500_000, C=33 * MS)

@@ -82,7 +82,7 @@ def errors(found: Callable[[int, int], Quaternion]) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def test_the_spline_tells_rates_of_the_body_in_its_own_frame() -> None:
+def test_the_spline_yields_body_rates_in_the_own_frame() -> None:
     """The oracle's own convention, by its difference quotient."""
     q0, w = MOTION(0.7)
     q1, _ = MOTION(0.7 + 1e-6)
@@ -132,7 +132,7 @@ drawn = st.builds(Sample, st.just(0), quaternions.map(normalize_one), rates)
 
 
 @given(drawn, drawn, drawn, st.integers(1, 40), st.integers(1, 40))
-def test_samples_themselves_are_met_whatever_their_signs(
+def test_samples_are_reproduced_for_any_quaternion_sign(
     before: Sample, a: Sample, b: Sample, gap: int, step: int
 ) -> None:
     before.t_ns, b.t_ns = -gap * MS, step * MS
@@ -192,7 +192,7 @@ def turned(angle: float) -> Quaternion:
     return (cos(angle / 2), 0.0, sin(angle / 2), 0.0)
 
 
-def test_means_since_the_sample_before_are_worse_than_no_rates() -> None:
+def test_mean_rates_are_worse_than_no_rates() -> None:
     """Why a driver must leave such rates out (``ImuSample.rate``)."""
 
     def mean(number: int) -> Sample:

@@ -30,7 +30,7 @@ def test_bins_are_in_order(delay: int, more: int) -> None:
     assert bin_of(delay) <= bin_of(delay + more)
 
 
-def test_what_is_older_than_a_minute_is_forgotten() -> None:
+def test_delays_older_than_a_minute_are_excluded() -> None:
     minute = DelayStatistics()
     minute.feed(0, 10 * S)
     for k in range(1, 75):

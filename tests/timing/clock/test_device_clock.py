@@ -126,7 +126,7 @@ def test_a_young_clock_does_not_trust_its_slope(seconds: int) -> None:
     assert float(np.sqrt(np.mean(np.square(worst)))) < 0.25
 
 
-def test_a_better_estimate_is_approached_slowly_and_sigma_says_how_far_it_is() -> None:
+def test_a_better_estimate_is_slewed_to_and_sigma_contains_the_difference() -> None:
     samples = [(t, u, c, t + (4 if c < 1000 else 1) * MS) for t, u, c, _ in
                Device(13, skew=0.0).samples(12, punctual)]  # fmt: skip
     errors, stamps = errors_of(DeviceClock(PERIOD), samples)
@@ -231,7 +231,7 @@ def test_after_a_restart_nothing_is_synced_before_it_has_settled(first: int) -> 
     assert all(stamp.synced for stamp in stamps[400:])  # settled within 5 s
 
 
-def test_a_counter_that_begins_anew_is_a_restart() -> None:
+def test_a_counter_reset_is_a_restart() -> None:
     clock, _ = restarted(0, "counter")
     assert clock.epoch == 1
 
@@ -259,7 +259,7 @@ def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
     assert (epochs[1150], epochs[1250], epochs[1999]) == (0, 1, 1)
 
 
-def test_a_gap_that_the_counter_shares_is_no_restart() -> None:
+def test_a_gap_shared_by_the_counter_is_no_restart() -> None:
     clock = DeviceClock(PERIOD)
     samples = [s for s in Device(8).samples(30, punctual) if not 900 < s[2] < 1400]
     for true, ticks, counter, arrival in samples:
@@ -281,7 +281,7 @@ def test_stale_bytes_before_fresh_ones_do_not_spoil_the_clock() -> None:
     assert clock.epoch == 0
 
 
-def test_what_the_decoder_calls_a_restart_is_one() -> None:
+def test_a_restart_reported_by_the_decoder_is_one() -> None:
     clock = DeviceClock(PERIOD)
     errors_of(clock, Device(11).samples(5, punctual))
     clock.feed_restart()

@@ -114,7 +114,7 @@ def test_from_passive_to_direct_time_neither_jumps_nor_runs_backwards() -> None:
     assert {stamp.epoch for _, stamp in wired.stamps} == {0}
 
 
-def test_without_edges_the_clock_falls_back_to_what_it_can_see() -> None:
+def test_without_edges_the_clock_falls_back_to_arrivals() -> None:
     wired = Wired()
     wired.run(12.0)
     assert wired.imu.state == "direct"
@@ -123,7 +123,7 @@ def test_without_edges_the_clock_falls_back_to_what_it_can_see() -> None:
     assert wired.imu.epoch == 0
 
 
-def test_a_server_that_begins_anew_takes_its_ties_with_it_until_new_edges_come() -> None:
+def test_a_server_restart_invalidates_sync_fits_until_new_edges_arrive() -> None:
     wired = Wired()
     wired.run(8.0)
     wired.server.feed_restart()
@@ -134,7 +134,7 @@ def test_a_server_that_begins_anew_takes_its_ties_with_it_until_new_edges_come()
     assert abs(np.mean(wired.imu_errors_us(50)) - np.mean(wired.frame_errors_us(50))) < 5.0
 
 
-def test_edges_that_are_half_a_frame_off_are_not_told_apart_and_not_used() -> None:
+def test_edges_half_a_frame_off_are_ambiguous_and_unused() -> None:
     wired = Wired(off_line_ns=FRAME // 2, least_delay_ms=1.0)
     wired.run(8.0)
     assert wired.imu.state == "passive"

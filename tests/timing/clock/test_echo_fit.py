@@ -84,7 +84,7 @@ def test_a_server_that_restarts_is_noticed_by_its_echo() -> None:
 
 
 @pytest.mark.parametrize("forged", [0, 5, 2**63 * SERVER_HZ // S])
-def test_one_forged_answer_at_a_time_changes_no_clock(forged: int) -> None:
+def test_single_forged_echoes_do_not_change_the_clock(forged: int) -> None:
     lan, clean, attacked = Lan(0), DeviceClock(PERIOD), DeviceClock(PERIOD)
     for k in range(40):
         echo = lan.echo(START + k * 200 * MS)

@@ -106,7 +106,7 @@ def test_a_burst_from_before_the_start_settles_nothing() -> None:
     assert clock.settled
 
 
-def test_one_wrong_stamp_of_arrival_is_no_restart() -> None:
+def test_one_wrong_arrival_time_is_no_restart() -> None:
     """A single sample that seems to come before it was taken is not stamped synced, that is all."""
     arrivals = read_late([(100.0, 0.0)], 12.0, 0.0)
     arrivals[800] -= 400 * MS
@@ -117,7 +117,7 @@ def test_one_wrong_stamp_of_arrival_is_no_restart() -> None:
     assert np.all(np.diff(stamps) > 0)
 
 
-def test_a_backward_step_of_the_estimate_is_told_once_and_waited_for() -> None:
+def test_a_backward_step_of_the_estimate_is_reported_once() -> None:
     """Fast samples after minutes of a full queue: one news, unsynced until stamps fit again."""
     arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
     arrivals[:1500] += 300 * MS

@@ -85,7 +85,7 @@ def test_delaying_a_point_off_the_hull_changes_nothing(
         assert lower_hull(later) == hull
 
 
-def test_the_envelope_never_lies_above_a_point_of_its_window() -> None:
+def test_the_minimum_delay_line_is_below_all_points_of_its_window() -> None:
     rng, envelope = np.random.default_rng(0), MinimumDelayFilter()
     for k in range(2000):
         y = int(rng.exponential(MS))

@@ -134,7 +134,7 @@ def test_a_wrong_gyro_scale_does_not_move_the_lag(
     )
 
 
-def test_at_rest_nothing_is_said(excerpt: Excerpt) -> None:
+def test_no_lag_is_estimated_at_rest(excerpt: Excerpt) -> None:
     refused = estimate_lag_of_rates(*excerpt.rates(0, 560)).refused
     assert refused is not None
     assert "too little motion" in refused
@@ -278,7 +278,7 @@ def test_periodic_motion_is_ambiguous_in_a_wide_search() -> None:
 
 
 @pytest.mark.parametrize("span_s", [0.5, 1.0, 3.0])
-def test_rounding_does_not_decide_what_periodic_motion_is_refused_for(span_s: float) -> None:
+def test_rounding_does_not_decide_the_rejection_of_periodic_motion(span_s: float) -> None:
     # The magnitude repeats every 0.5 s, so the border of each search correlates as well as zero.
     t = np.arange(0, 12, 0.01)
     t_ns = (t * 1e9).astype(np.int64)
@@ -296,7 +296,7 @@ def test_rounding_does_not_decide_what_periodic_motion_is_refused_for(span_s: fl
     assert "periodic: a lag of 500 ms fits as well" in refused
 
 
-def test_the_interpolant_follows_what_the_low_pass_lets_through() -> None:
+def test_the_interpolant_follows_the_low_pass_band() -> None:
     t = np.arange(0, 2, 0.01)
     waves = np.stack([np.sin(2 * np.pi * f * t) for f in (1, 4, 10)], axis=1)
     track = Rates(t, waves, np.zeros(t.size, dtype=np.intp), 0.01, 1.0)
@@ -330,7 +330,7 @@ def test_a_constant_lag_shows_no_drift() -> None:
     assert tracked.drift_sigma < 1e-6
 
 
-def test_a_step_is_told_once_and_an_outlier_never() -> None:
+def test_a_step_is_reported_once_and_an_outlier_never() -> None:
     tracker = LagTracker()
     lags = [4.0] * 10 + [9.0] + [4.0] * 10 + [7.0] * 20
     steps = [
