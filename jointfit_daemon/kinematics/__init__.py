@@ -1,1 +1,1 @@
-"""Geometry of limbs: rotations, chains, joint angles. Pure."""
+"""Kinematics of limbs: rotations, joint angles, chain models, inverse kinematics."""

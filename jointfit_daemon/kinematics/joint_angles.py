@@ -1,11 +1,11 @@
-r"""Angles of a joint from the rotation between its two segments.
+r"""Joint angles from the rotation between two segments.
 
 .. math:: q_j = q_{proximal}^* \otimes q_{distal}
 
-with matrix R, entries counted from 0. Law: segment axes and signs are those of CONVENTIONS.md (x to
-the right, y anterior, z proximal); rad; q and -q give the same. Where the middle angle of a
-sequence reaches 90 degrees the outer two turn about one line: the last is then called 0, the first
-takes all, and the frame is flagged as gimbal-locked.
+with matrix R, indices from 0. Segment axes and signs are those of CONVENTIONS.md (x to the right, y
+anterior, z proximal); angles in rad; q and -q give the same result. Where the middle angle of a
+sequence reaches 90 degrees, the outer two rotate about one line. The last one is then 0, the first
+one contains the whole rotation, and the frame is flagged as gimbal-locked.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 GIMBAL_SINE = 0.9999
-"""Sine of the middle angle beyond which the outer two are not told apart."""
+"""Sine of the middle angle above which the outer two are not separated."""
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -37,7 +37,7 @@ class AngleSequence(NamedTuple):
     angles: Array
     """rad, shape (..., 3)."""
     gimbal: NDArray[np.bool_]
-    """Where the first and last angle cannot be told apart, shape (...)."""
+    """Where the first and last angle are not separable, shape (...)."""
 
 
 def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
@@ -91,9 +91,9 @@ def anatomical(angles: ArrayLike, *, flexion_sign: float, left: bool) -> Array:
     angles : array_like, shape (..., 3)
         phi, theta, psi.
     flexion_sign : float
-        +1 for hip and ankle, -1 for the knee, whose heel goes back.
+        +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
     left : bool
-        A left limb: adduction and rotation change sign, so that both sides read alike.
+        Left limb: adduction and rotation change sign, so that both sides agree.
     """
     side = -1.0 if left else 1.0
     return np.multiply(np.asarray(angles, dtype=np.float64), [flexion_sign, side, side])
@@ -102,7 +102,8 @@ def anatomical(angles: ArrayLike, *, flexion_sign: float, left: bool) -> Array:
 def included_angle(q_joint: ArrayLike) -> Array:
     """Return the angle between the two bone axes, rad in [0, pi], shape (...); 0 when straight.
 
-    It is free of any choice of flexion axis. The inner angle of the joint is pi minus this.
+    It does not depend on the choice of the flexion axis. The inner angle of the joint is pi minus
+    this.
     """
     turned = rotation.rotate(q_joint, _DOWN)
     sine = np.hypot(turned[..., 0], turned[..., 1])
@@ -141,9 +142,9 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
 
 
 def functional_axis(q_joint: ArrayLike) -> Array:
-    """Return the axis a joint mostly turned about: unit, shape (3,), pointing to the right.
+    """Return the principal rotation axis of a joint: unit, shape (3,), pointing to the right.
 
-    First right singular vector of the joint's rotation vectors, shape (n, 4) in.
+    First right singular vector of the joint's rotation vectors; input shape (n, 4).
     """
     axis: Array = np.linalg.svd(rotation.log(q_joint), full_matrices=False)[2][0]
     return -axis if axis[0] < 0.0 else axis
@@ -178,7 +179,7 @@ def joint_covariance(q_joint: ArrayLike, proximal: ArrayLike, distal: ArrayLike)
 
     .. math:: \Sigma_j = \Sigma_{distal} + R^T \Sigma_{proximal} R
 
-    The segments' errors, each in its own axes, are taken as independent.
+    The errors of the segments, each in its own axes, are treated as independent.
     """
     R = rotation.to_matrix(q_joint)
     turned: Array = np.swapaxes(R, -1, -2) @ np.asarray(proximal) @ R
@@ -220,6 +221,7 @@ def read_joint(
     r02 = 2.0 * (x * z + w * y)
     minus_r12 = 2.0 * (w * x - y * z)
     r22 = 1.0 - 2.0 * (x * x + y * y)
+
     gimbal = abs(r02) > GIMBAL_SINE
     if gimbal:
         phi, psi = _wrapped_one(2.0 * atan2(x, w)), 0.0
@@ -227,36 +229,39 @@ def read_joint(
         phi = atan2(minus_r12, r22)
         psi = atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
     theta = asin(min(max(r02, -1.0), 1.0))
+
     side = -1.0 if left else 1.0
     angles = JointAngles(flexion_sign * phi, side * theta, side * psi)
     return JointReading(angles, pi - atan2(hypot(r02, minus_r12), r22), gimbal)
 
 
 class PatentReading(NamedTuple):
-    """A joint's angles as the patent has them, in one frame; see ``patent_angles``."""
+    """Joint angles of the patent in one frame; see ``patent_angles``."""
 
     alpha: float
     """rad, about x."""
     beta: float
     """rad, about y."""
     gamma: float
-    """rad, about z; 0 where it cannot be told from alpha."""
+    """Angle about z, rad; 0 in gimbal lock."""
     joint: float
     """pi - abs(alpha), rad: the patent's joint angle."""
     gimbal: bool
-    """Whether beta is so near 90 degrees that alpha took all of the turn."""
+    """Whether beta is close to 90 degrees, so that alpha contains the whole rotation."""
 
 
 def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
     """Return the patent's angles of one frame of plain tuples: those of ``patent_angles``."""
     w, x, y, z = between_one(q_proximal, q_distal)
     sine = 2.0 * (w * y - z * x)
+
     gimbal = abs(sine) > GIMBAL_SINE
     if gimbal:
         alpha, gamma = _wrapped_one(2.0 * atan2(x, w)), 0.0
     else:
         alpha = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         gamma = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
     beta = asin(min(max(sine, -1.0), 1.0))
     return PatentReading(alpha, beta, gamma, pi - abs(alpha), gimbal)
 

@@ -1,10 +1,10 @@
-"""Unit quaternions as numpy arrays: products, maps to rotation vectors and matrices, means.
+"""Unit quaternions as numpy arrays: products, rotation vectors, matrices, means.
 
-Law: Hamilton quaternions, scalar first, arrays of shape (..., 4) that broadcast against each other;
-vectors have shape (..., 3). ``q_a_b`` takes b-coordinates to a-coordinates and chains as
-``q_a_c = multiply(q_a_b, q_b_c)``. A quaternion and its negative are the same rotation: whatever
-differences, averages or interpolates here is blind to that sign; whoever uses components is not
-and aligns them first. For one sample at a time see ``rotation_scalar``, which is faster there.
+Hamilton quaternions, scalar first, arrays of shape (..., 4) that broadcast against each other;
+vectors have shape (..., 3). ``q_a_b`` maps b-coordinates to a-coordinates and chains as ``q_a_c =
+multiply(q_a_b, q_b_c)``. A quaternion and its negative are the same rotation: differences, averages
+and interpolation in this module are independent of the sign. Code that uses single components must
+align signs first. ``rotation_scalar`` is faster for one sample at a time.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def exp(r: ArrayLike) -> Array:
 def log(q: ArrayLike) -> Array:
     """Return the shortest rotation vector of unit quaternions, rad, shape (..., 4) to (..., 3).
 
-    Its length is at most pi; q and -q give the same. The angle comes from atan2, never from acos,
-    which loses all digits near the identity.
+    Its length is at most pi; q and -q give the same. The angle is computed by atan2; acos loses all
+    digits near the identity.
     """
     q = _floats(q)
     q = np.where(q[..., :1] < 0.0, -q, q)
@@ -140,8 +140,8 @@ def to_matrix(q: ArrayLike) -> Array:
 def from_matrix(R: ArrayLike) -> Array:
     """Return unit quaternions with w >= 0, shape (..., 4), of rotation matrices, shape (..., 3, 3).
 
-    The largest of the four squared components is taken by square root and the others are divided by
-    it, so no digit is lost at any angle. Source: Shepperd 1978.
+    The largest of the four squared components is computed by square root and the others are divided
+    by it, which is accurate at all angles. Source: Shepperd 1978.
     """
     R = _floats(R)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
@@ -167,9 +167,9 @@ def heading(angle: ArrayLike) -> Array:
 
 
 def heading_of(q: ArrayLike) -> Array:
-    """Return the twist about the vertical, rad in (-pi, pi], shape (...).
+    """Return the rotation about the vertical, rad in (-pi, pi], shape (...).
 
-    It is the heading that takes q closest to the identity: ``2 atan2(z, w)``, 0 where both vanish.
+    It is the heading closest to q: ``2 atan2(z, w)``, 0 where both vanish.
     """
     q = _floats(q)
     twice = 2.0 * np.arctan2(q[..., 3], q[..., 0])
@@ -178,9 +178,9 @@ def heading_of(q: ArrayLike) -> Array:
 
 
 def from_two(a: ArrayLike, b: ArrayLike) -> Array:
-    """Return the shortest rotation that takes direction a to direction b; shape (..., 4).
+    """Return the shortest rotation from direction a to direction b; shape (..., 4).
 
-    Opposite directions have no single shortest rotation: one about some normal of a is returned.
+    For opposite directions, where it is not unique, a rotation about a normal of a is returned.
     """
     a = _unit(a)
     b = _unit(b)
@@ -199,21 +199,21 @@ def _unit(v: ArrayLike) -> Array:
 
 
 def interpolate(q0: ArrayLike, q1: ArrayLike, a: ArrayLike) -> Array:
-    """Go the share `a` (shape (...)) of the short way from q0 to q1: q0 exp(a log(q0* q1))."""
+    """Return the rotation at fraction `a` (shape (...)) from q0 to q1: q0 exp(a log(q0* q1))."""
     share = _floats(a)[..., None]
     return multiply(q0, exp(share * log(multiply(conjugate(q0), q1))))
 
 
 def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Return the mean rotation, the largest eigenvector of the weighted sum of q q^T.
+    """Return the mean rotation, the dominant eigenvector of the weighted sum of q q^T.
 
-    It minimises the weighted squared chordal distance and does not care about signs.
-    Source: Markley et al. 2007, doi 10.2514/1.28949, eq. 12.
+    It minimizes the weighted squared chordal distance and does not depend on signs. Source: Markley
+    et al. 2007, doi 10.2514/1.28949, eq. 12.
 
     Parameters
     ----------
     q : array_like, shape (..., n, 4)
-        Rotations to average over axis -2, none of them NaN.
+        Rotations to average over axis -2, without NaN.
     weights : array_like, shape (..., n), optional
         Non-negative; equal if None.
 
@@ -225,7 +225,7 @@ def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
     Raises
     ------
     ValueError
-        There is nothing to average.
+        No rotations.
     """
     q = _floats(q)
     if q.shape[-2] == 0:
@@ -241,16 +241,16 @@ def first_eigenvector(M: ArrayLike) -> Array:
 
 
 def align_hemisphere(q: ArrayLike, ref: ArrayLike) -> Array:
-    """Return q or -q, whichever has a non-negative product with `ref`; shape (..., 4)."""
+    """Return q or -q, with a non-negative product with `ref`; shape (..., 4)."""
     q = _floats(q)
     product = np.sum(q * _floats(ref), axis=-1, keepdims=True)
     return np.where(product < 0.0, -q, q)
 
 
 def continuous(q: ArrayLike) -> Array:
-    """Return a series, shape (n, 4), with signs such that successive products are not negative.
+    """Return a series, shape (n, 4), with non-negative products of successive quaternions.
 
-    Rows that are NaN stay NaN; continuity is kept across them.
+    Rows with NaN stay NaN; continuity extends across them.
     """
     q = _floats(q).copy()
     seen = np.flatnonzero(np.isfinite(q).all(axis=-1))

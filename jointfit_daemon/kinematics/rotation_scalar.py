@@ -1,7 +1,7 @@
-"""One unit quaternion at a time, as plain tuples: for the step that runs once per frame.
+"""Unit quaternions as plain tuples, for code that runs once per sample or frame.
 
-Law: the same conventions and formulas as ``rotation``, on tuples of floats. A numpy call costs
-about a microsecond before it has done anything, which is more than a whole product costs here.
+Same conventions and formulas as ``rotation``. The overhead of one numpy call, about a microsecond,
+exceeds the cost of a whole product here.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def conjugate_one(q: Quaternion) -> Quaternion:
 
 
 def between_one(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return a* b, the orientation of b seen from a."""
+    """Return a* b, the orientation of b relative to a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (
@@ -50,7 +50,7 @@ def between_one(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate_one(q: Quaternion, v: Vector) -> Vector:
-    """Turn `v` from b- to a-coordinates by ``q_a_b``."""
+    """Rotate `v` from b- to a-coordinates by ``q_a_b``."""
     w, x, y, z = q
     vx, vy, vz = v
     tx = 2.0 * (y * vz - z * vy)
@@ -64,7 +64,7 @@ def rotate_one(q: Quaternion, v: Vector) -> Vector:
 
 
 def rotate_z_one(q: Quaternion, length: float) -> Vector:
-    """Return ``rotate_one(q, (0, 0, length))``, as bones need it, for less."""
+    """Return ``rotate_one(q, (0, 0, length))`` at lower cost."""
     w, x, y, z = q
     tx, ty = 2.0 * (y * length), -2.0 * (x * length)
     return (w * tx - z * ty, w * ty + z * tx, length + x * ty - y * tx)
@@ -89,7 +89,7 @@ def log_one(q: Quaternion) -> Vector:
 
 
 def difference_one(a: Quaternion, b: Quaternion) -> Vector:
-    """Return ``log_one(between_one(a, b))``, the turn from a to b, rad, by one call."""
+    """Return the rotation vector from a to b, rad: ``log_one(between_one(a, b))`` in one call."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     w = aw * bw + ax * bx + ay * by + az * bz
@@ -104,7 +104,7 @@ def difference_one(a: Quaternion, b: Quaternion) -> Vector:
 
 
 def perturb_one(q: Quaternion, r: Vector) -> Quaternion:
-    """Return ``multiply_one(q, exp_one(r))``, q turned by r in its own frame, by one call."""
+    """Return q rotated by r in its own frame: ``multiply_one(q, exp_one(r))`` in one call."""
     pw, px, py, pz = q
     x, y, z = r
     angle = sqrt(x * x + y * y + z * z)
@@ -138,7 +138,7 @@ def normalize_one(q: Sequence[float]) -> Quaternion:
 
 
 def interpolate_one(q0: Quaternion, q1: Quaternion, a: float) -> Quaternion:
-    """Go the share `a` of the short way from q0 to q1."""
+    """Return the rotation at fraction `a` from q0 to q1."""
     x, y, z = difference_one(q0, q1)
     return perturb_one(q0, (a * x, a * y, a * z))
 

@@ -1,1 +1,1 @@
-"""When things happened: device clocks to host time, streams to frames, IMU to optical lag."""
+"""Time: device clocks, lag between systems, alignment of streams to frames."""

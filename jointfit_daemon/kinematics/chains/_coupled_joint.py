@@ -1,12 +1,12 @@
-r"""A joint whose turns and shifts all follow one coordinate, as a knee's do.
+r"""Coupled joints: rotation and translation as functions of one coordinate, as in a knee.
 
-Law: between samples of the pose each number p of (quaternion, shift) runs on a cubic spline, the
-quaternion brought to length 1 afterwards. Per unit of the coordinate q the segment turns and
-slides, in its own axes, by
+Between samples of the pose each component p of (quaternion, shift) is a cubic spline; the
+quaternion is normalized afterwards. Per unit of the coordinate q the segment rotates and
+translates, in its own axes, by
 
 .. math:: \omega = 2\,vec(\bar p\, p') / |p|^2, \qquad v = R^T s'
 
-which are the exact derivatives of that curve. Beyond the samples p goes on straight.
+which are the exact derivatives of that curve. Beyond the samples p is extrapolated linearly.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _GUESSES = 91
+"""Coordinates tried by ``CoupledCurve.nearest``."""
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 COLUMNS = 10
-"""Numbers of a coupling: q, shift (3), omega (3), v (3)."""
+"""Numbers per coupling: q, shift (3), omega (3), v (3)."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoupledCurve:
-    """The pose of a segment in its parent as a function of one coordinate."""
+    """Pose of a segment in its parent as a function of one coordinate."""
 
     knots: Array
-    """Shape (n,), growing."""
+    """Coordinates of the samples, shape (n,), increasing."""
     pieces: Array
     """Cubic coefficients, highest first, of (w, x, y, z) and the shift; shape (4, n - 1, 7)."""
     starts: list[float]
-    """The knots as plain numbers."""
+    """The knots as plain floats."""
     rows: list[list[list[float]]]
-    """The coefficients as plain numbers: by piece, then by number."""
+    """The coefficients as plain floats, by piece, then by component."""
 
     @classmethod
     def through(cls, path: Sequence[Sequence[float]]) -> CoupledCurve:
@@ -56,7 +57,7 @@ class CoupledCurve:
 
     @property
     def home(self) -> float:
-        """Where the joint is at rest: at zero, or as near as the samples go."""
+        """Coordinate at rest: zero, or the nearest coordinate within the samples."""
         return float(np.clip(0.0, self.knots[0], self.knots[-1]))
 
     def at(self, amounts: Array) -> tuple[Array, Array]:
@@ -75,8 +76,10 @@ class CoupledCurve:
         h = (inside - self.knots[piece])[:, None]
         slope = (3.0 * a * h + 2.0 * b) * h + c
         p = ((a * h + b) * h + c) * h + d + slope * (amounts - inside)[:, None]
+
         square = (p[:, :4] ** 2).sum(axis=1, keepdims=True)
         R = rotation.to_matrix(p[:, :4] / np.sqrt(square))
+
         found = np.empty((len(p), COLUMNS))
         found[:, 0], found[:, 1:4] = amounts, p[:, 4:]
         w, v, dw, dv = p[:, :1], p[:, 1:4], slope[:, :1], slope[:, 1:4]
@@ -86,7 +89,7 @@ class CoupledCurve:
         return R, found
 
     def _at_one(self, amount: float) -> tuple[Array, Array]:
-        """Return the same for one instant: plain numbers are ten times faster there."""
+        """Return ``at`` for one instant: plain floats are ten times faster there."""
         starts = self.starts
         inside = min(max(amount, starts[0]), starts[-1])
         piece = min(max(bisect_left(starts, inside) - 1, 0), len(starts) - 2)
@@ -96,6 +99,7 @@ class CoupledCurve:
             s = (3.0 * a * h + 2.0 * b) * h + c
             p.append(((a * h + b) * h + c) * h + d + s * beyond)
             slope.append(s)
+
         w, x, y, z, *shift = p
         dw, dx, dy, dz, *ds = slope
         n = 2.0 / (w * w + x * x + y * y + z * z)
@@ -106,6 +110,7 @@ class CoupledCurve:
             (xy + wz, 1 - xx - zz, yz - wx),
             (xz - wy, yz + wx, 1 - xx - yy),
         )
+
         turns = (
             n * (w * dx - dw * x - y * dz + z * dy),
             n * (w * dy - dw * y - z * dx + x * dz),
@@ -115,7 +120,7 @@ class CoupledCurve:
         return np.array((R,)), np.array(((amount, *shift, *turns, *slides),))
 
     def nearest(self, turned: Array) -> Array:
-        """Return where on the curve rotations, shape (T, 3, 3), are nearest to it; shape (T,)."""
+        """Return the coordinates, (T,), of the poses nearest to rotations, (T, 3, 3)."""
         tried = np.linspace(self.knots[0], self.knots[-1], _GUESSES)
         match = turned.reshape(-1, 9) @ self.at(tried)[0].reshape(-1, 9).T
         return np.asarray(tried[match.argmax(axis=1)])

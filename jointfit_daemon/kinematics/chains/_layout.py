@@ -1,7 +1,4 @@
-"""The order of a chain as arrays: who moves whom, in which column, on which level.
-
-Law: computed once for a model, then only read; nothing here depends on an instant.
-"""
+"""Index arrays of a chain model: parents, columns and levels, computed once per model."""
 
 from __future__ import annotations
 
@@ -28,39 +25,41 @@ LEVI.setflags(write=False)
 
 @dataclass(frozen=True, slots=True)
 class ChainLayout:
-    """What every computation on a chain needs; S segments, nq degrees of freedom."""
+    """Arrays used by every computation on a chain; S segments, nq degrees of freedom."""
 
     nq: int
     levels: tuple[tuple[Index | slice, Index | slice], ...]
-    """Segments with a parent, those of equal depth together, and their parents."""
+    """Segments with a parent, grouped by depth, and their parents."""
     free: Index | slice
     """Free segments."""
     corners: Array
-    """Transforms to the parent but for rotations and own centers, shape (S, 4, 4)."""
+    """Transforms to the parent without rotations and own centers, shape (S, 4, 4)."""
     has_own_centers: bool
-    """Some joint center is not the origin of its segment."""
+    """Whether a joint center differs from the origin of its segment."""
     center: Array
-    """m, shape (S, 3); zero for free segments."""
+    """Joint centers in segment axes, m, shape (S, 3); zero for free segments."""
     segment_of: Index
     """Segment of each degree of freedom, shape (nq,)."""
     columns: tuple[tuple[int, slice], ...]
     """Each segment and its degrees of freedom."""
     turns: Array
-    """Axis (x, y, z, 0) of each turn, and a point (x, y, z, 1) it leaves in place, in segment axes;
-    no axis for shifts. Shape (nq, 4, 2)."""
+    """Axis (x, y, z, 0) of each rotational degree of freedom and a point (x, y, z, 1) on it, in
+    segment axes; zero axis for translations. Shape (nq, 4, 2).
+    """
     shifts: Index
-    """Columns that shift a free segment."""
+    """Columns that translate a free segment."""
     shift_twists: Array
     """Their twists, shape (len(shifts), 6)."""
     spread: Array
-    """Takes a step to the rotation vectors of all segments: shape (nq, 3 S)."""
+    """Maps a step to the rotation vectors of all segments; shape (nq, 3 S)."""
     below: Array
-    """1 where segment j is i or moves with it, shape (S, S)."""
+    """1 where segment j is i or a descendant of it, shape (S, S)."""
     moves: Array
     """1 where a degree of freedom moves a segment, shape (S, nq)."""
     lower: Array
-    """1 where the column's segment is the row's or before it on its way to the world, and the
-    column is not after the row; shape (nq, nq)."""
+    """1 where the column's segment is the row's or an ancestor of it, and the column is not after
+    the row; shape (nq, nq).
+    """
     strictly_lower: Array
     """The same without the diagonal."""
     coupled: tuple[tuple[int, int, CoupledCurve], ...]
@@ -68,11 +67,11 @@ class ChainLayout:
 
 
 def layout_of(model: ChainModel) -> ChainLayout:
-    """Return the layout of a model; the model keeps it."""
+    """Return the layout of a model, cached in the model."""
     kept = model.__dict__.get("_layout")
     if not isinstance(kept, ChainLayout):
         kept = _layout(model)
-        model.__dict__["_layout"] = kept  # beside its cached properties, as frozen as they are
+        model.__dict__["_layout"] = kept  # like its cached properties; the model is immutable
     return kept
 
 
@@ -85,17 +84,21 @@ def _layout(model: ChainModel) -> ChainLayout:
     for row, (i, k) in enumerate(columns):
         if k < 3 and joints[i].kind != "coupled":
             axes[row] = joints[i].axis if joints[i].kind == "hinge" else np.eye(3)[k]
+
     segment_of = np.array([i for i, _ in columns], dtype=np.intp)
     shifts = np.array([row for row, (_, k) in enumerate(columns) if k > 2], dtype=np.intp)
     center = np.where(is_free[:, None], 0.0, [j.center for j in joints])
     below = _below(parents)
+
     corners = np.tile(np.eye(4), (len(joints), 1, 1))
     corners[:, :3, 3] = np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints])
     spread = np.zeros((len(columns), len(parents), 3))
     spread[np.arange(len(columns)), segment_of] = axes
+
     turns = np.zeros((len(columns), 4, 2))
     turns[:, :3, 0], turns[:, :3, 1], turns[:, 3, 1] = axes, center[segment_of], 1.0
     lower = np.tril(below[np.ix_(segment_of, segment_of)].T)
+
     return ChainLayout(
         nq=len(columns),
         levels=_levels(parents),
@@ -141,7 +144,7 @@ def _levels(parents: list[int]) -> tuple[tuple[Index | slice, Index | slice], ..
 
 
 def _index(items: list[int]) -> Index | slice:
-    """Return evenly spaced items as a slice, which costs no copy."""
+    """Return evenly spaced indices as a slice, which avoids a copy."""
     step = items[1] - items[0] if len(items) > 1 else 1
     if items and step > 0 and items == list(range(items[0], items[-1] + 1, step)):
         return slice(items[0], items[-1] + 1, step)

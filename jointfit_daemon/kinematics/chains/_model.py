@@ -1,12 +1,12 @@
-r"""A tree of rigid segments on joints, with the markers that ride on them.
+r"""Chain models: a tree of rigid segments on joints, with markers fixed to the segments.
 
-Law: frozen data. Segments stand parents first. A segment's pose follows from its parent's by
+Immutable data; parents precede children. The pose of a segment follows from that of its parent,
 
 .. math:: R_i = R_p A_i, \qquad t_i = t_p + R_p\, c_p - R_i\, c_i
 
-where :math:`A_i` is all the joint may change: anything (``ball``), :math:`A_{rest}\exp(a\theta)`
-(``hinge``), anything and the origin, too (``free``). Of a ``coupled`` joint one coordinate moves
-:math:`A_i` and :math:`c_p` along a path. Axes and centers are metres in segment axes.
+with the joint rotation :math:`A_i`: arbitrary (``ball``), :math:`A_{rest}\exp(a\theta)`
+(``hinge``), or arbitrary with a free origin (``free``). One coordinate of a ``coupled`` joint moves
+:math:`A_i` and :math:`c_p` along a path. Axes and centers are in segment axes, in metres.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _FEWEST_SAMPLES = 4
 
 
 class InvalidChainModelError(ValueError):
-    """Segments, joints and markers that make no chain; the message lists all reasons."""
+    """Segments, joints and markers that do not form a chain; the message lists all reasons."""
 
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """What joins a segment to its parent."""
+    """Joint between a segment and its parent."""
 
     kind: JointKind = "free"
     center_in_parent: Vector = _ORIGIN
@@ -51,49 +51,54 @@ class Joint:
     center: Vector = _ORIGIN
     """The same point in the segment's own axes, m; unused when free."""
     axis: Vector = (1.0, 0.0, 0.0)
-    """Unit axis of a hinge, own axes; positive turns are right-handed about it."""
+    """Unit axis of a hinge in own axes; positive rotations are right-handed about it."""
     rest: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """q_parent_segment of a hinge at angle zero; of a ball, where a search without data begins."""
+    """q_parent_segment of a hinge at angle zero; of a ball, the start of a search without data."""
     limits: tuple[float, float] | None = None
-    """Lowest and highest angle of a hinge or coordinate of a coupled joint, rad; None: any."""
+    """Least and greatest angle of a hinge or coordinate of a coupled joint, rad; None: unlimited.
+    """
     path: tuple[Sample, ...] = ()
-    """Of a coupled joint: coordinate, rad, q_parent_segment, and what it adds to
-    ``center_in_parent``, parent's axes, m; smooth in between."""
+    """Samples of a coupled joint: coordinate, rad, q_parent_segment, and the shift added to
+    ``center_in_parent`` in the parent's axes, m. Interpolated by cubic splines.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """One rigid body of the tree."""
+    """One rigid body of the chain."""
 
     name: str
     parent: str | None = None
-    """None: the world."""
+    """Name of the parent; None: the world."""
     joint: Joint = Joint()
 
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A point fixed to a segment."""
+    """Point fixed to a segment."""
 
     name: str
     segment: str
     position: Vector
     """In segment axes, m."""
     weight: float = 1.0
-    """Of its squared error; 0 leaves it out."""
+    """Weight of its squared error; 0 excludes the marker."""
     locked: tuple[bool, bool, bool] = (False, False, False)
-    """Coordinates, segment axes, that a refinement must not move."""
+    """Coordinates in segment axes that a refinement must not change."""
 
 
 @dataclass(frozen=True)
 class ChainModel:
-    """Segments, parents first, and markers; no slots, its arrays are computed once, when asked.
+    """Segments, parents first, and markers.
+
+    Without slots: derived arrays are cached properties.
 
     Raises
     ------
     InvalidChainModelError
-        Doubled names, unknown parents or segments, parents after children, a free joint below a
-        parent, axes or rests that are no unit, limits the wrong way round, values not finite.
+            Duplicate names, unknown parents or segments, parents after children, a free joint with
+        a parent, axes or rest rotations of other than unit length, empty limits, or values that are
+        not finite.
     """
 
     segments: tuple[Segment, ...]
@@ -144,17 +149,17 @@ class ChainModel:
 
     @cached_property
     def locked(self) -> NDArray[np.bool_]:
-        """Coordinates a refinement must not move; shape (M, 3)."""
+        """Coordinates that a refinement must not change; shape (M, 3)."""
         return np.array([m.locked for m in self.markers], dtype=np.bool_).reshape(-1, 3)
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Degrees of freedom of each segment: of a free one three turns, then three shifts."""
+        """Columns of each segment; of a free one three rotations, then three translations."""
         ends = np.cumsum([0, *(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
     def with_markers(self, positions: ArrayLike) -> ChainModel:
-        """Return the model with its markers elsewhere: segment axes, m, shape (M, 3)."""
+        """Return the model with other marker positions in segment axes, m, shape (M, 3)."""
         new = np.asarray(positions, dtype=np.float64).reshape(len(self.markers), 3).tolist()
         moved = (
             replace(m, position=(x, y, z)) for m, (x, y, z) in zip(self.markers, new, strict=True)
@@ -162,7 +167,7 @@ class ChainModel:
         return replace(self, markers=tuple(moved))
 
     def with_locks(self, locked: Mapping[str, tuple[bool, bool, bool]]) -> ChainModel:
-        """Return the model with the locks of some markers set anew, by marker name."""
+        """Return the model with other locks for some markers, by marker name."""
         return replace(
             self,
             markers=tuple(
@@ -171,10 +176,9 @@ class ChainModel:
         )
 
     def scaled(self, factors: Mapping[str, ArrayLike]) -> ChainModel:
-        """Return the model with segments stretched: one factor or one per axis, by segment name.
+        """Return the model with scaled segments: one factor or one per axis, by segment name.
 
-        All that is fixed to a segment goes along: its markers, its own joint center and those of
-        its children.
+        Markers, the segment's own joint center and those of its children are scaled with it.
         """
         unknown = set(factors) - set(self.segment_names)
         if unknown:
@@ -261,5 +265,5 @@ def _wrong_markers(segments: tuple[Segment, ...], markers: tuple[Marker, ...]) -
 
 
 def rest_rotations(model: ChainModel) -> Array:
-    """Return every joint's rest as matrices R_parent_segment, shape (S, 3, 3)."""
+    """Return the rest rotation of every joint, R_parent_segment, shape (S, 3, 3)."""
     return rotation.to_matrix(np.array([s.joint.rest for s in model.segments]))

@@ -1,12 +1,12 @@
-r"""A chain at its instants: poses of segments, markers in the world, their Jacobian, steps.
+r"""Poses of a chain: segments and markers in the world, their Jacobian, and steps.
 
-Law: everything has the instants first, shape (T, ...). A step moves a state on its manifold,
+All arrays have the T instants first. A step moves a state on its manifold,
 
 .. math:: A_i \leftarrow A_i \exp(\delta_i), \qquad t_{root} \leftarrow t_{root} + \delta_t
 
-with :math:`\delta` in the columns `ChainModel.columns`: turns in the segment's own axes, rad, then
-for a free segment the shift of its origin in the world, m. A coupled joint's column is the step of
-its coordinate, which places the segment on its curve anew.
+with :math:`\delta` in the columns of `ChainModel.columns`: rotations in the segment's own axes,
+rad, then for a free segment the translation of its origin in the world, m. The column of a coupled
+joint is the step of its coordinate.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ class ChainState:
     origins: Array
     """World origins of the free segments, in their order, m, shape (T, F, 3)."""
     couplings: Array | None = None
-    """Coordinates of the coupled joints, in their order, and what follows from them
-    (`CoupledCurve.at`), shape (T, C, 10); None: there are none."""
+    """Coordinates of the coupled joints, in their order, with their derivatives
+    (`CoupledCurve.at`), shape (T, C, 10); None without coupled joints.
+    """
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -53,18 +54,18 @@ class ChainState:
         return ChainState(self.rotations[instants], self.origins[instants], some)
 
     def put(self, instants: NDArray[np.intp], other: ChainState) -> None:
-        """Write another state over some instants, in place."""
+        """Overwrite the state at some instants, in place."""
         self.rotations[instants], self.origins[instants] = other.rotations, other.origins
         if self.couplings is not None:
             self.couplings[instants] = other.couplings
 
     def copy(self) -> ChainState:
-        """Return a state of its own arrays."""
+        """Return a copy with its own arrays."""
         return self.take(np.arange(len(self)))
 
 
 def rest_state(model: ChainModel, count: int = 1) -> ChainState:
-    """Return the chain at rest, free origins in the world's, at `count` instants."""
+    """Return the chain at rest, free origins at the world origin, at `count` instants."""
     free = sum(s.joint.kind == "free" for s in model.segments)
     rest = np.broadcast_to(rest_rotations(model), (count, len(model.segments), 3, 3))
     return place_coupled(layout_of(model), rest.copy(), np.zeros((count, free, 3)), None)
@@ -77,7 +78,7 @@ def segment_poses(model: ChainModel, state: ChainState) -> tuple[Array, Array]:
 
 
 def transforms(layout: ChainLayout, state: ChainState) -> Array:
-    """Return each segment's transform to the world, shape (T, S, 4, 4), one level at a time."""
+    """Return each segment's transform to the world, shape (T, S, 4, 4), level by level."""
     rotations = state.rotations
     local = np.empty((*rotations.shape[:2], 4, 4))
     local[:] = layout.corners
@@ -102,18 +103,20 @@ def marker_positions(model: ChainModel, state: ChainState) -> Array:
 
 
 def twists(layout: ChainLayout, world: Array, couplings: Array | None = None) -> Array:
-    r"""Return what each degree of freedom does to points: shape (T, nq, 6).
+    r"""Return the twist of each degree of freedom, shape (T, nq, 6).
 
     A point x moves by :math:`\alpha\times x + \beta`; the row is :math:`(\alpha, \beta)`. For a
-    turn about the world axis :math:`\alpha` through C it is :math:`\beta = C \times \alpha`; a
-    coupled joint slides besides.
+    rotation about the world axis :math:`\alpha` through C, :math:`\beta = C \times \alpha`; a
+    coupled joint adds its translation.
     """
     found = np.empty((len(world), layout.nq, 6))
+
     turns = world[:, layout.segment_of, :3] @ layout.turns
     if couplings is not None:
         for c, (segment, column, _) in enumerate(layout.coupled):
             own = world[:, segment, :3, :3]
             turns[:, column, :, 0] = (own @ couplings[:, c, 4:7, None])[..., 0]
+
     found[..., :3] = turns[..., 0]
     found[..., 3:] = (skew(turns[..., 1]) @ turns[..., :1])[..., 0]
     if couplings is not None:
@@ -125,7 +128,7 @@ def twists(layout: ChainLayout, world: Array, couplings: Array | None = None) ->
 
 
 def skew(v: Array) -> Array:
-    """Return cross-product matrices, shape (..., 3, 3); one product, for hot paths."""
+    """Return cross-product matrices, shape (..., 3, 3), by one matrix product."""
     return (v @ LEVI).reshape(*v.shape[:-1], 3, 3)
 
 
@@ -134,15 +137,16 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
 
     .. math:: \partial x_m/\partial q_k = \alpha_k \times (x_m - C_k)
 
-    for the turns of all joints between the world and the marker's segment, the identity for the
-    shifts of its root, zero else.
+    for the rotations of all joints between the world and the marker's segment, the identity for the
+    translations of its root, zero otherwise.
     """
     layout = layout_of(model)
     world = transforms(layout, state)
     s = model.marker_segments
     x = (world[:, s, :3, :3] @ model.positions[:, :, None])[..., 0] + world[..., :3, 3][:, s]
     motion = twists(layout, world, state.couplings)
-    # alpha x X + beta as one product: [skew(alpha), beta] times (X, 1)
+
+    # alpha x X + beta as one product: [skew(alpha), beta] times (X, 1).
     maps = np.empty((len(world), layout.nq, 3, 4))
     maps[..., :3] = skew(motion[..., :3])
     maps[..., 3] = motion[..., 3:]
@@ -153,12 +157,12 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
 
 
 def apply_step(model: ChainModel, state: ChainState, delta: Array) -> ChainState:
-    """Return the state moved by `delta`, rad and m, shape (T, nq)."""
+    """Return the state after the step `delta`, rad and m, shape (T, nq)."""
     return step_state(layout_of(model), state, delta)
 
 
 def step_state(layout: ChainLayout, state: ChainState, delta: Array) -> ChainState:
-    """Return the state moved by `delta`, shape (T, nq)."""
+    """Return the state after the step `delta`, shape (T, nq)."""
     rotations = step_rotations(layout, state.rotations, delta)
     origins = state.origins + delta[:, layout.shifts].reshape(len(delta), -1, 3)
     if state.couplings is None:
@@ -170,14 +174,14 @@ def step_state(layout: ChainLayout, state: ChainState, delta: Array) -> ChainSta
 def place_coupled(
     layout: ChainLayout, rotations: Array, origins: Array, amounts: Array | None
 ) -> ChainState:
-    """Return a state with the coupled joints where their coordinates say.
+    """Return a state with coupled joints placed by their coordinates.
 
     Parameters
     ----------
     rotations, origins
         As in `ChainState`; rotations of coupled joints are overwritten in place.
     amounts
-        rad, shape (T, C); None: at rest.
+        Coordinates, rad, shape (T, C); None: at rest.
     """
     if not layout.coupled:
         return ChainState(rotations, origins)
@@ -206,7 +210,7 @@ def exp_matrix(r: Array) -> Array:
 
 
 def _exp_of_few(r: Array) -> Array:
-    """Return `exp_matrix(r)`, faster where there are few: a dozen array calls cost more."""
+    """Return `exp_matrix(r)` with plain floats, which is faster for a few vectors."""
     rows = []
     for x, y, z in r.reshape(-1, 3).tolist():
         angle = sqrt(x * x + y * y + z * z + _TINY)
@@ -224,10 +228,10 @@ def _exp_of_few(r: Array) -> Array:
 
 
 def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
-    """Return the step, shape (T, nq), that `apply_step` needs to go from a to b.
+    """Return the step, shape (T, nq), that takes state a to state b by `apply_step`.
 
-    For turns it is log(A_a^T A_b), of a hinge the part about its axis: joint-angle differences; of
-    a coupled joint the difference of its coordinate.
+    Rotations give log(A_a^T A_b), hinges its part about the axis, coupled joints the difference of
+    their coordinates.
     """
     layout = layout_of(model)
     between = rotation.from_matrix(np.swapaxes(a.rotations, -1, -2) @ b.rotations)
@@ -239,7 +243,7 @@ def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
 
 
 def between_coordinates(layout: ChainLayout, a: ChainState, b: ChainState, step: Array) -> None:
-    """Write how far coupled joints are in b from where they are in a into their columns."""
+    """Write the coordinate differences of coupled joints from a to b into `step`."""
     if a.couplings is not None and b.couplings is not None:
         columns = [column for _, column, _ in layout.coupled]
         step[:, columns] = b.couplings[..., 0] - a.couplings[..., 0]

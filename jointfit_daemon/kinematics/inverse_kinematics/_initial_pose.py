@@ -1,9 +1,8 @@
-r"""Where a search begins when nothing is known: each segment laid on its markers.
+"""Initial pose of a search: each segment aligned with its own markers.
 
-Law: from the world outwards, a segment takes the rotation that brings its markers, and the joint
-center its parent already has, nearest to where they are (Wahba's problem); a hinge keeps only the
-turn about its axis, a coupled joint the nearest place on its curve. A start need not be the
-optimum, but it must lie in its valley.
+From the root outwards, a segment takes the rotation that best maps its markers, and the joint
+center given by its parent, to the measured ones (Wahba's problem). A hinge takes the rotation about
+its axis only, a coupled joint the nearest pose on its curve.
 """
 
 from __future__ import annotations
@@ -26,25 +25,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _SQUARINGS = 10
+"""Matrix squarings in the power iteration of the eigenvector."""
 _THIN_M2 = 1e-4
-"""Second largest moment of a cloud, sum of squares, below which its rotation is a guess: 1 cm."""
+"""Second largest moment of a marker cloud, m², below which its rotation is undetermined: (1 cm)².
+"""
 _PULL_TO_REST = 1e-9
-"""Share of a segment's moments that speaks for its rest: decides only what the markers cannot."""
+"""Relative weight of the rest rotation; decides only undetermined directions."""
 
 
 def start_from_markers(
     model: ChainModel, measured: Array, weights: Array
 ) -> tuple[ChainState, NDArray[np.bool_]]:
-    """Return a state near the markers, and at which instants a segment had to be guessed.
+    """Return the initial state, and the instants at which a segment is undetermined.
 
     Parameters
     ----------
     model
         The chain.
     measured
-        m, shape (T, S, 3, K), finite.
+        Marker positions, m, shape (T, S, 3, K), finite.
     weights
-        Shape (T, S, K), zero where nothing was measured.
+        Shape (T, S, K), zero where markers are missing.
     """
     slots, count = marker_slots(model), len(measured)
     rest = rest_state(model).rotations[0]
@@ -65,6 +66,7 @@ def start_from_markers(
         else:
             above_R = world_R[:, parent]
             center = world_t[:, parent] + above_R @ corner
+
         cloud = (
             np.broadcast_to(slots.points[i, :3], measured[:, i].shape),
             measured[:, i],
@@ -72,6 +74,7 @@ def start_from_markers(
         )
         if joint.kind != "free":
             cloud = _with_center(*cloud, own, center)
+
         laid, middle, spans = _laid(*cloud, above_R @ rest[i])
         guessed |= (spans < _THIN_M2) & _has_markers(slots, i)
         turned = np.swapaxes(above_R, -1, -2) @ laid
@@ -81,6 +84,7 @@ def start_from_markers(
             A[:, i], coupling = curve.at(amounts[-1])
             shifted = np.asarray(joint.center_in_parent) + coupling[:, 1:4] - corner
             center = center + (above_R @ shifted[..., None])[..., 0]
+
         world_R[:, i] = above_R @ A[:, i]
         if joint.kind == "free":
             world_t[:, i] = middle
@@ -93,7 +97,7 @@ def start_from_markers(
 def _with_center(
     points: Array, measured: Array, weights: Array, own: Array, center: Array
 ) -> tuple[Array, Array, Array]:
-    """Return a cloud with the joint center, which the parent has already, as one point more."""
+    """Return a cloud with the joint center, known from the parent, as an additional point."""
     count = len(points)
     return (
         np.concatenate((points, np.broadcast_to(own[:, None], (count, 3, 1))), axis=-1),
@@ -105,12 +109,13 @@ def _with_center(
 def _laid(
     points: Array, measured: Array, weights: Array, rest: Array
 ) -> tuple[Array, Array, Array]:
-    """Return rotation (T, 3, 3), origin (T, 3) of one cloud, and its second moment, m^2, (T,)."""
+    """Return rotation (T, 3, 3), origin (T, 3) and second moment, m^2, (T,) of one cloud."""
     total = np.maximum(weights.sum(axis=-1), 1e-12)[:, None]
     middle_p = (points @ weights[..., None])[..., 0] / total
     middle_y = (measured @ weights[..., None])[..., 0] / total
     p, y = points - middle_p[..., None], measured - middle_y[..., None]
     moments = (p * weights[:, None]) @ np.swapaxes(p, -1, -2)
+
     size = np.trace(moments, axis1=-2, axis2=-1)
     B = (y * weights[:, None]) @ np.swapaxes(p, -1, -2)
     R = _nearest_rotation(B + (_PULL_TO_REST * size + 1e-12)[:, None, None] * rest)
@@ -120,15 +125,15 @@ def _laid(
 
 
 def _has_markers(slots: MarkerSlots, i: int) -> bool:
-    """Return whether a segment has markers of its own at all: without any, nothing is guessed."""
+    """Return whether a segment has markers of its own."""
     return bool((slots.places // slots.shape[1] == i).any())
 
 
 def _nearest_rotation(B: Array) -> Array:
-    r"""Return the rotations, shape (T, 3, 3), that maximise :math:`tr(R^T B)`.
+    """Return the rotations, shape (T, 3, 3), that maximize :math:`tr(R^T B)`.
 
-    The quaternion is the first eigenvector of Davenport's matrix (here by repeated squaring, which
-    costs ten products and no decomposition). Source: Horn 1987, doi 10.1364/JOSAA.4.000629.
+    The quaternion is the dominant eigenvector of Davenport's matrix, computed by repeated squaring:
+    ten products without a decomposition. Source: Horn 1987, doi 10.1364/JOSAA.4.000629.
     """
     K = np.empty((len(B), 4, 4))
     trace = np.trace(B, axis1=-2, axis2=-1)

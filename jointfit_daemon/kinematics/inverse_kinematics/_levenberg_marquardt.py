@@ -1,12 +1,13 @@
-r"""The search itself: Levenberg and Marquardt over many instants, each at its own pace.
+r"""Levenberg-Marquardt search over many instants, each with its own damping.
 
-Law: a step is taken only where it lowers the cost; where it does not, the damping grows. An instant
-that is done is left alone. Beside its markers the cost holds bands,
+Invariant: a step is accepted only where it lowers the cost; elsewhere the damping grows. Converged
+instants are excluded. In addition to the marker errors the cost contains bands,
 
 .. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
           v = \log(A_{ref}^T A)
 
-which hold open joints to the instant before (a band of no width) or hinges within their limits.
+which hold undetermined joints at the instant before (a band of zero width) or joints within their
+limits.
 """
 
 from __future__ import annotations
@@ -37,17 +38,25 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainLayout, ChainModel
 
 _DAMPING = 1e-4
-_EASIER, _HARDER, _HOPELESS = 0.2, 8.0, 1e6
+"""Initial relative damping."""
+_EASIER = 0.2
+"""Factor of the damping after an accepted step."""
+_HARDER = 8.0
+"""Factor of the damping after a rejected step."""
+_HOPELESS = 1e6
+"""Damping at which an instant is stopped."""
 _RIDGE = 1e-10
-_STILL = 1e-8  # rad, m: steps below it are rounding
+"""Absolute damping, for degrees of freedom without information."""
+_STILL = 1e-8
+"""Step that counts as rounding, rad and m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Where turns should be, and how much it costs to be elsewhere."""
+    """Allowed range of joint rotations, with the weight of the excess."""
 
     reference: ChainState
-    """Holds A_ref; at T instants or one."""
+    """State with A_ref, at T instants or one."""
     weights: Array
     """m^2/rad^2, shape (T, nq)."""
     low: Array
@@ -69,7 +78,7 @@ class Band:
         )
 
     def excess(self, layout: ChainLayout, state: ChainState) -> Array:
-        """Return how far turns are outside, rad, shape (T, nq)."""
+        """Return the excess of rotations over the band, rad, shape (T, nq)."""
         between = self.reference.rotations.swapaxes(-1, -2) @ state.rotations
         v = log_matrix(between).reshape(len(between), -1) @ layout.spread.T
         between_coordinates(layout, self.reference, state, v)
@@ -77,13 +86,13 @@ class Band:
 
 
 def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
-    """Return the band of the model's limits, none if it has none or they weigh nothing."""
+    """Return the band of the model's joint limits; none without limits or weight."""
     joints = [s.joint for s in model.segments]
     low, high = np.full(model.nq, -np.inf), np.full(model.nq, np.inf)
     for joint, columns in zip(joints, model.columns, strict=True):
         if joint.kind in ("hinge", "coupled") and joint.limits is not None:
             low[columns], high[columns] = joint.limits
-    for _, column, curve in layout_of(model).coupled:  # told from rest, as a hinge's are
+    for _, column, curve in layout_of(model).coupled:  # relative to rest, like hinge angles
         low[column], high[column] = low[column] - curve.home, high[column] - curve.home
     limited = np.isfinite(low) | np.isfinite(high)
     if weight == 0.0 or not limited.any():
@@ -92,7 +101,7 @@ def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
 
 
 def log_matrix(R: Array) -> Array:
-    """Return rotation vectors of matrices, rad; fast, and without direction near half a turn."""
+    """Return rotation vectors of matrices, rad; fast, without a defined direction near pi."""
     v = 0.5 * np.stack(
         (
             R[..., 2, 1] - R[..., 1, 2],
@@ -110,7 +119,7 @@ def log_matrix(R: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class SearchProblem:
-    """What is searched for, at T instants."""
+    """Least-squares problem at T instants."""
 
     model: ChainModel
     measured: Array
@@ -125,12 +134,12 @@ class SearchProblem:
 
     @property
     def typical_weight(self) -> float:
-        """Return the median weight of what was measured; 1 if nothing was."""
+        """Median weight of the present markers; 1 if there are none."""
         weighing = self.weights[self.weights > 0.0]
         return float(np.median(weighing)) if weighing.size else 1.0
 
     def take(self, instants: NDArray[np.intp], hold: Band | None = None) -> SearchProblem:
-        """Return the problem at some instants, with one band more if given."""
+        """Return the problem at some instants, with an additional band if given."""
         kept = tuple(b if len(b.weights) == 1 else b.take(instants) for b in self.bands)
         return replace(
             self,
@@ -161,7 +170,7 @@ class SearchProblem:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """The end of a search."""
+    """Result of a search."""
 
     state: ChainState
     weights: Array
@@ -171,7 +180,7 @@ class SearchResult:
 
 
 def search(problem: SearchProblem, start: ChainState) -> SearchResult:
-    """Return the least cost from `start`, robust weights included."""
+    """Return the minimum from `start`, with robust weights if configured."""
     found = _descend(problem, start)
     if problem.huber_m is None:
         return found
@@ -199,15 +208,18 @@ def _descend(problem: SearchProblem, start: ChainState) -> SearchResult:
         H, g = part.equations(state, at)
         diagonal = np.einsum("tkk->tk", H)
         diagonal += damping[:, None] * diagonal + _RIDGE
+
         step = np.asarray(-np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
         onward = step_state(layout, state, step)
         there, new_cost = part.at(onward)
+
         better = new_cost < cost
         done = better & (cost - new_cost < problem.tolerance * cost)
         done |= np.abs(step).max(axis=-1) < _STILL
         damping = np.where(better, _EASIER, _HARDER) * damping
         given_up = damping > _HOPELESS
         iterations[here] += 1
+
         state, at = _kept(better, (onward, there), (state, at))
         cost = np.where(better, new_cost, cost)
         ended = done | given_up
@@ -226,7 +238,7 @@ def _descend(problem: SearchProblem, start: ChainState) -> SearchResult:
 def _kept(
     better: NDArray[np.bool_], new: tuple[ChainState, MarkerFit], old: tuple[ChainState, MarkerFit]
 ) -> tuple[ChainState, MarkerFit]:
-    """Return the new where it is better."""
+    """Return the new state and fit where they are better, else the old ones."""
     keep = better[:, None, None]
     (onward, there), (state, at) = new, old
     couplings = (

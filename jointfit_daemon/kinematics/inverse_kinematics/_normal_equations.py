@@ -1,17 +1,17 @@
-r"""The least squares of a chain's markers, through sums over each segment's markers.
+r"""Normal equations of the marker errors, from sums over the markers of each segment.
 
-Law: with :math:`S_k=(\alpha_k,\beta_k)` the twist of degree of freedom k, what a marker cloud adds
-to the normal matrix is :math:`S_k^T I S_l`, where
+With the twists :math:`S_k=(\alpha_k,\beta_k)` of the degrees of freedom, a marker cloud contributes
+:math:`S_k^T I S_l` to the normal matrix, where
 
 .. math:: I = \sum_m w_m \begin{pmatrix} |x|^2 1 - x x^T & [x]_\times \\ -[x]_\times & 1
           \end{pmatrix}
 
-of all markers that both k and l move: those at and beyond the deeper of their segments. So an
-instant costs sums over markers once, then only segments and degrees of freedom; it is the
-composite rigid body algorithm with markers for masses. Source: Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 6.2.
+over all markers moved by both k and l. The cost is one sum over markers per instant, then
+operations on segments and degrees of freedom only: the composite rigid body algorithm with markers
+as masses. Source: Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2.
 
-Inside, the markers of each segment fill K slots, empty ones with weight zero: shape (T, S, 3, K).
+Internally the markers of each segment are padded to K slots, empty ones with weight zero: shape (T,
+S, 3, K).
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class MarkerSlots:
-    """Where each marker of a model sits in arrays (T, S, 3, K)."""
+    """Index of each marker of a model in arrays (T, S, 3, K)."""
 
     layout: ChainLayout
     points: Array
     """(x, y, z, 1) of each slot in segment axes, shape (S, 4, K)."""
     places: NDArray[np.intp]
-    """Of each marker in (S, K), flat; shape (M,)."""
+    """Flat index of each marker in (S, K); shape (M,)."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -64,7 +64,7 @@ class MarkerSlots:
 
 
 def marker_slots(model: ChainModel) -> MarkerSlots:
-    """Return the slots of a model's markers; the model keeps them."""
+    """Return the slots of a model's markers, cached in the model."""
     kept = model.__dict__.get("_slots")
     if not isinstance(kept, MarkerSlots):
         kept = _slots(model)
@@ -85,16 +85,16 @@ def _slots(model: ChainModel) -> MarkerSlots:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """A chain at T instants beside its measured markers."""
+    """Chain at T instants with its marker errors."""
 
     world: Array
     """Transforms of the segments, shape (T, S, 4, 4)."""
     cloud: Array
     """Rows x, y, z, 1 of each marker of the model, then its three errors; shape (T, S, 7, K)."""
     weighted: Array
-    """The same times the weights."""
+    """``cloud`` times the weights."""
     couplings: Array | None = None
-    """Of the state."""
+    """Couplings of the state."""
 
     @property
     def errors(self) -> Array:
@@ -115,18 +115,18 @@ class MarkerFit:
 
 
 def marker_fit(slots: MarkerSlots, state: ChainState, measured: Array, weights: Array) -> MarkerFit:
-    """Return the chain beside its markers.
+    """Return the marker errors of a state.
 
     Parameters
     ----------
     slots
-        Of the model.
+        Marker slots of the model.
     state
-        Of the chain.
+        State of the chain.
     measured
         Shape (T, S, 3, K), m, finite.
     weights
-        Shape (T, S, K), zero where nothing was measured.
+        Shape (T, S, K), zero where markers are missing.
     """
     world = transforms(slots.layout, state)
     cloud = np.empty((*world.shape[:2], 7, slots.shape[1]))
@@ -136,7 +136,7 @@ def marker_fit(slots: MarkerSlots, state: ChainState, measured: Array, weights: 
 
 
 def _sums_to_inertia() -> Array:
-    """Return what takes the sums (x, y, z, 1) w (x, y, z, 1, e)^T to (I, (x x e, e)), 6 x 7."""
+    """Return the map of the sums (x, y, z, 1) w (x, y, z, 1, e)^T to (I, (x x e, e)), 6 x 7."""
     out = np.zeros((4, 7, 6, 7))
     cross = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
     for i, j, k in cross:
@@ -164,13 +164,14 @@ def normal_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
 
 
 def lower_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
-    """Return the lower triangle of J^T W J, which is all a Cholesky factor needs, and J^T W e."""
+    """Return the lower triangle of J^T W J, as used by Cholesky, and J^T W e."""
     layout, count = slots.layout, len(at.world)
     sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)
     beyond = layout.below @ sums.reshape(count, -1, 28)
     bodies = (beyond @ _INERTIA).reshape(count, -1, 6, 7)
     motion = twists(layout, at.world, at.couplings)
-    # by segment: gathering bodies for every degree of freedom would cost memory, and so time
+
+    # By segment: gathering the inertia of every degree of freedom would need more memory.
     pushed = np.empty((*motion.shape[:2], 7))
     for s, columns in layout.columns:
         np.matmul(motion[:, columns], bodies[:, s], out=pushed[:, columns])

@@ -1,12 +1,13 @@
-r"""Where a chain must be so that its markers lie nearest to the measured ones.
+r"""Inverse kinematics of a chain from measured markers, for all instants of a trial.
 
-Law: at every instant
+At every instant
 
 .. math:: q_t = \arg\min_q \sum_m w_{tm} |x_m(q) - y_{tm}|^2
 
-by Levenberg and Marquardt, all instants at once, each with its own damping. A marker that is NaN
-weighs nothing. An instant whose markers leave something open is told, and in a second pass, one
-instant after the other, begins at and is held to the instant before it.
+is solved by the Levenberg-Marquardt method, all instants in parallel, each with its own damping.
+Missing markers (NaN) have no weight. Instants at which the markers leave a degree of freedom
+undetermined are reported. A second pass solves them in order, starting from the instant before and
+regularized toward it.
 """
 
 from __future__ import annotations
@@ -36,32 +37,34 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _TOGETHER = 4096
-"""Degrees of freedom searched together: their arrays stay in the processor's cache."""
+"""Degrees of freedom solved together, so that their arrays fit in the processor cache."""
 OPEN_M2 = 4e-4
-"""Information on a degree of freedom, m^2/rad^2, below which the markers leave it open: 2 cm."""
+"""Information, m^2/rad^2, below which a degree of freedom is undetermined: (2 cm)²."""
 
 
 @dataclass(frozen=True, slots=True)
 class IkOptions:
-    """How to search; the defaults are for markers on skin."""
+    """Options of the solver; the defaults are for skin-mounted markers."""
 
     iterations: int = 60
-    """At most, per instant and weighting."""
+    """Largest number per instant and weighting."""
     tolerance: float = 1e-7
-    """Relative decrease of the squared error at which an instant is done."""
+    """Relative decrease of the squared error at which an instant has converged."""
     huber_m: float | None = None
-    """Errors beyond weigh as c/|e|, m; None: plain least squares."""
+    """Huber threshold c of the marker error, m: larger errors have weight c/|e|; None: least
+    squares.
+    """
     reweightings: int = 2
-    """Rounds of new robust weights."""
+    """Passes with updated robust weights."""
     hold_m2: float = 1e-4
-    """Weight, m^2/rad^2, of a joint's turn since the instant before, if markers leave one open."""
+    """Weight, m^2/rad^2, toward the instant before where the markers leave a joint undetermined."""
     limit_m2: float = 0.0
-    """Weight, m^2/rad^2, of a hinge's excess over its limits; 0: limits are not looked at."""
+    """Weight, m^2/rad^2, of the excess over a joint's limits; 0 ignores the limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class IkResult:
-    """Poses at T instants and how well they fit; S segments, M markers."""
+    """Poses at T instants with their marker errors; S segments, M markers."""
 
     state: ChainState
     rotations: Array
@@ -69,13 +72,13 @@ class IkResult:
     origins: Array
     """World origins of the segments, m, shape (T, S, 3)."""
     residuals: Array
-    """Marker of the model minus measured, m, shape (T, M, 3); NaN where none was measured."""
+    """Model minus measured marker, m, shape (T, M, 3); NaN where missing."""
     weights: Array
-    """As used in the end, shape (T, M): 0 where missing, robust factors included."""
+    """Final weights, shape (T, M): 0 where missing, robust factors included."""
     converged: NDArray[np.bool_]
     """Shape (T,)."""
     underdetermined: NDArray[np.bool_]
-    """The markers left some degree of freedom open, which was held; shape (T,)."""
+    """The markers left a degree of freedom undetermined; shape (T,)."""
     iterations: NDArray[np.intp]
     """Shape (T,)."""
 
@@ -88,31 +91,32 @@ def solve_frames(
     start: ChainState | None = None,
     options: IkOptions | None = None,
 ) -> IkResult:
-    """Return the poses that bring the model's markers nearest to the measured ones.
+    """Return the poses that minimize the weighted marker errors.
 
     Parameters
     ----------
     model
-        Of S segments and M markers.
+        Chain of S segments and M markers.
     markers : array_like, shape (T, M, 3)
-        Measured, in the order of ``model.markers``, world, m; NaN where missing.
+        Measured positions in the world, m, in the order of ``model.markers``; NaN where missing.
     weights : array_like, shape (M,) or (T, M), optional
-        Of squared errors; the model's own if None.
+        Weights of squared errors; those of the model by default.
     start
-        Where to begin at each instant, length T; from the markers themselves if None.
+        Initial state of length T; computed from the markers by default.
     options
-        `IkOptions()` if None.
+        `IkOptions()` by default.
 
     Raises
     ------
     ValueError
-        Shapes that do not belong together, negative weights.
+        Inconsistent shapes or negative weights.
     """
     options = options or IkOptions()
     measured, seen = checked_markers(model, markers)
     w = checked_weights(model, weights, seen)
     if start is not None and len(start) != len(measured):
         raise ValueError(f"start has {len(start)} instants, the markers {len(measured)}")
+
     slots = marker_slots(model)
     problem = SearchProblem(
         model,
@@ -124,14 +128,17 @@ def solve_frames(
         reweightings=options.reweightings,
         bands=limits_of(model, options.limit_m2),
     )
+
     if start is None:
         start, guessed = start_from_markers(model, problem.measured, problem.weights)
     else:
         guessed = np.zeros(len(measured), dtype=np.bool_)
+
     solution = _Solution.of(problem, start)
     size = max(_TOGETHER // model.nq, 1)
     for first in range(0, len(measured), size):
         solution.solve(np.arange(first, min(first + size, len(measured))))
+
     is_open = solution.is_open()
     solution.follow(guessed | is_open, is_open, options.hold_m2 * problem.typical_weight)
     return solution.result(seen, is_open)
@@ -139,7 +146,7 @@ def solve_frames(
 
 @dataclass(frozen=True, slots=True)
 class _Solution:
-    """What is being found, instant by instant; its arrays are written in place."""
+    """Solution in progress; its arrays are written in place."""
 
     problem: SearchProblem
     state: ChainState
@@ -159,7 +166,7 @@ class _Solution:
         )
 
     def solve(self, instants: NDArray[np.intp], hold: Band | None = None) -> None:
-        """Search at some instants from where they are."""
+        """Solve some instants from their current state."""
         part = self.problem.take(instants, hold)
         found = search(part, self.state.take(instants))
         self.state.put(instants, found.state)
@@ -168,10 +175,10 @@ class _Solution:
         self.iterations[instants] += found.iterations
 
     def is_open(self) -> NDArray[np.bool_]:
-        """Return at which instants the markers leave a degree of freedom open.
+        """Return the instants at which the markers leave a degree of freedom undetermined.
 
-        That is where a pivot of the normal matrix is small, each being what the markers say about
-        one degree of freedom when those after it are free to follow.
+        There a Cholesky pivot of the normal matrix is small. A pivot is the information about one
+        degree of freedom while the later ones are free.
         """
         slots = marker_slots(self.problem.model)
         at = marker_fit(slots, self.state, self.problem.measured, self.weights)
@@ -180,10 +187,10 @@ class _Solution:
     def follow(
         self, doubtful: NDArray[np.bool_], is_open: NDArray[np.bool_], hold_m2: float
     ) -> None:
-        """Search doubtful instants once more, each from the one before it (or after, at first).
+        """Solve the doubtful instants again, each from the one before it (at the start: after it).
 
-        Runs of doubtful instants do not touch each other, so their first ones are searched
-        together, then their second ones, and so on.
+        Runs of doubtful instants are independent: their first instants are solved together, then
+        their second ones, and so on.
         """
         for instants, before in _waves(doubtful):
             last = self.state.take(before)
@@ -210,14 +217,14 @@ class _Solution:
 
 
 def open_instants(H: Array) -> NDArray[np.bool_]:
-    """Return where normal matrices, shape (T, nq, nq), leave a degree of freedom open."""
+    """Return the instants at which the normal matrix, (T, nq, nq), is undetermined."""
     ridge = 1e-9 * np.eye(H.shape[-1])
     pivots = np.diagonal(np.linalg.cholesky(H + ridge), axis1=-2, axis2=-1)
     return np.asarray((pivots**2 < OPEN_M2).any(axis=-1))
 
 
 def _waves(doubtful: NDArray[np.bool_]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return instants to be searched together and the solved ones they follow."""
+    """Return groups of instants to solve together, with the solved instants they start from."""
     good = np.flatnonzero(~doubtful)
     bad = np.flatnonzero(doubtful)
     if not good.size:
@@ -230,7 +237,7 @@ def _waves(doubtful: NDArray[np.bool_]) -> list[tuple[NDArray[np.intp], NDArray[
 
 
 def checked_markers(model: ChainModel, markers: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-    """Return measured markers with zeros for NaN, and which of them are there, shape (T, M)."""
+    """Return measured markers with zeros for NaN, and their presence, shape (T, M)."""
     measured = np.asarray(markers, dtype=np.float64)
     if measured.ndim != 3 or measured.shape[1:] != (len(model.markers), 3):
         raise ValueError(
@@ -241,7 +248,7 @@ def checked_markers(model: ChainModel, markers: ArrayLike) -> tuple[Array, NDArr
 
 
 def checked_weights(model: ChainModel, weights: ArrayLike | None, seen: NDArray[np.bool_]) -> Array:
-    """Return weights, shape (T, M), zero where nothing was measured."""
+    """Return weights, shape (T, M), zero where markers are missing."""
     w = model.weights if weights is None else np.asarray(weights, dtype=np.float64)
     if w.shape not in {seen.shape, seen.shape[1:]}:
         raise ValueError(f"weights have shape {w.shape}, expected {seen.shape[1:]} or {seen.shape}")
@@ -251,7 +258,7 @@ def checked_weights(model: ChainModel, weights: ArrayLike | None, seen: NDArray[
 
 
 def tracking_error(residuals: Array) -> float:
-    """Return the root of the mean squared distance over all markers present, m; NaN if none is."""
+    """Return the RMS distance of all present markers, m; NaN if there are none."""
     square = np.einsum("...i,...i->...", residuals, residuals)
     seen = np.isfinite(square)
     return float(np.sqrt(square[seen].mean())) if seen.any() else float("nan")

@@ -1,20 +1,20 @@
-"""Streams of samples to frames at a fixed rate: every stream interpolated to the same instant.
+"""Alignment of sample streams to frames at a fixed rate.
 
-Law: pure; time comes in with samples and with ``advance``. Bounded memory. Frames come out in
-order, each once, whatever comes in. Every pushed sample gets exactly one verdict.
+Time advances with samples and with ``advance``; memory is bounded. Frames are emitted in order,
+each once. Every sample has exactly one outcome.
 
-Frame k is true for ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on when
-anything started. It goes out as soon as every living stream has a sample at or after t_k, or at
-its deadline: each stream's next sample is expected at its usual delay, and is waited for 1.5 of
-its periods at most. What is lacking then is continued from the last samples for up to 2.5 periods,
-and is missing after that.
+Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on
+the start time. It is emitted when every living stream has a sample at or after t_k, or at its
+deadline: the next sample of each stream is expected at its usual delay, plus at most 1.5 of its
+periods. Missing samples are extrapolated by up to 2.5 periods; after that the stream is missing
+from the frame.
 
-Invariant: frames never stop. While no stream can serve them, they go out without orientations, as
-soon as every stream counts as lost, and then at the usual delay. Only frames that nobody asked for
-within a second (the whole process was stopped) are passed over.
+Invariant: frames never stop. While no stream has samples, frames are emitted without orientations,
+first when every stream counts as lost, then at the usual delay. Only frames that were not requested
+within a second (the whole process was stopped) are skipped.
 
-In mode ``fast`` a stream is content with a sample one of its own periods before t_k, and what lies
-between is extrapolated: frames leave one period earlier, never before t_k itself.
+In mode ``fast`` a sample one period of its stream before t_k is sufficient, and the rest is
+extrapolated: frames are emitted one period earlier, never before t_k itself.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ if TYPE_CHECKING:
 __all__ = ["AlignedFrame", "FrameAligner", "Mode", "SampleOutcome", "StreamSpec"]
 
 Mode = Literal["smooth", "fast"]
-"""``smooth`` waits for samples and interpolates; ``fast`` extrapolates by a period at most."""
+"""``smooth`` waits for samples and interpolates; ``fast`` extrapolates by at most one period."""
 
 OWED_NS = 1_000_000_000
-"""Frames without orientations that are older than this are passed over, ns: a process that was
-stopped for an hour would have to send 360 000 of them."""
+"""Age, ns, above which frames without orientations are skipped: a process that was stopped for an
+hour would otherwise emit 360 000 of them.
+"""
 
 
 class AlignedFrame(NamedTuple):
@@ -43,14 +44,15 @@ class AlignedFrame(NamedTuple):
 
     t_ns: int
     completed_ns: int
-    """Arrival of the sample that completed the frame, or the deadline that ended the waiting."""
+    """Arrival of the sample that completed the frame, or its deadline, ns."""
     orientations: Mapping[str, Quaternion]
-    """Of every stream that is not missing, in the order of the streams."""
+    """Orientation of every stream that is not missing, in the order of the streams."""
     extrapolated: frozenset[str]
     missing: frozenset[str]
     synced: bool
-    """Whether the clocks behind all of `orientations` had settled; without any, whether those
-    behind the last frame with some had, until a stream ends."""
+    """Whether the clocks of all `orientations` have settled. Without orientations: the value of
+    the last frame with some, until a stream ends.
+    """
 
 
 _NONE: frozenset[str] = frozenset()
@@ -62,16 +64,15 @@ class FrameAligner:
     Parameters
     ----------
     streams : mapping of str to StreamSpec
-        The streams, by id; the order is the order of what comes out.
+        Streams by id, in the order of the output.
     period_ns : int
-        Time from frame to frame, ns.
+        Frame period, ns.
     mode : {"smooth", "fast"}
         Whether to wait for samples.
     active : bool
-        While False samples are counted as idle and no frames come out.
+        While False, samples are counted as idle and no frames are emitted.
     begin_ns : int, optional
-        Instant from which on frames are owed, with or without samples, ns; by default that of the
-        first sample.
+        Instant of the first frame, with or without samples, ns; default: that of the first sample.
 
     Raises
     ------
@@ -108,9 +109,9 @@ class FrameAligner:
         """When each stream is ready for the next frame; empty until that is asked."""
         self.emitted_frames = 0
         self.skipped_frames = 0
-        """Frames that were passed over, see ``OWED_NS``."""
+        """Number of skipped frames, see ``OWED_NS``."""
         self.forced_frames = 0
-        """Frames that went out at their deadline."""
+        """Number of frames emitted at their deadline."""
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -125,46 +126,47 @@ class FrameAligner:
         epoch: int = 0,
         rate: Vector | None = None,
     ) -> SampleOutcome | None:
-        """Take one sample; return its verdict if that is certain already.
+        """Add a sample; return its outcome if it is already known.
 
         Parameters
         ----------
         name : str
-            A stream of this aligner; another is a KeyError.
+            Stream id; KeyError if unknown.
         t_ns, arrival_ns : int
-            Host instant it is true for, and of its arrival, ns.
+            Host time of the sampling instant and of the arrival, ns.
         q : Quaternion
-            Unit quaternion; its sign does not matter.
+            Unit quaternion of either sign.
         synced : bool
             Whether its clock has settled.
         epoch : int
-            Epoch of its clock: samples of different epochs are never joined.
+            Epoch of its clock; samples of different epochs are not combined.
         rate : Vector, optional
-            Angular rate at `t_ns` in the sensor's own frame, rad/s, where it was measured.
+            Measured angular rate at `t_ns` in the sensor's own frame, rad/s.
         """
         stream = self._streams[name]
         if not self._active:
             return stream.idle()
         self._changed = True
-        if epoch != stream.epoch:  # its samples so far will be forgotten
+        if epoch != stream.epoch:  # the stream discards its samples
             self._served = None
+
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
         verdict = stream.push(
             t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns, rate=rate
         )
-        if self._dues:  # of the others nothing has changed
+        if self._dues:  # the other streams are unchanged
             self._dues[name] = self._due_of(stream)
         return verdict
 
     def counts(self, name: str) -> dict[str, int]:
-        """Return ``received`` and what became of it: the verdicts and ``pending`` add up to it."""
+        """Return the number of received samples by outcome, and of pending ones."""
         return self._streams[name].counts()
 
     # --- frames ------------------------------------------------------------------------------
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when ``advance`` will emit a frame if no sample comes; None: none is owed yet."""
+        """Time at which ``advance`` emits a frame without further samples, ns; or None."""
         if self._changed:
             self._deadline_ns = self._due() if self._active else None
             self._changed = False
@@ -172,7 +174,7 @@ class FrameAligner:
 
     @property
     def next_ns(self) -> int | None:
-        """Return the instant of the next frame, ns; None: none is owed yet."""
+        """Instant of the next frame, ns; None before the first."""
         return None if self._next is None else self._next * self._period_ns
 
     def advance(self, now_ns: int, *, complete_only: bool = False) -> list[AlignedFrame]:
@@ -183,9 +185,8 @@ class FrameAligner:
         now_ns : int
             Host instant, ns.
         complete_only : bool
-            Return no frame that still lacks a sample, even if its deadline has passed. For calls
-            between two reads: after a stall of the process the missing sample has usually
-            arrived and waits in the kernel, to be read next.
+                Return no frame that lacks a sample, even after its deadline. For calls between two
+            reads: after a stall of the process the missing sample is usually waiting in the kernel.
         """
         frames: list[AlignedFrame] = []
         while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
@@ -197,7 +198,7 @@ class FrameAligner:
         return frames
 
     def _lacks_sample(self) -> bool:
-        """Return whether a stream that is waited for has no sample at or after the next frame."""
+        """Return whether an expected stream has no sample at or after the next frame."""
         t_k = (self._next or 0) * self._period_ns
         return any(
             stream.waited_for and stream.newest_ns < (t_k - stream.period_ns if self._fast else t_k)
@@ -205,7 +206,7 @@ class FrameAligner:
         )
 
     def _pass_over(self, now_ns: int) -> bool:
-        """Go on to what a stream can serve or is not too old; False if the next frame is."""
+        """Skip to the first frame that is recent or can be served; False if it is the next."""
         until_ns = now_ns - OWED_NS
         if self._serves_ns is not None:
             until_ns = min(until_ns, self._serves_ns)
@@ -217,19 +218,19 @@ class FrameAligner:
         return True
 
     def _find_servers(self) -> None:
-        """Note whether a stream serves the next frame, else from when on one will."""
+        """Determine whether a stream serves the next frame, or else from when on."""
         starts = self._starts()
         self._serves_ns = min(starts, default=None)
         if self._next is None and self._serves_ns is not None:
             self._next = self._served = -(-self._serves_ns // self._period_ns)
 
     def _starts(self) -> list[int]:
-        """Return from when on streams can serve; settle those that cannot."""
+        """Return the first instants that streams can serve; reset streams that have ended."""
         starts: list[int] = []
         t_next, served = self.next_ns, False
         for _, stream in self._items:
             if served and stream.waited_for:
-                continue  # one is enough, and this one has not ended
+                continue  # one serving stream is sufficient, and this one has not ended
             start = stream.serves_from(t_next)
             if start is None:
                 stream.settle()
@@ -241,7 +242,7 @@ class FrameAligner:
         return starts
 
     def _due(self) -> int | None:
-        """Return when the next frame is or was complete, or its deadline if it is not, ns."""
+        """Return the time at which the next frame is complete, or its deadline, ns."""
         if self._served is None or self._served != self._next:
             self._dues.clear()
             self._find_servers()
@@ -250,7 +251,7 @@ class FrameAligner:
             return None
         if self._served != self._next:
             return max([t_k, *[stream.given_up_ns(t_k) for _, stream in self._items]])
-        if not self._dues:  # else more samples change nothing but their own stream's
+        if not self._dues:  # else each sample updates the due time of its own stream only
             self._dues = {name: self._due_of(stream) for name, stream in self._items}
         latest = max(self._dues.values())
         return max(t_k, latest) if self._fast else latest
@@ -264,6 +265,7 @@ class FrameAligner:
         t_k = number * self._period_ns
         self._next = number + 1
         self._completed_ns = completed_ns = max(self._completed_ns, due_ns)
+
         orientations: dict[str, Quaternion] = {}
         extrapolated: list[str] = []
         missing: list[str] = []
@@ -278,8 +280,11 @@ class FrameAligner:
             if stream.extrapolated:
                 extrapolated.append(name)
                 forced = True
-        if not orientations:  # as before, while no stream has ended: a pause unsettles no clock
+        if (
+            not orientations
+        ):  # unchanged while no stream has ended: a pause does not unsettle clocks
             synced = self._synced and any(stream.waited_for for _, stream in self._items)
+
         self._synced = synced
         self.emitted_frames += 1
         self.forced_frames += forced
@@ -292,7 +297,7 @@ class FrameAligner:
             synced,
         )
 
-    # --- changes of state --------------------------------------------------------------------
+    # --- control -----------------------------------------------------------------------------
 
     @property
     def active(self) -> bool:
@@ -306,17 +311,17 @@ class FrameAligner:
         self._active, self._changed, self._served = wanted, True, None
 
     def lose(self, name: str) -> None:
-        """Take it that the stream has ended: do not wait for it until it returns."""
+        """Mark a stream as ended; frames do not wait for it until it returns."""
         self._streams[name].lose()
         self._changed, self._served = True, None
 
     def reset(self, name: str) -> None:
-        """Forget the samples of a stream whose clock began anew."""
+        """Discard the samples of a stream whose clock restarted."""
         self._streams[name].reset()
         self._changed, self._served = True, None
 
     def close(self) -> None:
-        """Give every pending sample its verdict; the next sample begins anew."""
+        """Count the outcome of every pending sample; the next sample starts again."""
         for _, stream in self._items:
             stream.reset()
         self._changed, self._served = True, None

@@ -1,11 +1,9 @@
-r"""Orientation between, and shortly after, the samples of one stream.
+r"""Interpolation and short extrapolation of the orientations of one stream.
 
-Law: pure, tuples of floats, a few microseconds a call; knows no stream, no frame, no clock.
-
-All of it happens in the tangent space of the newest sample *a* at or before the instant,
-:math:`r(t) = \log(q_a^* q(t))`, where the other samples are plain vectors: no interval is joined to
-the next by anything but a polynomial through them. Angular rates are those of the body, in its own
-frame: :math:`\dot q = q \otimes (0, \omega/2)`.
+Tuples of floats; a few microseconds per call. All computations use the tangent space of the newest
+sample *a* at or before the instant, :math:`r(t) = \log(q_a^* q(t))`, where the other samples are
+plain vectors. Angular rates are those of the body in its own frame: :math:`\dot q = q \otimes (0,
+\omega/2)`.
 """
 
 from __future__ import annotations
@@ -20,41 +18,44 @@ if TYPE_CHECKING:
 
 _NS = 1e-9
 CURVATURE_SHARE = 0.5
-"""Share of the measured curvature that is extrapolated: see docs/timing.md."""
-_CONTRADICTS, _CONTRADICTS_RAD = 0.25, 0.02
-"""By how much a turn between two samples may differ from their rates: relative, and rad."""
+"""Fraction of the measured curvature used in extrapolation; see docs/timing.md."""
+_CONTRADICTS = 0.25
+"""Relative difference between a rotation and the integral of its rates that is accepted."""
+_CONTRADICTS_RAD = 0.02
+"""Absolute difference accepted in addition, rad."""
 
 
 class OrientationSample(Protocol):
-    """A sample as far as this module looks at it."""
+    """Sample of a stream, as used by this module."""
 
     t_ns: int
     q: Quaternion
     rate: Vector | None
     """Angular rate in the sensor's own frame at ``t_ns``, rad/s; None: not measured."""
     turn: Vector | None
-    """From the sample before it, rad, kept here once it is worked out; None where that is not yet
-    so, and again when another sample comes between them."""
+    """Rotation vector from the sample before it, rad, cached; None before it is computed, and
+    again after a sample is inserted between them.
+    """
 
 
 def interpolate_orientation(
     before: OrientationSample | None, a: OrientationSample, b: OrientationSample, t_ns: int
 ) -> Quaternion:
-    r"""Return the orientation at `t_ns`, between the neighbors `a` and `b`.
+    r"""Return the orientation at `t_ns`, between the neighbours `a` and `b`.
 
-    With rates at both ends a cubic (Hermite) in the tangent space of `a`; else with a sample
-    `before` them a parabola through all three,
+    With rates at both ends the result is a cubic Hermite interpolation in the tangent space of `a`.
+    Otherwise, with a sample `before` them, it is the parabola through all three,
 
     .. math:: r(x) = r_b \frac{x (x + h_0)}{h_1 (h_0 + h_1)}
               + r_0 \frac{x (x - h_1)}{h_0 (h_0 + h_1)}
 
-    with :math:`h_0, h_1` the intervals before and after `a`; else at constant rate (slerp). The
-    parabola's error is of third order in the interval, that of slerp of second.
+    with :math:`h_0, h_1` the intervals before and after `a`; otherwise slerp. The error of the
+    parabola is of third order in the interval, that of slerp of second order.
 
     Parameters
     ----------
     before, a, b : OrientationSample
-        Neighbors in order of time; `before` may be missing. Signs of quaternions do not matter.
+        Neighbours in order of time; `before` may be missing. Signs of quaternions do not matter.
     t_ns : int
         Instant in ``[a.t_ns, b.t_ns]``.
     """
@@ -65,7 +66,7 @@ def interpolate_orientation(
     elif before is not None:
         h0 = (a.t_ns - before.t_ns) * _NS
         m, n = x * (x + h0) / (h * (h0 + h)), x * (h - x) / (h0 * (h0 + h))
-        r = _combine(m, turn, n, _turn_to(a, before))  # seen from `a`, `before` is at minus that
+        r = _combine(m, turn, n, _turn_to(a, before))  # `before` is at minus that in this space
     else:
         share = x / h
         r = (share * turn[0], share * turn[1], share * turn[2])
@@ -81,14 +82,14 @@ def extrapolate_orientation(
 ) -> Quaternion:
     r"""Return the orientation at `t_ns`, after the last sample `a`.
 
-    It goes on at the last rate, which is measured or that of the last interval, and bends as the
-    rates did for as long as that interval lasted:
+    The motion continues at the last rate (measured, or that of the last interval), with a fraction
+    of the measured angular acceleration for the duration of that interval:
 
     .. math:: r(x) = v x + \tfrac12 \beta\, a\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
               \quad x_c = \min(x, h_0)
 
-    with the last interval's rate *v*, the second divided difference *a*, and :math:`\beta` = 1/2:
-    in full it would follow a faster motion, and scatter more (docs/timing.md has the figures).
+    with the last interval's rate *v*, the second divided difference *a*, and :math:`\beta` = 1/2. A
+    larger :math:`\beta` follows faster motion but amplifies noise (docs/timing.md).
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def extrapolate_orientation(
     t_ns : int
         Instant at or after ``a.t_ns``.
     bend : float
-        Share beta of the measured curvature, used where rates are not measured.
+        The factor beta, used where rates are not measured.
     """
     x, h0 = (t_ns - a.t_ns) * _NS, (a.t_ns - before.t_ns) * _NS
     x_c = min(x, h0)
@@ -110,7 +111,7 @@ def extrapolate_orientation(
         if earlier is not None:
             h1 = (before.t_ns - earlier.t_ns) * _NS
             first = difference_one(a.q, earlier.q)
-            # in the tangent space of `a`: earlier at `first`, before at -turn, a at 0
+            # In the tangent space of `a`: `earlier` at `first`, `before` at -turn, `a` at 0.
             weight = bend * (x_c * (x_c + h0) + (2.0 * x_c + h0) * (x - x_c)) / (h0 + h1)
             bent = _combine(weight * (1.0 / h0 + 1.0 / h1), turn, weight / h1, first)
             r = (r[0] + bent[0], r[1] + bent[1], r[2] + bent[2])
@@ -118,7 +119,7 @@ def extrapolate_orientation(
 
 
 def _turn_to(sample: OrientationSample, before: OrientationSample) -> Vector:
-    """Return the turn from the sample before, which the next interval asks for, too."""
+    """Return the rotation vector from the sample before, cached for the next interval."""
     if sample.turn is None:
         sample.turn = difference_one(before.q, sample.q)
     return sample.turn
@@ -137,7 +138,7 @@ def _cross(u: Vector, v: Vector) -> Vector:
 
 
 def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
-    """Tell whether rates explain the turn between them: other axes or units would not."""
+    """Return whether rates agree with the rotation between them; wrong axes or units do not."""
     miss = size = 0.0
     for i in range(3):
         miss += (0.5 * h * (start[i] + end[i]) - turn[i]) ** 2
@@ -146,10 +147,10 @@ def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
 
 
 def _hermite(start: Vector, end: Vector, turn: Vector, x: float, h: float) -> Vector:
-    """Return the cubic from 0 to `turn` that leaves and arrives with the given body rates.
+    """Return the cubic from 0 to `turn` with the given body rates at both ends.
 
-    At its end the tangent is the rate through the inverse right Jacobian of the turn,
-    ``w + r x w / 2 + r x (r x w) / 12``, to third order.
+    The end tangent is the rate through the inverse right Jacobian of the rotation, ``w + r x w / 2
+    + r x (r x w) / 12``, to third order.
     """
     across = _cross(turn, end)
     twice = _cross(turn, across)

@@ -1,8 +1,8 @@
-"""One stream on its way into frames: its waiting samples, its habits, its verdicts.
+"""One stream of the frame aligner: its pending samples, its usual delay, its counters.
 
-Law: pure, bounded; knows nothing of the other streams. A sample stays while a frame may still need
-it, at most three at or before the last frame (what an extrapolation needs), and gets its verdict
-when it leaves.
+Bounded memory, independent of the other streams. A sample stays while a frame may still need it; at
+most three at or before the last frame stay for extrapolation. Its outcome is counted when it
+leaves.
 """
 
 from __future__ import annotations
@@ -17,52 +17,61 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
 CAPACITY = 512
-"""Samples that may wait in one stream."""
+"""Largest number of pending samples."""
 PATIENCE = 1.45
-"""Periods a sample is waited for beyond its usual delay: under 1.5 with the delay's own ripple."""
+"""Periods to wait for a sample beyond its usual delay: below 1.5 including the ripple of the delay.
+"""
 REACH = 2.5
-"""Periods after the last sample that may be extrapolated over."""
+"""Largest extrapolation after the last sample, periods."""
 GAP = 4.0
-"""Periods between two samples that may be interpolated over."""
+"""Largest interval between two samples for interpolation, periods."""
 CROWDED = 0.5
-"""Periods between two samples that tell no rate: while a clock settles, stamps may crowd."""
+"""Least interval between two samples for a rate, periods: timestamps may crowd while a clock
+settles.
+"""
 LOST_PERIODS = 3
+"""Silence after which a stream counts as lost, periods."""
 LOST_LEAST_NS = 50_000_000
+"""Least silence after which a stream counts as lost, ns."""
 FUTURE_NS = 100_000_000
-"""A stamp this far after its own arrival is no stamp."""
+"""Timestamp after its own arrival by more than this is invalid, ns."""
 PAST_NS = 10_000_000_000
-"""A stamp this far before its arrival is of no use to anyone live."""
+"""Timestamp before its own arrival by more than this is too late for live use, ns."""
 DELAY_MOST_NS = 250_000_000
-"""A stream that is always later than this does not hold up the others."""
+"""Largest delay that frames wait for, ns."""
 
-_EARLY = 20  # a twentieth of a period: a sample due just before t_k may as well come just after
+_EARLY = 20
+"""Samples expected up to 1/20 period before a frame may also arrive just after it."""
 _DELAY_STEP = 128
-_DELAY_UP = 3  # three steps up for one down: settles where a quarter of the samples is later
-_BEHIND = 3  # samples at or before a frame that an extrapolation needs
+"""The usual delay changes by 1/128 period per sample."""
+_DELAY_UP = 3
+"""Steps up per step down: the usual delay converges to the 75th percentile."""
+_BEHIND = 3
+"""Number of samples at or before a frame that extrapolation needs."""
 
 
 class StreamSpec(NamedTuple):
-    """What is known of a stream beforehand."""
+    """Configuration of a stream."""
 
     period_ns: int
-    """Nominal time from sample to sample, ns."""
+    """Nominal sample period, ns."""
 
 
 class SampleOutcome(StrEnum):
-    """What became of a sample."""
+    """Outcome of a sample."""
 
     USED = "used"
-    """Took part in at least one emitted frame."""
+    """Used in at least one frame."""
     DECIMATED = "decimated"
-    """Passed over: the stream is faster than the frames."""
+    """Skipped: the stream is faster than the frames."""
     LATE = "late"
-    """Came when the frames that needed it were out, and no later frame needed it."""
+    """Arrived after the frames that needed it; no later frame needed it."""
     DUPLICATE = "duplicate"
-    """Has the time of a sample that is there already."""
+    """Same time as another sample."""
     DROPPED = "dropped"
-    """Given up: overflow, reset, close, or a stamp from the future."""
+    """Discarded: overflow, reset, close, or a timestamp in the future."""
     IDLE = "idle"
-    """Came while nobody wanted frames."""
+    """Arrived while the aligner was inactive."""
 
 
 class _Sample:
@@ -98,19 +107,19 @@ class Stream:
         self._delay_ns: int | None = None  # usual arrival minus stamp
         self._samples: deque[_Sample] = deque()
         self.epoch: int | None = None
-        """Of the clock behind the samples."""
+        """Epoch of the clock behind the samples."""
         self.waited_for = False
-        """Whether more is expected of it."""
+        """Whether more samples are expected."""
         self._received = 0
         self._counts = dict.fromkeys(SampleOutcome, 0)
         self.newest_ns = self.newest_arrival_ns = 0
         self.extrapolated = self.synced = False
         """What the last ``at`` did, and whether the clock behind it had settled."""
 
-    # --- in ----------------------------------------------------------------------------------
+    # --- samples -----------------------------------------------------------------------------
 
     def idle(self) -> SampleOutcome:
-        """Count a sample nobody wants."""
+        """Count a sample that arrived while the aligner was inactive."""
         self._received += 1
         return self._count(SampleOutcome.IDLE)
 
@@ -125,7 +134,10 @@ class Stream:
         passed_ns: int | None,
         rate: Vector | None = None,
     ) -> SampleOutcome | None:
-        """Take a sample; `passed_ns` is the last frame that is out. Return an early verdict."""
+        """Add a sample; return its outcome if it is already known.
+
+        `passed_ns` is the instant of the last emitted frame.
+        """
         self._received += 1
         if t_ns > arrival_ns + FUTURE_NS:
             return self._count(SampleOutcome.DROPPED)
@@ -139,6 +151,7 @@ class Stream:
         sample.late = passed_ns is not None and t_ns <= passed_ns
         if samples and t_ns <= samples[-1].t_ns:
             return self._insert(sample)
+
         delay_ns, usual_ns = arrival_ns - t_ns, self._delay_ns
         if usual_ns is not None:
             least, most = usual_ns - self._delay_step, usual_ns + _DELAY_UP * self._delay_step
@@ -153,7 +166,7 @@ class Stream:
         return None
 
     def _insert(self, sample: _Sample) -> SampleOutcome | None:
-        """Put a reordered sample where it belongs, if it is still worth anything there."""
+        """Insert a reordered sample if a later frame may still need it."""
         samples = self._samples
         at = len(samples)
         while at and samples[at - 1].t_ns > sample.t_ns:
@@ -166,10 +179,10 @@ class Stream:
         samples.insert(at, sample)
         return None
 
-    # --- out ---------------------------------------------------------------------------------
+    # --- frames ------------------------------------------------------------------------------
 
     def serves_from(self, t_ns: int | None) -> int | None:
-        """Return the first instant at or after `t_ns` that this stream can serve; None if none."""
+        """Return the first instant at or after `t_ns` that this stream can serve, or None."""
         samples = self._samples
         if not samples:
             return None
@@ -187,7 +200,7 @@ class Stream:
         return t_ns if before is not None and t_ns - before.t_ns <= self._reach_ns else None
 
     def due(self, t_ns: int) -> int:
-        """Return when the sample at or after `t_ns` came, or until when to wait for it, ns."""
+        """Return the arrival of the first sample at or after `t_ns`, or its deadline, ns."""
         if not self.waited_for:
             return 0
         newest = self.newest_ns
@@ -202,10 +215,10 @@ class Stream:
         return 0
 
     def given_up_ns(self, t_ns: int) -> int:
-        """Return until when a frame at `t_ns` that no stream can serve waits for this one, ns.
+        """Return how long a frame at `t_ns` without any samples waits for this stream, ns.
 
-        A stream that still sends is waited for until its usual delay is over, however long that
-        is, and until it counts as lost.
+        The frame waits for the usual delay of the stream, however long, until the stream counts as
+        lost.
         """
         if self.newest_ns >= t_ns:
             return t_ns
@@ -216,10 +229,11 @@ class Stream:
         return max(usual_ns, min(t_ns + delay_ns, self.newest_arrival_ns) + self._lost_after_ns)
 
     def at(self, t_ns: int) -> Quaternion | None:
-        """Return the orientation at `t_ns`, which grows from call to call; None: missing."""
+        """Return the orientation at `t_ns`, increasing from call to call; None: missing."""
         self.extrapolated = False
         samples = self._samples
-        after = len(samples)  # as a place: of the first sample after `t_ns`, one of the newest
+
+        after = len(samples)  # index of the first sample after `t_ns`
         while after and samples[after - 1].t_ns > t_ns:
             after -= 1
         if not after:
@@ -227,6 +241,7 @@ class Stream:
         while after > _BEHIND:
             self._leave(samples.popleft(), SampleOutcome.DECIMATED)
             after -= 1
+
         last = after - 1
         a = samples[last]
         if a.t_ns == t_ns:
@@ -241,7 +256,7 @@ class Stream:
         return self._beyond(last, t_ns)
 
     def _before(self, at: int) -> _Sample | None:
-        """Return the sample before the one at that place, if the two tell a rate."""
+        """Return the sample before the one at that index, if the two determine a rate."""
         if not at:
             return None
         before = self._samples[at - 1]
@@ -273,23 +288,23 @@ class Stream:
     # --- end ---------------------------------------------------------------------------------
 
     def lose(self) -> None:
-        """Stop waiting for this stream until a sample comes."""
+        """Stop waiting for this stream until its next sample."""
         self.waited_for = False
 
     def settle(self) -> None:
-        """Nothing here serves a frame any more: if the stream has ended, nothing ever will."""
+        """Discard the samples of a stream that has ended: no frame can use them."""
         if self._samples and not self.waited_for:
             self.reset()
 
     def reset(self) -> None:
-        """Forget all samples; what no frame used is dropped."""
+        """Discard all samples; those that no frame used count as dropped."""
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), SampleOutcome.DROPPED)
         self.waited_for, self.epoch = False, None
 
     def counts(self) -> dict[str, int]:
-        """Return samples received, by verdict, and still pending."""
+        """Return the number of received samples by outcome, and of pending ones."""
         verdicts = {verdict.value: count for verdict, count in self._counts.items()}
         return {"received": self._received, **verdicts, "pending": len(self._samples)}
 

@@ -1,8 +1,7 @@
-"""Angular rates for the lag: derived from orientations, centred, filtered without phase.
+"""Angular rates from orientations or gyros, and their zero-phase low-pass filter.
 
-Law: whole tracks, numpy. Nothing here may shift a signal in time: a rate is stamped in the middle
-of the interval it was measured over, and every filter is symmetric. A rate stamped at the left end
-instead would shift the lag by half a sample.
+Invariant: no function shifts a signal in time. A rate is timestamped in the middle of its interval
+and every filter is symmetric. A timestamp at the left end would shift the lag by half a sample.
 """
 
 from __future__ import annotations
@@ -21,16 +20,20 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 KERNEL_HALF_S = 0.08
-"""Half the length of the low-pass; what a run of rates loses at either end."""
+"""Half length of the low-pass kernel, s; the loss at both ends of a run."""
 GAP = 1.5
-"""Nominal periods between two poses from which on something is missing."""
+"""Interval in nominal periods above which samples are missing."""
 BRIDGE_S = 0.035
-"""Gaps up to this are bridged by the mean rate over them: exact in integral, symmetric, and
-harmless below the cut-off. Longer ones split the track."""
+"""Longest gap bridged by its mean rate, s: exact in integral, symmetric, and below the cut-off
+period. Longer gaps split the track.
+"""
 
 _KAISER = 5.0
+"""Shape parameter of the Kaiser window."""
 _MOST_ANGLE = np.pi / 2
+"""Largest rotation between two poses, rad; a larger one is ambiguous."""
 _STENCIL = 5
+"""Samples of the fourth-order difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,18 +41,18 @@ class Rates:
     """Angular rate of a body in its own frame."""
 
     t_s: Floats
-    """Instants, s after the origin, shape (n,)."""
+    """Instants since the origin, s, shape (n,)."""
     w: Floats
-    """rad/s, shape (n, 3)."""
+    """Rates, rad/s, shape (n, 3)."""
     run: NDArray[np.intp]
-    """Number of the gapless stretch each belongs to, never falling, shape (n,)."""
+    """Index of the gapless run of each sample, non-decreasing, shape (n,)."""
     period_s: float
     """Median sample period, s."""
     valid_share: float
-    """Share of the track's duration that is covered."""
+    """Covered fraction of the track's duration."""
 
     def runs(self) -> list[slice]:
-        """Return the gapless stretches."""
+        """Return the gapless runs."""
         edges = np.flatnonzero(np.diff(self.run)) + 1
         bounds = [0, *edges.tolist(), self.run.size]
         return [slice(a, b) for a, b in pairwise(bounds) if b > a]
@@ -84,11 +87,14 @@ def rates_from_orientations(
     if t.size < 3:  # noqa: PLR2004 - one rate is no track
         return _empty()
     q = q[seen]
+
     step = np.diff(t)
     period = float(np.median(step))
     turn = rotation.log(rotation.multiply(rotation.conjugate(q[:-1]), q[1:]))
     usable = (step > 0) & (step < max(GAP * period, bridge_s))
     usable &= np.linalg.norm(turn, axis=1) < _MOST_ANGLE
+
+    # A bridged gap is split into equal pieces of about one period.
     pieces = np.where(usable, np.maximum(1, np.rint(step / period)), 0).astype(np.intp)
     first = np.repeat(np.cumsum(pieces) - pieces, pieces)
     share = (np.arange(first.size) - first + 0.5) / np.repeat(pieces, pieces)
@@ -104,11 +110,12 @@ def rates_from_orientations(
 
 
 def rates_from_gyro(t_ns: NDArray[np.int64], w: Floats, origin_ns: int) -> Rates:
-    """Return measured rates, rad/s, shape (n, 3), as a track; NaN rows are samples not seen."""
+    """Return measured rates, rad/s, shape (n, 3), as a track; rows with NaN are missing."""
     seen = np.isfinite(w).all(axis=1)
     t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
     if t.size < 3:  # noqa: PLR2004 - one rate is no track
         return _empty()
+
     step = np.diff(t)
     period = float(np.median(step))
     whole = (step > 0) & (step < GAP * period)
@@ -122,16 +129,17 @@ def _empty() -> Rates:
 
 
 def low_pass(rates: Rates, cutoff_hz: float) -> Rates:
-    """Return the rates through a symmetric FIR (sinc times Kaiser, a quarter of a second).
+    """Return the low-pass filtered rates (sinc times Kaiser, symmetric FIR of 0.16 s).
 
-    The kernel is one function of time for all sample rates, so two tracks are filtered alike.
-    Only places with a whole kernel of data remain: no start-up transients.
+    The kernel is the same function of time at all sample rates, so two tracks are filtered
+    identically. Only samples with full kernel support remain, without transients.
     """
     half = int(KERNEL_HALF_S / rates.period_s) if np.isfinite(rates.period_s) else 0
     at = np.arange(-half, half + 1) * rates.period_s if half else np.zeros(1)
     window = np.i0(_KAISER * np.sqrt(np.clip(1.0 - (at / KERNEL_HALF_S) ** 2, 0.0, 1.0)))
     kernel = np.sinc(2.0 * cutoff_hz * at) * window
     kernel /= kernel.sum()
+
     runs = [run for run in rates.runs() if run.stop - run.start >= kernel.size]
     if not runs:
         return _empty()
@@ -150,7 +158,7 @@ def low_pass(rates: Rates, cutoff_hz: float) -> Rates:
 
 
 class Interpolant:
-    """Cubic Hermite interpolant of a track, run by run, with slopes of fourth order."""
+    """Cubic Hermite interpolant of each run, with fourth-order slopes."""
 
     def __init__(self, rates: Rates) -> None:
         self._t, self._w, self._run = rates.t_s, rates.w, rates.run
@@ -161,7 +169,7 @@ class Interpolant:
                 self.slopes[run] = _slopes(rates.t_s[run], rates.w[run])
 
     def locate(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Return the interval each instant lies in, and whether it lies inside a run."""
+        """Return the interval of each instant, and whether it is inside a run."""
         if self._t.size < 2:  # noqa: PLR2004 - an interval has two ends
             return np.zeros(t.size, dtype=np.intp), np.zeros(t.size, dtype=np.bool_)
         at = np.clip(np.searchsorted(self._t, t, side="right") - 1, 0, self._t.size - 2)
@@ -169,10 +177,11 @@ class Interpolant:
         return at, inside
 
     def __call__(self, t: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return value, time derivative (both shape (n, 3)) and validity at instants `t`, s."""
+        """Return value and time derivative, shape (n, 3) each, and validity at instants `t`, s."""
         at, inside = self.locate(t)
         if not inside.any():
             return np.zeros((t.size, 3)), np.zeros((t.size, 3)), inside
+
         h = (self._t[at + 1] - self._t[at])[:, None]
         x = (t - self._t[at])[:, None] / h
         f0, f1 = self._w[at], self._w[at + 1]
@@ -185,7 +194,7 @@ class Interpolant:
 
 
 def _slopes(t: Floats, w: Floats) -> Floats:
-    """Return dw/dt: central differences of fourth order, of second near the ends."""
+    """Return dw/dt by fourth-order central differences, second order near the ends."""
     slopes = np.empty_like(w)
     slopes[:] = np.gradient(w, t, axis=0)
     if t.size >= _STENCIL:

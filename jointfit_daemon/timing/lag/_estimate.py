@@ -1,15 +1,16 @@
-r"""Lag of an IMU behind motion capture, found from the motion itself.
+r"""Lag of an IMU behind motion capture, estimated from angular rates.
 
-Law: pure, whole windows, numpy. No world frames, no heading, no gravity, no mount: this comes
-before all other fits. It says how sure it is, and refuses rather than guesses.
+The estimate needs no world frame, heading, gravity or sensor-to-segment alignment, so it precedes
+all other fits. It has a standard deviation and is rejected where the data do not determine it.
 
-Two bodies rigidly connected turn at the same rate up to a constant rotation and a gyro bias,
+Two rigidly connected bodies have the same angular rate up to a constant rotation and a gyro bias,
 
 .. math:: g(t + \tau) = R\,\omega(t) + b + n ,
 
-g and omega each in its own body frame. The lag tau is **IMU stamp minus mocap stamp of the same
-event**: positive when the IMU is later; subtract it from IMU stamps. It is what the clocks cannot
-see: unseen transport delay, filters inside both systems, exposure conventions.
+with g and omega each in its own body frame. The lag tau is **IMU timestamp minus mocap timestamp of
+the same event**: positive when the IMU is later; subtract it from IMU timestamps. It contains what
+the clocks cannot observe: constant transport delay, filters in both systems, and exposure
+conventions.
 """
 
 from __future__ import annotations
@@ -43,73 +44,80 @@ NO_OVERLAP = "the tracks do not overlap"
 STAY = "stay in view of the cameras"
 IRREGULAR = "move faster and irregularly, about several axes"
 _NYQUIST_SHARE = 0.4
+"""Largest cut-off frequency as a fraction of the lower sample rate."""
 _LEAST_OVERLAP = 0.5
+"""Least overlap of the tracks, as a fraction of the reference, for a correlation."""
 _CANDIDATE = 0.5
-"""Share of the best correlation from which on a maximum deserves a fit of its own."""
+"""Fraction of the best correlation above which a maximum is fitted."""
 _CANDIDATES = 4
+"""Largest number of fitted maxima."""
 _TIE = 1e-3
-"""Correlations of magnitudes that differ by less do not rank lags: periodic motion gives equal
-maxima, whose order is rounding. The fits on three axes decide between them."""
+"""Correlation difference below which lags are not ranked: periodic motion has equal maxima, which
+rounding would order. The three-axis fits decide between them.
+"""
 _SAME_S = 0.01
-"""Fits that end this near to each other are one."""
+"""Distance below which two fitted lags are the same solution, s."""
 _RIVAL = 1.5
-"""A rival that leaves less than this times the residual variance cannot be told apart."""
+"""Ratio of residual variances below which two solutions cannot be distinguished."""
 _AGREE = 0.005
-"""No two systems agree on a rate better than to this share of it."""
+"""Relative accuracy to which two systems agree on a rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagSettings:
-    """How to search, and the gates an estimate must pass."""
+    """Search range of the lag, and the thresholds an estimate must pass."""
 
     span_s: float = 0.15
-    """Largest lag searched for, s. 3 s at first contact if a clock is not mapped."""
+    """Largest lag in the search, s; use 3 s if a clock is not mapped to host time."""
     step_s: float = 0.004
     cutoff_hz: float = 10.0
-    """Low-pass on both rates; at most 0.4 of the lower sample rate."""
+    """Low-pass cut-off for both rates, Hz; at most 0.4 of the lower sample rate."""
     bridge_s: float = BRIDGE_S
     min_rate: float = radians(30.0)
-    """RMS angular rate of the reference, rad/s."""
+    """Least RMS angular rate of the reference, rad/s."""
     min_acceleration: float = radians(300.0)
-    """RMS angular acceleration of the reference, rad/s²."""
+    """Least RMS angular acceleration of the reference, rad/s²."""
     max_sigma_ns: float = 700_000.0
-    """Well above what ordinary motion gives: a gate near it would choose windows by their luck."""
+    """Largest standard deviation, ns; well above that of ordinary motion, so that the threshold
+    does not select windows by chance.
+    """
     min_r2: float = 0.98
-    """Right data on one rigid body reach 0.998; skin-mounted sensors deserve less."""
+    """Least R²: correct data on one rigid body reach 0.998, sensors on soft tissue less."""
     min_weight: float = 0.7
-    """Mean Huber weight: else the fit rests on a minority of the data."""
+    """Least mean Huber weight; below, the fit depends on a minority of the data."""
     min_valid: float = 0.8
-    """Share of the window without gaps."""
+    """Least fraction of the window without gaps."""
     max_bias: float = radians(10.0)
-    """Larger means wrong units or a wrong stream, rad/s."""
+    """Largest rate bias, rad/s; a larger one indicates wrong units or a wrong stream."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """A lag, how sure it is, and what else the fit found."""
+    """Lag with its standard deviation and the diagnostics of the fit."""
 
     lag_ns: float
-    """IMU stamp minus reference stamp of the same event, ns; NaN if there was nothing to fit."""
+    """IMU timestamp minus reference timestamp of the same event, ns; NaN without a fit."""
     sigma_ns: float
-    """Standard deviation, honest for correlated residuals, ns."""
+    """Standard deviation, ns, valid for correlated residuals."""
     r2: float
     """1 - sum |residual|² / sum |omega|²."""
     refused: str | None
-    """Why not to use it; None if it may be used."""
+    """Reason for the rejection; None if the estimate is valid."""
     q_imu_ref: Quaternion = IDENTITY_ONE
-    """Takes reference-body coordinates to IMU coordinates. About a single axis it is a guess."""
+    """Rotation from reference-body to IMU coordinates; undetermined about a single axis of motion.
+    """
     bias: Vector = (0.0, 0.0, 0.0)
-    """Of the IMU's rate, rad/s."""
+    """Bias of the IMU's rate, rad/s."""
     residual_rms: float = nan
-    """Per axis, rad/s."""
+    """RMS residual per axis, rad/s."""
     rate_rms: float = nan
-    """Of the reference, rad/s."""
+    """RMS angular rate of the reference, rad/s."""
     acceleration_rms: float = nan
-    """Of the reference, rad/s²."""
+    """RMS angular acceleration of the reference, rad/s²."""
     mean_weight: float = nan
     valid_share: float = nan
     pairs: int = 0
-    """Rates compared."""
+    """Number of compared rates."""
 
 
 def estimate_lag(
@@ -121,22 +129,22 @@ def estimate_lag(
 ) -> LagEstimate:
     """Estimate the lag between two tracks of orientations.
 
-    The lag of orientations is not the lag of the gyro behind them (an orientation filter leads its
-    gyro by half its internal period): it belongs to the quantity it was estimated from.
+    The lag of filtered orientations differs from the lag of the gyro: an orientation filter leads
+    its gyro by half its internal period. It applies to the quantity it was estimated from.
 
     Parameters
     ----------
     imu_t_ns, ref_t_ns : ndarray, shape (n,), (m,)
         Host instants, strictly increasing, ns.
     imu_q, ref_q : ndarray, shape (n, 4), (m, 4)
-        q_world_body of either, each in its own world; rows with NaN are poses not seen.
+        q_world_body of each, each in its own world; rows with NaN are missing poses.
     settings : LagSettings, optional
-        Search and gates.
+        Search range and thresholds.
 
     Returns
     -------
     LagEstimate
-        Refused, saying why, where the data cannot tell.
+        With a reason in ``refused`` where the data do not determine the lag.
     """
     settings = settings or LagSettings()
     if min(np.size(imu_t_ns), np.size(ref_t_ns)) == 0:
@@ -150,10 +158,12 @@ def estimate_lag(
     estimate = estimate_lag_of_rates(imu, ref, settings)
     if not estimate.r2 < settings.min_r2:
         return estimate
+
+    # A failed R² is the sign of quaternions in the inverse convention.
     turned = rates(ref_t_ns, rotation.conjugate(ref_q))
     if estimate_lag_of_rates(imu, turned, settings).refused is not None:
         return estimate
-    hint = f"{estimate.refused}; it fits with one side's quaternions conjugated"
+    hint = f"{estimate.refused}; the fit succeeds with one side's quaternions conjugated"
     return replace(estimate, refused=hint)
 
 
@@ -162,7 +172,7 @@ def estimate_lag_of_rates(
 ) -> LagEstimate:
     """Estimate the lag between two tracks of angular rates with a common origin.
 
-    See ``estimate_lag``.
+    Parameters as in ``estimate_lag``.
     """
     work = estimate_in_steps(imu, ref, settings)
     while True:
@@ -176,16 +186,18 @@ def estimate_lag_of_rates(
 def estimate_in_steps(
     imu: Rates, ref: Rates, settings: LagSettings | None = None
 ) -> Generator[None, None, LagEstimate]:
-    """Do ``estimate_lag_of_rates`` in steps of a few milliseconds, so that nothing need wait."""
+    """Run ``estimate_lag_of_rates`` in steps of a few milliseconds, for use in the event loop."""
     settings = settings or LagSettings()
     cutoff = min(settings.cutoff_hz, _NYQUIST_SHARE / max(imu.period_s, ref.period_s))
     valid = min(imu.valid_share, ref.valid_share)
+
     imu = low_pass(imu, cutoff)
     yield
     ref = low_pass(ref, cutoff)
     if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
         refused = f"no gapless stretch of data: {STAY}"
         return LagEstimate(nan, inf, nan, refused, valid_share=valid)
+
     rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)
     seen = LagEstimate(
         nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
@@ -193,6 +205,7 @@ def estimate_in_steps(
     if rate < settings.min_rate or acceleration < settings.min_acceleration:
         return replace(seen, refused=_too_little(rate, acceleration, settings))
     yield
+
     coarse, why = coarse_lags(imu, ref, settings)
     if why is not None:
         return replace(seen, refused=why)
@@ -207,7 +220,7 @@ def estimate_in_steps(
 
 
 def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
-    """Return the best of the fits, and why not to use it."""
+    """Return the best of the fits, with the reason for a rejection."""
     fit, rival = _best_and_rival(fits, seen)
     estimate = replace(
         seen,
@@ -231,8 +244,8 @@ def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> Lag
 def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagFit | None]:
     """Return the best fit, and another lag that fits nearly as well, or None.
 
-    Without a rival the least residual is best. With rivals the residuals do not decide: the
-    smallest lag is returned, and the rival nearest to it.
+    Without a rival the fit with the smallest residual is best. With rivals the residuals do not
+    decide: the smallest lag is returned, with the rival nearest to it.
     """
     best = min(fits, key=lambda fit: fit.residual_rms)
     limit = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2
@@ -257,7 +270,7 @@ def _too_little(rate: float, acceleration: float, settings: LagSettings) -> str:
 
 
 def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | None:
-    """Return the first gate the estimate fails, with the remedy, in words."""
+    """Return the message of the first threshold that the estimate fails, or None."""
     share, bias = estimate.valid_share, float(np.degrees(np.linalg.norm(fit.bias)))
     gates = (
         (
@@ -268,12 +281,12 @@ def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | No
         (fit.converged, f"the fit did not converge: {IRREGULAR}"),
         (
             estimate.r2 >= settings.min_r2,
-            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: not the same motion, or a wrong "
-            "convention; check that the sensor sits on this body, and that it sits firmly",
+            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: different motions or a wrong convention; "
+            "check that the sensor is on this body and attached firmly",
         ),
         (
             estimate.mean_weight >= settings.min_weight,
-            "too many outliers: check for markers that swap or are hidden",
+            "too many outliers: check for swapped or occluded markers",
         ),
         (
             bias <= float(np.degrees(settings.max_bias)),
@@ -293,17 +306,18 @@ def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | No
 
 
 def _ms(value_ns: float) -> str:
-    return f"{value_ns * 1e-6:.2f} ms" if value_ns < inf else "all rests on one moment"
+    return f"{value_ns * 1e-6:.2f} ms" if value_ns < inf else "only one moment determines it"
 
 
 def coarse_lags(
     imu: Rates, ref: Rates, settings: LagSettings
 ) -> tuple[tuple[float, ...], str | None]:
-    """Return lags, s, that correlate the magnitudes of both rates, best first, or why not.
+    """Return candidate lags, s, best first, and the reason if there are none.
 
-    The magnitude needs no rotation. The best correlation must be a maximum inside the search: one
-    at its border means that the lag lies outside. Maxima that differ by less than `_TIE` have no
-    order, so they are ranked by the size of the lag, and those at the border are fitted, too.
+    Candidates are maxima of the correlation of both rate magnitudes, which need no rotation. The
+    best one must lie inside the search range; a maximum at the border means that the lag is
+    outside. Maxima that differ by less than ``_TIE`` are ranked by the size of the lag, those at
+    the border included.
     """
     step, reach = settings.step_s, round(settings.span_s / settings.step_s)
     scores = _correlations(imu, ref, step, reach)
@@ -329,11 +343,13 @@ def coarse_lags(
 
 
 def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
-    """Return the normalized correlation of the magnitudes at ``(i - reach) * step``."""
+    """Return the normalized correlation of the magnitudes at lags ``(i - reach) * step``."""
     grid = np.arange(ref.t_s[0], ref.t_s[-1], step)
     wide = grid[0] + step * np.arange(-reach, grid.size + reach)
+
     a, a_ok = _magnitude(ref, grid)
     b, b_ok = _magnitude(imu, wide)
+
     least = _LEAST_OVERLAP * a_ok.sum()
     scores = np.full(2 * reach + 1, -inf)
     for shift in range(scores.size):
@@ -347,7 +363,7 @@ def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
 
 
 def _magnitude(rates: Rates, t: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return |rate| at instants `t`, linear between samples, and where it is known."""
+    """Return |rate| at instants `t`, by linear interpolation, and where it is valid."""
     _, inside = Interpolant(rates).locate(t)
     return np.interp(t, rates.t_s, np.linalg.norm(rates.w, axis=1)), inside
 

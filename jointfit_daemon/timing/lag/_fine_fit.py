@@ -1,7 +1,4 @@
-"""The fine fit of the lag: rotation, bias and lag at once, on three axes.
-
-Law: pure; starts from a coarse lag; returns numbers, judges nothing.
-"""
+"""Fine fit of the lag: rotation, bias and lag in one solve, on three axes."""
 
 from __future__ import annotations
 
@@ -20,18 +17,24 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._angular_rates import Floats, Rates
 
 HUBERS = (1.5, 2.4, np.inf)
-"""Times sigma, on the norm of three, whose median is 1.538. Optics err in bursts, and then low is
-best; where errors grow with the motion instead, the largest come with what tells most."""
+"""Huber thresholds tried, in standard deviations of the norm of three components (median 1.538). A
+low one suits bursts of optical errors; a high one suits errors that grow with the motion, where
+the largest residuals carry the most information.
+"""
 CHOICES = 6
-"""Iterations that choose among them, by the least variance of the lag; then the choice stands."""
+"""Iterations in which the threshold of the least lag variance is chosen; then it is fixed."""
 MEDIAN_NORM = 1.538
-"""Median norm of a standard normal vector of three."""
+"""Median norm of a standard normal vector of three components."""
 STEP_S = 0.020
+"""Largest change of the lag per iteration, s."""
 ITERATIONS = 30
+"""Largest number of iterations."""
 DONE_S = 1e-6
-"""A step this small, twice in a row, ends the search. The rotation is not asked: about a single
-axis of motion it may turn for ever without a word to the lag."""
+"""Change of the lag, s, that ends the search if reached twice in a row. The rotation is not
+checked: about a single axis of motion it may change without any effect on the lag.
+"""
 LEAST_PAIRS = 16
+"""Least number of compared rates."""
 
 _FIRST_HUBER = 2.4
 _TINY = 1e-12
@@ -39,18 +42,18 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class LagFit:
-    """What the fit found, in the convention of ``lag``."""
+    """Result of the fit, with the sign convention of ``LagEstimate``."""
 
     tau_s: float
     sigma_s: float
     rotation: Floats
-    """R, reference-body to IMU coordinates, shape (3, 3)."""
+    """Rotation R from reference-body to IMU coordinates, shape (3, 3)."""
     bias: Floats
-    """rad/s, shape (3,)."""
+    """Bias of the IMU's rate, rad/s, shape (3,)."""
     r2: float
     residual_rms: float
     mean_weight: float
-    """Of the usual Huber weights, clipped at 2.4, whichever were used."""
+    """Mean Huber weight at the threshold 2.4, whichever threshold was used."""
     pairs: int
     converged: bool
 
@@ -62,14 +65,14 @@ class _State(NamedTuple):
 
 
 class _Linear(NamedTuple):
-    """Residuals r (n, 3), weights w (n,), and the Jacobian's columns."""
+    """Linearized problem: residuals r (n, 3), weights w (n,), and the Jacobian."""
 
     r: Floats
     w: Floats
     jac: Floats
-    """Of phi and b, shape (n, 3, 6)."""
+    """Derivatives with respect to rotation and bias, shape (n, 3, 6)."""
     jtau: Floats
-    """Of tau, shape (n, 3)."""
+    """Derivative with respect to the lag, shape (n, 3)."""
     omega: Floats
     t_s: Floats
     give: Floats
@@ -79,33 +82,34 @@ class _Linear(NamedTuple):
 def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, LagFit | None]:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
-    Gauss-Newton on all seven unknowns with Huber weights on |r|, clipped where the residuals
-    themselves say that it pays. The faster track is interpolated
-    at the instants of the slower one. The standard deviation is that of ``lag_sigma``.
+    Gauss-Newton on all seven unknowns with Huber weights on |r|; the threshold is chosen by the
+    variance of the lag. The faster track is interpolated at the instants of the slower one.
 
     Parameters
     ----------
     imu, ref : Rates
-        Filtered alike.
+        Low-pass filtered with the same kernel.
     start_s : float
         Coarse lag, s.
 
     Yields
     ------
     None
-        After every iteration: about a millisecond of work.
+        After every iteration, about a millisecond of work.
 
     Returns
     -------
     LagFit or None
-        None if too little overlaps.
+        None if the overlap is too short.
     """
-    swapped = imu.period_s > ref.period_s  # then omega is interpolated at the instants of g
+    # The faster track is interpolated; if that is the reference, g and omega are exchanged.
+    swapped = imu.period_s > ref.period_s
     fast, slow = (ref, imu) if swapped else (imu, ref)
     cubic = Interpolant(fast)
     state = _start(cubic, slow, -start_s if swapped else start_s)
     if state is None:
         return None
+
     converged, before = False, float("inf")
     clip: float | None = None
     for iteration in range(ITERATIONS):
@@ -120,10 +124,13 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, Lag
             break
         before = moved
         yield
+
     linear = _linearize(cubic, slow, state, clip)
     if linear is None:
         return None
     yield
+
+    # R and b of the exchanged problem: omega = R^T g - R^T b.
     rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
     whole = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
     norm = np.linalg.norm(linear.r, axis=1)
@@ -144,7 +151,7 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, Lag
 
 
 def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
-    """Return R by SVD of the covariance, means removed, and b = 0."""
+    """Return the initial rotation by SVD of the covariance, means removed, with zero bias."""
     g, _, ok = cubic(slow.t_s + tau)
     if ok.sum() < LEAST_PAIRS:
         return None
@@ -173,7 +180,7 @@ def _linearize(
 
 
 def _scale(norm: Floats) -> float:
-    """Return sigma per axis of residuals so long, robust."""
+    """Return the robust standard deviation per axis of residuals of these norms."""
     return max(float(np.median(norm)), _TINY) / MEDIAN_NORM
 
 
@@ -183,10 +190,10 @@ def _clipped(norm: Floats, clip: float) -> Floats:
 
 
 def _best_clip(linear: _Linear) -> float:
-    r"""Return the clip, rad/s, of the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
+    r"""Return the threshold, rad/s, of the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
 
-    h is what a row may tell of the lag. Residuals are taken as they come, each for its own: that
-    they are correlated is the same for all clips.
+    h is the information of a row about the lag. Correlations between residuals are neglected, since
+    they are the same for all thresholds.
     """
     norm, information = np.linalg.norm(linear.r, axis=1), np.sum(linear.jtau**2, axis=1)
 
@@ -200,13 +207,15 @@ def _best_clip(linear: _Linear) -> float:
 
 
 def _step(linear: _Linear, state: _State) -> tuple[_State, float]:
-    """Return the next state and how far the lag moved, s."""
+    """Return the next state and the change of the lag, s."""
     jac = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
     weighted = jac * linear.w[:, None, None]
     normal = np.einsum("nij,nik->jk", weighted, jac)
     gradient = np.einsum("nij,ni->j", weighted, linear.r)
+
     normal[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(normal[:3, :3]), _TINY)
     normal[6, 6] += _TINY
+
     move = -np.linalg.solve(normal, gradient)
     tau = float(np.clip(move[6], -STEP_S, STEP_S))
     rot = rotation.to_matrix(rotation.exp(move[:3])) @ state.rot

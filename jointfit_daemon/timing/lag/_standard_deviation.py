@@ -1,21 +1,20 @@
-r"""How far a fitted lag may be off: a standard deviation that trusts nothing about the residuals.
+r"""Standard deviation of a fitted lag, without assumptions about the residuals.
 
-Law: pure; judges a finished fit, changes nothing. Residuals of low-passed rates are correlated
-over the filter's memory, and where the two bodies or the two systems disagree (skin, lens, gyro
-scale) over whole movements. So the variance is taken in several ways and the largest one counts:
+Residuals of low-pass filtered rates are correlated over the filter length. Where the two bodies or
+systems disagree (soft tissue, lens, gyro scale), they are correlated over whole movements. The
+variance is therefore estimated in several ways, and the largest is used:
 
-* the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each stretch of the window,
-  with at most 20 stretches, none shorter than the filter's memory, and with half as many
-  again and again while five remain. It needs no model of the residuals, and a stretch that
-  everything rests on betrays itself;
-* Newey and West (1987), residuals correlated over the shortest of these stretches.
+* the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each block of the window, with
+at most 20 blocks, none shorter than the filter, then with half as many blocks repeatedly while five
+remain. It needs no model of the residuals, and it reveals a block that alone determines the result;
+* Newey and West (1987), with residuals correlated over the shortest of these blocks.
 
-A variance from few stretches is itself a guess. :math:`\nu + 1 = (\sum h)^2/\sum h^2` counts the
-stretches that carry the information h about the lag, and the finest scale is widened by the
-quantile of Student's t with :math:`\nu` degrees of freedom over the normal one as rare, so that no
-more windows are far off than the normal distribution lets be. Coarser scales only look for what
-lasts, and are widened by :math:`\nu/(\nu-2)`, the variance of t. One tap in a window of rest leaves
-nothing to count, and the answer is infinite.
+A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum h^2` is the
+effective number of blocks that carry the information h about the lag. The finest scale is widened
+by the ratio of the Student t quantile with :math:`\nu` degrees of freedom to the normal quantile of
+equal probability. Coarser scales only detect long correlations; they are widened by
+:math:`\nu/(\nu-2)`, the variance of t. With a single tap in a window of rest the result is
+infinite.
 """
 
 from __future__ import annotations
@@ -30,15 +29,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._angular_rates import Floats
 
 RIDGE = 1e-9
-"""Relative, on the rotation: motion about one axis leaves it open about that axis."""
+"""Relative ridge on the rotation, which motion about one axis leaves undetermined about that axis.
+"""
 LEAST_BLOCKS = 5
+"""Least number of blocks."""
 MOST_BLOCKS = 20
-"""More would be shorter than they need be: noise of orientations is a rate that swings back, and
-stretches too short to see it do so are overrated."""
+"""Largest number of blocks. Shorter blocks would overrate orientation noise, whose rate is
+anticorrelated over short times.
+"""
 SIGMAS = 2.8
-"""Where the tails are made equal."""
+"""Normal quantile at which the tail probabilities are matched."""
 _LEAST_FREEDOM = 2.0
-"""Below, a variance estimated from so few has no mean."""
+"""Degrees of freedom below which the variance of Student's t does not exist."""
 _TINY = 1e-12
 
 
@@ -87,7 +89,7 @@ def lag_sigma(columns: Columns, t_s: Floats, memory_s: float) -> float:
 
 
 def _curvature(columns: Columns) -> tuple[Floats, Floats]:
-    """Return each row's share of the normal matrix, (n, 7, 7), and of the gradient, (n, 7)."""
+    """Return each row's contribution to the normal matrix, (n, 7, 7), and the gradient, (n, 7)."""
     jacobian, residual, weight, give = columns
     weighted = jacobian * weight[:, None, None]
     gradient = np.einsum("nij,ni->nj", weighted, residual)
@@ -97,7 +99,7 @@ def _curvature(columns: Columns) -> tuple[Floats, Floats]:
 
 
 def _widest(table: Floats, block: NDArray[np.int64], whole: Floats, free: float) -> float:
-    """Return the largest standard deviation of all scales; `free` is that of no scale, squared."""
+    """Return the largest standard deviation over all scales; `free` is the Newey-West variance."""
     variances: list[float] = []
     while True:
         first = np.flatnonzero(np.diff(block, prepend=-1))
@@ -113,16 +115,16 @@ def _widest(table: Floats, block: NDArray[np.int64], whole: Floats, free: float)
 
 
 def _rarity(freedom: float) -> float:
-    """Return Student's quantile that is as rare as `SIGMAS` of a normal one, over `SIGMAS`.
+    """Return Student's quantile of the probability of `SIGMAS`, divided by `SIGMAS`.
 
-    Wallace's approximation (1959), good to a percent from three degrees of freedom on.
+    Wallace's approximation (1959), accurate to 1 % from three degrees of freedom on.
     """
     normal = SIGMAS * (8.0 * freedom + 3.0) / (8.0 * freedom + 1.0)
     return float(np.sqrt(freedom * np.expm1(normal**2 / freedom))) / SIGMAS
 
 
 def _newey_west(score: Floats, lags: int) -> float:
-    """Return the variance of the sum of `score`, correlated over so many samples."""
+    """Return the variance of the sum of `score`, correlated over `lags` samples."""
     variance = float(score @ score)
     for lag in range(1, min(lags, len(score) - 1) + 1):
         variance += 2.0 * (1.0 - lag / (lags + 1)) * float(score[lag:] @ score[:-lag])
@@ -130,9 +132,9 @@ def _newey_west(score: Floats, lags: int) -> float:
 
 
 def _jackknife(table: Floats, whole: Floats) -> float:
-    """Return the variance of the lag from what it would be without each block.
+    """Return the jackknife variance of the lag.
 
-    One Gauss-Newton step from the solution, weights as they are.
+    One Gauss-Newton step from the solution, with fixed weights, for each deleted block.
     """
     rest = whole - table[:, :49].reshape(-1, 7, 7)
     pull = table[:, 49:56]

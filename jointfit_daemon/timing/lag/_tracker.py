@@ -1,8 +1,8 @@
-r"""The lag while it runs: many gated windows, one estimate, and a word when it steps.
+r"""Running lag estimate from many windows, with detection of steps.
 
-Law: pure; one update a window. A Kalman filter on :math:`(\tau, \dot\tau)`. With both clocks mapped
-the lag is constant, so the drift is small by assumption and a step is news: a device restarted, or
-changed a filter.
+A Kalman filter on :math:`(\tau, \dot\tau)`, one update per window. With both clocks mapped to host
+time the lag is constant, so the drift is small by assumption. A step indicates that a device
+restarted or changed a filter.
 """
 
 from __future__ import annotations
@@ -15,36 +15,38 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._estimate import LagEstimate
 
 DRIFT_NOISE = 0.02e-6
-"""Random walk of the drift, per square root of a second."""
+"""Random walk of the drift, 1/sqrt(s)."""
 DRIFT_SD = 5e-6
-"""Prior standard deviation of the drift: two mapped clocks."""
+"""Prior standard deviation of the drift of two mapped clocks, dimensionless."""
 GATE_SIGMAS = 4.0
+"""Innovation threshold in standard deviations."""
 STEP_WINDOWS = 3
-"""Refused windows in a row that agree are a step."""
+"""Consistent windows in a row beyond the threshold that count as a step."""
 AGREE_NS = 500_000.0
+"""Largest range of consistent lags, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedLag:
-    """The lag after a window."""
+    """Lag after a window."""
 
     lag_ns: float
     sigma_ns: float
     drift: float
-    """d lag / dt, dimensionless; over 2e-6 is a fault of a clock fit."""
+    """d lag / dt, dimensionless; above 2e-6 a clock fit is faulty."""
     drift_sigma: float
     step_ns: float | None = None
-    """How far the lag stepped, if this window decided that it did."""
+    """Size of the step, if this window confirmed one, ns."""
 
 
 class LagTracker:
-    """Follows one lag through overlapping windows.
+    """Kalman filter of one lag over overlapping windows.
 
     Parameters
     ----------
     window_s, hop_s : float
-        Length of a window, and time from one to the next, s. Windows that overlap tell less than
-        they seem to: their variance is taken ``window / hop`` times.
+            Length of a window, and time from one to the next, s. Overlapping windows are not
+        independent: their variance is multiplied by ``window / hop``.
     """
 
     __slots__ = ("_drift", "_inflate", "_pp", "_pt", "_refused", "_t_ns", "_tau", "_tt")
@@ -57,9 +59,9 @@ class LagTracker:
         self._refused: list[float] = []
 
     def feed(self, t_ns: int, estimate: LagEstimate) -> TrackedLag | None:
-        """Take the estimate of a window centered at `t_ns`; return the lag, None before the first.
+        """Add the estimate of a window centred at `t_ns`; return the lag, None before the first.
 
-        A refused estimate changes nothing but time.
+        A rejected estimate only advances the time.
         """
         if self._t_ns is not None:
             self._predict((t_ns - self._t_ns) * 1e-9)
@@ -70,11 +72,13 @@ class LagTracker:
         if self._t_ns is None:
             self._start(t_ns, tau, variance)
             return self._now()
+
         innovation = tau - self._tau
         if abs(innovation) <= GATE_SIGMAS * sqrt(self._tt + variance):
             self._refused.clear()
             self._update(innovation, variance)
             return self._now()
+
         self._refused = [*self._refused[-(STEP_WINDOWS - 1) :], tau]
         agree = max(self._refused) - min(self._refused) <= AGREE_NS * 1e-9
         if len(self._refused) < STEP_WINDOWS or not agree:
@@ -83,9 +87,9 @@ class LagTracker:
         return self._now(step_ns=1e9 * innovation)
 
     def widen(self, sd_ns: float) -> None:
-        """Doubt the lag, but keep it: a clock behind it began anew and may have settled elsewhere.
+        """Increase the uncertainty of the lag by `sd_ns` after a clock restart.
 
-        The next window within `sd_ns` moves it as far as the data ask, and is no step.
+        The next window then moves the lag without counting as a step.
         """
         self._tt += (sd_ns * 1e-9) ** 2
         self._refused = []
