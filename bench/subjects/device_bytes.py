@@ -13,8 +13,8 @@ from jointfit_protocols import xbus, xcdi
 from jointfit_protocols.can import CanFrame, pack_frames, slcan
 from jointfit_protocols.natnet import ServerInfo, encode
 from jointfit_protocols.xbus import mtdata2
-from jointfit_simulators.natnet_stage import Stage, StagedBody, Stamps, model_definition
-from jointfit_simulators.placement import CLUSTERS
+from jointfit_simulators.body import CLUSTERS
+from jointfit_simulators.devices import Stage, StagedBody, Stamps, model_definition
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -15,12 +15,9 @@ from bench.subjects.simulated_wearer import NS, bench_rig, phases
 from jointfit_daemon.calibration import CalibrationRefused
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.kinematics import rotation
-from jointfit_simulators.cameras import Cameras
-from jointfit_simulators.orientation import Rotation, from_wxyz, to_wxyz
-from jointfit_simulators.programme import Step
-from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.body import SENSORS, Rotation, Step, Wearer, from_wxyz, to_wxyz
+from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
-from jointfit_simulators.wearer import SENSORS, Wearer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

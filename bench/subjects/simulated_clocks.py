@@ -18,14 +18,18 @@ from jointfit_protocols import xbus, xcdi
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.natnet import EchoRequest, EchoResponse, ServerInfo, encode
 from jointfit_protocols.xbus import mtdata2
-from jointfit_simulators.cameras import CameraFrames, Cameras
-from jointfit_simulators.clocks import Ticker
-from jointfit_simulators.natnet_stage import Stage, StagedBody, Stamps, model_definition
-from jointfit_simulators.placement import CLUSTERS
-from jointfit_simulators.programme import Step
-from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.body import CLUSTERS, SENSORS, Step, Wearer
+from jointfit_simulators.devices import (
+    CameraFrames,
+    Cameras,
+    OrientationSensor,
+    Stage,
+    StagedBody,
+    Stamps,
+    Ticker,
+    model_definition,
+)
 from jointfit_simulators.settings import Knobs
-from jointfit_simulators.wearer import SENSORS, Wearer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,7 +39,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import Quaternion
     from jointfit_daemon.pipeline.events import Event
-    from jointfit_simulators.clocks import Samples
+    from jointfit_simulators.devices import Samples
 
 NS = 1_000_000_000
 BEGIN_NS = 5_000 * NS

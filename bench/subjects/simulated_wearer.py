@@ -16,13 +16,10 @@ import numpy as np
 from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTrack
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.config import parse_rig
-from jointfit_simulators.cameras import CameraFrames, Cameras
-from jointfit_simulators.placement import CLUSTERS
-from jointfit_simulators.programme import Step
-from jointfit_simulators.rig_file import RigOptions, rig_toml
-from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.body import CLUSTERS, SENSORS, Step, Wearer
+from jointfit_simulators.devices import CameraFrames, Cameras, OrientationSensor
+from jointfit_simulators.scene import RigOptions, rig_toml
 from jointfit_simulators.settings import Knobs
-from jointfit_simulators.wearer import SENSORS, Wearer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -27,24 +27,32 @@ from typing import TYPE_CHECKING
 
 import orjson
 
-from jointfit_simulators.clocks import ClockFault
-from jointfit_simulators.motion import MOTIONS
-from jointfit_simulators.phase_follower import PhaseFollower
-from jointfit_simulators.play_directory import play_directory
-from jointfit_simulators.programme import UnknownMotion, parse_programme
-from jointfit_simulators.replayed import Replayed
-from jointfit_simulators.rig_file import RigOptions
-from jointfit_simulators.sample_data import write_sample
-from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
+from jointfit_simulators.body import (
+    MOTIONS,
+    SENSORS,
+    Replayed,
+    UnknownMotion,
+    Wearer,
+    parse_programme,
+    read_recording,
+)
+from jointfit_simulators.devices import ClockFault
+from jointfit_simulators.sample import write_sample
+from jointfit_simulators.scene import (
+    BadCommand,
+    PhaseFollower,
+    RigOptions,
+    Scene,
+    SceneOptions,
+    play_directory,
+)
 from jointfit_simulators.settings import Knobs, knobs_from_toml, perfect, turn
-from jointfit_simulators.trial import read_recording
-from jointfit_simulators.wearer import SENSORS, Wearer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_simulators.observation import Subject
-    from jointfit_simulators.play_directory import PlayDirectory
+    from jointfit_simulators.body import Subject
+    from jointfit_simulators.scene import PlayDirectory
 
 USAGE = 2
 ORIGIN_NS = 100_000_000

@@ -18,7 +18,7 @@ from jointfit_daemon.driver import _SLCAN_BITRATES, CanBusSettings
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
 from jointfit_drivers.ports._slcan_bus import SlcanBus
 from jointfit_protocols.can.slcan import BITRATES, bitrate_code
-from jointfit_simulators.rig_file import RigOptions
+from jointfit_simulators.scene import RigOptions
 
 PROJECT = Path(__file__).resolve().parents[2]
 Table = dict[str, Any]

@@ -36,8 +36,8 @@ from jointfit_daemon.files.orientations import (
     write_sto,
 )
 from jointfit_daemon.files.text import MalformedFileError
-from jointfit_simulators.c3d_file import c3d_bytes
-from jointfit_simulators.sample_data import _write_models
+from jointfit_simulators.sample._c3d_file import c3d_bytes
+from jointfit_simulators.sample._sample_data import _write_models
 from jointfit_simulators.settings import Knobs
 
 if TYPE_CHECKING:

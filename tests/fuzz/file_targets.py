@@ -24,8 +24,8 @@ from jointfit_daemon.files.orientations import (
     read_sto,
 )
 from jointfit_protocols.can._candump import parse_candump
-from jointfit_simulators.c3d_file import c3d_bytes
-from jointfit_simulators.sample_data import write_sample
+from jointfit_simulators.sample import write_sample
+from jointfit_simulators.sample._c3d_file import c3d_bytes
 from tests.fuzz.broker_targets import folder
 from tests.fuzz.target import Target
 

@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_simulators.cameras import CameraFrames, Cameras
-from jointfit_simulators.clocks import NS, Ticker
-from jointfit_simulators.line_noise import line_noise
-from jointfit_simulators.placement import CLUSTERS
-from jointfit_simulators.programme import parse_programme
-from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.body import CLUSTERS, SENSORS, Wearer, parse_programme
+from jointfit_simulators.body._random_signal import Wander
+from jointfit_simulators.body._soft_tissue import SoftTissue
+from jointfit_simulators.devices import NS, CameraFrames, Cameras, OrientationSensor, Ticker
 from jointfit_simulators.settings import Knobs, perfect, turn
-from jointfit_simulators.soft_tissue import SoftTissue
-from jointfit_simulators.wander import Wander
-from jointfit_simulators.wearer import SENSORS, Wearer
+from jointfit_simulators.wires import line_noise
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from jointfit_simulators.observation import Observation
+    from jointfit_simulators.body import Observation
 
 NOTHING = perfect(Knobs())
 WALK_AND_SQUATS = parse_programme("walk:60,squat:60")

@@ -9,21 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_simulators.limb import (
+from jointfit_simulators.body import MOTIONS, LegGeometry, Step, UnknownMotion, parse_programme
+from jointfit_simulators.body._limb import (
     ANKLE,
     COORDINATES,
     HIP,
     KNEE,
     PELVIS_POSITION,
     PELVIS_TURN,
-    LegGeometry,
     included_angle,
     leg_pose,
 )
-from jointfit_simulators.motion import MOTIONS, motions_of
-from jointfit_simulators.motion_file import motion_from_file
-from jointfit_simulators.posture import person
-from jointfit_simulators.programme import Programme, Step, UnknownMotion, parse_programme
+from jointfit_simulators.body._motion import motions_of
+from jointfit_simulators.body._motion_file import motion_from_file
+from jointfit_simulators.body._motion_script import Programme
+from jointfit_simulators.body._posture import person
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_simulators.mishaps import SLIP_S, Mishaps
+from jointfit_simulators.devices import Mishaps
+from jointfit_simulators.devices._sensor_faults import SLIP_S
 
 T_S = np.arange(0.0, 4.0, 0.01)
 SAID = Rotation.from_rotvec(

@@ -27,9 +27,7 @@ from jointfit_protocols.natnet import (
     decode,
     encode,
 )
-from jointfit_simulators.natnet_options import NatNetServerOptions
-from jointfit_simulators.natnet_server import NatNetServer
-from jointfit_simulators.natnet_stage import StagedBody
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

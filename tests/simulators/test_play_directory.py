@@ -11,15 +11,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from jointfit_daemon.tools.embedded_broker import embedded_broker, free_port
-from jointfit_simulators.motion import MOTIONS
-from jointfit_simulators.natnet_port import LOOPBACK
-from jointfit_simulators.phase_follower import MOTIONS_OF_PHASES, PhaseFollower
-from jointfit_simulators.play_directory import (
-    DirectoryInUseError,
-    PortInUseError,
-    play_directory,
-)
-from jointfit_simulators.rig_file import RigOptions
+from jointfit_simulators.body import MOTIONS
+from jointfit_simulators.devices import LOOPBACK
+from jointfit_simulators.scene import PhaseFollower, RigOptions, play_directory
+from jointfit_simulators.scene._phase_follower import MOTIONS_OF_PHASES
+from jointfit_simulators.scene._play_directory import DirectoryInUseError, PortInUseError
 from tests.system.station import Station, listening, running
 
 if TYPE_CHECKING:
@@ -166,7 +162,7 @@ async def test_a_phase_with_several_motions_plays_them_in_turn_until_the_next_ph
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     short = {"functional": (("functional", 0.05), ("walk", 0.05)), "align": (("plate", 0.05),)}
-    monkeypatch.setattr("jointfit_simulators.phase_follower.MOTIONS_OF_PHASES", short)
+    monkeypatch.setattr("jointfit_simulators.scene._phase_follower.MOTIONS_OF_PHASES", short)
     played: list[str] = []
     follower = PhaseFollower(RigOptions(mqtt_port=free_port()), played.append, lambda _: None)
     following = asyncio.create_task(follower.run())

@@ -6,7 +6,7 @@ import asyncio
 import os
 from typing import TYPE_CHECKING
 
-from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from pathlib import Path

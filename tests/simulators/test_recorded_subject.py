@@ -10,13 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.files.orientations import read_orientations_npz
-from jointfit_simulators.cameras import Cameras
-from jointfit_simulators.programme import Step, UnknownMotion, parse_programme
-from jointfit_simulators.replayed import Replayed
+from jointfit_simulators.body import (
+    SENSORS,
+    Replayed,
+    Step,
+    UnknownMotion,
+    parse_programme,
+    read_recording,
+)
+from jointfit_simulators.body._recorded_trial import Track
+from jointfit_simulators.devices import Cameras
+from jointfit_simulators.scene._truth_log import TruthLog
 from jointfit_simulators.settings import Knobs, perfect
-from jointfit_simulators.trial import Track, read_recording
-from jointfit_simulators.truth_log import TruthLog
-from jointfit_simulators.wearer import SENSORS
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,12 +10,11 @@ from typing import Any
 import orjson
 import pytest
 
-from jointfit_simulators.clocks import NS, ClockFault, Ticker
-from jointfit_simulators.programme import parse_programme
-from jointfit_simulators.sample_log import SampleLog
+from jointfit_simulators.body import Wearer, parse_programme
+from jointfit_simulators.devices import NS, ClockFault, Ticker
 from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
+from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.settings import Knobs
-from jointfit_simulators.wearer import Wearer
 
 NOW = 10**13
 """Host time for parts that look at no clock of their own."""

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_simulators.clocks import NS
+from jointfit_simulators.body._recorded_trial import Track
+from jointfit_simulators.devices import NS
+from jointfit_simulators.scene._streams import ImuStream
 from jointfit_simulators.settings import Knobs, perfect, turn
-from jointfit_simulators.streams import ImuStream
-from jointfit_simulators.trial import Track
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 NOW = 5 * 10**12

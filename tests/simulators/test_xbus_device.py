@@ -13,7 +13,8 @@ import pytest
 from jointfit_protocols.xbus import MessageId, XbusCodec, XbusMessage, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, decode_item, split
-from jointfit_simulators.xbus_device import WAKE_UP_S, XbusDevice, XbusDeviceOptions
+from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.devices._xbus_device import WAKE_UP_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,13 +17,16 @@ import pytest
 
 from jointfit_daemon.tools.child_processes import daemon
 from jointfit_protocols.xcdi import XcdiIds
-from jointfit_simulators.can_wire import SlcanAdapter
-from jointfit_simulators.natnet_options import NatNetServerOptions
-from jointfit_simulators.natnet_server import NatNetServer
-from jointfit_simulators.natnet_stage import StagedBody
-from jointfit_simulators.pty_line import PtyLine
-from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
-from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.devices import (
+    NatNetServer,
+    NatNetServerOptions,
+    StagedBody,
+    XbusDevice,
+    XbusDeviceOptions,
+    XcdiDevice,
+    XcdiDeviceOptions,
+)
+from jointfit_simulators.wires import PtyLine, SlcanAdapter
 from tests.system.station import (
     BASE,
     Listener,

@@ -23,10 +23,7 @@ from jointfit_protocols.natnet import (
     ServerInfo,
     encode,
 )
-from jointfit_simulators.natnet_options import NatNetServerOptions
-from jointfit_simulators.natnet_server import NatNetServer
-from jointfit_simulators.natnet_stage import StagedBody
-from jointfit_simulators.xbus_device import XbusDevice
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody, XbusDevice
 from tests.system.station import BASE, Listener, listening
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon
-from jointfit_simulators.natnet_replay import NatNetReplay
-from jointfit_simulators.xbus_replay import XbusReplay
+from jointfit_simulators.devices._natnet_replay import NatNetReplay
+from jointfit_simulators.devices._xbus_replay import XbusReplay
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

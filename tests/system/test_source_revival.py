@@ -11,8 +11,8 @@ import pytest
 
 from jointfit_daemon.tools.child_processes import ChildProcess, daemon
 from jointfit_simulators.contract_scene import orientation
-from jointfit_simulators.pty_line import PtyLine
-from jointfit_simulators.xbus_device import XbusDevice
+from jointfit_simulators.devices import XbusDevice
+from jointfit_simulators.wires import PtyLine
 from tests.system.station import BASE, Listener, listening
 
 if TYPE_CHECKING:

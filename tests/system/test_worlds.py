@@ -14,11 +14,9 @@ import pytest
 
 from jointfit_daemon.tools.demo._score import DemoScore
 from jointfit_daemon.tools.demo._truth import TruthReader
-from jointfit_simulators.programme import parse_programme
-from jointfit_simulators.rig_file import RigOptions
-from jointfit_simulators.scene import Scene, SceneOptions
+from jointfit_simulators.body import Wearer, parse_programme
+from jointfit_simulators.scene import RigOptions, Scene, SceneOptions
 from jointfit_simulators.settings import Knobs, perfect, turn
-from jointfit_simulators.wearer import Wearer
 from tests.system.station import BASE, SENSORS, Station, in_this_process, listening
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from jointfit_daemon.outputs.mqtt._error_messages import broker_fault
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.embedded_broker import free_port
-from jointfit_simulators.sample_data import write_sample
+from jointfit_simulators.sample import write_sample
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from jointfit_daemon.tools.__main__ import app
 from jointfit_protocols.xbus import XbusCodec, XbusMessage, encode
 from jointfit_protocols.xcdi import XcdiIds
-from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

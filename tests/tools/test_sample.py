@@ -13,8 +13,8 @@ from jointfit_daemon.files.mocap._c3d import read_c3d_with_up
 from jointfit_daemon.files.models import read_model, read_osim
 from jointfit_daemon.files.orientations import read_orientations_npz, read_orientations_sto
 from jointfit_daemon.tools.__main__ import app
-from jointfit_simulators.c3d_file import c3d_bytes
-from jointfit_simulators.sample_data import write_sample
+from jointfit_simulators.sample import write_sample
+from jointfit_simulators.sample._c3d_file import c3d_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from jointfit_simulators.can_wire import PythonCanWire
+from jointfit_simulators.wires import PythonCanWire
 from tests.vm.vcan_link import LINK, ip
 
 

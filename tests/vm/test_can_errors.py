@@ -11,11 +11,11 @@ import pytest
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.xcdi import XcdiImu
-from jointfit_simulators.xcdi_device import XcdiDevice
+from jointfit_simulators.devices import XcdiDevice
 from tests.vm.vcan_link import NEEDS_VCAN, Heard, identity, running, settings
 
 if TYPE_CHECKING:
-    from jointfit_simulators.can_wire import PythonCanWire
+    from jointfit_simulators.wires import PythonCanWire
 
 pytestmark = NEEDS_VCAN
 

@@ -21,9 +21,9 @@ from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu
 from jointfit_protocols.can import HOST_DROPPED, host_count
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_protocols.xcdi._messages import id_block
-from jointfit_simulators.can_wire import PythonCanWire
+from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.driver_contract import DriverContract
-from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.wires import PythonCanWire
 from tests.vm.vcan_link import BUS, LINK, NEEDS_VCAN, Heard, identity, ip, running, settings
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from jointfit_protocols.can import CanFrame, unpack_frames
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from jointfit_simulators.xcdi_device import XcdiDevice
+    from jointfit_simulators.devices import XcdiDevice
 
 LINK = "vcan0"
 

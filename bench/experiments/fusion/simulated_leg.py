@@ -25,12 +25,9 @@ from jointfit_daemon.calibration.phases import (
 )
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
-from jointfit_simulators.cameras import Cameras
-from jointfit_simulators.orientation import to_wxyz
-from jointfit_simulators.programme import Step
-from jointfit_simulators.sensors import OrientationSensor
+from jointfit_simulators.body import SENSORS, Step, Wearer, to_wxyz
+from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
-from jointfit_simulators.wearer import SENSORS, Wearer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

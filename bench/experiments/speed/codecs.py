@@ -20,7 +20,7 @@ from jointfit_daemon.driver import CanBusSettings, find_driver
 from jointfit_daemon.model import Chunk, ImuSample, MocapFrame
 from jointfit_protocols import natnet, xbus, xcdi
 from jointfit_protocols.can import slcan
-from jointfit_simulators.placement import CLUSTERS
+from jointfit_simulators.body import CLUSTERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,7 +21,7 @@ from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpen
 from jointfit_daemon.timing.alignment import FrameAligner, StreamSpec
 from jointfit_daemon.timing.clock import DeviceClock
 from jointfit_protocols.xcdi import XcdiIds
-from jointfit_simulators.wearer import SENSORS
+from jointfit_simulators.body import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -33,8 +33,8 @@ from jointfit_protocols.natnet import (
     ServerInfo,
     encode,
 )
-from jointfit_simulators.clocks import DeviceClock
-from jointfit_simulators.wearer import SENSORS
+from jointfit_simulators.body import SENSORS
+from jointfit_simulators.devices import DeviceClock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

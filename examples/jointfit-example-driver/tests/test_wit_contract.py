@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.driver_contract import DriverContract
-from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.wires import PtyLine
 
 from jointfit_wit.imu import WitImu, WitSettings
 from jointfit_wit.simulator import WitDevice

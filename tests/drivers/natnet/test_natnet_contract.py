@@ -11,11 +11,9 @@ from typing_extensions import override
 from jointfit_daemon.model import MocapFrame
 from jointfit_drivers.natnet import NatNetMocap, NatNetSettings
 from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
+from jointfit_simulators.devices._natnet_port import NatNetPort
 from jointfit_simulators.driver_contract import DriverContract
-from jointfit_simulators.natnet_options import NatNetServerOptions
-from jointfit_simulators.natnet_port import NatNetPort
-from jointfit_simulators.natnet_server import NatNetServer
-from jointfit_simulators.natnet_stage import StagedBody
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -20,10 +20,8 @@ from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _session
 from jointfit_drivers.ports.udp_socket import StampedSocket, local_address
 from jointfit_protocols.natnet import MessageId, ServerInfo, encode
 from jointfit_simulators.contract_scene import Listener
-from jointfit_simulators.natnet_options import NatNetServerOptions
-from jointfit_simulators.natnet_replay import NatNetReplay
-from jointfit_simulators.natnet_server import NatNetServer
-from jointfit_simulators.natnet_stage import StagedBody
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
+from jointfit_simulators.devices._natnet_replay import NatNetReplay
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

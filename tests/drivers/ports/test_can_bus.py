@@ -16,9 +16,8 @@ from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import CanFrame
 from jointfit_protocols.can.slcan import encode_frame
 from jointfit_protocols.xcdi._messages import id_block
-from jointfit_simulators.can_wire import SlcanAdapter
-from jointfit_simulators.pty_line import PtyLine
-from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.wires import PtyLine, SlcanAdapter
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable

@@ -18,8 +18,8 @@ from jointfit_drivers.ports.can_bus import shared_bus
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import CanFrame, unpack_frames
 from jointfit_protocols.xcdi._messages import id_block
-from jointfit_simulators.can_wire import PythonCanWire
-from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.wires import PythonCanWire
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 

@@ -12,10 +12,10 @@ from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols.xbus.configuration import MAX_RATE
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.devices._inertial_signals import Felt
 from jointfit_simulators.driver_contract import DriverContract
-from jointfit_simulators.felt import Felt
-from jointfit_simulators.pty_line import PtyLine
-from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,8 +19,8 @@ from jointfit_protocols.xbus import MessageId, XbusCodec, XbusMessage
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
 from jointfit_simulators.contract_scene import orientation
-from jointfit_simulators.pty_line import PtyLine
-from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

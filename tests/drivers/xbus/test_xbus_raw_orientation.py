@@ -21,7 +21,7 @@ from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols import xbus
 from jointfit_protocols.xbus import mtdata2
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
-from jointfit_simulators.felt import Felt
+from jointfit_simulators.devices._inertial_signals import Felt
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,7 +11,7 @@ from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols.xbus import XbusCodec, XbusMessage, encode
 from jointfit_protocols.xbus.mtdata2 import Item, decode_item, split
-from jointfit_simulators.xbus_device import XbusDevice
+from jointfit_simulators.devices import XbusDevice
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,8 +20,8 @@ from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.configuration import SyncSetting
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_simulators.contract_scene import orientation
-from jointfit_simulators.xbus_device import XbusDevice, XbusDeviceOptions
-from jointfit_simulators.xbus_sync_lines import SyncLines
+from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
+from jointfit_simulators.devices._xbus_sync_lines import SyncLines
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

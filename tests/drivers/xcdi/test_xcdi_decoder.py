@@ -18,7 +18,8 @@ from jointfit_drivers.xcdi import XcdiDecoder, XcdiIdSettings, XcdiImu, XcdiSett
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, host_corrupt, host_dropped, pack_frames
 from jointfit_protocols.xcdi import DataId, XcdiIds
 from jointfit_protocols.xcdi._messages import id_block
-from jointfit_simulators.xcdi_device import XcdiDevice, XcdiDeviceOptions, interleaved
+from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.devices._xcdi_device import interleaved
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

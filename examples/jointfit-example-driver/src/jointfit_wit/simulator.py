@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.pty_line import PtyLine
+from jointfit_simulators.wires import PtyLine
 
 from jointfit_wit import frames
 

@@ -1,0 +1,119 @@
+"""A right leg of known geometry: joint angles in, bones and joint centers out. The truth.
+
+Law: forward kinematics only, over whole arrays; no noise, no sensor, no clock. Base world: z up,
+the wearer faces +y when the pelvis heading is 0. Segment frames: origin at the proximal joint
+center, z from the distal to the proximal joint center, y anterior, x to the wearer's right, so
+that in upright stance every part's frame equals the base world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_simulators.body._orientation import Rotation, to_wxyz
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PARTS = ("pelvis", "thigh", "shank", "foot")
+JOINTS = ("hip", "knee", "ankle")
+
+COORDINATES = 22
+"""Columns of a coordinate array: the posture of leg and plate at one instant."""
+PELVIS_POSITION = slice(0, 3)
+"""Position of the pelvis origin (mid-pelvis) in the base world, m."""
+PELVIS_TURN = slice(3, 6)
+"""Heading (about z), tilt (about x), list (about y): intrinsic z-x-y, rad."""
+HIP = slice(6, 9)
+"""Flexion, adduction, internal rotation, rad; likewise KNEE and ANKLE."""
+KNEE = slice(9, 12)
+ANKLE = slice(12, 15)
+LEG_ANGLES = slice(6, 15)
+PLATE_POSITION = slice(15, 18)
+"""Position of the plate's center, m."""
+PLATE_TURN = slice(18, 21)
+"""Rotation vector of the plate, rad."""
+ON_PLATE = 21
+"""1: the sensors sit on the plate; 0: they are worn; between: they are carried over."""
+
+
+@dataclass(frozen=True, slots=True)
+class LegGeometry:
+    """Bones of one leg, m."""
+
+    thigh_m: float = 0.42
+    shank_m: float = 0.40
+    hip_in_pelvis: tuple[float, float, float] = (0.09, 0.02, -0.07)
+    """Hip center in pelvis coordinates: right, anterior, up."""
+    ankle_height_m: float = 0.08
+    """Ankle center above the sole."""
+
+    @property
+    def standing_pelvis(self) -> tuple[float, float, float]:
+        """Pelvis origin when the wearer stands upright over the world's origin, m."""
+        leg = self.ankle_height_m + self.shank_m + self.thigh_m
+        return (0.0, 0.0, leg - self.hip_in_pelvis[2])
+
+    @property
+    def standing_ankle(self) -> tuple[float, float, float]:
+        """Ankle center in that stance, m."""
+        return (self.hip_in_pelvis[0], self.hip_in_pelvis[1], self.ankle_height_m)
+
+
+class LegPose(NamedTuple):
+    """Bones at n instants, base world."""
+
+    orientations: dict[str, Rotation]
+    """Rotation of each part (n of them): part coordinates to base world."""
+    origins: dict[str, NDArray[np.float64]]
+    """Origin of each part, shape (n, 3), m: pelvis origin, hip, knee, ankle."""
+
+
+def joint_rotation(flexion_sign: int, angles: NDArray[np.float64]) -> Rotation:
+    r"""Return the rotation of a joint of a right leg from its clinical angles.
+
+    .. math:: R = R_x(s f) R_y(a) R_z(i)
+
+    with flexion *f*, adduction *a*, internal rotation *i* (Grood and Suntay's order), and s = +1
+    for hip flexion and ankle dorsiflexion, -1 for the knee, whose flexion brings the heel back.
+
+    Parameters
+    ----------
+    flexion_sign
+        *s* above.
+    angles
+        Flexion, adduction, rotation, rad, shape (n, 3).
+    """
+    return Rotation.from_euler("XYZ", angles * np.array([flexion_sign, 1, 1]))
+
+
+def leg_pose(geometry: LegGeometry, coordinates: NDArray[np.float64]) -> LegPose:
+    """Return the bones for coordinates of shape (n, COORDINATES)."""
+    pelvis = Rotation.from_euler("ZXY", coordinates[:, PELVIS_TURN])
+    thigh = pelvis * joint_rotation(1, coordinates[:, HIP])
+    shank = thigh * joint_rotation(-1, coordinates[:, KNEE])
+    foot = shank * joint_rotation(1, coordinates[:, ANKLE])
+    origin = coordinates[:, PELVIS_POSITION]
+    hip = origin + pelvis.apply(np.array(geometry.hip_in_pelvis))
+    knee = hip + thigh.apply(np.array([0.0, 0.0, -geometry.thigh_m]))
+    ankle = knee + shank.apply(np.array([0.0, 0.0, -geometry.shank_m]))
+    return LegPose(
+        dict(zip(PARTS, (pelvis, thigh, shank, foot), strict=True)),
+        dict(zip(PARTS, (origin, hip, knee, ankle), strict=True)),
+    )
+
+
+def included_angle(thigh: Rotation, shank: Rotation) -> NDArray[np.float64]:
+    """Return the inner angle between two bones' long axes, rad, shape (n,): pi when straight."""
+    down = np.array([0.0, 0.0, -1.0])
+    a, b = thigh.apply(down), shank.apply(down)
+    bend = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+    return np.pi - np.asarray(bend, dtype=np.float64)
+
+
+def orientations(pose: LegPose, part: str) -> NDArray[np.float64]:
+    """Return q_world_part, shape (n, 4), scalar first."""
+    return to_wxyz(pose.orientations[part])

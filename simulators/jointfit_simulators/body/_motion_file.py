@@ -1,0 +1,111 @@
+"""Motions from files: joint angles over time, as TOML keys, NPZ arrays or OpenSim kinematics.
+
+TOML, degrees, clinical signs, one table a key; a smooth curve is laid through them::
+
+    loop = true                     # else the last posture is held
+    [[key]]
+    t_s = 0.0
+    hip = [20, 0, 0]                # flexion, adduction, internal rotation; left out: 0
+    knee = [5, 0, 0]
+    ankle = [0, 0, 0]
+    pelvis = [0, 0, 0]              # heading, tilt, list
+
+NPZ, radians: ``t`` (n,) seconds and any of ``hip knee ankle pelvis`` (n, 3).
+
+MOT or STO: the coordinates of OpenSim's lower-limb models, right leg. Their axes (x forward, y up,
+z right) are ours renamed; their pelvis turns by tilt, list, rotation in this order.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from jointfit_daemon.files.orientations import read_sto
+from jointfit_daemon.files.text import read_toml
+from jointfit_simulators.body._limb import ANKLE, HIP, KNEE, PELVIS_POSITION, PELVIS_TURN
+from jointfit_simulators.body._orientation import Rotation
+from jointfit_simulators.body._posture import Style, upright
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_simulators.body._motion import Motion
+
+_ANGLES = {"hip": HIP, "knee": KNEE, "ankle": ANKLE, "pelvis": PELVIS_TURN}
+_PARTS = {**_ANGLES, "position": PELVIS_POSITION}
+
+
+def _read_toml(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+    table = read_toml(path)
+    keys = table.get("key", [])
+    t_s = np.array([key["t_s"] for key in keys], dtype=np.float64)
+    angles = {
+        part: np.radians([key.get(part, (0.0, 0.0, 0.0)) for key in keys]) for part in _ANGLES
+    }
+    return t_s, angles, bool(table.get("loop", False))
+
+
+def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+    with np.load(path, allow_pickle=False) as arrays:
+        t_s = np.asarray(arrays["t"], dtype=np.float64)
+        angles = {
+            part: np.asarray(arrays[part], dtype=np.float64) for part in _PARTS if part in arrays
+        }
+    return t_s, angles, False
+
+
+def _read_opensim(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+    table = read_sto(path)
+    unit = np.pi / 180 if table.in_degrees else 1.0
+
+    def columns(*names: str) -> NDArray[np.float64]:
+        return np.column_stack([table.column(name) for name in names])
+
+    hip = unit * columns("hip_flexion_r", "hip_adduction_r", "hip_rotation_r")
+    turn = Rotation.from_euler(
+        "XYZ", unit * columns("pelvis_tilt", "pelvis_list", "pelvis_rotation")
+    )
+    angles = {
+        "hip": hip,
+        "knee": unit * columns("knee_angle_r") * [1, 0, 0],
+        "ankle": unit * columns("ankle_angle_r") * [1, 0, 0],
+        "pelvis": np.unwrap(turn.as_euler("ZXY"), axis=0),
+        "position": columns("pelvis_tz", "pelvis_tx", "pelvis_ty"),
+    }
+    return table.t_s, angles, False
+
+
+_READERS = {".toml": _read_toml, ".npz": _read_npz, ".mot": _read_opensim, ".sto": _read_opensim}
+
+
+def motion_from_file(path: Path, style: Style) -> Motion:
+    """Return the motion a file describes; curves between its keys have two continuous derivatives.
+
+    Raises
+    ------
+    ValueError
+        A file of another kind, fewer than two keys, times that do not increase, or a loop whose
+        ends differ.
+    """
+    if path.suffix.lower() not in _READERS:
+        raise ValueError(f"{path}: a motion is read from {', '.join(_READERS)}")
+    t_s, angles, loop = _READERS[path.suffix.lower()](path)
+    if not len(t_s) > 1 or np.any(np.diff(t_s) <= 0):
+        raise ValueError(f"{path}: needs at least two keys with increasing t_s")
+    ends: Literal["periodic", "clamped"] = "periodic" if loop else "clamped"
+    curves = {part: CubicSpline(t_s, values, bc_type=ends) for part, values in angles.items()}
+    length = float(t_s[-1] - t_s[0])
+
+    def motion(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        place = t_s[0] + (t % length if loop else np.clip(t, 0.0, length))
+        coordinates = upright(style, t)
+        for part, curve in curves.items():
+            coordinates[:, _PARTS[part]] = curve(place)
+        return coordinates
+
+    return motion

@@ -1,0 +1,89 @@
+"""Where sensors and markers sit on the wearer.
+
+Law: positions in the frame of the body part that carries them, m; chosen once a run.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_simulators.body._orientation import Rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_simulators.body._limb import LegGeometry
+
+CLUSTERS: dict[str, tuple[str, ...]] = {
+    "pelvis": ("P1", "P2", "P3", "P4"),
+    "thigh": ("T1", "T2", "T3", "T4"),
+    "shank": ("C1", "C2", "C3", "C4"),
+    "foot": ("F1", "F2", "F3", "F4"),
+    "plate": ("R1", "R2", "R3", "R4", "R5"),
+}
+"""Markers by body part; C is for calf (S is a sensor), R for the rigid plate."""
+
+_PLACEMENT_M = 0.008
+"""Nobody sticks a marker exactly where the drawing shows it."""
+
+
+def strapped(random: np.random.Generator, most_rad: float) -> Rotation:
+    """Return how a sensor sits: turned by up to `most_rad` about a random axis."""
+    axis = random.standard_normal(3)
+    return Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0, most_rad))
+
+
+def skin_templates(
+    random: np.random.Generator, geometry: LegGeometry
+) -> dict[str, NDArray[np.float64]]:
+    """Return marker positions in the frame of each part, upright stance, shape (4, 3).
+
+    Pelvis: spines of the ilium, front and back. Thigh and shank: plates of four on the outside
+    and front, spread along the bone as far as the soft parts allow. Foot: heel, instep, toes.
+    """
+    thigh, shank = geometry.thigh_m, geometry.shank_m
+    drawn = {
+        "pelvis": [
+            (0.12, 0.08, 0.0),
+            (-0.12, 0.08, 0.0),
+            (0.05, -0.10, 0.02),
+            (-0.05, -0.10, 0.02),
+        ],
+        "thigh": [
+            (0.075, 0.03, -0.28 * thigh),
+            (0.02, 0.085, -0.42 * thigh),
+            (0.07, -0.035, -0.62 * thigh),
+            (0.045, 0.06, -0.80 * thigh),
+        ],
+        "shank": [
+            (0.055, 0.03, -0.20 * shank),
+            (0.0, 0.06, -0.38 * shank),
+            (0.055, -0.035, -0.58 * shank),
+            (0.03, 0.04, -0.82 * shank),
+        ],
+        "foot": [
+            (0.0, -0.06, -0.045),
+            (0.035, 0.05, -0.03),
+            (-0.035, 0.06, -0.02),
+            (0.0, 0.13, -0.05),
+        ],
+    }
+    return {
+        part: np.array(found) + random.normal(0.0, _PLACEMENT_M, (len(found), 3))
+        for part, found in drawn.items()
+    }
+
+
+def plate_template() -> NDArray[np.float64]:
+    """Return the plate's markers in its own frame: an asymmetric five on stalks, shape (5, 3)."""
+    return np.array(
+        [
+            (0.16, 0.10, 0.03),
+            (-0.15, 0.11, 0.05),
+            (0.15, -0.12, 0.04),
+            (-0.16, -0.10, 0.02),
+            (0.03, 0.02, 0.09),
+        ]
+    )

@@ -1,0 +1,71 @@
+"""What a sensor makes of its true orientation: its own world, slow drift and scatter.
+
+Law: orientations in, orientations out; where the sensor sits and what its clock says is settled
+elsewhere.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_simulators.body import Rotation, from_wxyz, heading, to_wxyz, vector_wander
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_simulators.settings import Knobs
+
+_DRIFT_HZ = (0.005, 0.1)
+"""Band of the slow error: a fusion filter wanders over ten seconds to minutes."""
+
+
+class OrientationSensor:
+    r"""One IMU's orientation output.
+
+    .. math:: \hat q(t) = e(t)\; q_{W_s W}\; q(t)\; n(t)
+
+    with the sensor's own world :math:`W_s` (a heading, and a tilt only by radical fault), the slow
+    error *e* on the world side, where fusion filters err, and the white scatter *n*.
+
+    Parameters
+    ----------
+    knobs
+        Sizes of the errors, and the dice.
+    name
+        The sensor.
+    """
+
+    def __init__(self, knobs: Knobs, name: str) -> None:
+        world = knobs.random(f"world {name}")
+        self.heading_rad = float(world.uniform(0.0, np.radians(knobs.heading_spread_deg)))
+        about = world.uniform(0.0, 2 * np.pi)
+        tilted = knobs.world_tilt_sensor in {"", name}
+        tilt = np.radians(knobs.world_tilt_deg) if tilted else 0.0
+        level = Rotation.from_rotvec([tilt * np.cos(about), tilt * np.sin(about), 0.0])
+        self.world = level * heading(self.heading_rad)
+        """Base world to the sensor's own world."""
+        self._slow = vector_wander(
+            knobs.random(f"slow error {name}"),
+            1,
+            low_hz=_DRIFT_HZ[0],
+            high_hz=_DRIFT_HZ[1],
+            rms=np.radians(knobs.orientation_slow_deg),
+        )
+        self._white = knobs.random(f"white error {name}")
+        self._white_rad = np.radians(knobs.orientation_white_deg) / np.sqrt(3)
+
+    def report(
+        self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return what the sensor says, q_world_sensor, shape (n, 4); NaN stays NaN."""
+        known = np.isfinite(q_base_sensor[:, 0])
+        found = np.full_like(q_base_sensor, np.nan)
+        scatter = self._white.standard_normal((len(t_s), 3)) * self._white_rad
+        if np.any(known):
+            true = from_wxyz(q_base_sensor[known])
+            slow = Rotation.from_rotvec(self._slow.at(t_s[known]))
+            said = slow * self.world * true * Rotation.from_rotvec(scatter[known])
+            found[known] = to_wxyz(said)
+        return found

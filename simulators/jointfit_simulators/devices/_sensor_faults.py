@@ -1,0 +1,71 @@
+"""What goes wrong with a worn sensor while it runs: it sticks, slips, or its world turns.
+
+Law: orientations in, orientations out, block by block; the truth is not touched. A command takes
+effect with the next block, a fifth of a second later at most.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_simulators.body import Rotation, from_wxyz, to_wxyz
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SLIP_S = 0.3
+"""How long a slip takes."""
+_ASKEW = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
+"""Axis of a slip, sensor axes: none of them alone."""
+
+
+class Mishaps:
+    """The mishaps of one sensor."""
+
+    def __init__(self) -> None:
+        self._stuck = False
+        self._held: NDArray[np.float64] | None = None
+        self._slipped_rad, self._slip_s, self._before_rad = 0.0, -np.inf, 0.0
+        self._rate_rad_s, self._turned_rad = 0.0, 0.0
+        self._now_s = -np.inf
+
+    def stick(self) -> None:
+        """Let it repeat itself."""
+        self._stuck = True
+
+    def free(self) -> None:
+        """Let it say the truth again; where it slipped to it stays."""
+        self._stuck, self._held = False, None
+
+    def slip(self, angle_rad: float) -> None:
+        """Let it slide by an angle, on top of where it is."""
+        self._before_rad = self._slipped_rad
+        self._slipped_rad += angle_rad
+        self._slip_s = self._now_s
+
+    def drift(self, rate_rad_s: float) -> None:
+        """Let its world turn about the vertical from now on; 0 ends that where it has come to."""
+        self._rate_rad_s = rate_rad_s
+
+    def apply(self, t_s: NDArray[np.float64], said: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what the sensor says instead, q_world_sensor, shape (n, 4); NaN stays NaN."""
+        if not len(t_s):
+            return said
+        before_s = float(t_s[0]) if np.isinf(self._now_s) else self._now_s
+        turned = self._turned_rad + self._rate_rad_s * (t_s - before_s)
+        self._now_s, self._turned_rad = float(t_s[-1]), float(turned[-1])
+        share = np.clip((t_s - self._slip_s) / SLIP_S, 0.0, 1.0)
+        slipped = self._before_rad + share * (self._slipped_rad - self._before_rad)
+        known = np.isfinite(said[:, 0])
+        if (np.any(turned) or np.any(slipped)) and np.any(known):
+            world = Rotation.from_rotvec(turned[known, None] * np.array([0.0, 0.0, 1.0]))
+            slide = Rotation.from_rotvec(slipped[known, None] * _ASKEW)
+            said = said.copy()
+            said[known] = to_wxyz(world * from_wxyz(said[known]) * slide)
+        if self._stuck and self._held is None and np.any(known):
+            self._held = said[known][0].copy()
+        if self._held is not None:
+            said = np.where(known[:, None], self._held, said)
+        return said

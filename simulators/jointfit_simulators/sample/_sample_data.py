@@ -1,0 +1,298 @@
+"""Sample data for every command that reads files: one leg, recorded in a few short trials.
+
+Invariant: the same seed gives the same files. The sensors' worlds, the cameras' world and the
+reference are one world, and the clocks of a trial are one clock, as in an edited recording; skin,
+mounts, sensor errors, scatter and hidden markers are those of the default knobs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+import numpy as np
+
+from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
+from jointfit_daemon.files.orientations import (
+    OrientationTable,
+    OrientationTrial,
+    write_orientations_npz,
+    write_orientations_sto,
+)
+from jointfit_protocols.xcdi import XcdiIds
+from jointfit_simulators.body import PARTS, Step, Wearer, to_wxyz
+from jointfit_simulators.devices import Cameras, OrientationSensor, XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.sample._c3d_file import c3d_bytes
+from jointfit_simulators.sample._sample_captures import candump_text, natnet_pcap, xbus_bytes
+from jointfit_simulators.sample._sample_model import (
+    leg_parts,
+    misplaced_markers,
+    model_osim,
+    model_toml,
+)
+from jointfit_simulators.scene import RigOptions, rig_toml
+from jointfit_simulators.settings import Knobs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_protocols.can import CanFrame
+    from jointfit_simulators.devices import Pose, Vector
+    from jointfit_simulators.imu_device import Quaternion
+
+RATE_HZ = 50.0
+"""Of sensors and cameras in the trials: enough for slow movements, and small files."""
+CAPTURE_HZ = 100.0
+CAPTURE_S = 2.0
+APART_S = 200.0
+"""Between the beginnings of two trials, so that no two of them share noise."""
+TRIALS = {
+    "standing": 5.0,
+    "squats": 8.0,
+    "walking": 8.0,
+    "knee_swings": 8.0,
+    "sit_to_stand": 8.0,
+}
+"""Each trial and its length, s."""
+_MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}
+_SENSORS = ("S1", "S2", "S3", "S4")
+_IDS = {
+    "S2": XcdiIds(0x205, 0x206, 0x221, status_word=None, error=None),
+    "S4": XcdiIds(0x405, 0x406, 0x421, status_word=None, error=None),
+}
+
+
+class SampleTrial(NamedTuple):
+    """What was recorded in one trial, z up."""
+
+    t_s: NDArray[np.float64]
+    sensors: Mapping[str, NDArray[np.float64]]
+    """q_world_sensor, shape (n, 4)."""
+    bones: Mapping[str, NDArray[np.float64]]
+    """q_world_segment, shape (n, 4)."""
+    markers: tuple[str, ...]
+    positions: NDArray[np.float64]
+    """Shape (n, len(markers), 3), m; NaN where hidden."""
+    bodies: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+    """Rigid bodies of the cameras: positions, m, shape (n, 3), and q_world_body, shape (n, 4)."""
+
+
+class FolderNotEmptyError(ValueError):
+    """The folder for the sample data has something in it."""
+
+
+def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[str, str]:
+    """Write the sample data.
+
+    Parameters
+    ----------
+    folder
+        Made when absent.
+    seed
+        Another seed is another wearer.
+    force
+        Write into a folder that has something in it; files of the same names are replaced.
+
+    Returns
+    -------
+    dict
+        What each file is and which command reads it, by file name.
+
+    Raises
+    ------
+    FolderNotEmptyError
+        The folder is not empty, and `force` is not set.
+    OSError
+        It cannot be written to.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not force:
+        message = f"{folder} is not empty: name a new folder, or use --force to replace files in it"
+        raise FolderNotEmptyError(message)
+    folder.mkdir(parents=True, exist_ok=True)
+
+    knobs = dataclasses.replace(
+        Knobs(seed=seed), heading_spread_deg=0.0, optical_heading_deg=0.0, mocap_hz=RATE_HZ
+    )
+    trials = {
+        name: _record(knobs, _MOTIONS.get(name, name), APART_S * number, length_s, RATE_HZ)
+        for number, (name, length_s) in enumerate(TRIALS.items())
+    }
+    return (
+        _write_marker_trials(folder, trials)
+        | _write_orientation_trials(folder, trials)
+        | _write_models(folder, knobs)
+        | _write_captures(folder, knobs)
+        | _write_rig(folder, knobs)
+    )
+
+
+def _wearer(knobs: Knobs, motion: str, start_s: float) -> Wearer:
+    return Wearer(knobs, [Step(motion, 1.0)], start_s=start_s)
+
+
+def _record(
+    knobs: Knobs, motion: str, start_s: float, length_s: float, rate_hz: float
+) -> SampleTrial:
+    wearer = _wearer(knobs, motion, start_s)
+    since_s = np.arange(round(length_s * rate_hz)) / rate_hz
+    t_s = start_s + since_s
+    seen = wearer.observe([t_s] * len(_SENSORS), t_s, t_s)
+
+    sensors = {
+        name: OrientationSensor(knobs, name).report(t_s, q)
+        for name, q in zip(wearer.sensors, seen.sensors, strict=True)
+    }
+    bones = {part: to_wxyz(seen.truth.orientations[part]) for part in ("thigh", "shank")}
+
+    names = tuple(name for part in PARTS for name in wearer.clusters[part])
+    cameras = Cameras(knobs, wearer, rate_hz=rate_hz)
+    frames = cameras.see(seen)
+    bodies = {
+        body: (frames.body_positions[:, column], frames.body_orientations[:, column])
+        for column, body in enumerate(cameras.bodies)
+    }
+    return SampleTrial(since_s, sensors, bones, names, frames.markers[:, : len(names)], bodies)
+
+
+def _write_marker_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dict[str, str]:
+    written = {}
+    for name, trial in trials.items():
+        y_up = trial.positions[..., [1, 2, 0]]  # forward, up, right: OpenSim's axes
+        numbers = np.arange(1, len(trial.t_s) + 1)
+        write_trc(
+            folder / f"{name}.trc",
+            MarkerTrajectories(trial.markers, trial.t_s, numbers, y_up, RATE_HZ),
+        )
+        written[f"{name}.trc"] = "markers, y up: jointfit center, markers, fuse"
+
+    squats = trials["squats"]
+    y_up = squats.positions[..., [1, 2, 0]]
+    (folder / "squats.c3d").write_bytes(c3d_bytes(squats.markers, y_up, rate_hz=RATE_HZ, up="+Y"))
+    return written | {"squats.c3d": "the markers of squats.trc: jointfit center, fuse"}
+
+
+def _write_orientation_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dict[str, str]:
+    written = {}
+    for name, trial in trials.items():
+        write_orientations_npz(
+            folder / f"{name}.npz", OrientationTrial(trial.t_s, trial.sensors, trial.bones, {})
+        )
+        written[f"{name}.npz"] = "sensors S1 to S4 and the bones: jointfit fuse"
+    for name in ("standing", "walking"):
+        sensors = trials[name].sensors
+        table = OrientationTable(
+            tuple(sensors), trials[name].t_s, np.stack(list(sensors.values()), axis=1), RATE_HZ
+        )
+        write_orientations_sto(folder / f"{name}.sto", table)
+        written[f"{name}.sto"] = f"the sensors of {name}.npz, z up: jointfit fuse"
+    return written
+
+
+def _write_models(folder: Path, knobs: Knobs) -> dict[str, str]:
+    wearer = _wearer(knobs, "stand", 0.0)
+    parts = leg_parts(wearer.geometry)
+    markers = misplaced_markers(knobs.random("model"), wearer.clusters, wearer.templates, parts)
+    (folder / "leg.toml").write_text(model_toml(parts, markers), encoding="utf-8")
+    (folder / "leg.osim").write_text(model_osim(parts, markers), encoding="utf-8")
+    said = "a chain model, its markers misplaced by about 1 cm: jointfit markers"
+    return {"leg.toml": said, "leg.osim": "the same model for OpenSim: jointfit markers"}
+
+
+def _write_captures(folder: Path, knobs: Knobs) -> dict[str, str]:
+    start_s = APART_S * len(TRIALS)
+    trial = _record(knobs, "squat", start_s, CAPTURE_S, CAPTURE_HZ)
+    times_ns = [round(t_s * 1e9) for t_s in trial.t_s.tolist()]
+
+    s1 = zip(times_ns, _quaternions(trial, "S1"), strict=True)
+    (folder / "xbus.bin").write_bytes(xbus_bytes(s1))
+    (folder / "can.log").write_text(candump_text(_groups(trial, times_ns), "can0"), "utf-8")
+
+    frames = [
+        (t_ns, _markers(trial, index), _bodies(trial, index)) for index, t_ns in enumerate(times_ns)
+    ]
+    clusters = {part: _wearer(knobs, "stand", 0.0).clusters[part] for part in PARTS}
+    (folder / "cameras.pcap").write_bytes(natnet_pcap(clusters, frames, CAPTURE_HZ))
+    return {
+        "xbus.bin": "sensor S1 on its UART: jointfit decode xbus",
+        "can.log": "sensors S2 and S4 on CAN, as candump -L writes it: jointfit decode xcdi",
+        "cameras.pcap": "the cameras' datagrams: jointfit decode natnet",
+    }
+
+
+def _quaternions(trial: SampleTrial, name: str) -> list[Quaternion]:
+    return [cast("Quaternion", tuple(q)) for q in trial.sensors[name].tolist()]
+
+
+def _markers(trial: SampleTrial, index: int) -> dict[str, Vector | None]:
+    places = trial.positions[index].tolist()
+    return {
+        name: None if np.isnan(at[0]) else cast("Vector", tuple(at))
+        for name, at in zip(trial.markers, places, strict=True)
+    }
+
+
+def _bodies(trial: SampleTrial, index: int) -> dict[str, Pose | None]:
+    poses = ((name, p[index].tolist(), q[index].tolist()) for name, (p, q) in trial.bodies.items())
+    return {
+        name: None if np.isnan(p[0]) else cast("Pose", (tuple(p), tuple(q))) for name, p, q in poses
+    }
+
+
+class _NoWire:
+    """A bus that nobody reads: the device only makes frames."""
+
+    bitrate: int | None = None
+    is_open = False
+
+    def send(self, frames: Iterable[CanFrame]) -> bool:  # noqa: ARG002 - as CanWire
+        return False
+
+    async def run(self) -> None: ...
+
+    def unplug(self) -> None: ...
+
+    def plug(self) -> None: ...
+
+
+def _groups(trial: SampleTrial, times_ns: list[int]) -> list[tuple[int, list[CanFrame]]]:
+    devices = {
+        name: XcdiDevice(_NoWire(), XcdiDeviceOptions(ids=ids)) for name, ids in _IDS.items()
+    }
+    found = []
+    for index, t_ns in enumerate(times_ns):
+        for place, (name, device) in enumerate(devices.items()):
+            q = cast("Quaternion", tuple(trial.sensors[name][index].tolist()))
+            found.append((t_ns + place * 1_000_000, device.group(t_ns, q)))
+    return found
+
+
+def _write_rig(folder: Path, knobs: Knobs) -> dict[str, str]:
+    wearer = _wearer(knobs, "stand", 0.0)
+    devices = []
+    for name, segment in wearer.sensors.items():
+        lines = ["[[imu]]", f'id = "{name}"', f'segment = "{segment}"']
+        if name in _IDS:
+            ids = _IDS[name]
+            lines += [
+                'driver = "xcdi"',
+                'can = "can0"',
+                f"ids = {{ sample_time = {ids.sample_time:#05x}, group_counter = "
+                f"{ids.group_counter:#05x}, quaternion = {ids.quaternion:#05x} }}",
+            ]
+        else:
+            lines += ['driver = "xbus"', f'port = "/dev/jointfit/imu-{name}"', "baud = 921600"]
+        devices.append("\n".join([*lines, "rate_hz = 100", ""]))
+    devices.append('[can.can0]\ninterface = "socketcan"\nchannel = "can0"\n')
+    text = rig_toml(
+        RigOptions(name="sample", mqtt_base="jointfit/sample", store="sample"),
+        devices=devices,
+        mocap='[mocap]\ndriver = "natnet"\nserver = "192.168.1.10"\nup_axis = "y"',
+        clusters=wearer.clusters,
+        bones=(),
+        plate=True,
+    )
+    (folder / "rig.toml").write_text(text, encoding="utf-8")
+    return {"rig.toml": "a rig of four sensors and cameras: jointfit check, jointfitd"}

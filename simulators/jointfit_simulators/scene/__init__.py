@@ -1,0 +1,17 @@
+"""A whole scene in real time: a subject, its devices, their streams, and the ground truth."""
+
+from jointfit_simulators.scene._phase_follower import PhaseFollower
+from jointfit_simulators.scene._play_directory import PlayDirectory, play_directory
+from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
+from jointfit_simulators.scene._scene import BadCommand, Scene, SceneOptions
+
+__all__ = [
+    "BadCommand",
+    "PhaseFollower",
+    "PlayDirectory",
+    "RigOptions",
+    "Scene",
+    "SceneOptions",
+    "play_directory",
+    "rig_toml",
+]

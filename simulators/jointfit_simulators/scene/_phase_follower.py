@@ -1,0 +1,109 @@
+"""Moves as the calibration phase of a daemon asks for: the only module of the simulator with MQTT.
+
+Invariant: it reads the published contract (topic ``calibration``, docs/mqtt.md) and nothing else of
+the daemon; it sends nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import aiomqtt
+import orjson
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_simulators.scene._rig_file import RigOptions
+
+MOTIONS_OF_PHASES: dict[str, tuple[tuple[str, float], ...]] = {
+    "align": (("plate", 20.0),),
+    "static": (("stand", 5.0),),
+    "functional": (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
+    "calibrated": (("walk", 20.0),),
+}
+"""Motions of each phase, in turn, and their lengths in s; in other phases the subject stands."""
+_OTHERWISE = (("stand", 5.0),)
+_RETRY_S = 1.0
+
+
+class PhaseFollower:
+    """Plays the motions of the phase that a daemon publishes.
+
+    Parameters
+    ----------
+    rig
+        Where the broker is, and the daemon's base topic.
+    play
+        Begins a motion.
+    report
+        Takes a line for people when the broker is lost or found.
+    """
+
+    def __init__(
+        self, rig: RigOptions, play: Callable[[str], None], report: Callable[[str], None]
+    ) -> None:
+        self._rig, self._play, self._report = rig, play, report
+        self._phase: str | None = None
+        self._moving: asyncio.Task[None] | None = None
+
+    async def run(self) -> None:
+        """Follow until cancelled; a broker that is absent is tried again every second."""
+        place = f"{self._rig.mqtt_host}:{self._rig.mqtt_port}"
+        reported = ""
+        try:
+            while True:
+                try:
+                    async with self._client() as client:
+                        topic = f"{self._rig.mqtt_base}/calibration"
+                        await client.subscribe(topic, qos=1)
+                        reported = f"follows {topic} on broker {place}"
+                        self._report(reported)
+                        async for message in client.messages:
+                            self._take(message.payload)
+                except aiomqtt.MqttError:
+                    lost = (
+                        f"no broker at {place}: start one there, or set --mqtt-host and --mqtt-port"
+                    )
+                    if lost != reported:  # once, not every second
+                        reported = lost
+                        self._report(lost)
+                await asyncio.sleep(_RETRY_S)
+        finally:
+            if self._moving is not None:
+                self._moving.cancel()
+
+    def _client(self) -> aiomqtt.Client:
+        modern = self._rig.mqtt_version == "5"
+        return aiomqtt.Client(
+            self._rig.mqtt_host,
+            self._rig.mqtt_port,
+            protocol=aiomqtt.ProtocolVersion.V5 if modern else aiomqtt.ProtocolVersion.V311,
+        )
+
+    def _take(self, payload: object) -> None:
+        """Begin the motions of a new phase; a repeated status changes nothing."""
+        try:
+            status = orjson.loads(payload) if isinstance(payload, bytes | bytearray) else None
+        except orjson.JSONDecodeError:
+            return
+        phase = status.get("phase") if isinstance(status, dict) else None
+        if not isinstance(phase, str) or phase == self._phase:
+            return
+        self._phase = phase
+        if self._moving is not None:
+            self._moving.cancel()
+        motions = MOTIONS_OF_PHASES.get(phase, _OTHERWISE)
+        self._play(motions[0][0])
+        self._moving = asyncio.create_task(self._go_on(motions), name="motions of the phase")
+
+    async def _go_on(self, motions: tuple[tuple[str, float], ...]) -> None:
+        """Play the motions after the first, in turn."""
+        if len(motions) == 1:
+            return
+        for at, (name, seconds) in enumerate(cycle(motions)):
+            if at:
+                self._play(name)
+            await asyncio.sleep(seconds)

@@ -1,0 +1,117 @@
+"""The directory of a ``play``: one simulator at a time, and the camera port of the run before.
+
+Invariant: two simulators never share a directory; the lock goes with the process, however it ends.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+import orjson
+
+from jointfit_simulators.devices import LOOPBACK
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+STATE_FILE = ".jointfit-sim.json"
+"""Holds the lock, and for the next run ``{"pid": …, "command_port": …}``."""
+_LARGEST = 1000  # bytes; what is longer was not written here
+_PORTS = range(1, 65536)
+
+
+class DirectoryInUseError(ValueError):
+    """Another simulator plays in the directory; the message names it and the remedy."""
+
+
+class PortInUseError(ValueError):
+    """The command port that was asked for cannot be opened."""
+
+
+class PlayDirectory:
+    """A directory that this process owns."""
+
+    def __init__(self, path: Path, file: int) -> None:
+        self._path, self._file = path, file
+        self._before = _state(file)
+
+    def command_port(self, asked: int | None) -> int:
+        """Return the command port for the NatNet server; 0 is any free port.
+
+        A port that was asked for must be free. Otherwise it is the port of the run before in this
+        directory, so that a running daemon finds its cameras again, if that is still free.
+
+        Raises
+        ------
+        PortInUseError
+            `asked` is taken, or no port number.
+        """
+        if asked is not None:
+            if asked not in _PORTS:
+                raise PortInUseError(f"--command-port {asked}: expected 1 to {_PORTS[-1]}")
+            if why := _taken(asked):
+                raise PortInUseError(
+                    f"--command-port {asked}: cannot open UDP {LOOPBACK}:{asked} ({why}): choose"
+                    f" another, or end the program that has it (ss -ulnp 'sport = {asked}')"
+                )
+            return asked
+        before = self._before.get("command_port")
+        if isinstance(before, int) and before in _PORTS and not _taken(before):
+            return before
+        return 0
+
+    def remember(self, command_port: int | None) -> None:
+        """Keep the port for the next run; None: there are no cameras, the old one stays."""
+        kept = self._before.get("command_port") if command_port is None else command_port
+        os.ftruncate(self._file, 0)
+        os.pwrite(self._file, orjson.dumps({"pid": os.getpid(), "command_port": kept}), 0)
+
+
+@contextmanager
+def play_directory(path: Path) -> Iterator[PlayDirectory]:
+    """Create the directory and own it for as long as the block lasts.
+
+    Raises
+    ------
+    DirectoryInUseError
+        Another process owns it.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    file = os.open(path / STATE_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            pid = _state(file).get("pid", "unknown")
+            raise DirectoryInUseError(
+                f"{path}: a simulator (process {pid}) already plays here: stop it (kill {pid}), or"
+                " choose another --directory"
+            ) from None
+        owned = PlayDirectory(path, file)
+        owned.remember(None)
+        yield owned
+    finally:
+        os.close(file)
+
+
+def _state(file: int) -> dict[str, object]:
+    with suppress(orjson.JSONDecodeError):
+        found = orjson.loads(os.pread(file, _LARGEST, 0))
+        if isinstance(found, dict):
+            return found
+    return {}
+
+
+def _taken(port: int) -> str | None:
+    """Return why `port` cannot be bound, or None."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            return error.strerror
+    return None

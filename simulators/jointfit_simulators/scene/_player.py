@@ -1,0 +1,156 @@
+"""Plays a scene in real time: plans a fifth of a second ahead, then sends each sample when due.
+
+Law: one loop, absolute deadlines. Late is late: what was due earlier leaves at once, in order and
+with its own stamp, as from a device whose host was busy. After a stop of seconds (a suspended
+machine) the missed time is left out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import time
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from jointfit_simulators.devices import NS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from jointfit_simulators.body import Subject
+    from jointfit_simulators.scene._optical_stream import OpticalStream
+    from jointfit_simulators.scene._streams import ImuStream
+    from jointfit_simulators.scene._truth_log import TruthLog
+
+BLOCK_NS = NS // 5
+AHEAD_NS = NS // 10
+"""A block is planned when less than this is left of the one before."""
+GIVE_UP_NS = 2 * NS
+TRUTH_NS = NS // 100
+_FLUSH_NS = NS // 10
+
+
+class Stream(Protocol):
+    """What has planned samples."""
+
+    def emit(self, *, heard: bool) -> None:
+        """Send the next one, or drop it where nobody is to hear it."""
+
+    def forget(self) -> None:
+        """Drop all that are planned."""
+
+
+class Player:
+    """The streams of a scene, in time.
+
+    Parameters
+    ----------
+    subject
+        Who moves.
+    imus
+        The worn sensors.
+    optical
+        The cameras.
+    truth
+        Where the truth goes.
+    origin_ns
+        Host time at which the subject's time is 0.
+    sync_line
+        A wire goes from the cameras' sync output to all sensors: an edge an exposure.
+    """
+
+    def __init__(
+        self,
+        subject: Subject,
+        imus: Mapping[str, ImuStream],
+        optical: OpticalStream,
+        truth: TruthLog,
+        *,
+        origin_ns: int,
+        sync_line: bool = False,
+    ) -> None:
+        self._sync_line = sync_line
+        self._subject, self._optical, self._truth = subject, optical, truth
+        self._imus = [imus[name] for name in subject.sensors]
+        self._streams: list[Stream] = [*self._imus, optical]
+        self._origin_ns = origin_ns
+        self._planned_ns = origin_ns
+        self._due: list[tuple[int, int]] = []  # when, stream; a heap
+        self.paused = False
+        """Nothing is sent while set; what is due meanwhile is dropped, not delayed."""
+        self.left_out_ns = 0
+        """Time left out because the machine stood still."""
+
+    def motion(self) -> str:
+        """Return what is being done now."""
+        return self._subject.motion_at((time.monotonic_ns() - self._origin_ns) / NS)
+
+    def play(self, name: str) -> None:
+        """Begin another motion as soon as it can still be planned; UnknownMotion if unknown."""
+        self._subject.play(name, (self._planned_ns - self._origin_ns) / NS)
+
+    async def run(self) -> None:
+        """Play until cancelled."""
+        flushed_ns = 0
+        while True:
+            now_ns = time.monotonic_ns()
+            if now_ns > self._planned_ns + GIVE_UP_NS:
+                self.left_out_ns += now_ns - self._planned_ns
+                self._planned_ns = now_ns
+            if now_ns > self._planned_ns - AHEAD_NS:
+                self._plan_block()
+            self._send_due(time.monotonic_ns())
+            if now_ns > flushed_ns + _FLUSH_NS:
+                self._truth.advance(now_ns)
+                flushed_ns = now_ns
+            await asyncio.sleep(self._idle_s())
+
+    def finish(self) -> None:
+        """Send nothing any more and write what truth there is up to now."""
+        self.paused = True
+        self._due.clear()
+        for stream in self._streams:
+            stream.forget()
+        self._truth.advance(time.monotonic_ns())
+
+    def _idle_s(self) -> float:
+        """Return the time until something has to be done."""
+        wake_ns = self._planned_ns - AHEAD_NS
+        if self._due:
+            wake_ns = min(wake_ns, self._due[0][0])
+        return max(0.0, (wake_ns - time.monotonic_ns()) / NS)
+
+    def _seconds(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return (t_ns - self._origin_ns) / NS
+
+    def _plan_block(self) -> None:
+        begin_ns, end_ns = self._planned_ns, self._planned_ns + BLOCK_NS
+        imu_ns = [imu.plan(begin_ns, end_ns) for imu in self._imus]
+        exposures_ns = self._optical.plan(begin_ns, end_ns)
+        if self._sync_line:
+            for imu in self._imus:
+                imu.wire(exposures_ns)
+        first = -(-begin_ns // TRUTH_NS) * TRUTH_NS
+        truth_ns = np.arange(first, end_ns, TRUTH_NS, dtype=np.int64)
+        imu_s = [self._seconds(t_ns) for t_ns in imu_ns]
+        truth_s = self._seconds(truth_ns)
+        seen = self._subject.observe(imu_s, self._seconds(exposures_ns), truth_s)
+        for number, (imu, t_s, q) in enumerate(zip(self._imus, imu_s, seen.sensors, strict=True)):
+            self._schedule(number, imu.fill(t_s, q))
+        self._schedule(len(self._imus), self._optical.fill(seen))
+        motions = [self._subject.motion_at(t) for t in truth_s.tolist()]
+        self._truth.add(truth_ns, motions, seen.truth, self._optical.cameras.world)
+        self._planned_ns = end_ns
+        self._subject.forget_before((begin_ns - self._origin_ns) / NS)
+
+    def _schedule(self, stream: int, due_ns: list[int]) -> None:
+        for due in due_ns:
+            heapq.heappush(self._due, (due, stream))
+
+    def _send_due(self, now_ns: int) -> None:
+        while self._due and self._due[0][0] <= now_ns:
+            self._streams[heapq.heappop(self._due)[1]].emit(heard=not self.paused)

@@ -1,0 +1,355 @@
+"""A whole scene: somebody moves, sensors and cameras report it as bytes, the truth is written.
+
+Law: wiring and commands only; what moves, errs and is encoded lives in other modules.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jointfit_simulators.body import UnknownMotion, to_wxyz
+from jointfit_simulators.devices import NS, Cameras, Ticker
+from jointfit_simulators.scene._hardware import WIRES, mocap_table, optical_server, wire_up
+from jointfit_simulators.scene._optical_stream import OpticalStream
+from jointfit_simulators.scene._player import Player
+from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
+from jointfit_simulators.scene._sample_log import SampleLog
+from jointfit_simulators.scene._truth_log import TruthLog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from jointfit_simulators.body import Subject
+    from jointfit_simulators.devices import ClockFault, NatNetServer
+    from jointfit_simulators.scene._streams import ImuStream
+    from jointfit_simulators.settings import Knobs
+
+RIG_FILE = "rig.toml"
+TRUTH_FILE = "truth.jsonl"
+SAMPLES_FILE = "samples.jsonl"
+OPTICAL = "mocap"
+DOWN_S = 1.0
+"""How long the motion-capture server is away when it restarts."""
+LINGER_S = 0.3
+"""Ports stay open this long after the last byte, so that it can be read."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which hardware there is."""
+
+    directory: Path
+    mocap: bool = True
+    can: str = "slcan"
+    wires: Mapping[str, str] = dataclasses.field(default_factory=lambda: WIRES)
+    rig: RigOptions = dataclasses.field(default_factory=RigOptions)
+    clocks: Mapping[str, ClockFault] = dataclasses.field(default_factory=dict)
+    """Clocks that are asked for, by sensor or ``mocap``; the dice give the others."""
+    script: tuple[tuple[float, str], ...] = ()
+    """Commands and when to obey them, s from the beginning of the run."""
+    sync_line: bool = False
+    """A wire from the cameras' sync output to the first sync input of every UART sensor."""
+    ptp: bool = False
+    """Cameras and host are on PTP."""
+    command_port: int = 0
+    """UDP port of the motion-capture server; 0: any free one."""
+    sample_log: bool = False
+    """Tell the true instant of every sample sent."""
+
+
+class BadCommand(ValueError):  # noqa: N818 - named for what happened
+    """A command that means nothing; the message says what would."""
+
+
+class Scene:
+    """Virtual hardware at work.
+
+    Parameters
+    ----------
+    knobs
+        Imperfections.
+    subject
+        Who wears the sensors.
+    options
+        Which hardware there is.
+    now_ns
+        Host time at which the subject's time is 0.
+    """
+
+    def __init__(
+        self, knobs: Knobs, subject: Subject, options: SceneOptions, *, now_ns: int
+    ) -> None:
+        self._options, self._subject = options, subject
+        _check_clocks(options.clocks, (*subject.sensors, OPTICAL))
+        options.directory.mkdir(parents=True, exist_ok=True)
+        self._hardware = wire_up(
+            knobs,
+            subject.sensors,
+            options.directory,
+            wires=options.wires,
+            can=options.can,
+            now_ns=now_ns,
+            sync_line=options.sync_line,
+        )
+        cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
+        samples = options.directory / SAMPLES_FILE
+        self._samples = SampleLog(samples) if options.sample_log else None
+        told = None if self._samples is None else self._samples.add
+        ticker = Ticker(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
+        self._tickers = {n: s.ticker for n, s in self._hardware.streams.items()} | {OPTICAL: ticker}
+        for name, fault in options.clocks.items():
+            self._tickers[name].ask(fault, now_ns)
+        for stream in self._hardware.streams.values():
+            stream.told = told
+        self._server: NatNetServer | None = None
+        if options.mocap:
+            self._server = optical_server(
+                knobs,
+                subject.clusters,
+                cameras.bodies,
+                ticker,
+                ptp=options.ptp,
+                command_port=options.command_port,
+            )
+        self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
+        self._origin_ns = now_ns
+        self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
+        self._player = Player(
+            subject,
+            self._hardware.streams,
+            self._optical,
+            self._truth,
+            origin_ns=now_ns,
+            sync_line=options.sync_line,
+        )
+        self._quit = asyncio.Event()
+        self._verbs = self._commands(cameras)
+
+    def _commands(self, cameras: Cameras) -> dict[str, Callable[[str], None]]:
+        """Return what each command does with the words after it."""
+        return {
+            "play": self._play,
+            "unplug": lambda name: self._plugs(name)[0](),
+            "plug": lambda name: self._plugs(name)[1](),
+            "reboot": self._reboot,
+            "stick": lambda name: self._stream(name).mishaps.stick(),
+            "free": lambda name: self._stream(name).mishaps.free(),
+            "slip": self._slip,
+            "drift": self._drift,
+            "occlude": lambda word: setattr(cameras, "covered", _on(word)),
+            "mocap": self._mocap,
+            "pause": lambda word: setattr(self._player, "paused", _on(word or "on")),
+            "quit": lambda _: self._quit.set(),
+        }
+
+    def _facts(self, knobs: Knobs, now_ns: int) -> dict[str, object]:
+        cameras, streams = self._optical.cameras, self._hardware.streams
+        return {
+            "t_ns": now_ns,
+            "knobs": dataclasses.asdict(knobs),
+            "sensors": dict(self._subject.sensors),
+            "optical_heading_rad": cameras.heading_rad,
+            "sensor_heading_rad": {n: s.sensor.heading_rad for n, s in streams.items()},
+            "q_optical_sensorworld": {
+                n: to_wxyz(cameras.world * s.sensor.world.inv()) for n, s in streams.items()
+            },
+            "clocks": {
+                n: {"boot_ns": ticker.clock.boot_ns, "skew": ticker.clock.skew}
+                for n, ticker in self._tickers.items()
+            },
+            **self._subject.facts,
+        }
+
+    async def run(self, say: Callable[[dict[str, object]], None]) -> None:
+        """Play until `stop`; then send nothing more, linger, and close everything.
+
+        Parameters
+        ----------
+        say
+            Told where everything is when all is ready, and what was sent when nothing more is.
+        """
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                serving = [
+                    tasks.create_task(stream.device.run(), name=f"device {name}")
+                    for name, stream in self._hardware.streams.items()
+                ]
+                if self._server is not None:
+                    serving.append(tasks.create_task(self._server.run(), name="natnet"))
+                    await self._server.ready.wait()
+                rig = self._write_rig()
+                playing = tasks.create_task(self._player.run(), name="player")
+                following = tasks.create_task(self._follow_script(say), name="script")
+                truth = self._options.directory / TRUTH_FILE
+                ports = self._hardware.ports
+                say({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
+                await self._quit.wait()
+                playing.cancel()
+                following.cancel()
+                self._player.finish()
+                say(self.account())
+                await asyncio.sleep(LINGER_S)
+                for task in serving:
+                    task.cancel()
+        finally:  # cancelled or failed, too: ports and files stay open otherwise
+            self.close()
+
+    async def _follow_script(self, say: Callable[[dict[str, object]], None]) -> None:
+        """Obey every command of the script in its time."""
+        for at_s, line in sorted(self._options.script):
+            due_ns = self._origin_ns + round(at_s * NS)
+            await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / NS))
+            try:
+                self.command(line)
+            except BadCommand as error:
+                say({"error": str(error)})
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._quit.set()
+
+    def close(self) -> None:
+        """Close the truth and unplug everything."""
+        self._truth.close()
+        if self._samples is not None:
+            self._samples.close()
+        for stream in self._hardware.streams.values():
+            stream.device.unplug()
+        if self._server is not None:
+            self._server.unplug()
+
+    def _write_rig(self) -> Path:
+        path = self._options.directory / RIG_FILE
+        text = rig_toml(
+            self._options.rig,
+            devices=self._hardware.tables,
+            mocap=self._mocap_table(),
+            clusters=self._subject.clusters,
+            bones=self._subject.visible_bones,
+            plate="plate" in self._subject.templates,
+        )
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    def _mocap_table(self) -> str:
+        if self._server is None:
+            return ""
+        return mocap_table(self._server, sync_line=self._options.sync_line)
+
+    @property
+    def command_port(self) -> int | None:
+        """Return the UDP port of the motion-capture server; None without one."""
+        return None if self._server is None else self._server.command_port
+
+    def command(self, line: str) -> dict[str, object] | None:
+        """Obey one line; return the answer of ``status``.
+
+        Raises
+        ------
+        BadCommand
+            No such command, motion, sensor or word.
+        """
+        verb, _, rest = line.strip().partition(" ")
+        if verb == "status":
+            return self.status()
+        if verb not in self._verbs:
+            raise BadCommand(f"no command {verb!r}; there are: {', '.join(self._verbs)}, status")
+        try:
+            self._verbs[verb](rest.strip())
+        except UnknownMotion as error:
+            raise BadCommand(str(error)) from error
+        return None
+
+    def _play(self, name: str) -> None:
+        self._player.play(name)
+
+    def _reboot(self, name: str) -> None:
+        if name == OPTICAL:
+            self._restart_server(clock_anew=True)
+        else:
+            self._stream(name).device.power_cycle()
+
+    def _slip(self, words: str) -> None:
+        stream, degrees = self._with_number(words, "slip S1 15 (degrees)")
+        stream.mishaps.slip(math.radians(degrees))
+
+    def _drift(self, words: str) -> None:
+        stream, degrees = self._with_number(words, "drift S1 5 (degrees a minute)")
+        stream.mishaps.drift(math.radians(degrees) / 60.0)
+
+    def _with_number(self, words: str, example: str) -> tuple[ImuStream, float]:
+        name, _, number = words.partition(" ")
+        stream = self._stream(name)
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise BadCommand(f"{words!r}: expected a sensor and a number, as in {example}")
+        return stream, value
+
+    def _mocap(self, word: str) -> None:
+        if word == "restart":
+            self._restart_server(clock_anew=False)
+        else:
+            self._optical.running = _on(word)
+
+    def _restart_server(self, *, clock_anew: bool) -> None:
+        """Close the server and open it a second later; only a reboot begins its clock anew."""
+        server = self._server
+        if server is None:
+            raise BadCommand("there is no motion-capture server")
+        server.unplug()
+        if clock_anew:
+            self._tickers[OPTICAL].reboot(time.monotonic_ns())
+        asyncio.get_running_loop().call_later(DOWN_S, server.restart)
+
+    def _stream(self, name: str) -> ImuStream:
+        try:
+            return self._hardware.streams[name]
+        except KeyError:
+            known = ", ".join(self._hardware.streams)
+            raise BadCommand(f"no sensor {name!r}; there are: {known}") from None
+
+    def _plugs(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
+        found = self._hardware.bus if name == "can0" and self._hardware.bus else self._stream(name)
+        return found.unplug, found.plug
+
+    def status(self) -> dict[str, object]:
+        """Return what is going on, as JSON values."""
+        return {
+            "t_ns": time.monotonic_ns(),
+            "motion": self._player.motion(),
+            "devices": {n: s.status() for n, s in self._hardware.streams.items()},
+            "mocap": {"sent": self._optical.sent, "running": self._optical.running},
+            "left_out_ms": self._player.left_out_ns / 1e6,
+        }
+
+    def account(self) -> dict[str, object]:
+        """Return what was sent in all, as JSON values."""
+        streams = self._hardware.streams
+        return {
+            "sent": {**{n: s.device.sent for n, s in streams.items()}, "mocap": self._optical.sent},
+            "dropped_out": {n: s.dropped_out for n, s in streams.items()},
+            "refused": {n: s.refused for n, s in streams.items()},
+            "unheard": {n: s.unheard for n, s in streams.items()},
+        }
+
+
+def _check_clocks(asked: Mapping[str, ClockFault], known: tuple[str, ...]) -> None:
+    for name in asked:
+        if name not in known:
+            raise BadCommand(f"no clock {name!r}; there are: {', '.join(known)}")
+
+
+def _on(word: str) -> bool:
+    words = {"on": True, "start": True, "off": False, "stop": False}
+    if word not in words:
+        raise BadCommand(f"{word!r}: expected {' or '.join(words)}")
+    return words[word]

@@ -1,0 +1,173 @@
+"""From poses to samples on a wire: one stream a device, planned in blocks, sent one by one.
+
+Law: a sample is stamped with its true instant, however late it reaches the wire; every sample
+taken while the device measures is sent, dropped by the knob, or refused by a full line, and
+counted as such.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol, cast
+
+import numpy as np
+
+from jointfit_simulators.devices import NS, Mishaps, OrientationSensor, Ticker
+from jointfit_simulators.imu_device import ImuDevice
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_simulators.imu_device import Quaternion
+    from jointfit_simulators.settings import Knobs
+
+
+SampleTold = Callable[[str, int, int], None]
+"""Told of every sample sent: device, its number as sent, true instant on the host's clock, ns."""
+
+
+_EDGES = 4096
+
+
+class WornDevice(ImuDevice, Protocol):
+    """A virtual IMU with the faults this scene plays."""
+
+    def edge(self, device_ns: int) -> None:
+        """Take an edge on its sync input, at a time of its own clock; nothing where it has none."""
+
+    @property
+    def counter(self) -> int:
+        """Number that its next sample will carry."""
+
+    @property
+    def line_ns(self) -> int:
+        """How long a sample takes on the line, first byte to last, ns; 0 where it takes none."""
+
+    def lose(self, count: int) -> None:
+        """Lose the next `count` samples: they take a counter value and are not sent."""
+
+    def power_cycle(self) -> None:
+        """Lose power for a moment: clock and counter begin anew."""
+
+    def unplug(self) -> None:
+        """Take its wire away."""
+
+    def plug(self) -> None:
+        """Put it back."""
+
+
+class ImuStream:
+    """One worn sensor: its error, its clock, its device.
+
+    Parameters
+    ----------
+    knobs
+        Everything that is wrong with it.
+    name
+        Its id.
+    device
+        Where samples go.
+    latency_ms
+        Least delay of its transport.
+    shared_wire
+        Others use its wire: unplugging it means that it falls silent.
+    now_ns
+        Host time at which the run begins.
+    told
+        Told of every sample sent.
+    """
+
+    def __init__(
+        self,
+        knobs: Knobs,
+        name: str,
+        device: WornDevice,
+        *,
+        latency_ms: float,
+        shared_wire: bool,
+        now_ns: int,
+        told: SampleTold | None = None,
+    ) -> None:
+        self.name, self.device, self.told = name, device, told
+        self.sensor, self.mishaps = OrientationSensor(knobs, name), Mishaps()
+        self.ticker = Ticker(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
+        self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
+        self._unplugged = False
+        self._waiting: deque[tuple[int, int, Quaternion | None]] = deque()
+        self._edges: deque[int] = deque(maxlen=_EDGES)
+        self.dropped_out = 0
+        """Samples taken while measuring and never sent, as the knob wants it."""
+        self.unheard = 0
+        """Samples that nobody could hear: unplugged, paused, or not told to measure."""
+        self.refused = 0
+        """Samples the line had no room for."""
+
+    def wire(self, edges_ns: NDArray[np.int64]) -> None:
+        """Let edges come on its sync line at these host instants."""
+        self._edges.extend(edges_ns.tolist())
+
+    def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
+        """Take the samples of a block; return their true host instants."""
+        rate_hz = self.device.rate_hz or self._fallback_hz
+        self._taken = self.ticker.samples(begin_ns, end_ns, NS / rate_hz)
+        return self._taken.host_ns
+
+    def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
+        """Give the planned samples their orientations; return when each is due on the wire."""
+        said = self.mishaps.apply(t_s, self.sensor.report(t_s, q_base_sensor))
+        lost = self._taken.dropped | ~np.isfinite(said[:, 0])
+        for true_ns, stamp, q, never in zip(
+            self._taken.host_ns.tolist(), self._taken.device_ns.tolist(), said.tolist(),
+            lost.tolist(), strict=True,
+        ):  # fmt: skip
+            self._waiting.append((true_ns, stamp, None if never else cast("Quaternion", tuple(q))))
+        # the host has a sample when its last byte is there
+        return cast("list[int]", (self._taken.due_ns + self.device.line_ns).tolist())
+
+    def emit(self, *, heard: bool = True) -> None:
+        """Put the next sample on the wire, or drop it where nobody is to hear it."""
+        true_ns, stamp, q = self._waiting.popleft()
+        while self._edges and self._edges[0] <= true_ns:
+            self.device.edge(self.ticker.device_ns(self._edges.popleft()))
+        if self._unplugged or not heard or not self.device.streaming:
+            self.unheard += 1
+            return
+        if q is None:
+            self.dropped_out += 1
+            self.device.lose(1)
+            self.device.push(stamp, (1.0, 0.0, 0.0, 0.0))
+            return
+        before, number = self.device.sent, self.device.counter
+        self.device.push(stamp, q)
+        if self.device.sent == before:
+            self.refused += 1
+        elif self.told is not None:
+            self.told(self.name, number, true_ns)
+
+    def forget(self) -> None:
+        """Drop what is planned and not sent."""
+        self._waiting.clear()
+
+    def unplug(self) -> None:
+        """Take the device off its wire."""
+        self._unplugged = True
+        if not self._shared:
+            self.device.unplug()
+
+    def plug(self) -> None:
+        """Put it back."""
+        self._unplugged = False
+        if not self._shared:
+            self.device.plug()
+
+    def status(self) -> dict[str, object]:
+        """Return the counters, as JSON values."""
+        return {
+            "streaming": self.device.streaming and not self._unplugged,
+            "rate_hz": self.device.rate_hz,
+            "sent": self.device.sent,
+            "dropped_out": self.dropped_out,
+            "refused": self.refused,
+            "unheard": self.unheard,
+        }

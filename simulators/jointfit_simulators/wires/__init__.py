@@ -1,0 +1,7 @@
+"""Virtual wires: serial lines on ptys, CAN buses, line noise."""
+
+from jointfit_simulators.wires._can_wire import CanWire, PythonCanWire, SlcanAdapter
+from jointfit_simulators.wires._line_noise import line_noise
+from jointfit_simulators.wires._pty_line import PtyLine
+
+__all__ = ["CanWire", "PtyLine", "PythonCanWire", "SlcanAdapter", "line_noise"]
