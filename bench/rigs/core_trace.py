@@ -14,7 +14,7 @@ from typing_extensions import override
 from jointfit_daemon.model import MocapFrame
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived
-from jointfit_daemon.pipeline.sources import Stamped
+from jointfit_daemon.pipeline.sources import StampedMeasurement
 from jointfit_daemon.timing.lag import estimate_lag
 
 if TYPE_CHECKING:
@@ -108,15 +108,18 @@ class TracingCore(Core):
         return outputs
 
     @override
-    def _take(
-        self, source: str, state: SourceState, items: list[Stamped | Corrupt | DeviceEvent]
+    def _process(
+        self,
+        source: str,
+        state: SourceState,
+        items: list[StampedMeasurement | Corrupt | DeviceEvent],
     ) -> list[Output]:
         for item in items:
-            if isinstance(item, Stamped) and not item.stamp.duplicate:
+            if isinstance(item, StampedMeasurement) and not item.stamp.duplicate:
                 self._write(source, state, item)
-        return super()._take(source, state, items)
+        return super()._process(source, state, items)
 
-    def _write(self, source: str, state: SourceState, item: Stamped) -> None:
+    def _write(self, source: str, state: SourceState, item: StampedMeasurement) -> None:
         trace, measured, stamp = self.trace, item.measurement, item.stamp
         trace.latency_ns.setdefault(source, state.clock.latency_ns)
         row = Stamping(

@@ -23,7 +23,7 @@ from typing_extensions import override
 
 from jointfit_daemon.model import ImuSample, LimbState
 from jointfit_daemon.pipeline import Core
-from jointfit_daemon.pipeline.sources import Stamped
+from jointfit_daemon.pipeline.sources import StampedMeasurement
 from jointfit_daemon.timing.clock import SLEW
 
 if TYPE_CHECKING:
@@ -138,15 +138,18 @@ class WatchedCore(Core):
         self.frames: list[JudgedFrame] = []
 
     @override
-    def _take(
-        self, source: str, state: SourceState, items: list[Stamped | Corrupt | DeviceEvent]
+    def _process(
+        self,
+        source: str,
+        state: SourceState,
+        items: list[StampedMeasurement | Corrupt | DeviceEvent],
     ) -> list[Output]:
         for item in items:
-            if isinstance(item, Stamped):
+            if isinstance(item, StampedMeasurement):
                 self._judge(source, item, state)
-        return super()._take(source, state, items)
+        return super()._process(source, state, items)
 
-    def _judge(self, source: str, item: Stamped, state: SourceState) -> None:
+    def _judge(self, source: str, item: StampedMeasurement, state: SourceState) -> None:
         measured, stamp = item.measurement, item.stamp
         number = measured.counter if isinstance(measured, ImuSample) else measured.number
         lag_ns = self._lag_ns.get(source, 0)

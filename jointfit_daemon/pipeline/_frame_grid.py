@@ -1,8 +1,8 @@
-"""The grid of frames of a rig, and the verdicts on its sensors' samples.
+"""Frame grid of a rig, across reloads of the configuration, and the counts of its samples.
 
-Invariant: frames are owed from the first configuration on, with or without samples, and their
-instants grow across reloads. A reload begins a new grid only where it lays frames out anew; samples
-that waited get their verdict then, and counts go on for every sensor that is still there.
+Invariant: frames are due from the first configuration on, with or without samples, and their
+instants increase across reloads. A reload starts a new grid only if it changes rates, sensors or
+the alignment mode. Samples that wait are then counted, and the counts of remaining sensors go on.
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ _NS = 1_000_000_000
 
 
 class FrameGrid:
-    """Aligns the sensors of one rig, from reload to reload.
+    """Holds the frame aligner of one rig and replaces it when a reload requires it.
 
     Parameters
     ----------
     rig : Rig
-        The first one.
+        The first configuration.
     begin_ns : int
-        Host time from which on frames are owed, ns.
+        Host time from which frames are due, ns.
     """
 
     def __init__(self, rig: Rig, begin_ns: int) -> None:
         self._layout = _layout(rig)
         self._names = _sensors(rig)
-        self._before: dict[str, dict[str, int]] = {}
-        """Counts of aligners that a reload replaced."""
+        self._counts_before: dict[str, dict[str, int]] = {}
+        """Counts of the aligners that reloads replaced."""
         self.aligner = _aligner(rig, begin_ns)
 
-    def follow(self, rig: Rig) -> None:
-        """Go on with a rig that was reloaded."""
+    def reload(self, rig: Rig) -> None:
+        """Apply a reloaded configuration."""
         if _layout(rig) == self._layout:
             return
         self.aligner.close()
-        known = self.verdicts()
+        counts = self.counts()
         self.aligner = _aligner(rig, self.aligner.next_ns)
         self._layout, self._names = _layout(rig), _sensors(rig)
-        # one that is gone takes its counts along: it may come back, and begins at nothing then
-        self._before = {name: known[name] for name in self._names if name in known}
+        # A removed sensor loses its counts: if it is added again, it starts from 0.
+        self._counts_before = {name: counts[name] for name in self._names if name in counts}
 
-    def verdicts(self) -> dict[str, dict[str, int]]:
-        """Return the verdicts on every sensor's samples since the daemon started."""
-        return {name: self._counts(name) for name in self._names}
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return the counts of every sensor's samples since the daemon started, by outcome."""
+        return {name: self._sensor_counts(name) for name in self._names}
 
-    def _counts(self, name: str) -> dict[str, int]:
-        before = self._before.get(name, {})
+    def _sensor_counts(self, name: str) -> dict[str, int]:
+        before = self._counts_before.get(name, {})
         return {key: n + before.get(key, 0) for key, n in self.aligner.counts(name).items()}
 
 

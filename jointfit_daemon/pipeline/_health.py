@@ -1,7 +1,4 @@
-"""The part of ``bridge/health`` that the core knows: counters and clocks of every device.
-
-Law: a snapshot, computed when asked for; nothing here changes anything.
-"""
+"""Health of devices, calibration and fusion: the part of ``bridge/health`` that the core knows."""
 
 from __future__ import annotations
 
@@ -19,24 +16,27 @@ _NS_PER_MS = 1e6
 _NS_PER_US = 1e3
 
 
-def health_of(
+def core_health(
     sources: Mapping[str, SourceState],
-    counted: Mapping[str, Mapping[str, int]],
+    counts: Mapping[str, Mapping[str, int]],
     session: CalibrationSession,
     fuser: LimbFuser,
     now_ns: int,
 ) -> dict[str, object]:
-    """Return the health of every device and of the calibration, as JSON-able values.
+    """Return the health of all devices, the calibration and fusion, as JSON values.
 
-    For every device ``received = used + decimated + idle + late + duplicate + dropped + pending``;
-    what is pending gets its verdict within a few sample periods.
+    Invariant for each device:
+    ``received = used + decimated + idle + late + duplicate + dropped + pending``. Pending samples
+    are counted elsewhere within a few sample periods.
     """
     devices = {}
     for name, state in sources.items():
-        verdicts = counted[name]
+        samples = counts[name]
         if state.source.kind == "mocap":
-            verdicts = _mocap(state, verdicts)
-        devices[name] = {**_wire(state, now_ns), **verdicts, **_clock(state), **_filter(state)}
+            samples = _mocap_counts(state, samples)
+        devices[name] = {**_wire_health(state, now_ns), **samples, **_clock_health(state)}
+        if (orientation_filter := state.info.get("orientation_filter")) is not None:
+            devices[name]["orientation_filter"] = orientation_filter
         if state.source.kind == "imu":
             devices[name]["sensor"] = fuser.sensor_monitor.state(name)
     return {
@@ -46,11 +46,11 @@ def health_of(
     }
 
 
-def _mocap(state: SourceState, counted: Mapping[str, int]) -> dict[str, int]:
-    """Camera frames are used or idle as they come; the decoder withheld the others."""
+def _mocap_counts(state: SourceState, counts: Mapping[str, int]) -> dict[str, int]:
+    """Return the counts of a mocap source, with the frames that its decoder withheld."""
     withheld = state.withheld()
     return {
-        **counted,
+        **counts,
         "received": state.counts.received + sum(withheld.values()),
         "decimated": 0,
         "late": withheld["late"],
@@ -60,7 +60,7 @@ def _mocap(state: SourceState, counted: Mapping[str, int]) -> dict[str, int]:
     }
 
 
-def _wire(state: SourceState, now_ns: int) -> dict[str, object]:
+def _wire_health(state: SourceState, now_ns: int) -> dict[str, object]:
     counts, last = state.counts, state.last_arrival_ns
     return {
         "online": state.online,
@@ -74,7 +74,7 @@ def _wire(state: SourceState, now_ns: int) -> dict[str, object]:
     }
 
 
-def _clock(state: SourceState) -> dict[str, object]:
+def _clock_health(state: SourceState) -> dict[str, object]:
     clock = state.clock
     delays, rate = clock.minute.delays, clock.minute.rate_hz
     return {
@@ -93,12 +93,6 @@ def _clock(state: SourceState) -> dict[str, object]:
     }
 
 
-def _filter(state: SourceState) -> dict[str, object]:
-    """Return rest and bias of an orientation filter on the gateway, as its decoder told them."""
-    told = state.info.get("orientation_filter")
-    return {} if told is None else {"orientation_filter": told}
-
-
 def _us(value_ns: float | None) -> float | None:
-    """Return microseconds; unknown where there is no figure yet, infinity included."""
+    """Return a time in microseconds; None if it is unknown or infinite."""
     return None if value_ns is None or not isfinite(value_ns) else round(value_ns / _NS_PER_US, 1)

@@ -1,7 +1,7 @@
-"""What camera frames are used for while it runs: calibration, lags, learning, and where O1 is.
+"""Distribution of mocap frames: calibration, lag monitoring, online learning, position of O1.
 
-Law: every frame is counted once, used or idle. Only live ones are looked at, and only those whose
-stamp is mapped to the host's clock are paired with sensors.
+Invariant: every frame is counted once, as used or idle. Only live frames are used, and only frames
+whose stamp is synchronized to the host clock are paired with sensors.
 """
 
 from __future__ import annotations
@@ -15,57 +15,58 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, Vector
     from jointfit_daemon.pipeline.calibration_session import CalibrationSession
-    from jointfit_daemon.pipeline.online_learning import OnlineLearner
-    from jointfit_daemon.pipeline.sources import LagWatch, Stamped
+    from jointfit_daemon.pipeline.online_learning import OnlineFrameCollector
+    from jointfit_daemon.pipeline.sources import LagMonitor, StampedMeasurement
 
 FRESH_NS = 200_000_000
-"""A rig whose cameras gave a live frame within this time runs in mode ``imu+mocap``."""
+"""Age up to which the last live frame makes the mode ``imu+mocap``, ns."""
 
 
-class CameraUse:
-    """Takes the frames of one rig's cameras."""
+class MocapRouter:
+    """Distributes the mocap frames of one rig and counts them."""
 
     def __init__(self) -> None:
-        self._seen_ns: int | None = None
+        self._live_ns: int | None = None
         self._used = self._idle = 0
         self._locator: OpticalOrigin | None = None
         self.origin: Vector | None = None
-        """O1 in the frame before, optical world, m; None where it was not seen."""
+        """O1 in the last frame, optical world, m; None if not visible."""
 
-    def begin_again(self) -> None:
-        """Forget the counts: the rig has no cameras any more."""
+    def reset_counts(self) -> None:
+        """Set the counts to 0: the rig has no mocap source any more."""
         self._used = self._idle = 0
 
-    def wear(self, chain: Chain, calibration: Calibration | None) -> None:
-        """Look for O1 as this calibration has it, or not at all."""
+    def set_calibration(self, chain: Chain, calibration: Calibration | None) -> None:
+        """Locate O1 by the markers of `calibration`, or not at all."""
         self._locator = OpticalOrigin(chain, calibration) if calibration else None
         self.origin = None
 
-    def fresh(self, now_ns: int) -> bool:
-        """Tell whether the cameras gave a live frame a moment ago."""
-        return self._seen_ns is not None and now_ns - self._seen_ns < FRESH_NS
+    def is_fresh(self, now_ns: int) -> bool:
+        """Return whether a live frame arrived within the last 200 ms."""
+        return self._live_ns is not None and now_ns - self._live_ns < FRESH_NS
 
-    def verdicts(self) -> dict[str, int]:
-        """Return how many frames were of use, and how many nobody needed."""
+    def counts(self) -> dict[str, int]:
+        """Return the numbers of used and idle frames."""
         return {"used": self._used, "idle": self._idle}
 
-    def take(
+    def add(
         self,
         now_ns: int,
-        item: Stamped,
+        item: StampedMeasurement,
         session: CalibrationSession,
-        lags: LagWatch | None,
-        learner: OnlineLearner,
+        lags: LagMonitor | None,
+        collector: OnlineFrameCollector,
     ) -> None:
-        """Take one frame and give it to all who want it."""
+        """Pass one frame to all consumers."""
         frame, stamp, used = item.measurement, item.stamp, False
         if isinstance(frame, ImuSample):
             return
+
         if frame.live:
-            self._seen_ns = now_ns
+            self._live_ns = now_ns
             if lags is not None and stamp.synced:
                 lags.add_mocap(stamp.t_ns, frame, stamp.epoch)
-                learner.add_mocap(stamp.t_ns, frame, stamp.epoch)
+                collector.add_mocap(stamp.t_ns, frame, stamp.epoch)
             if session.collecting:
                 used = True
                 session.add_mocap(stamp.t_ns, frame)

@@ -1,7 +1,9 @@
-"""Turns what wires and clocks do into notices, at most one a minute for each kind and device.
+"""Rate limit for notices about wires and clocks: one per minute, device and kind.
 
-Invariant: nothing is lost by the limit. A condition is reported when it begins, with its sums once
-a minute while it lasts, and when a minute has passed without it.
+A condition is reported when it begins, with its totals once a minute while it lasts, and when a
+minute passed without it.
+
+Invariant: the totals of all notices equal the totals of all events; the limit loses nothing.
 """
 
 from __future__ import annotations
@@ -17,12 +19,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 QUIET_NS = 60_000_000_000
-"""Least time between two notices of a kind and device, ns: health counts every single one."""
+"""Shortest time between two notices of one device and kind, ns. ``bridge/health`` counts all."""
 
 _NS_PER_S = 1_000_000_000
 
 STEP_NS = 2_000_000
-"""UNIX time set by less is followed and not told of."""
+"""Smallest step of UNIX time that is reported, ns: NTP adjusts by less."""
 
 Level = Literal["info", "warning", "error"]
 _LEVELS: dict[str, Level] = {
@@ -30,12 +32,12 @@ _LEVELS: dict[str, Level] = {
     "error": "error",
 }
 _JUMPS = {"restart": "clock", "clock": "clock", "counter": "wire"}
-"""Kind of the notice for each device event that is reported by its last text and its number."""
+"""Kind of the notice for device events that are reported by their last text and their number."""
 
 
 @dataclass(slots=True)
-class _Held:
-    told_ns: int
+class _Condition:
+    reported_ns: int
     count: int = 0
     amount: int = 0
     lasting: bool = False
@@ -45,41 +47,41 @@ class _Held:
 
 
 @dataclass(slots=True)
-class Bulletin:
-    """Collects corruption, gaps, jumps of clocks; passes on everything else at once."""
+class NoticeLimiter:
+    """Collects corruption, gaps and clock jumps; passes on all other events at once."""
 
-    _held: dict[tuple[str, str], _Held] = field(default_factory=dict)
+    _conditions: dict[tuple[str, str], _Condition] = field(default_factory=dict)
 
     def add(self, now_ns: int, source: str, item: Corrupt | DeviceEvent) -> list[Notice]:
-        """Take one happening; return what may be told already."""
+        """Add one event; return the notices that are due."""
         if isinstance(item, Corrupt):
-            return self._hold(now_ns, (source, "corrupt"), item.discarded, item.reason)
+            return self._collect(now_ns, (source, "corrupt"), item.discarded, item.reason)
         if item.kind == "gap":
             lost = item.data.get("lost", 1)
-            return self._hold(
+            return self._collect(
                 now_ns, (source, "gap"), lost if isinstance(lost, int) else 1, item.text
             )
         if item.kind in _JUMPS:
-            return self._hold(now_ns, (source, item.kind), 1, item.text, item.data)
+            return self._collect(now_ns, (source, item.kind), 1, item.text, item.data)
         level: Level = _LEVELS.get(item.kind, "info")
         return [Notice(now_ns, "device", source, item.text, level, dict(item.data))]
 
     def due(self, now_ns: int) -> list[Notice]:
-        """Return the held-back notices whose quiet time is over."""
-        if not self._held:
+        """Return the collected notices whose quiet time has passed."""
+        if not self._conditions:
             return []
         notices = []
-        for key, held in self._held.items():
-            if now_ns - held.told_ns < QUIET_NS:
+        for key, condition in self._conditions.items():
+            if now_ns - condition.reported_ns < QUIET_NS:
                 continue
-            if held.count:
-                held.lasting = key[1] not in _JUMPS
-                notices.append(_notice(now_ns, key, held))
-            elif held.lasting:
-                notices.append(_ended(now_ns, key, held))
+            if condition.count:
+                condition.lasting = key[1] not in _JUMPS
+                notices.append(_notice(now_ns, key, condition))
+            elif condition.lasting:
+                notices.append(_end_notice(now_ns, key, condition))
         return notices
 
-    def _hold(
+    def _collect(
         self,
         now_ns: int,
         key: tuple[str, str],
@@ -87,63 +89,65 @@ class Bulletin:
         text: str,
         data: Mapping[str, object] = MappingProxyType({}),
     ) -> list[Notice]:
-        held = self._held.setdefault(key, _Held(told_ns=now_ns - QUIET_NS))
-        held.count += 1
-        held.amount += amount
-        held.text, held.data = text, data
-        if now_ns - held.told_ns < QUIET_NS:
+        condition = self._conditions.setdefault(key, _Condition(reported_ns=now_ns - QUIET_NS))
+        condition.count += 1
+        condition.amount += amount
+        condition.text, condition.data = text, data
+        if now_ns - condition.reported_ns < QUIET_NS:
             return []
-        held.lasting = False
-        return [_notice(now_ns, key, held)]
+        condition.lasting = False
+        return [_notice(now_ns, key, condition)]
 
 
-def _notice(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
+def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
     source, kind = key
     if kind in _JUMPS:
-        return _jump(now_ns, key, held)
+        return _jump_notice(now_ns, key, condition)
+
     if kind == "gap":
-        text = f"{held.amount} sample{'s' if held.amount > 1 else ''} lost on the way"
+        text = f"{condition.amount} sample{'s' if condition.amount > 1 else ''} lost"
     else:
-        text = f"{held.amount} bytes made no message: {held.text}"
-    if held.lasting:
-        text = f"{text}, in the last {(now_ns - held.told_ns) / _NS_PER_S:.0f} s"
-    data = _sums(kind, held)
-    held.told_ns, held.count, held.amount = now_ns, 0, 0
+        text = f"{condition.amount} bytes discarded: {condition.text}"
+    if condition.lasting:
+        text = f"{text}, in the last {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
+    data = _totals(kind, condition)
+    condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
     return Notice(now_ns, "wire", source, text, "warning", data)
 
 
-def _ended(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
-    """Return that nothing of a kind happened since the last notice."""
+def _end_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
+    """Return the notice that a condition did not occur since the last one."""
     source, kind = key
-    what = "no sample was lost" if kind == "gap" else "all bytes made messages"
-    passed_s = (now_ns - held.told_ns) / _NS_PER_S
-    held.told_ns, held.lasting = now_ns, False
-    return Notice(now_ns, "wire", source, f"{what} for {passed_s:.0f} s", "info", _sums(kind, held))
+    what = "no samples lost" if kind == "gap" else "no bytes discarded"
+    quiet_s = (now_ns - condition.reported_ns) / _NS_PER_S
+    condition.reported_ns, condition.lasting = now_ns, False
+    text = f"{what} for {quiet_s:.0f} s"
+    return Notice(now_ns, "wire", source, text, "info", _totals(kind, condition))
 
 
-def _sums(kind: str, held: _Held) -> dict[str, object]:
+def _totals(kind: str, condition: _Condition) -> dict[str, object]:
     if kind == "gap":
-        return {"gaps": held.count, "lost": held.amount}
-    return {"runs": held.count, "discarded_bytes": held.amount}
+        return {"gaps": condition.count, "lost": condition.amount}
+    return {"runs": condition.count, "discarded_bytes": condition.amount}
 
 
-def _jump(now_ns: int, key: tuple[str, str], held: _Held) -> Notice:
-    """Return the last of what was held back, and how often there was something of its kind."""
+def _jump_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
+    """Return the last event of a kind, and the number of events since the last notice."""
     source, kind = key
-    text, data = held.text, dict(held.data)
-    if held.count > 1:
-        text = f"{text} (the last of {held.count} such events)"
-        data["events"] = held.count
-    held.told_ns, held.count, held.amount = now_ns, 0, 0
+    text, data = condition.text, dict(condition.data)
+    if condition.count > 1:
+        text = f"{text} (last of {condition.count} such events)"
+        data["events"] = condition.count
+    condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
     return Notice(now_ns, _JUMPS[kind], source, text, "warning", data)
 
 
-def unix_time_set(now_ns: int, step_ns: int) -> list[Notice]:
-    """Return what to tell when UNIX time of this host was set forward by `step_ns`."""
+def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
+    """Return the notice about UNIX time of this host having been set forward by `step_ns`."""
     if abs(step_ns) < STEP_NS:
         return []
     step_s = step_ns / 1e9
-    text = f"UNIX time was set back by {-step_s:.3f} s"
-    if step_s > 0:  # in suspend CLOCK_MONOTONIC stands still
-        text = f"UNIX time was set forward by {step_s:.3f} s, or the host slept so long"
+    text = f"UNIX time of this host was set back by {-step_s:.3f} s"
+    if step_s > 0:  # CLOCK_MONOTONIC stops in suspend
+        text = f"UNIX time was set forward by {step_s:.3f} s, or the host was suspended that long"
     return [Notice(now_ns, "clock", "host", text, "warning", {"step_s": step_s})]

@@ -1,7 +1,7 @@
-"""Feeds recorded events to a fresh core: the same limb states come out, byte for byte.
+"""Replay of recorded events in a new core: gives the limb states of the live run, byte for byte.
 
-Law: what the live shell did beyond moving events (opening ports, running the worker, storing) is
-already in the events; a replay does none of it.
+Opening of ports, calibration jobs and storage are not repeated: the recorded events contain their
+results.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def replay(events: Iterable[Event]) -> Iterator[Output]:
-    """Yield every output of the core over `events`, in order."""
+    """Yield all outputs of a new core for `events`, in order."""
     core = Core()
     for event in events:
         yield from core.feed(event)
 
 
 def replay_states(events: Iterable[Event]) -> Iterator[LimbState]:
-    """Yield only the limb states."""
+    """Yield the limb states of a new core for `events`, in order."""
     return (output for output in replay(events) if isinstance(output, LimbState))

@@ -1,12 +1,13 @@
-"""What goes into the core and what comes out of it. Law: frozen data, nothing else.
+"""Input events and outputs of the core, as frozen data.
 
-Everything that can change what the core does is one of the input events below, so a log of them,
-fed to a fresh core, gives the same outputs again.
+Invariant: only input events change the core. A log of them, fed to a new core, gives the same
+outputs again.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.model import LimbState
@@ -18,25 +19,25 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chunk
 
-# --- in ---------------------------------------------------------------------------------------
+# --- input events -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Configured:
-    """A rig was loaded: the first event of all, and again at every reload."""
+    """A configuration was loaded: the first event, and again at every reload."""
 
     t_ns: int
     rig: Rig
     calibration: Calibration | None
-    """What the store held for this rig."""
+    """Newest stored calibration of the rig."""
     calibration_version: int | None = None
     calibration_age_s: float = 0.0
-    """How long ago it was stored, s: its headings have wandered since."""
+    """Time since it was stored, s: heading uncertainty has grown since."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceOpened:
-    """A driver began to run: what it emits from here on goes to a fresh decoder."""
+    """A driver started; its chunks go to a new decoder."""
 
     t_ns: int
     source: str
@@ -44,7 +45,7 @@ class SourceOpened:
 
 @dataclass(frozen=True, slots=True)
 class SourceClosed:
-    """A driver ended: lost (tried again) or misconfigured (stays away) or removed by a reload."""
+    """A driver ended: lost (will be retried), misconfigured (will not), or removed by a reload."""
 
     t_ns: int
     source: str
@@ -54,7 +55,7 @@ class SourceClosed:
 
 @dataclass(frozen=True, slots=True)
 class ChunkArrived:
-    """Bytes of one source."""
+    """Bytes of one source arrived."""
 
     source: str
     chunk: Chunk
@@ -62,25 +63,25 @@ class ChunkArrived:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Time went on without anything arriving: the core's deadline, or a shell's heartbeat."""
+    """Time passed without other events: a deadline of the core, or a heartbeat of the runner."""
 
     t_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Somebody asked for something; arguments were validated at the edge."""
+    """A request of a client, with validated arguments."""
 
     t_ns: int
     command: str
-    """``calibrate`` so far."""
+    """``calibrate`` is the only command."""
     transaction: str
     arguments: Mapping[str, object]
 
 
 @dataclass(frozen=True, slots=True)
 class JobFinished:
-    """The worker ended a job: `result` as the job's kind defines it, or `error` says why not."""
+    """The worker finished a job with a result, or failed with an error."""
 
     t_ns: int
     job: int
@@ -90,7 +91,7 @@ class JobFinished:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationStored:
-    """The store wrote the calibration that ``CalibrationReady`` handed out."""
+    """The calibration of the last ``CalibrationReady`` was stored."""
 
     t_ns: int
     version: int
@@ -98,9 +99,9 @@ class CalibrationStored:
 
 @dataclass(frozen=True, slots=True)
 class UnixOffset:
-    """UNIX time minus CLOCK_MONOTONIC: at the start, and whenever it is another.
+    """UNIX time minus CLOCK_MONOTONIC: at the start, and whenever it changes.
 
-    They run at the same rate, so another one means that UNIX time was set, or that the host slept.
+    Both clocks have the same rate, so a change means that UNIX time was set or the host suspended.
     """
 
     t_ns: int
@@ -119,12 +120,12 @@ Event = (
     | UnixOffset
 )
 
-# --- out --------------------------------------------------------------------------------------
+# --- outputs ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """A change of state worth telling: goes to ``bridge/event`` and the log."""
+    """A change worth reporting: published on ``bridge/event`` and logged."""
 
     t_ns: int
     kind: str
@@ -146,10 +147,24 @@ class DeviceStatus:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device said of itself; retained."""
+    """Information that a device reported about itself; retained."""
 
     id: str
     data: Mapping[str, object]
+
+
+class CalibrationPhase(StrEnum):
+    """Phases of the calibration session."""
+
+    UNCALIBRATED = "uncalibrated"
+    ALIGN = "align"
+    ALIGNED = "aligned"
+    STATIC = "static"
+    POSED = "posed"
+    FUNCTIONAL = "functional"
+    FITTING = "fitting"
+    CALIBRATED = "calibrated"
+    ABORTED = "aborted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,31 +172,30 @@ class CalibrationStatus:
     """Phase and quality of the calibration; retained."""
 
     t_ns: int
-    phase: str
-    """``uncalibrated``, ``align``, ``aligned``, ``static``, ``posed``, ``functional``,
-    ``fitting``, ``calibrated`` or ``aborted``."""
+    phase: CalibrationPhase
     text: str
     version: int | None = None
-    """Of the calibration in force; None while there is none, or it is not stored (yet)."""
+    """Version of the calibration in force; None if there is none or it is not stored."""
     quality: Mapping[str, object] = field(default_factory=dict)
-    """Figures of what just ended, else of the calibration in force."""
+    """Quality of the phase that ended, else of the calibration in force."""
     kept: str | None = None
-    """Why the result that just came was not taken and the calibration in force stays."""
+    """Reason why a new result was rejected and the calibration in force is kept."""
     refused: Mapping[str, object] = field(default_factory=dict)
-    """Figures of the result that was not taken."""
+    """Quality of the rejected result."""
 
     @property
     def level(self) -> Literal["info", "warning"]:
-        """Return how much attention it needs: a result that was refused or aborted needs some."""
-        return "warning" if self.phase == "aborted" or self.kept is not None else "info"
+        """Level of the event: a rejected result or an aborted phase is a warning."""
+        aborted = self.phase == CalibrationPhase.ABORTED
+        return "warning" if aborted or self.kept is not None else "info"
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationProgress:
-    """How far the running phase is; at most 5 a second."""
+    """Progress of the running phase; at most 5 a second."""
 
     t_ns: int
-    phase: str
+    phase: CalibrationPhase
     progress: float
     """0 to 1."""
     text: str
@@ -190,7 +204,7 @@ class CalibrationProgress:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """Work for the worker process: ``calibration.jobs.run_job(kind, payload)``, all picklable."""
+    """A job for the worker process: ``calibration.jobs.run_job(kind, payload)``, picklable."""
 
     job: int
     kind: str
@@ -199,21 +213,21 @@ class FitJob:
 
 @dataclass(frozen=True, slots=True)
 class CancelJob:
-    """The result of this job is no longer wanted: stop the worker."""
+    """The result of this job is no longer needed: stop the worker."""
 
     job: int
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationReady:
-    """A calibration to be stored; answered with ``CalibrationStored``."""
+    """A calibration to store; answered with ``CalibrationStored``."""
 
     calibration: Calibration
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The answer to a request: exactly one each."""
+    """The reply to a request: exactly one each."""
 
     command: str
     transaction: str

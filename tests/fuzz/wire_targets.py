@@ -106,8 +106,8 @@ def feed_core(source: str, chunks: Iterable[bytes]) -> None:
 def feed_source(source: str, chunks: Iterable[bytes]) -> None:
     """Take chunks through decoder and clock of one source, and its events to JSON."""
     (configured,) = (item for item in rig().sources if item.id == source)
-    state = SourceState.of(configured)
-    state.opened()
+    state = SourceState.create(configured)
+    state.start()
     t_ns = BEGIN_NS
     for event in camera_hello(t_ns) if source == "mocap" else ():
         if isinstance(event, ChunkArrived):
@@ -117,7 +117,7 @@ def feed_source(source: str, chunks: Iterable[bytes]) -> None:
         for item in state.feed(Chunk(t_ns, data)):
             if isinstance(item, DeviceEvent):
                 encode_payload(item.data)
-    state.closed()
+    state.stop()
 
 
 # --- serial -----------------------------------------------------------------------------------

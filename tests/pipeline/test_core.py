@@ -1,4 +1,4 @@
-"""The core as a whole, on bytes: what comes in is accounted for, what comes out is in order."""
+"""The core with byte streams: counts of samples, order of frames, replay."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def fed(events: list[Event]) -> Bench:
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32))
-def test_whatever_comes_every_sample_has_one_verdict_and_frames_are_in_order(seed: int) -> None:
+def test_every_sample_is_counted_once_and_frames_are_in_order(seed: int) -> None:
     bench = fed(troubled(random.Random(seed)))
     for name, device in bench.devices().items():
         accounted = sum(device[key] for key in (*VERDICTS, "pending"))
@@ -91,14 +91,14 @@ def test_whatever_comes_every_sample_has_one_verdict_and_frames_are_in_order(see
 
 @settings(max_examples=10)
 @given(st.integers(0, 2**32))
-def test_whatever_comes_a_replay_through_the_log_gives_the_same_states(seed: int) -> None:
+def test_replay_through_the_log_gives_the_same_states(seed: int) -> None:
     bench = fed(troubled(random.Random(seed)))
     logged = [decode_event(orjson.loads(encode_event(event))) for event in bench.fed]
     again = [encode_state(state) for state in replay_states(logged)]
     assert again == [encode_state(state) for state in bench.states]
 
 
-def test_nothing_is_pending_once_all_devices_are_gone() -> None:
+def test_no_sample_is_pending_after_all_sources_closed() -> None:
     events = opening()
     events += sorted((chunk(s, n) for s in SOURCES for n in range(COUNT)), key=arrival_ns)
     gone_ns = arrival_ns(events[-1]) + 300 * MS
@@ -140,14 +140,14 @@ def test_missing_samples_delay_a_frame_by_one_and_a_half_periods_at_most(
         assert holed[t_ns] - whole[t_ns] <= PATIENCE * PERIOD_NS, (t_ns, missing)
 
 
-def test_one_missing_sample_does_delay_its_frame() -> None:
+def test_missing_sample_delays_its_frame() -> None:
     """The bound is not met by never waiting."""
     whole, holed = waited(frozenset()), waited(frozenset({("S4", SETTLED + 5)}))
     delays = [holed[t_ns] - whole[t_ns] for t_ns in whole if t_ns in holed]
     assert max(delays) > 0.5 * PERIOD_NS
 
 
-def test_samples_that_waited_in_the_kernel_during_a_stall_are_not_late() -> None:
+def test_samples_buffered_during_a_stall_are_not_late() -> None:
     bench = Bench()
     bench.feed(opening())
     bench.feed(sorted((chunk(n, i) for n in SOURCES for i in range(2 * SETTLED)), key=arrival_ns))

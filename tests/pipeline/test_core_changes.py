@@ -1,4 +1,4 @@
-"""The core while devices come, go, change and restart: counts agree, and what is told is so."""
+"""The core while devices connect, disconnect, restart and change by reloads."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def accounted(bench: Bench) -> None:
         assert device["received"] == sum(device[key] for key in VERDICTS), (name, device)
 
 
-def test_a_sample_that_a_closing_decoder_gives_up_does_not_bring_the_device_back() -> None:
+def test_rest_of_a_closed_decoder_does_not_set_the_device_online() -> None:
     bench = Bench()
     bench.feed([*opening(), *samples(SENSORS, 0, 20)])
     # the start of a message that never ended hides a whole one until the decoder gives it up
@@ -79,7 +79,7 @@ def test_a_sample_that_a_closing_decoder_gives_up_does_not_bring_the_device_back
     assert [o.online for o in bench.out if isinstance(o, DeviceStatus) and o.id == "S1"][-1] is True
 
 
-def test_a_source_that_fails_again_and_again_without_a_sample_is_reported_once() -> None:
+def test_repeated_failure_without_samples_is_reported_once() -> None:
     bench = Bench()
     bench.feed([*opening(), *samples(SENSORS, 0, 20)])
     for number in range(20, 24):
@@ -90,7 +90,7 @@ def test_a_source_that_fails_again_and_again_without_a_sample_is_reported_once()
     assert texts.count("no such speed") == 2, "once, and once more after it had streamed"
 
 
-def test_a_reload_that_changes_a_port_keeps_the_counts_in_agreement() -> None:
+def test_counts_agree_after_a_reload_that_changes_a_port() -> None:
     bench = Bench()
     bench.feed([*opening(), *samples((*SENSORS, "mocap"), 0, 20)])
     moved = table()
@@ -103,7 +103,7 @@ def test_a_reload_that_changes_a_port_keeps_the_counts_in_agreement() -> None:
     accounted(bench)
 
 
-def test_a_device_that_is_taken_out_and_put_back_begins_at_nothing() -> None:
+def test_counts_of_a_device_start_at_0_after_removal_and_return() -> None:
     bench = Bench()
     bench.feed([*opening(), *samples((*SENSORS, "mocap"), 0, 20)])
     without = table()
@@ -166,7 +166,7 @@ def calibrated_by_standing(rig_table: dict[str, Any]) -> tuple[Bench, Calibratio
         {"S1": "thigh", "S2": "thigh", "S3": "shank", "S4": "foot"},
     ],
 )
-def test_limbs_of_any_shape_are_calibrated_by_standing_still(worn: dict[str, str]) -> None:
+def test_static_calibration_of_any_chain(worn: dict[str, str]) -> None:
     bench, _ = calibrated_by_standing(shaped(worn))
     state = bench.states[-1]
     assert state.mode == "imu"
@@ -177,7 +177,7 @@ def test_limbs_of_any_shape_are_calibrated_by_standing_still(worn: dict[str, str
     accounted(bench)
 
 
-def test_a_calibration_of_yesterday_is_claimed_with_a_heading_of_yesterday() -> None:
+def test_heading_uncertainty_grows_with_the_age_of_the_calibration() -> None:
     rig = shaped({"S1": "thigh", "S3": "shank"})
     _, calibration = calibrated_by_standing(rig)
     sds = []
@@ -193,7 +193,7 @@ def test_a_calibration_of_yesterday_is_claimed_with_a_heading_of_yesterday() -> 
     assert sds[1] == pytest.approx(math.hypot(sds[0], wandered), rel=1e-3)
 
 
-def test_a_reload_goes_on_with_the_same_watch_of_a_limb_that_is_worn_alike() -> None:
+def test_reload_preserves_the_consistency_monitor() -> None:
     worn = {"S1": "thigh", "S2": "thigh", "S3": "shank"}
     bench, calibration = calibrated_by_standing(shaped(worn))
     watched = bench.core._fuser.consistency
@@ -224,7 +224,7 @@ def reconnected(after: Iterable[Event]) -> tuple[Bench, list[Notice]]:
     return bench, notices
 
 
-def test_a_sensor_that_reconnects_and_ran_on_needs_no_new_pose() -> None:
+def test_reconnect_without_restart_preserves_the_pose() -> None:
     bench, notices = reconnected(samples(["S3"], 922, 960))
     assert notices == []
     assert bench.devices()["S3"]["restarts"] == 0
@@ -232,7 +232,7 @@ def test_a_sensor_that_reconnects_and_ran_on_needs_no_new_pose() -> None:
     assert bench.devices()["S3"]["epoch"] == 0
 
 
-def test_a_counter_that_stood_still_while_the_port_was_away_is_no_restart() -> None:
+def test_counter_that_stood_still_while_disconnected_is_no_restart() -> None:
     """A device that is being configured counts no samples, and its time goes on."""
     with patch.object(core_feed, "counter", lambda number: number - 60):
         after = samples(["S3"], 922, 960)
@@ -242,7 +242,7 @@ def test_a_counter_that_stood_still_while_the_port_was_away_is_no_restart() -> N
 
 
 @pytest.mark.parametrize("begins_at", [0, 5, 600, 850, 1_000])
-def test_a_sensor_that_reconnects_with_another_time_or_counter_needs_a_new_pose(
+def test_reconnect_with_changed_time_or_counter_discards_the_pose(
     begins_at: int,
 ) -> None:
     later = at(922) - at(begins_at)
@@ -261,7 +261,7 @@ def test_a_sensor_that_reconnects_with_another_time_or_counter_needs_a_new_pose(
 
 
 @pytest.mark.parametrize(("params", "mode"), [(0, "imu+mocap"), (4, "imu")])
-def test_only_live_cameras_make_the_optical_mode(params: int, mode: str) -> None:
+def test_only_live_mocap_frames_give_the_optical_mode(params: int, mode: str) -> None:
     worn = {"S1": "thigh", "S3": "shank"}
     _, calibration = calibrated_by_standing(shaped(worn))
     rig, bench = parse_rig(shaped(worn, mocap=True)), Bench()

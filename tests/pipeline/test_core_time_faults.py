@@ -1,4 +1,4 @@
-"""Faults of time, bytes to limb states: frames stay in order, it is told, and it heals."""
+"""Time faults from bytes to limb states: order of frames, notices and recovery."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def rebooted(sent: Sent) -> Sent | None:
     return sent
 
 
-def test_a_device_that_reboots_is_told_and_settles_before_it_counts_as_synced() -> None:
+def test_device_restart_is_reported_and_settles_before_it_is_synced() -> None:
     run = live(rebooted)
     assert_sane(run)
     assert_healed(run)
@@ -215,7 +215,7 @@ def test_a_device_that_reboots_is_told_and_settles_before_it_counts_as_synced() 
 
 
 @pytest.mark.parametrize("jump_s", [-3.0, -0.2, 0.2, 3.0, 600.0])
-def test_a_device_clock_that_jumps_is_told_and_settles_anew(jump_s: float) -> None:
+def test_device_clock_jump_is_reported_and_settles_again(jump_s: float) -> None:
     def jumped(sent: Sent) -> Sent:
         if sent.name == "S2":
             sent.device_ns += round(jump_s * NS)
@@ -231,7 +231,7 @@ def test_a_device_clock_that_jumps_is_told_and_settles_anew(jump_s: float) -> No
 
 
 @pytest.mark.parametrize("asleep_s", [0.5, 30.0, 7_200.0])
-def test_a_host_that_slept_settles_anew_with_every_device(asleep_s: float) -> None:
+def test_all_clocks_settle_again_after_suspend(asleep_s: float) -> None:
     """CLOCK_MONOTONIC stands still in suspend; the devices count on."""
 
     def slept(sent: Sent) -> Sent:
@@ -246,7 +246,7 @@ def test_a_host_that_slept_settles_anew_with_every_device(asleep_s: float) -> No
     assert {sync for sync, _ in run.between(100 * MS, 1_500 * MS)} == {"settling"}
 
 
-def test_a_host_that_slept_and_lost_its_ports_settles_anew() -> None:
+def test_all_clocks_settle_again_after_suspend_with_lost_ports() -> None:
     """As after a real suspend: drivers see a loss and come back a second later."""
 
     def slept(sent: Sent) -> Sent | None:
@@ -264,7 +264,7 @@ def test_a_host_that_slept_and_lost_its_ports_settles_anew() -> None:
     assert {sync for sync, _ in run.between(950 * MS, 2_500 * MS)} == {"settling"}
 
 
-def test_a_host_that_stood_still_gets_late_bytes_and_no_new_epoch() -> None:
+def test_stall_of_the_host_starts_no_new_epoch() -> None:
     """Half a second without CPU: everything arrives at once, with right device times."""
 
     def delayed(sent: Sent) -> Sent:
@@ -279,7 +279,7 @@ def test_a_host_that_stood_still_gets_late_bytes_and_no_new_epoch() -> None:
     assert {sync for sync, _ in run.between(0, 10 * NS)} == {"locked"}
 
 
-def test_stamps_sent_twice_are_duplicates_and_frames_do_not_mind() -> None:
+def test_repeated_stamps_are_duplicates_without_effect_on_frames() -> None:
     def repeated(sent: Sent) -> Sent:
         if sent.name == "S1" and sent.number % 10 == 0:
             sent.device_ns -= PERIOD_NS  # the time of the sample before
@@ -299,7 +299,7 @@ def test_stamps_sent_twice_are_duplicates_and_frames_do_not_mind() -> None:
 
 
 @pytest.mark.parametrize("jump", [7, 30_000, 65_530])
-def test_a_counter_that_jumps_alone_changes_no_time(jump: int) -> None:
+def test_counter_jump_alone_changes_no_stamp(jump: int) -> None:
     def jumped(sent: Sent) -> Sent:
         if sent.name == "S1":
             sent.counter += jump
@@ -313,7 +313,7 @@ def test_a_counter_that_jumps_alone_changes_no_time(jump: int) -> None:
 
 
 @pytest.mark.parametrize("jump", [-30_000, -20, 20, 30_000])
-def test_a_counter_that_jumps_where_there_is_no_clock_is_told_and_settles_anew(jump: int) -> None:
+def test_counter_jump_without_device_clock_is_reported_and_settles_again(jump: int) -> None:
     def jumped(sent: Sent) -> Sent:
         if sent.name == "S4":
             sent.counter += jump
@@ -382,7 +382,9 @@ troubles = st.lists(
 @pytest.mark.timeout(120)  # ten seconds where nothing else runs
 @settings(max_examples=6)
 @given(troubles)
-def test_whatever_happens_to_time_it_heals(script: list[tuple[str, str, int, int, int]]) -> None:
+def test_recovery_from_any_sequence_of_time_faults(
+    script: list[tuple[str, str, int, int, int]],
+) -> None:
     def change(sent: Sent) -> Sent | None:
         found: Sent | None = sent
         for kind, name, first, length, size in script:
@@ -400,7 +402,7 @@ def undisturbed() -> Lived:
     return live(lambda sent: sent)
 
 
-def test_nothing_is_said_of_clocks_that_run() -> None:
+def test_healthy_clocks_give_no_notice() -> None:
     run = undisturbed()
     assert_sane(run)
     assert_healed(run, 0)

@@ -1,4 +1,4 @@
-"""Cameras on PTP through the real core: this host's own time, whatever UNIX time is set to."""
+"""Mocap with PTP stamps in the core: stamps are independent of steps of UNIX time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from jointfit_daemon.pipeline.events import Event
-    from jointfit_daemon.pipeline.sources import SourceState, Stamped
+    from jointfit_daemon.pipeline.sources import SourceState, StampedMeasurement
 
 S = 1_000_000_000
 BITSTREAM = (4, 1)
@@ -49,14 +49,14 @@ class WatchedCore(Core):
         """Frame number, stamp, whether synced, state of the clock."""
 
     @override
-    def _take(self, source: str, state: SourceState, items: list[Any]) -> list[Any]:
+    def _process(self, source: str, state: SourceState, items: list[Any]) -> list[Any]:
         for item in items:
             measured: MocapFrame | None = getattr(item, "measurement", None)
             if isinstance(measured, MocapFrame):
                 self._note(item, measured, state)
-        return super()._take(source, state, items)
+        return super()._process(source, state, items)
 
-    def _note(self, item: Stamped, frame: MocapFrame, state: SourceState) -> None:
+    def _note(self, item: StampedMeasurement, frame: MocapFrame, state: SourceState) -> None:
         stamp = item.stamp
         self.frames.append((frame.number or 0, stamp.t_ns, stamp.synced, state.clock.state))
 
@@ -129,7 +129,7 @@ def rig() -> Rig:
     return Rig()
 
 
-def test_cameras_on_ptp_are_stamped_to_the_nanosecond_and_health_says_direct(rig: Rig) -> None:
+def test_ptp_mocap_stamps_are_exact_and_health_reports_direct(rig: Rig) -> None:
     rig.start()
     rig.stream(6)
     assert rig.state() == "direct"
@@ -138,7 +138,7 @@ def test_cameras_on_ptp_are_stamped_to_the_nanosecond_and_health_says_direct(rig
     assert not rig.notices()
 
 
-def test_without_unix_time_they_stay_passive(rig: Rig) -> None:
+def test_ptp_stamps_are_unused_without_unix_time(rig: Rig) -> None:
     rig.start()
     rig.core._unix_offset_ns = None
     for state in rig.core._sources.values():
@@ -148,7 +148,7 @@ def test_without_unix_time_they_stay_passive(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS, 40 * MS, -40 * MS])
-def test_unix_time_set_wrong_moves_no_stamp_and_set_right_again_is_used_again(
+def test_wrong_unix_time_moves_no_stamp_and_is_used_again_when_corrected(
     rig: Rig, step_ns: int
 ) -> None:
     rig.start()
@@ -172,7 +172,7 @@ def test_unix_time_set_wrong_moves_no_stamp_and_set_right_again_is_used_again(
     assert sum("sync time differs" in n.text for n in rig.notices()) == 1
 
 
-def test_a_host_that_starts_with_a_wrong_date_is_never_synced_wrongly(rig: Rig) -> None:
+def test_start_with_a_wrong_date_gives_no_wrong_sync(rig: Rig) -> None:
     rig.start(UNIX_NS - 5 * HOUR_NS)
     rig.stream(4)
     assert rig.state() in {"settling", "passive"}
@@ -183,7 +183,7 @@ def test_a_host_that_starts_with_a_wrong_date_is_never_synced_wrongly(rig: Rig) 
     assert rig.errors_ms(rig.number - 10) == [0.0] * 10
 
 
-def test_a_reload_does_not_forget_unix_time(rig: Rig) -> None:
+def test_reload_preserves_the_unix_offset(rig: Rig) -> None:
     rig.start()
     rig.stream(1)
     layout = table()

@@ -1,4 +1,4 @@
-"""Sensors that fall silent or stick are reported, also when all do at once."""
+"""Notices of lost and stuck sensors."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def samples(names: Iterable[str], first: int, end: int) -> list[Event]:
     return sorted(found, key=arrival_ns)
 
 
-def told(bench: Bench) -> list[tuple[float, str, object]]:
-    """Return when (ms since the beginning), of whom and what was told."""
+def reports(bench: Bench) -> list[tuple[float, str, object]]:
+    """Return time (ms since the start), sensor and state of the notices."""
     return [
         ((o.t_ns - BEGIN_NS) / MS, o.id, o.data["state"])
         for o in bench.out
@@ -30,13 +30,13 @@ def told(bench: Bench) -> list[tuple[float, str, object]]:
     ]
 
 
-def test_a_sensor_that_falls_silent_is_told_within_half_a_second_and_again_when_back() -> None:
+def test_loss_and_recovery_of_a_sensor_are_reported() -> None:
     bench = Bench()
     bench.feed(opening())
     bench.feed(samples(SENSORS, 0, 100))
     bench.feed(samples(("S2", "S3", "S4"), 100, 200))
     bench.feed(samples(SENSORS, 200, 450))
-    (lost_ms, lost, state), (back_ms, back, again) = told(bench)
+    (lost_ms, lost, state), (back_ms, back, again) = reports(bench)
     assert (lost, state, back, again) == ("S1", "lost", "S1", "ok")
     assert 1000 < lost_ms < 1500
     assert 4000 < back_ms < 4500
@@ -44,19 +44,19 @@ def test_a_sensor_that_falls_silent_is_told_within_half_a_second_and_again_when_
     assert "sensor" not in bench.devices()["mocap"]
 
 
-def test_silence_of_all_sensors_at_once_is_reported_and_frames_go_on() -> None:
+def test_loss_of_all_sensors_is_reported_and_frames_continue() -> None:
     bench = Bench()
     bench.feed(opening())
     bench.feed(samples(SENSORS, 0, 100))
     bench.wait_until(BEGIN_NS + 3000 * MS)
-    assert [(name, state) for _, name, state in told(bench)] == [(s, "lost") for s in SENSORS]
-    assert all(1000 < t < 1500 for t, _, _ in told(bench))
+    assert [(name, state) for _, name, state in reports(bench)] == [(s, "lost") for s in SENSORS]
+    assert all(1000 < t < 1500 for t, _, _ in reports(bench))
     grown = [b.t_ns - a.t_ns for a, b in itertools.pairwise(bench.states)]
     assert set(grown) == {PERIOD_NS}
     assert bench.states[-1].t_ns > BEGIN_NS + 2900 * MS
 
 
-def test_a_stuck_sensor_is_told_flagged_and_not_used() -> None:
+def test_stuck_sensor_is_reported_flagged_and_excluded() -> None:
     turning = core_feed.orientation
     bench = Bench()
     bench.feed(opening())
@@ -64,7 +64,7 @@ def test_a_stuck_sensor_is_told_flagged_and_not_used() -> None:
     stuck = patch.object(core_feed, "orientation", lambda s, k: turning(s, 100 if s == "S3" else k))
     with stuck:
         bench.feed(samples(SENSORS, 100, 200))
-    ((at_ms, name, state),) = told(bench)
+    ((at_ms, name, state),) = reports(bench)
     assert (name, state) == ("S3", "stuck")
     assert 1000 < at_ms < 1500
     assert bench.devices()["S3"]["sensor"] == "stuck"

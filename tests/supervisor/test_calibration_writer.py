@@ -13,6 +13,7 @@ from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.outputs.mqtt import Incoming
 from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
     CalibrationReady,
     CalibrationStatus,
     CalibrationStored,
@@ -112,7 +113,7 @@ class ReadyCore:
     def feed(self, event: Event) -> list[Output]:
         self.events.append(event)
         if isinstance(event, Request) and not event.arguments:
-            status = CalibrationStatus(event.t_ns, "calibrated", "calibrated")
+            status = CalibrationStatus(event.t_ns, CalibrationPhase.CALIBRATED, "calibrated")
             return [CalibrationReady(self.calibration), status]
         return []
 

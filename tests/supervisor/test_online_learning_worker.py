@@ -77,10 +77,10 @@ def moved(first: int, last: int, *, cameras: bool = True) -> list[Event]:
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(core_feed, "orientation", orientation)
     monkeypatch.setattr(core_feed, "camera_bytes", camera_bytes)
-    monkeypatch.setattr(_frame_collector, "ENOUGH", 340)
-    monkeypatch.setattr(_frame_collector, "EVERY_NS", 30_000_000)
-    monkeypatch.setattr(_frame_collector, "STILL_DOT", 2.0)
-    monkeypatch.setattr(_frame_collector, "REST_NS", 100_000_000)
+    monkeypatch.setattr(_frame_collector, "MIN_FRAMES", 340)
+    monkeypatch.setattr(_frame_collector, "INTERVAL_NS", 30_000_000)
+    monkeypatch.setattr(_frame_collector, "POSTURE_COSINE", 2.0)
+    monkeypatch.setattr(_frame_collector, "REFIT_NS", 100_000_000)
 
 
 async def answered(bench: Bench, job: FitJob) -> None:

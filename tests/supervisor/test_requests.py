@@ -31,7 +31,7 @@ def incoming(payload: bytes, command: str = "calibrate", **more: Any) -> Incomin
     [
         (b"{", "is not JSON"),
         (b"[]", "expected a JSON object"),
-        (b'{"phase":"stand"}', "expected 'align', 'static', 'functional', 'abort' or 'unlearn'"),
+        (b'{"phase":"stand"}', "expected 'align', 'static', 'functional', 'abort' or 'revert'"),
         (b'{"phase":"static","seconds":-1}', "should be greater than 0"),
         (b'{"phase":"static","force":"yes"}', "should be a valid boolean"),
         (b'{"phase":"static","transaction":7}', "should be a valid string"),

@@ -12,7 +12,7 @@ from bench.framework.measurement import Bench, Row, cpu_s, loop_s, repeats
 from bench.subjects.simulated_wearer import bench_rig, fitted, phases
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.model import MocapFrame, MocapLayout
-from jointfit_daemon.pipeline.sources import LagWatch
+from jointfit_daemon.pipeline.sources import LagMonitor
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
@@ -44,7 +44,7 @@ def _events() -> list[Event]:
     return sorted(found, key=lambda event: event[0])
 
 
-def _play(watch: LagWatch, events: list[Event]) -> tuple[float, float, float]:
+def _play(watch: LagMonitor, events: list[Event]) -> tuple[float, float, float]:
     """Return the CPU time of adding one, of the steps by the second, and of the longest step, s."""
     adding, steps = 0.0, []
     for t_ns, sensor, said in events:
@@ -60,7 +60,7 @@ def rows(quick: bool) -> list[Row]:
     events, rig = _events(), bench_rig()
     calibration = fitted(rig)
     tries = min(repeats(quick), 7)
-    played = [_play(LagWatch(rig.chain, calibration), events) for _ in range(tries)]
+    played = [_play(LagMonitor(rig.chain, calibration), events) for _ in range(tries)]
     add, second, most = (median(figures) for figures in zip(*played, strict=True))
     loop = loop_s()
     figures = (

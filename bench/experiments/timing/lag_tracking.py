@@ -11,7 +11,7 @@ from bench.framework.experiment import Experiment, Figure
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
 from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.model import Chain, ClockEcho, MocapFrame, MocapLayout, TickClock
-from jointfit_daemon.pipeline.sources import LagWatch
+from jointfit_daemon.pipeline.sources import LagMonitor
 from jointfit_daemon.timing.clock import DeviceClock
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class _Stamps:
 def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
     """Play a moving wearer through both clocks into the watch; return what it found."""
     tracks, stamps = made_up(seed, seconds, 0.0), _Stamps(case, seed)
-    watch, told = LagWatch(CHAIN, CALIBRATION), []
+    watch, told = LagMonitor(CHAIN, CALIBRATION), []
     events: list[tuple[int, int, Quaternion]] = []
     for kind, times, turned in ((0, tracks.t_imu, tracks.q_imu), (1, tracks.t_ref, tracks.q_ref)):
         events += [
@@ -112,7 +112,7 @@ def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
         )
         if stamp >= 0:
             watch.add_mocap(stamp, frame)
-    tracked = watch.memory["S1"].tracked
+    tracked = watch.sensors["S1"].tracked
     if tracked is None:
         return Found(np.nan, np.nan, np.nan, np.nan, told)
     figures = (tracked.lag_ns / MS, tracked.sigma_ns / MS)

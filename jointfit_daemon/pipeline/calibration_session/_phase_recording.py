@@ -1,6 +1,6 @@
-"""One phase of a calibration while it collects: what came, how far it is, what the wearer hears.
+"""Recording of one calibration phase: trial, progress and instructions for the subject.
 
-Law: records and watches. When a phase begins, ends or is given up is the session's to decide.
+The session decides when a phase starts, ends or is aborted.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.calibration.guidance import first_of
 from jointfit_daemon.pipeline.calibration_session._stillness_gate import SILENT_NS, StillnessGate
 from jointfit_daemon.pipeline.calibration_session._trial_recorder import TrialRecorder
+from jointfit_daemon.pipeline.events import CalibrationPhase
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationTrial
@@ -17,94 +18,95 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
 _NS = 1_000_000_000
-PROGRESS_NS = 200_000_000  # five a second: what a progress bar can show
-STATIC_PATIENCE_S = 120.0
-"""A pose that is not still within this time is given up, with the reason."""
-CAMERAS = "the cameras"
-TEXTS = {
-    "align": "turn the plate with all sensors by hand, about several axes",
-    "static": "stand still and upright, facing one way, joints straight",
-    "functional": "move every joint through its range: walk, squat, circle",
+PROGRESS_NS = 200_000_000
+"""Interval of progress reports, ns: five a second suffice for a progress bar."""
+STATIC_TIMEOUT_S = 120.0
+"""Time after which a static phase without stillness is aborted, s."""
+MOCAP = "the mocap system"
+INSTRUCTIONS = {
+    CalibrationPhase.ALIGN: "turn the plate with all sensors by hand, about several axes",
+    CalibrationPhase.STATIC: "stand still and upright, facing one way, joints straight",
+    CalibrationPhase.FUNCTIONAL: "move every joint through its range: walk, squat, circle",
 }
-_KEEP_TURNING = "keep turning the plate about several axes"
 
 
-class Phase:
-    """What one phase has collected.
+class PhaseRecording:
+    """Records one phase and measures its progress.
 
     Parameters
     ----------
-    name : {"align", "static", "functional"}
-        Static ends after so long a stillness, align after so long a time, functional when its
-        guide misses nothing any more, after so long a time at the latest.
+    phase : CalibrationPhase
+        ``static`` ends after `wanted_s` of stillness, ``align`` after `wanted_s`, ``functional``
+        when the guide misses nothing any more, after `wanted_s` at the latest.
     chain : Chain
-        Whose sensors take part.
-    began_ns : int
-        Now.
+        Sensors that take part.
+    start_ns : int
+        Host time of the start.
     wanted_s : float
         Length, s.
     guide : MovementGuide, optional
-        Of the functional phase.
-    least_s : float
-        What a guide may not end before, s.
+        Guide of a functional phase.
+    min_s : float
+        Shortest length of a functional phase, s.
     """
 
     def __init__(
         self,
-        name: str,
+        phase: CalibrationPhase,
         chain: Chain,
-        began_ns: int,
+        start_ns: int,
         wanted_s: float,
         *,
         guide: MovementGuide | None = None,
-        least_s: float = 0.0,
+        min_s: float = 0.0,
     ) -> None:
-        self.name, self.wanted_s = name, wanted_s
-        self._guide, self._least_s = guide, min(least_s, wanted_s)
+        self.phase, self.wanted_s = phase, wanted_s
+        self._guide, self._min_s = guide, min(min_s, wanted_s)
         self._look: MovementLook | None = None
-        self._began_ns = self._told_ns = began_ns
+        self._start_ns = self._progress_ns = start_ns
         self._recorder = TrialRecorder()
         sensors = [sensor for group in chain.sensors for sensor in group]
-        self._gate = StillnessGate(sensors) if name == "static" else None
+        self._gate = StillnessGate(sensors) if phase == CalibrationPhase.STATIC else None
         self._latest: dict[str, Quaternion] = {}
-        self._heard_ns = dict.fromkeys(sensors, began_ns)
-        if name != "static":
-            self._heard_ns[CAMERAS] = began_ns
+        self._last_ns = dict.fromkeys(sensors, start_ns)
+        if phase != CalibrationPhase.STATIC:
+            self._last_ns[MOCAP] = start_ns
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
-        """Take one orientation; return True when it ended a stillness."""
+        """Add one orientation; return whether it ended a stillness."""
         self._recorder.add_sample(sensor, t_ns, q_world_sensor)
         self._latest[sensor] = q_world_sensor
-        self._heard_ns[sensor] = t_ns
+        self._last_ns[sensor] = t_ns
         return self._gate is not None and self._gate.feed(sensor, t_ns, q_world_sensor)
 
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
-        """Take one camera frame."""
+        """Add one mocap frame."""
         self._recorder.add_mocap(t_ns, frame)
         if self._guide is not None:
             self._guide.add_mocap(frame)
-        if CAMERAS in self._heard_ns:
-            self._heard_ns[CAMERAS] = t_ns
+        if MOCAP in self._last_ns:
+            self._last_ns[MOCAP] = t_ns
 
-    def due(self, now_ns: int) -> bool:
-        """Tell whether it is time to look at the progress again, and take it for looked at."""
-        if now_ns < self._told_ns + PROGRESS_NS:
+    def progress_due(self, now_ns: int) -> bool:
+        """Return whether the interval of progress reports has passed, and start the next one."""
+        if now_ns < self._progress_ns + PROGRESS_NS:
             return False
-        self._told_ns = now_ns
+        self._progress_ns = now_ns
         return True
 
     def progress(self, now_ns: int) -> tuple[float, str, dict[str, object]]:
-        """Return how far it is, 0 to 1, what the wearer should know, and figures."""
+        """Return the progress, 0 to 1, the instruction for the subject, and data."""
         if self._gate is not None:
             still_s = self._gate.still_s(now_ns)
             text = self._gate.text(now_ns)
             return self._share(still_s), text, {"still_s": round(still_s, 2)}
-        elapsed_s = (now_ns - self._began_ns) / _NS
-        silent = [name for name, t in self._heard_ns.items() if now_ns - t > SILENT_NS]
-        done, text = self._share(elapsed_s), _KEEP_TURNING
+
+        elapsed_s = (now_ns - self._start_ns) / _NS
+        silent = [name for name, t in self._last_ns.items() if now_ns - t > SILENT_NS]
+        done, text = self._share(elapsed_s), "keep turning the plate about several axes"
         data: dict[str, object] = {}
         if self._guide is not None:
-            done, text, data = self._guided(self._guide, elapsed_s, silent)
+            done, text, data = self._guided_progress(self._guide, elapsed_s, silent)
         if silent:
             text = f"no data from {', '.join(silent)}; {text}"
         return done, text, data
@@ -112,12 +114,12 @@ class Phase:
     def _share(self, seconds: float) -> float:
         return min(1.0, max(0.0, seconds / self.wanted_s))
 
-    def _guided(
+    def _guided_progress(
         self, guide: MovementGuide, elapsed_s: float, silent: list[str]
     ) -> tuple[float, str, dict[str, object]]:
-        """Return how far a movement is: the whole of it once nothing is missing."""
-        alive = {name: q for name, q in self._latest.items() if name not in silent}
-        look = self._look = guide.look(alive, elapsed_s)
+        """Return the progress of a movement: 1 once nothing is missing."""
+        latest = {name: q for name, q in self._latest.items() if name not in silent}
+        look = self._look = guide.look(latest, elapsed_s)
         data: dict[str, object] = {
             "joints": look.joints,
             "parts": look.parts,
@@ -125,28 +127,28 @@ class Phase:
         }
         if not look.ready or silent:
             return self._share(elapsed_s), first_of(look.missing) or "keep moving", data
-        left_s = self._least_s - elapsed_s
+        left_s = self._min_s - elapsed_s
         if left_s > 0.0:
             return self._share(elapsed_s), f"all joints known; keep moving, {left_s:.0f} s", data
         return 1.0, f"all joints known after {elapsed_s:.0f} s", data
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What the wearer has not shown so far, each with its remedy."""
+        """Movements that are still missing, each with its remedy."""
         return () if self._look is None else self._look.missing
 
-    def given_up(self, now_ns: int) -> bool:
-        """Tell whether a stillness has been waited for long enough."""
-        patience_ns = round(STATIC_PATIENCE_S * _NS)
-        return self._gate is not None and now_ns - self._began_ns > patience_ns
+    def timed_out(self, now_ns: int) -> bool:
+        """Return whether a static phase has waited for stillness too long."""
+        timeout_ns = round(STATIC_TIMEOUT_S * _NS)
+        return self._gate is not None and now_ns - self._start_ns > timeout_ns
 
     @property
     def overflowed(self) -> int:
-        """Measurements that found no room."""
+        """Number of measurements that exceeded the size of the recording."""
         return self._recorder.overflowed
 
     def trial(self, now_ns: int) -> CalibrationTrial:
-        """Return what was recorded; of a static phase only the stillness it ended with."""
+        """Return the recording; of a static phase only the stillness at its end."""
         if self._gate is None:
             return self._recorder.trial()
         return self._recorder.trial(self._gate.still_since_ns, now_ns)

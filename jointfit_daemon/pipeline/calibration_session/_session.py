@@ -1,11 +1,10 @@
-"""The calibration as the wearer lives it: align, static, functional, fitting, calibrated.
+"""Calibration session: the phases align, static and functional, and the fits that follow them.
 
-Law: a pure state machine. It records what the core hands it, asks the worker for fits, and tells
-what it wants to be told; it never fits anything itself and never blocks acquisition.
+The session records the measurements of a phase, requests a fit from the worker process, and
+publishes status and progress. Its phases and transitions are a table
+(:mod:`jointfit_daemon.pipeline.calibration_session._state_machine`).
 
-    uncalibrated ─► align ─► aligned
-         └────────► static ─► posed ─► functional ─► fitting ─► calibrated
-                              any phase ─► aborted (with the reason)
+Invariant: the session never computes a fit itself, so it never blocks acquisition.
 """
 
 from __future__ import annotations
@@ -17,9 +16,21 @@ from typing import TYPE_CHECKING, Any, Literal
 from jointfit_daemon.calibration import PLATE
 from jointfit_daemon.calibration.guidance import MovementGuide
 from jointfit_daemon.limb_model import Calibration
-from jointfit_daemon.pipeline.calibration_session._phase_recording import TEXTS, Phase
-from jointfit_daemon.pipeline.calibration_session._trial_recorder import LONGEST_S
+from jointfit_daemon.pipeline.calibration_session._phase_recording import (
+    INSTRUCTIONS,
+    STATIC_TIMEOUT_S,
+    PhaseRecording,
+)
+from jointfit_daemon.pipeline.calibration_session._state_machine import (
+    COLLECTING,
+    RESTING,
+    START,
+    TRANSITIONS,
+    SessionEvent,
+)
+from jointfit_daemon.pipeline.calibration_session._trial_recorder import MAX_PHASE_S
 from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
     CalibrationProgress,
     CalibrationReady,
     CalibrationStatus,
@@ -28,7 +39,7 @@ from jointfit_daemon.pipeline.events import (
     Notice,
     Reply,
 )
-from jointfit_daemon.pipeline.online_learning import Learned
+from jointfit_daemon.pipeline.online_learning import OnlineRefits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,34 +47,32 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, Fresh
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
-    from jointfit_daemon.pipeline.sources import LagWatch
-
-COLLECTING = tuple(TEXTS)
+    from jointfit_daemon.pipeline.sources import LagMonitor
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class _RunningFit:
     job: int
-    kind: str
+    phase: CalibrationPhase
     static: CalibrationTrial | None
-    """The pose to be remembered if the worker accepts it."""
+    """Static trial that the session retains if the fit accepts it."""
 
 
 class CalibrationSession:
-    """Runs one calibration after another for one rig.
+    """Runs the calibrations of one rig, one after another.
 
     Parameters
     ----------
     chain : Chain
-        What is calibrated.
+        The limb to calibrate.
     settings : CalibrationSettings
-        Durations, markers and method of rig.toml.
+        Durations, markers and method from rig.toml.
     mocap : bool
-        Whether the rig has an optical system; without it only a static calibration is possible.
+        Whether the rig has a mocap source; without it only a static calibration is possible.
     calibration : Calibration or None
-        What is in force already.
+        The calibration in force.
     version : int or None
-        Under which number the store has it.
+        Its version in the store.
     """
 
     def __init__(
@@ -78,86 +87,94 @@ class CalibrationSession:
         self._chain, self._settings, self._mocap = chain, settings, mocap
         self.calibration = calibration
         self.version = version
-        """Of the calibration in force; None while it is not stored."""
-        self.lags: LagWatch | None = None
-        """Knows the lags that are configured and those seen while running."""
-        self._phase: Phase | None = None
+        """Version of the calibration in force; None while it is not stored."""
+        self.lags: LagMonitor | None = None
+        """Configured lags, and lags estimated during operation."""
+        self._state = self._resting_phase
+        self._recording: PhaseRecording | None = None
+        self._fit: _RunningFit | None = None
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
-        self._pose_s = settings.static_s  # how long a pose was asked for, not what rig.toml has
+        self._static_s = settings.static_s
+        """Requested length of the static pose, s; may differ from rig.toml."""
         self._jobs = 0
-        self._fitting: _Fit | None = None
         self._force = False
-        self.learned = Learned()
+        self.refits = OnlineRefits()
 
-    def take_over(self, before: CalibrationSession, *, same_rig: bool) -> None:
-        """Go on from the session before a reload: its worlds and pose, if they are still true."""
-        self._jobs = before._jobs  # numbers are never used twice
+    def resume(self, before: CalibrationSession, *, same_rig: bool) -> None:
+        """Continue from the session before a reload; keep alignment and pose if `same_rig`."""
+        self._jobs = before._jobs  # job numbers are never reused
         if same_rig:
             self._alignment, self._static = before._alignment, before._static
-            self._pose_s = before._pose_s
-            self.learned.paused = before.learned.paused
+            self._static_s = before._static_s
+            self.refits.paused = before.refits.paused
 
     @property
     def collecting(self) -> bool:
-        """Whether measurements are wanted right now."""
-        return self._phase is not None
+        """Whether a phase is recording measurements."""
+        return self._recording is not None
 
     @property
     def may_learn(self) -> bool:
-        """Whether nothing is calibrated or learned right now, and there is something to improve."""
-        busy = self._phase is not None or self._fitting is not None
-        known = self.calibration is not None and not self.learned.paused
-        return known and not busy and self.learned.job is None
+        """Whether a refit may start: calibrated, not paused, and no phase or fit running."""
+        available = self.calibration is not None and not self.refits.paused
+        return available and self._state in RESTING and self.refits.job is None
 
     @property
-    def phase(self) -> str:
-        """Return what goes on; between phases, whether a calibration is in force."""
-        if self._phase is not None:
-            return self._phase.name
-        if self._fitting is not None:
-            return "fitting"
-        return "calibrated" if self.calibration is not None else "uncalibrated"
+    def phase(self) -> CalibrationPhase:
+        """The running phase; otherwise whether a calibration is in force."""
+        return self._resting_phase if self._state in RESTING else self._state
 
-    # --- what arrives ------------------------------------------------------------------------
+    @property
+    def _resting_phase(self) -> CalibrationPhase:
+        if self.calibration is None:
+            return CalibrationPhase.UNCALIBRATED
+        return CalibrationPhase.CALIBRATED
+
+    # --- measurements ------------------------------------------------------------------------
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> list[Output]:
-        """Take one orientation; call only while ``collecting``."""
-        if self._phase is not None and self._phase.add_sample(sensor, t_ns, q_world_sensor):
-            text = f"{sensor} moved: the time of standing still begins anew"
+        """Add one orientation; call only while ``collecting``."""
+        recording = self._recording
+        if recording is not None and recording.add_sample(sensor, t_ns, q_world_sensor):
+            text = f"{sensor} moved: stillness is timed from the start again"
             return [Notice(t_ns, "calibration", sensor, text)]
         return []
 
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
-        """Take one camera frame; call only while ``collecting``."""
-        if self._phase is not None:
-            self._phase.add_mocap(t_ns, frame)
+        """Add one mocap frame; call only while ``collecting``."""
+        if self._recording is not None:
+            self._recording.add_mocap(t_ns, frame)
 
     def advance(self, now_ns: int) -> list[Output]:
-        """End the phase when it has what it wants; tell progress at most five times a second."""
-        phase = self._phase
-        if phase is None or not phase.due(now_ns):
+        """Publish progress at most five times a second, and end the phase when it is complete."""
+        recording = self._recording
+        if recording is None or not recording.progress_due(now_ns):
             return []
-        done, text, data = phase.progress(now_ns)
+        done, text, data = recording.progress(now_ns)
         outputs: list[Output] = [
-            CalibrationProgress(now_ns, phase.name, round(done, 3), text, data)
+            CalibrationProgress(now_ns, recording.phase, round(done, 3), text, data)
         ]
         if done >= 1.0:
-            return outputs + self._collected(phase, now_ns)
-        if phase.given_up(now_ns):
-            outputs += self.abort(now_ns, f"no {phase.wanted_s:g} s of stillness: {text}")
+            return outputs + self._start_fit(recording, now_ns)
+        if recording.timed_out(now_ns):
+            reason = (
+                f"no {recording.wanted_s:g} s of stillness within {STATIC_TIMEOUT_S:g} s: {text}"
+            )
+            outputs += self.abort(now_ns, reason)
         return outputs
 
-    def restarted(self, t_ns: int, sensor: str) -> list[Output]:
-        """Take it that a sensor was off: the heading of its world may be another from here on."""
+    def restart_sensor(self, t_ns: int, sensor: str) -> list[Output]:
+        """Discard the static pose: the heading of a restarted sensor may have changed."""
         outputs: list[Output] = []
-        if self._phase is not None and self._phase.name != "static":  # stillness begins anew anyway
-            outputs += self.abort(t_ns, f"{sensor} restarted in the middle: repeat the phase")
+        if self._recording is not None and self._recording.phase != CalibrationPhase.STATIC:
+            outputs += self.abort(t_ns, f"{sensor} restarted during the phase: repeat it")
+
         posed, self._static = self._static is not None, None
         if posed or self._alignment is not None or self.calibration is not None:
             text = (
-                f"{sensor} restarted: unless it finds north by itself its heading is another now; "
-                "repeat the static pose, and the align phase before it if there was one"
+                f"{sensor} restarted: without a heading reference of its own, its heading changed. "
+                "Repeat the static pose, and the align phase before it if there was one"
             )
             outputs.append(Notice(t_ns, "calibration", sensor, text, "warning"))
         return outputs
@@ -165,82 +182,88 @@ class CalibrationSession:
     # --- requests ----------------------------------------------------------------------------
 
     def request(self, request: Request) -> list[Output]:
-        """Begin or end a phase; the reply says ``accepted``, the rest is told as it happens."""
+        """Start or abort a phase, or revert online learning; the first output is the reply."""
         wanted = str(request.arguments.get("phase", ""))
-        if wanted == "unlearn":
-            return self._unlearn(request)
+        if wanted == "revert":
+            return self._revert_refits(request)
         if wanted == "abort":
-            outputs = self.abort(request.t_ns, "asked to")
+            outputs = self.abort(request.t_ns, "abort requested")
             data = {"phase": self.phase}
             return [*outputs, Reply(request.command, request.transaction, "ok", data)]
+
         wanted_s = _seconds(request.arguments.get("seconds"))
         refusal = self._refusal(wanted)
-        if refusal is None and wanted_s is not None and not 0.0 < wanted_s <= LONGEST_S:
-            refusal = ("seconds", f"expected a number above 0 and up to {LONGEST_S}")
+        if refusal is None and wanted_s is not None and not 0.0 < wanted_s <= MAX_PHASE_S:
+            refusal = ("seconds", f"expected a number above 0 and up to {MAX_PHASE_S}")
         if refusal is not None:
             key, message = refusal
             error = {"key": key, "message": message}
             return [Reply(request.command, request.transaction, "error", {}, error)]
+
+        phase = CalibrationPhase(wanted)
         self._force = request.arguments.get("force") is True
         return [
             Reply(request.command, request.transaction, "accepted", {"phase": wanted}),
-            *self._begin(request.t_ns, wanted, wanted_s or self._default_s(wanted)),
+            *self._start(request.t_ns, phase, wanted_s or self._default_s(phase)),
         ]
 
-    def _unlearn(self, request: Request) -> list[Output]:
-        """Go back to the models before online learning, and learn nothing until a new movement."""
+    def _revert_refits(self, request: Request) -> list[Output]:
+        """Restore the models from before online learning, and pause it until the next movement."""
         now = self.calibration
-        before = None if now is None else self.learned.taken_back(now)
-        if before is None or self._fitting is not None:
-            error = {"key": "phase", "message": "nothing was learned since the daemon started"}
+        before = None if now is None else self.refits.revert(now)
+        if before is None or self._fit is not None:
+            message = "no online learning since the daemon started: there is nothing to revert"
+            error = {"key": "phase", "message": message}
             return [Reply(request.command, request.transaction, "error", {}, error)]
+
         self.calibration, self.version = before, None
-        text = "what was learned while running is taken back; nothing more is, until calibrated"
+        text = "online learning reverted and paused until the next functional calibration"
         return [
             Reply(request.command, request.transaction, "ok", {"phase": self.phase}),
             CalibrationReady(before),
-            self._tell(request.t_ns, self.phase, text),
+            self._status(request.t_ns, self.phase, text),
         ]
 
-    def learn(self, fresh: Fresh) -> list[Output]:
-        """Have the models fitted to what the cameras saw; call only while ``may_learn``."""
+    def request_refit(self, fresh: Fresh) -> list[Output]:
+        """Request a refit of the models to new frames; call only while ``may_learn``."""
         if self.calibration is None:
             return []
         self._jobs += 1
         job = self._jobs, self.calibration, self._chain, self._settings, fresh
-        return [self.learned.ask(*job)]
+        return [self.refits.request(*job)]
 
-    def _learn(self, event: JobFinished, before: Calibration) -> list[Output]:
-        found, notice = self.learned.finished(event, before, self.version)
+    def _finish_refit(self, event: JobFinished, before: Calibration) -> list[Output]:
+        found, notice = self.refits.finish(event, before, self.version)
         if found is None:
             return [notice]
         self.calibration, self.version = found, None
-        told = self._tell(event.t_ns, self.phase, "models learned while running are in force")
-        return [notice, CalibrationReady(found), told]
+        text = "models from online learning are in use"
+        return [notice, CalibrationReady(found), self._status(event.t_ns, self.phase, text)]
 
     def _refusal(self, wanted: str) -> tuple[str, str] | None:
+        """Return key and message of the reason why a phase cannot start, or None."""
         if wanted not in COLLECTING:
             return "phase", f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
-        if self.phase in (*COLLECTING, "fitting"):
+        if self._state not in RESTING:
             return "phase", (
-                f"the phase {self.phase!r} is running: wait until it ends, or abort it with"
+                f"phase '{self.phase}' is running: wait until it ends, or abort it with"
                 ' `jointfit calibrate RIG.toml --abort` (over MQTT: {"phase":"abort"})'
             )
         if wanted in ("align", "functional") and not self._mocap:
-            return "phase", f"{wanted!r} needs an optical system: add [mocap] to rig.toml"
-        unready = self._unmarked(wanted) or (self._unposed() if wanted == "functional" else None)
-        return None if unready is None else ("phase", unready)
+            return "phase", f"{wanted!r} needs a mocap system: add [mocap] to rig.toml"
+        reason = self._missing_markers(wanted)
+        if reason is None and wanted == "functional":
+            reason = self._missing_pose()
+        return None if reason is None else ("phase", reason)
 
-    def _unposed(self) -> str | None:
-        """Return what a movement lacks of a static pose."""
+    def _missing_pose(self) -> str | None:
         if self._static is None:
-            return "a static pose comes first: send static, stand still, then functional"
+            return "'functional' needs a static pose first: request static and stand still"
         if self._static.optical is None:
-            return "the cameras saw nothing of the static pose: repeat it in their view"
+            return "no mocap data of the static pose: repeat it in view of the cameras"
         return None
 
-    def _unmarked(self, wanted: str) -> str | None:
-        """Return what the cameras could not recognise in a phase, and how to name it."""
+    def _missing_markers(self, wanted: str) -> str | None:
         settings = self._settings
         if wanted == "align" and settings.plate is None and PLATE not in settings.markers:
             return (
@@ -257,137 +280,169 @@ class CalibrationSession:
             )
         return None
 
-    def _default_s(self, wanted: str) -> float:
+    def _default_s(self, phase: CalibrationPhase) -> float:
         settings = self._settings
         return {
-            "align": settings.align_s,
-            "static": settings.static_s,
-            "functional": settings.functional_s,
-        }[wanted]
+            CalibrationPhase.ALIGN: settings.align_s,
+            CalibrationPhase.STATIC: settings.static_s,
+            CalibrationPhase.FUNCTIONAL: settings.functional_s,
+        }[phase]
 
-    def _begin(self, t_ns: int, name: str, wanted_s: float) -> list[Output]:
+    def _start(self, t_ns: int, phase: CalibrationPhase, wanted_s: float) -> list[Output]:
+        self._change(START[phase])
         guide, settings = None, self._settings
-        if name == "functional":
+        if phase == CalibrationPhase.FUNCTIONAL:
             guide = MovementGuide(self._chain, settings, self._static)
-        wanted_s = min(wanted_s, LONGEST_S)
-        least_s = settings.functional_min_s
-        self._phase = Phase(name, self._chain, t_ns, wanted_s, guide=guide, least_s=least_s)
+        wanted_s = min(wanted_s, MAX_PHASE_S)
+        min_s = settings.functional_min_s
+        self._recording = PhaseRecording(
+            phase, self._chain, t_ns, wanted_s, guide=guide, min_s=min_s
+        )
         most = "at most " if guide is not None else ""
-        return [self._tell(t_ns, name, f"{TEXTS[name]}, {most}{wanted_s:g} s")]
+        return [self._status(t_ns, phase, f"{INSTRUCTIONS[phase]}, {most}{wanted_s:g} s")]
 
-    # --- phases end --------------------------------------------------------------------------
+    def _change(self, event: SessionEvent) -> None:
+        self._state = TRANSITIONS[self._state, event]
 
-    def _collected(self, phase: Phase, now_ns: int) -> list[Output]:
-        self._phase = None
-        trial, settings = phase.trial(now_ns), self._settings
+    # --- fits --------------------------------------------------------------------------------
+
+    def _start_fit(self, recording: PhaseRecording, now_ns: int) -> list[Output]:
+        self._change(SessionEvent.RECORDED)
+        self._recording = None
+        phase, trial, settings = recording.phase, recording.trial(now_ns), self._settings
+
         payload: dict[str, object] = {"chain": self._chain}
-        if phase.name == "align":
+        if phase == CalibrationPhase.ALIGN:
             payload["trial"] = trial
         else:
             stored = None if self.calibration is None else self.calibration.to_dict()
-            payload |= {"alignment": self._alignment, "previous": stored, phase.name: trial}
-        if phase.name == "static":
-            self._pose_s = phase.wanted_s
-        elif phase.name == "functional":
+            payload |= {"alignment": self._alignment, "previous": stored, phase.value: trial}
+        if phase == CalibrationPhase.STATIC:
+            self._static_s = recording.wanted_s
+        elif phase == CalibrationPhase.FUNCTIONAL:
             payload["static"] = self._static
-        payload["settings"] = replace(settings, static_s=self._pose_s)
+        payload["settings"] = replace(settings, static_s=self._static_s)
         if self.lags is not None:
             payload |= {"lag_ns": self.lags.known_ns(), "tracked": self.lags.tracked()}
+
         self._jobs += 1
-        self.learned.job = None  # one worker: it leaves what it learns for this
-        self._fitting = _Fit(self._jobs, phase.name, trial if phase.name == "static" else None)
+        self.refits.job = None  # the only worker drops a running refit for this fit
+        static = trial if phase == CalibrationPhase.STATIC else None
+        self._fit = _RunningFit(self._jobs, phase, static)
+
         outputs: list[Output] = []
-        if phase.overflowed:
-            text = f"{phase.overflowed} measurements found no room: ask for a shorter phase"
-            outputs.append(Notice(now_ns, "calibration", phase.name, text, "warning"))
-        outputs += _notes(now_ns, phase.name, phase.missing)
-        said = "; ".join((f"fitting the {phase.name} trial", *phase.missing))
+        if recording.overflowed:
+            text = (
+                f"{recording.overflowed} measurements exceeded the size of the recording and were "
+                "dropped: choose a shorter phase"
+            )
+            outputs.append(Notice(now_ns, "calibration", phase, text, "warning"))
+        outputs += _notices(now_ns, phase, recording.missing)
+        text = "; ".join((f"fitting the {phase} trial", *recording.missing))
         return [
             *outputs,
-            self._tell(now_ns, "fitting", said),
-            FitJob(self._jobs, phase.name, payload),
+            self._status(now_ns, CalibrationPhase.FITTING, text),
+            FitJob(self._jobs, phase.value, payload),
         ]
 
-    def job_finished(self, event: JobFinished) -> list[Output]:
-        """Take what the worker made of the last phase. Results of cancelled jobs are ignored."""
-        fit = self._fitting
-        if event.job == self.learned.job and self.calibration is not None:
-            return self._learn(event, self.calibration)
+    def finish_job(self, event: JobFinished) -> list[Output]:
+        """Use the result of the worker. Results of cancelled jobs are ignored."""
+        fit = self._fit
+        if event.job == self.refits.job and self.calibration is not None:
+            return self._finish_refit(event, self.calibration)
         if fit is None or event.job != fit.job:
             return []
-        self._fitting = None
+
+        self._fit = None
         result = event.result or {}
         failure = event.error or result.get("refused") or (None if result else "no result")
-        if fit.kind == "static":
+        if fit.phase == CalibrationPhase.STATIC:
             self._static = fit.static if failure is None else None
         if failure is not None:
-            return [self._tell(event.t_ns, "aborted", f"{fit.kind}: {failure}")]
-        return self._finished(event.t_ns, fit.kind, dict(result))
+            self._change(SessionEvent.FAILED)
+            text = f"{fit.phase}: {failure}"
+            return [self._status(event.t_ns, CalibrationPhase.ABORTED, text)]
+        return self._use_result(event.t_ns, fit.phase, dict(result))
 
-    def _finished(self, t_ns: int, kind: str, result: dict[str, Any]) -> list[Output]:
+    def _use_result(
+        self, t_ns: int, phase: CalibrationPhase, result: dict[str, Any]
+    ) -> list[Output]:
         quality = result.get("quality", {})
-        if kind == "align":
+        if phase == CalibrationPhase.ALIGN:
+            self._change(SessionEvent.ALIGNMENT_FITTED)
             self._alignment = result["alignment"]
-            said = self._tell(t_ns, "aligned", "worlds aligned", {"alignment": quality})
-            return [*_notes(t_ns, kind, result["alignment"].get("notes", ())), said]
-        if kind == "static":
+            quality = {"alignment": quality}
+            status = self._status(t_ns, CalibrationPhase.ALIGNED, "worlds aligned", quality)
+            return [*_notices(t_ns, phase, result["alignment"].get("notes", ())), status]
+
+        static = phase == CalibrationPhase.STATIC
+        if static:
             quality = {"static": quality}
         if "calibration" not in result:
-            return [self._tell(t_ns, "posed", "static pose taken", quality)]
-        keep = result.get("worse")
-        if keep is not None and not self._force:
-            text = f"the stored calibration stays, the new one is worse: {keep}; force overrides"
-            return [replace(self._tell(t_ns, self.phase, text), kept=str(keep), refused=quality)]
+            self._change(SessionEvent.POSE_FITTED)
+            return [self._status(t_ns, CalibrationPhase.POSED, "static pose recorded", quality)]
+
+        worse = result.get("worse")
+        if worse is not None and not self._force:
+            self._change(SessionEvent.RESULT_WORSE)
+            text = f"new calibration rejected, it is worse than the stored one: {worse}; use force"
+            status = self._status(t_ns, self.phase, f"{text} to replace it")
+            return [replace(status, kept=str(worse), refused=quality)]
+
+        self._change(SessionEvent.POSE_FITTED if static else SessionEvent.CALIBRATION_FITTED)
         self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
-        if kind == "functional":
-            self.learned = Learned()
-        phase = "posed" if kind == "static" else "calibrated"
-        text = "static pose taken: sensors re-seated" if kind == "static" else "calibrated"
+        if phase == CalibrationPhase.FUNCTIONAL:
+            self.refits = OnlineRefits()
+        text = "static pose recorded: sensor alignments updated" if static else "calibrated"
         return [
-            *(_notes(t_ns, kind, self.calibration.notes) if kind == "functional" else ()),
-            *_notes(t_ns, kind, result.get("notes", ()), "info"),
+            *(() if static else _notices(t_ns, phase, self.calibration.notes)),
+            *_notices(t_ns, phase, result.get("notes", ()), "info"),
             CalibrationReady(self.calibration),
-            self._tell(t_ns, phase, text, quality),
+            self._status(t_ns, self._state, text, quality),
         ]
 
-    def stored(self, event: CalibrationStored) -> list[Output]:
-        """Take the number of the calibration in force; what goes on meanwhile goes on."""
+    def set_stored_version(self, event: CalibrationStored) -> list[Output]:
+        """Set the version of the calibration in force after it was stored."""
         self.version = event.version
         return [self.status(event.t_ns, f"stored as version {event.version}")]
 
     def status(self, t_ns: int, text: str) -> CalibrationStatus:
-        """Return what is to be told of the session as it stands."""
-        return self._tell(t_ns, self.phase, text)
+        """Return the status of the session."""
+        return self._status(t_ns, self.phase, text)
 
-    def abort(self, t_ns: int, why: str) -> list[Output]:
-        """End whatever runs."""
-        if self._phase is None and self._fitting is None:
+    def abort(self, t_ns: int, reason: str) -> list[Output]:
+        """Abort the running phase or fit, if any."""
+        if self._state in RESTING:
             return []
         outputs: list[Output] = []
-        if self._fitting is not None:
-            outputs.append(CancelJob(self._fitting.job))
-        self._phase = self._fitting = None
-        return [*outputs, self._tell(t_ns, "aborted", why)]
+        if self._fit is not None:
+            outputs.append(CancelJob(self._fit.job))
+        self._change(SessionEvent.FAILED)
+        self._recording = self._fit = None
+        return [*outputs, self._status(t_ns, CalibrationPhase.ABORTED, reason)]
 
-    def _tell(
-        self, t_ns: int, phase: str, text: str, quality: Mapping[str, object] | None = None
+    def _status(
+        self,
+        t_ns: int,
+        phase: CalibrationPhase,
+        text: str,
+        quality: Mapping[str, object] | None = None,
     ) -> CalibrationStatus:
-        """Return a status with the given figures, else with those of the calibration in force."""
+        """Return a status with the given quality, else that of the calibration in force."""
         if quality is None:
             quality = {} if self.calibration is None else self.calibration.quality
         return CalibrationStatus(t_ns, phase, text, self.version, quality)
 
 
 def _seconds(value: object) -> float | None:
-    """Return a number of seconds as it was asked for; NaN for what is none."""
+    """Return a requested number of seconds; NaN if it is not a number."""
     if value is None:
         return None
     usable = isinstance(value, int | float) and not isinstance(value, bool)
     return float(str(value)) if usable else math.nan
 
 
-def _notes(
-    t_ns: int, kind: str, notes: Sequence[str], level: Literal["info", "warning"] = "warning"
+def _notices(
+    t_ns: int, phase: str, notes: Sequence[str], level: Literal["info", "warning"] = "warning"
 ) -> list[Output]:
-    """Return what the wearer should know besides the figures."""
-    return [Notice(t_ns, "calibration", kind, note, level) for note in notes]
+    return [Notice(t_ns, "calibration", phase, note, level) for note in notes]

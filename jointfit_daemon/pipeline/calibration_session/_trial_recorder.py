@@ -1,7 +1,4 @@
-"""Keeps one calibration phase: samples and camera frames on the host clock, bounded.
-
-Law: appends while recording, hands out arrays once; decides nothing.
-"""
+"""Recorder of one calibration phase: samples and mocap frames on the host clock, bounded."""
 
 from __future__ import annotations
 
@@ -15,24 +12,26 @@ from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTr
 if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, Quaternion
 
-LONGEST_S = 600
-"""No phase is longer; at 400 Hz a sensor then holds 240 000 samples, about 40 MB."""
+MAX_PHASE_S = 600
+"""Longest phase, s: 240 000 samples of a sensor at 400 Hz, about 40 MB."""
 
-_NS = 1_000_000_000
-_MAX_SAMPLES = LONGEST_S * 400
+_MAX_SAMPLES = MAX_PHASE_S * 400
 
 
 @dataclass(slots=True)
 class TrialRecorder:
-    """Records from construction on."""
+    """Records from construction on.
+
+    Invariant: the tracks of a trial are strictly increasing in time.
+    """
 
     _samples: dict[str, list[tuple[int, Quaternion]]] = field(default_factory=dict)
     _frames: list[tuple[int, MocapFrame]] = field(default_factory=list)
     overflowed: int = 0
-    """Measurements refused because the phase lasted longer than the bound."""
+    """Measurements rejected because the recording was full."""
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> None:
-        """Keep one orientation."""
+        """Record one orientation."""
         track = self._samples.setdefault(sensor, [])
         if len(track) < _MAX_SAMPLES:
             track.append((t_ns, q_world_sensor))
@@ -40,14 +39,14 @@ class TrialRecorder:
             self.overflowed += 1
 
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
-        """Keep one camera frame."""
+        """Record one mocap frame."""
         if len(self._frames) < _MAX_SAMPLES:
             self._frames.append((t_ns, frame))
         else:
             self.overflowed += 1
 
     def trial(self, start_ns: int | None = None, end_ns: int | None = None) -> CalibrationTrial:
-        """Return what was kept between two instants, each track strictly increasing in time."""
+        """Return the recording between two instants, both included."""
         low = -(2**62) if start_ns is None else start_ns
         high = 2**62 if end_ns is None else end_ns
         sensors = {
@@ -59,7 +58,7 @@ class TrialRecorder:
 
 
 def _increasing(t_ns: np.ndarray) -> np.ndarray:
-    """Return the indices that keep time strictly increasing: a restarted clock may step back."""
+    """Return the indices of a strictly increasing subsequence: restarted clocks may step back."""
     if t_ns.size == 0:
         return np.zeros(0, dtype=np.int64)
     before = np.concatenate(([np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)[:-1]))
@@ -74,15 +73,16 @@ def _sensor_track(rows: list[tuple[int, Quaternion]]) -> SensorTrack:
 
 
 def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
-    """Merge frames of one or more layouts by name; what a layout lacks is NaN."""
+    """Merge frames of one or more layouts by name; names that a layout lacks are NaN."""
     layouts = dict.fromkeys(frame.layout for _, frame in frames)
     markers = tuple(dict.fromkeys(name for layout in layouts for name in layout.markers))
     bodies = tuple(dict.fromkeys(name for layout in layouts for name in layout.bodies))
+
     n = len(frames)
     positions = np.full((n, len(markers), 3), np.nan)
     body_positions = np.full((n, len(bodies), 3), np.nan)
     body_orientations = np.full((n, len(bodies), 4), np.nan)
-    for layout in layouts:  # all frames of a layout at once: a row at a time would hold up the core
+    for layout in layouts:  # one copy a layout: a copy a frame would block the core
         rows = np.array([row for row, (_, frame) in enumerate(frames) if frame.layout == layout])
         seen = [frame for _, frame in frames if frame.layout == layout]
         to_marker = np.array([markers.index(name) for name in layout.markers], dtype=np.intp)
@@ -92,6 +92,7 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
         body_orientations[np.ix_(rows, to_body)] = np.stack(
             [frame.body_orientations for frame in seen]
         )
+
     t_ns = np.array([t for t, _ in frames], dtype=np.int64)
     keep = _increasing(t_ns)
     return OpticalTrack(

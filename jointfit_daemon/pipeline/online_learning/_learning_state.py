@@ -1,6 +1,7 @@
-"""What keeps a limb from learning on while cameras see it, and since when.
+"""State of online learning: whether it can proceed, and the reason and duration of an obstacle.
 
-Law: pure. A hindrance that lasts is told once, and its end; nobody in view of the cameras is none.
+A lasting obstacle is reported once, and so is its end. A subject outside the view of the cameras is
+no obstacle.
 """
 
 from __future__ import annotations
@@ -13,81 +14,83 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _NS = 1_000_000_000
-TOLD_NS = 60 * _NS
-"""A hindrance is told after this; a movement out of view or a lost sensor is mostly shorter."""
-AWAY_NS = 2 * _NS
-"""Silence of the cameras after which they are not there."""
-NAMED = 4
-"""Markers that are named one by one."""
+REPORT_NS = 60 * _NS
+"""Duration after which an obstacle is reported, ns: most occlusions are shorter."""
+MOCAP_SILENT_NS = 2 * _NS
+"""Silence after which the mocap system is regarded as off, ns."""
+MAX_NAMES = 4
+"""Number of markers that a text lists by name."""
 
 
-class LearningWatch:
-    """Follows one learner.
+class LearningMonitor:
+    """Follows the state of one frame collector.
 
     Parameters
     ----------
     off : str or None
-        Why nothing will ever be learned as it stands; None: it may be.
+        Reason why the configuration or calibration excludes online learning; None if it does not.
     """
 
     def __init__(self, off: str | None = None) -> None:
         self._off = off
-        self._heard_ns: int | None = None
-        self._well_ns: int | None = None
-        """When a frame was last good for learning, or when looking began."""
-        self._why: str | None = None
+        self._mocap_ns: int | None = None
+        self._usable_ns: int | None = None
+        """Instant of the last usable frame, or of the first frame."""
+        self._obstacle: str | None = None
         self._in_view = False
-        self._told = False
+        self._reported = False
 
-    def well(self, now_ns: int) -> None:
-        """Take it that a frame could be learned from."""
-        self._heard_ns = self._well_ns = now_ns
-        self._why, self._in_view = None, True
+    def add_usable(self, now_ns: int) -> None:
+        """Add a frame that can be used for learning."""
+        self._mocap_ns = self._usable_ns = now_ns
+        self._obstacle, self._in_view = None, True
 
-    def hindered(self, now_ns: int, why: str, *, in_view: bool = True) -> None:
-        """Take it that a frame could not, and why; `in_view`: somebody is seen at all."""
-        self._heard_ns, self._why, self._in_view = now_ns, why, in_view
-        if self._well_ns is None or not in_view:  # who is away hinders nothing
-            self._well_ns = now_ns
+    def add_obstacle(self, now_ns: int, reason: str, *, in_view: bool = True) -> None:
+        """Add a frame that cannot be used; `in_view`: whether any marker is visible."""
+        self._mocap_ns, self._obstacle, self._in_view = now_ns, reason, in_view
+        if self._usable_ns is None or not in_view:  # absence does not count as obstacle
+            self._usable_ns = now_ns
 
     def notices(self, now_ns: int) -> list[Notice]:
-        """Return what is worth telling at `now_ns`, each change once."""
-        if self._well_ns is None:
+        """Return the notices that are due at `now_ns`, each once."""
+        if self._usable_ns is None:
             return []
-        if self._told:
-            if self._why is not None:
+        if self._reported:
+            if self._obstacle is not None:
                 return []
-            self._told = False
-            return [Notice(now_ns, "calibration", "online", "learns again from what cameras see")]
-        if self._why is None or now_ns - self._well_ns < TOLD_NS or self._away(now_ns):
+            self._reported = False
+            return [Notice(now_ns, "calibration", "online", "online learning resumed")]
+
+        present = self._mocap_present(now_ns) and self._in_view
+        if self._obstacle is None or now_ns - self._usable_ns < REPORT_NS or not present:
             return []
-        self._told = True
-        stopped_s = (now_ns - self._well_ns) // _NS
-        text = f"nothing has been learned for {stopped_s} s: {self._why}"
-        data = {"reason": self._why, "stopped_s": stopped_s}
+        self._reported = True
+        stopped_s = (now_ns - self._usable_ns) // _NS
+        text = f"online learning stopped for {stopped_s} s: {self._obstacle}"
+        data = {"reason": self._obstacle, "stopped_s": stopped_s}
         return [Notice(now_ns, "calibration", "online", text, "warning", data)]
 
-    def _away(self, now_ns: int) -> bool:
-        return self._heard_ns is None or now_ns - self._heard_ns > AWAY_NS or not self._in_view
+    def _mocap_present(self, now_ns: int) -> bool:
+        return self._mocap_ns is not None and now_ns - self._mocap_ns <= MOCAP_SILENT_NS
 
     def health(self, now_ns: int, kept: int) -> dict[str, object]:
-        """Return the state of learning, JSON-able.
+        """Return the state as JSON values, for ``bridge/health``.
 
         Parameters
         ----------
         now_ns : int
             Host time.
         kept : int
-            Frames that wait for a refit.
+            Number of frames that wait for a refit.
         """
-        state, reason, since_ns = "learning", self._why, self._well_ns
+        state, reason, since_ns = "learning", self._obstacle, self._usable_ns
         if self._off is not None:
             state, reason = "off", self._off
-        elif self._heard_ns is None or now_ns - self._heard_ns > AWAY_NS:
-            state, reason = "waiting", "no live frame of the cameras"
+        elif not self._mocap_present(now_ns):
+            state, reason = "waiting", "no live mocap frames"
         elif not self._in_view:
             state = "waiting"
-        elif self._why is not None:
+        elif self._obstacle is not None:
             state = "stopped"
         stopped = state == "stopped" and since_ns is not None
         return {
@@ -98,8 +101,8 @@ class LearningWatch:
         }
 
 
-def hidden(markers: Sequence[str]) -> str:
-    """Return in words which markers the cameras do not see."""
-    named = ", ".join(markers[:NAMED])
-    more = f" and {len(markers) - NAMED} more" if len(markers) > NAMED else ""
-    return f"the cameras do not see {named}{more}"
+def not_visible(markers: Sequence[str]) -> str:
+    """Return the text that names the markers that are not visible."""
+    named = ", ".join(markers[:MAX_NAMES])
+    more = f" and {len(markers) - MAX_NAMES} more" if len(markers) > MAX_NAMES else ""
+    return f"not visible to the cameras: {named}{more}"

@@ -1,7 +1,4 @@
-"""What becomes of a refit while running: taken, kept away or taken back, and how it is told.
-
-Law: a state of its own beside the session's; the session asks it, and owns the calibration.
-"""
+"""Refits of the models during operation: request, result and reversal."""
 
 from __future__ import annotations
 
@@ -18,29 +15,29 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationSettings, Fresh
     from jointfit_daemon.model import Chain
     from jointfit_daemon.pipeline.events import JobFinished
-    from jointfit_daemon.pipeline.online_learning._frame_collector import OnlineLearner
+    from jointfit_daemon.pipeline.online_learning._frame_collector import OnlineFrameCollector
 
 
-class Verdict(NamedTuple):
-    """What a refit came to."""
+class RefitOutcome(NamedTuple):
+    """Outcome of a refit."""
 
     calibration: Calibration | None
-    """To be taken, or None."""
+    """Calibration with the new models; None if they are not used."""
     notice: Notice
 
 
 @dataclass(slots=True)
-class Learned:
-    """Refits of one session."""
+class OnlineRefits:
+    """Refits since the last functional calibration."""
 
     job: int | None = None
-    """That runs."""
-    taught: Calibration | None = None
-    """As it was before the first refit that was taken: what can be gone back to."""
+    """Number of the running refit."""
+    original: Calibration | None = None
+    """Calibration before the first refit that was used: the target of a reversal."""
     paused: bool = False
-    """Nothing is learned until the next functional phase: somebody took it back."""
+    """Whether online learning waits for the next functional calibration, after a reversal."""
 
-    def ask(
+    def request(
         self,
         job: int,
         calibration: Calibration,
@@ -48,43 +45,48 @@ class Learned:
         settings: CalibrationSettings,
         fresh: Fresh,
     ) -> FitJob:
-        """Return the work of a refit."""
+        """Return the job of a refit."""
         self.job = job
         payload = {"chain": chain, "settings": settings, "fresh": fresh}
         return FitJob(job, "online", payload | {"previous": calibration.to_dict()})
 
-    def finished(self, event: JobFinished, before: Calibration, version: int | None) -> Verdict:
-        """Return what came of it."""
+    def finish(self, event: JobFinished, before: Calibration, version: int | None) -> RefitOutcome:
+        """Return the outcome of the running refit."""
         self.job = None
         result: dict[str, Any] = dict(event.result or {})
         failure = event.error or result.get("refused") or (None if result else "no result")
         if failure is not None:
-            text = f"nothing learned: {failure}"
-            return Verdict(None, Notice(event.t_ns, "calibration", "online", text, "warning"))
-        data = _shown(result.get("quality", {}).get("online", {}))
+            text = f"models unchanged: {failure}"
+            return RefitOutcome(None, Notice(event.t_ns, "calibration", "online", text, "warning"))
+
+        data = _notice_data(result.get("quality", {}).get("online", {}))
         if "calibration" not in result:
-            text = f"nothing learned: {result.get('kept')}"
-            return Verdict(None, Notice(event.t_ns, "calibration", "online", text, "info", data))
-        self.taught = self.taught or before
+            text = f"models unchanged: {result.get('kept')}"
+            return RefitOutcome(
+                None, Notice(event.t_ns, "calibration", "online", text, "info", data)
+            )
+
+        self.original = self.original or before
         found = Calibration.from_dict(result["calibration"])
         online = {**found.quality["online"], "from_version": version}
         found = replace(found, quality={**found.quality, "online": online})
-        text = f"learned from {online['frames']} frames in view of the cameras"
-        return Verdict(found, Notice(event.t_ns, "calibration", "online", text, "info", data))
+        text = f"models refitted with {online['frames']} mocap frames"
+        return RefitOutcome(found, Notice(event.t_ns, "calibration", "online", text, "info", data))
 
-    def health(self, learner: OnlineLearner, now_ns: int) -> dict[str, object]:
-        """Return the state of learning, JSON-able: somebody may have stopped it altogether."""
-        found = learner.health(now_ns)
+    def health(self, collector: OnlineFrameCollector, now_ns: int) -> dict[str, object]:
+        """Return the state of online learning as JSON values, for ``bridge/health``."""
+        found = collector.health(now_ns)
         if self.paused and found["state"] != "off":
-            why = "taken back by `unlearn`, until the next functional phase"
-            return found | {"state": "off", "reason": why, "stopped_s": None}
+            reason = "reverted; paused until the next functional calibration"
+            return found | {"state": "off", "reason": reason, "stopped_s": None}
         return found
 
-    def taken_back(self, calibration: Calibration) -> Calibration | None:
-        """Return the calibration with the models it had before; None where nothing was learned."""
-        old, self.taught = self.taught, None
+    def revert(self, calibration: Calibration) -> Calibration | None:
+        """Return the calibration with its original models; None if no refit was used."""
+        old, self.original = self.original, None
         if old is None:
             return None
+
         self.paused = True
         quality = {key: value for key, value in calibration.quality.items() if key != "online"}
         if "online" in old.quality:
@@ -102,20 +104,20 @@ class Learned:
         )
 
 
-def _shown(figures: Mapping[str, Any]) -> dict[str, object]:
-    """Return what an event tells: degrees, to four digits."""
-    shown: dict[str, object] = {key: figures[key] for key in ("frames", "judged") if key in figures}
+def _notice_data(quality: Mapping[str, Any]) -> dict[str, object]:
+    """Return the data of the notice: errors in degrees, to four digits."""
+    data: dict[str, object] = {key: quality[key] for key in ("frames", "judged") if key in quality}
     for when in ("before", "after"):
-        errors = figures.get(f"{when}_rad", {})
-        shown[f"{when}_deg"] = {n: float(f"{math.degrees(x):.4g}") for n, x in errors.items()}
-    return shown
+        errors = quality.get(f"{when}_rad", {})
+        data[f"{when}_deg"] = {n: float(f"{math.degrees(x):.4g}") for n, x in errors.items()}
+    return data
 
 
-def models_only(before: Calibration, after: Calibration) -> bool:
-    """Tell whether two calibrations differ in models and figures alone."""
-    return _but_models(before) == _but_models(after)
+def only_models_differ(before: Calibration, after: Calibration) -> bool:
+    """Return whether two calibrations are equal except for models and quality."""
+    return _without_models(before) == _without_models(after)
 
 
-def _but_models(one: Calibration) -> Calibration:
-    bare = replace(one, segment={}, correlations={}, memory="")
+def _without_models(calibration: Calibration) -> Calibration:
+    bare = replace(calibration, segment={}, correlations={}, memory="")
     return replace(bare, quality={}, created_utc="", software="")

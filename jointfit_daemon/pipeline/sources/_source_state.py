@@ -1,7 +1,7 @@
-"""One source inside the core: its decoder, its clock and its counters.
+"""State of one source in the core: decoder, clock and counters.
 
-Law: knows nothing of frames, calibration or other sources. Turns chunks into stamped samples and
-counts what a wire did to them.
+Converts chunks to stamped samples and counts losses and errors. It knows nothing of frames,
+calibration or other sources.
 """
 
 from __future__ import annotations
@@ -9,14 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.model import (
-    ClockEcho,
-    Corrupt,
-    DeviceEvent,
-    ImuSample,
-    MocapFrame,
-    SyncPulse,
-)
+from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
 from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
 from jointfit_daemon.pipeline.sources._sync_lines import SyncLines
 from jointfit_daemon.timing.clock import DeviceClock, Edge
@@ -32,11 +25,11 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 _MEASUREMENTS = (ImuSample, MocapFrame)
 WITHHELD = ("unpublished", "duplicates", "late")
-"""Counters a decoder may have of what it decoded and did not hand on."""
+"""Counters that a decoder may have for frames that it decoded but did not return."""
 
 
-class Stamped(NamedTuple):
-    """A measurement with the host instant it is true for."""
+class StampedMeasurement(NamedTuple):
+    """A measurement and its instant on the host clock."""
 
     measurement: ImuSample | MocapFrame
     stamp: Stamp
@@ -44,50 +37,51 @@ class Stamped(NamedTuple):
 
 @dataclass(slots=True)
 class WireCounts:
-    """What happened on the wire since the daemon started; decoders come and go with reconnects."""
+    """Counts since the daemon started; they go on when a reconnect replaces the decoder."""
 
     received: int = 0
     """Samples decoded."""
     corrupt: int = 0
-    """Runs of bytes that made no message."""
+    """Runs of discarded bytes."""
     discarded_bytes: int = 0
     lost: int = 0
-    """Samples the device's counter says were sent and never came."""
+    """Samples that the device counted but that did not arrive."""
     restarts: int = 0
-    """Times the device restarted: it reported so, its clock showed it, or it was away and nothing
-    shows that it ran on."""
+    """Restarts of the device, reported by it or seen in its clock. A device that was away counts as
+    restarted unless its clock shows otherwise."""
     opened: int = 0
     """Times the source was opened; all but the first are reconnects."""
 
 
 @dataclass(slots=True)
 class SourceState:
-    """The live half of one configured source."""
+    """The state of one configured source."""
 
     source: Source
     clock: DeviceClock
     lines: SyncLines = field(default_factory=SyncLines)
-    """Where edges of sync lines meet: one for the whole rig."""
+    """Sync lines of the rig, shared by its sources."""
     online: bool = False
     open: bool = False
     last_arrival_ns: int | None = None
     counts: WireCounts = field(default_factory=WireCounts)
     info: Mapping[str, object] = field(default_factory=dict)
     closed_text: str = ""
-    """Why it was closed last."""
+    """Reason of the last closing."""
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
 
     @classmethod
-    def of(
+    def create(
         cls,
         source: Source,
         before: SourceState | None = None,
         lines: SyncLines | None = None,
     ) -> SourceState:
-        """Return the state of a source not opened yet; `before` had its name and gives its counts.
+        """Return the state of a source that is not open yet.
 
-        Verdicts on its samples go on, too: a count that began anew would contradict them.
+        The counts of `before`, the state of the same id before a reload, are continued: the counts
+        of its samples in the frame grid continue as well, and both must agree.
         """
         mean_ns, sd_ns = latency_prior(source)
         period_ns = round(_NS / source.rate_hz)
@@ -99,11 +93,11 @@ class SourceState:
             state.counts, state._withheld = before.counts, before.withheld()
         return state
 
-    def opened(self) -> None:
-        """Begin anew with a fresh decoder: what was half received will never be completed.
+    def start(self) -> None:
+        """Start with a new decoder when the source was opened.
 
-        What a sensor did while it was away is shown by its next sample. A camera server's clock
-        settles within a second, so nothing old is trusted.
+        The next sample of an IMU shows what its clock did meanwhile. The clock of a mocap server
+        settles within a second, so its old fit is discarded.
         """
         if self.counts.opened and self.source.kind == "mocap":
             self.clock.feed_restart()
@@ -114,84 +108,88 @@ class SourceState:
         self.open = True
         self.counts.opened += 1
 
-    def closed(self) -> list[Stamped | Corrupt | DeviceEvent]:
-        """Return what the decoder still gives up, and forget it."""
+    def stop(self) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
+        """Return the rest of the decoder's output, and drop the decoder."""
         decoder, self._decoder = self._decoder, None
         self.open = self.online = False
         if decoder is None:
             return []
-        taken = self._take(decoder.flush(), decoder)
+        items = self._process(decoder.flush(), decoder)
         for name in WITHHELD:
             self._withheld[name] += getattr(decoder, name, 0)
-        return taken
+        return items
 
     def withheld(self) -> dict[str, int]:
-        """Return how many decoded frames never left the decoders, by why (see ``Decoder``)."""
+        """Return the numbers of decoded frames that were not returned, by reason."""
         return {
             name: count + getattr(self._decoder, name, 0) for name, count in self._withheld.items()
         }
 
-    def feed(self, chunk: Chunk) -> list[Stamped | Corrupt | DeviceEvent]:
-        """Return what `chunk` completed, stamped; nothing while the source is not open."""
+    def feed(self, chunk: Chunk) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
+        """Return the stamped samples and events that `chunk` completes; none while closed."""
         decoder = self._decoder
         if decoder is None:
             return []
         self.last_arrival_ns = chunk.t_ns
-        return self._take(decoder.feed(chunk), decoder)
+        return self._process(decoder.feed(chunk), decoder)
 
-    def _take(
+    def _process(
         self, decoded: list[Decoded], decoder: Decoder
-    ) -> list[Stamped | Corrupt | DeviceEvent]:
-        taken: list[Stamped | Corrupt | DeviceEvent] = []
+    ) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
+        items: list[StampedMeasurement | Corrupt | DeviceEvent] = []
         clock, tick_clock = self.clock, decoder.tick_clock
         for item in decoded:
             if isinstance(item, _MEASUREMENTS):
-                stamped = self._stamped(item, tick_clock)
-                if clock.news:  # found by this sample, and so to be known before it
-                    taken += self._told()
-                taken.append(stamped)
+                stamped = self._stamp(item, tick_clock)
+                if clock.news:  # an event that a sample reveals comes before the sample
+                    items += self._clock_events()
+                items.append(stamped)
                 continue
+
             if isinstance(item, ClockEcho):
                 clock.feed_echo(item, tick_clock)
             elif isinstance(item, SyncPulse):
-                self._edge(item, tick_clock)
+                self._add_pulse(item, tick_clock)
             else:
                 self._count(item)
-                taken.append(item)
+                items.append(item)
             if clock.news:
-                taken += self._told()
-        return taken
+                items += self._clock_events()
+        return items
 
-    def _stamped(self, item: ImuSample | MocapFrame, tick_clock: TickClock | None) -> Stamped:
+    def _stamp(
+        self, item: ImuSample | MocapFrame, tick_clock: TickClock | None
+    ) -> StampedMeasurement:
         self.counts.received += 1
         clock = self.clock
         if isinstance(item, ImuSample):
             now_ns, arrival_ns = self.last_arrival_ns or 0, item.arrival_ns
-            if arrival_ns > now_ns:  # a stamp of kernel or adapter that is simply wrong
+            if arrival_ns > now_ns:  # a kernel or adapter stamp in the future is wrong
                 item, arrival_ns = item._replace(arrival_ns=now_ns), now_ns
-            return Stamped(
+            return StampedMeasurement(
                 item, clock.feed_sample(item.ticks, item.counter, arrival_ns, tick_clock)
             )
+
         stamp = clock.feed_sample(item.ticks, item.number, item.arrival_ns, tick_clock)
         number = getattr(self.source.settings, "sync_line", None)
         if number is not None and stamp.synced and item.live and clock.last_u is not None:
             edge = Edge(clock.host_ns(clock.last_u), clock.last_u)
-            self.lines.exposures(number, self.source.id, clock, edge)
-        return Stamped(item, stamp)
+            self.lines.add_exposure(number, self.source.id, clock, edge)
+        return StampedMeasurement(item, stamp)
 
-    def _edge(self, pulse: SyncPulse, tick_clock: TickClock | None) -> None:
+    def _add_pulse(self, pulse: SyncPulse, tick_clock: TickClock | None) -> None:
         clock = self.clock
         own_ns = clock.edge_ns(pulse.ticks, tick_clock)
         if own_ns is not None and clock.settled:
             edge = Edge(clock.host_ns(own_ns), own_ns)
-            self.lines.edge(pulse.line, self.source.id, clock, edge)
+            self.lines.add_edge(pulse.line, self.source.id, clock, edge)
 
-    def _told(self) -> list[DeviceEvent]:
-        """Return what the clock has to tell; it goes before the sample it was found by."""
-        told = [DeviceEvent(news.kind, news.text, dict(news.data)) for news in self.clock.news]
+    def _clock_events(self) -> list[DeviceEvent]:
+        """Return the events of the clock, and count its restarts."""
+        events = [DeviceEvent(news.kind, news.text, dict(news.data)) for news in self.clock.news]
         self.clock.news.clear()
-        self.counts.restarts += sum(event.kind == "restart" for event in told)
-        return told
+        self.counts.restarts += sum(event.kind == "restart" for event in events)
+        return events
 
     def _count(self, item: Corrupt | DeviceEvent) -> None:
         if isinstance(item, Corrupt):

@@ -1,8 +1,10 @@
-"""The sync lines of a rig: whose edges are whose.
+"""Sync lines of a rig: which edges of which sources belong together.
 
-Law: deterministic; knows clocks and edges, no measurements. The reference of a line is the cameras
-if their table names it (``sync_line``: an edge at every exposure), else the first source whose edge
-arrived. All others on the line are tied to it.
+The reference of a line is the mocap source whose table names the line (``sync_line``: one edge per
+exposure), else the first source whose edge arrived. The clocks of all other sources on the line are
+tied to the reference.
+
+Invariant: the result depends only on the edges and clocks, in order of arrival.
 """
 
 from __future__ import annotations
@@ -16,50 +18,50 @@ if TYPE_CHECKING:
 
 
 class _Line:
-    __slots__ = ("clocks", "edges", "heard_ns", "reference")
+    __slots__ = ("clocks", "edges", "last_ns", "reference")
 
     def __init__(self) -> None:
         self.edges = SyncLine()
         self.reference: str | None = None
-        self.heard_ns = 0
+        self.last_ns = 0
         self.clocks: dict[str, DeviceClock] = {}
 
 
 class SyncLines:
-    """All sync lines, by number."""
+    """All sync lines of a rig, by number."""
 
     def __init__(self) -> None:
         self._lines: dict[int, _Line] = {}
-        self._cameras: dict[int, str] = {}
+        self._mocap_lines: set[int] = set()
 
     @property
     def unmatched(self) -> int:
-        """Edges that could not be told from their neighbors."""
+        """Number of edges that could not be assigned to one edge of the reference."""
         return sum(line.edges.unmatched for line in self._lines.values())
 
-    def exposures(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
-        """Take a camera frame whose exposure made an edge on line `number`."""
-        self._cameras[number] = source
-        self._instant(number, source, clock, edge)
+    def add_exposure(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
+        """Add a mocap frame whose exposure made an edge on line `number`."""
+        self._mocap_lines.add(number)
+        self._add_reference_edge(number, source, clock, edge)
 
-    def edge(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
-        """Take an edge that `source` stamped on line `number`."""
+    def add_edge(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
+        """Add an edge on line `number` that `source` time-stamped."""
         line = self._lines.setdefault(number, _Line())
-        silent = edge.t_ns - line.heard_ns > SYNC_STALE_NS
-        if line.reference is None or (silent and number not in self._cameras):
+        silent = edge.t_ns - line.last_ns > SYNC_STALE_NS
+        if line.reference is None or (silent and number not in self._mocap_lines):
             line.reference, line.edges = source, SyncLine()
         if line.reference == source:
-            self._instant(number, source, clock, edge)
+            self._add_reference_edge(number, source, clock, edge)
             return
         line.clocks[source] = clock
         line.edges.pulse(source, edge)
         self._tie(line, source)
 
-    def _instant(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
+    def _add_reference_edge(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
         line = self._lines.setdefault(number, _Line())
         if line.reference != source:
             line.reference, line.edges = source, SyncLine()
-        line.clocks[source], line.heard_ns = clock, edge.t_ns
+        line.clocks[source], line.last_ns = clock, edge.t_ns
         line.edges.instant(edge)
         for name in line.clocks:
             if name != source:

@@ -53,8 +53,8 @@ class _Arguments(BaseModel):
 class CalibrateArguments(_Arguments):
     """``bridge/request/calibrate``."""
 
-    phase: Literal["align", "static", "functional", "abort", "unlearn"] = Field(
-        description="the phase to begin, or `abort`; `unlearn` takes back what was learned online"
+    phase: Literal["align", "static", "functional", "abort", "revert"] = Field(
+        description="the phase to begin, or `abort`; `revert` takes back what was learned online"
     )
     seconds: float | None = Field(
         None, gt=0, le=600, description="length of the phase, s; default: as in rig.toml"

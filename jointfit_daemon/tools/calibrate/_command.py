@@ -37,7 +37,7 @@ LONGEST_S = 600.0
 ORDER = ("align", "static", "functional")
 IMMEDIATE_REQUESTS = {
     "abort": "aborted; current state: ",
-    "unlearn": "online learning reverted; current state: ",
+    "revert": "online learning reverted; current state: ",
 }
 INSTRUCTIONS = {
     "align": "Fix all sensors to the plate and rotate the plate by hand about all three axes.",
@@ -72,7 +72,7 @@ def calibrate(
     phase: Annotated[
         list[str] | None,
         typer.Option(
-            help="align, static, functional, abort or unlearn; repeatable. Default: static, and"
+            help="align, static, functional, abort or revert; repeatable. Default: static, and"
             " functional if rig.toml has a motion-capture source."
         ),
     ] = None,

@@ -19,6 +19,7 @@ from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter, encode_pose
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
 from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
     CalibrationProgress,
     CalibrationStatus,
     DeviceInfo,
@@ -237,8 +238,10 @@ async def test_changes_of_state_go_where_the_contract_says(
 ) -> None:
     reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
     reporter.handle(Notice(0, "device", "S1", "streaming"))
-    reporter.handle(CalibrationStatus(0, "calibrated", "done", 3, {"rms_m": 0.004}))
-    reporter.handle(CalibrationProgress(0, "functional", 0.5, "keep moving", {"arc_deg": 40.0}))
+    reporter.handle(CalibrationStatus(0, CalibrationPhase.CALIBRATED, "done", 3, {"rms_m": 0.004}))
+    reporter.handle(
+        CalibrationProgress(0, CalibrationPhase.FUNCTIONAL, 0.5, "keep moving", {"arc_deg": 40.0})
+    )
     reporter.health({"devices": {}, "process": {"cpu_pct": 3.0}})
     reporter.log_line("warning", "x", "hot", 2)
     found = await sent(outbox)

@@ -1,4 +1,4 @@
-"""The calibration session: phases begin, end, refuse and abort as the wearer is told they do."""
+"""The calibration session: start, end, refusal and abort of phases."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def turned(angle: float) -> tuple[float, float, float, float]:
     return (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
 
 
-def wear(
+def feed(
     one: CalibrationSession,
     start_s: float,
     end_s: float,
@@ -67,7 +67,7 @@ def wear(
     sensors: tuple[str, ...] = SENSORS,
     cameras: bool = True,
 ) -> list[Output]:
-    """Feed sensors at 50 Hz, turning at `speed` rad/s, and the cameras; let time go on."""
+    """Feed sensors at 50 Hz, turning at `speed` rad/s, and mocap frames."""
     out: list[Output] = []
     for k in range(round(start_s * 50), round(end_s * 50)):
         t_ns = k * SECOND // 50
@@ -84,41 +84,41 @@ def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
 
 
 def done(one: CalibrationSession, job: FitJob, **result: object) -> list[Output]:
-    return one.job_finished(JobFinished(99 * SECOND, job.job, result, None))
+    return one.finish_job(JobFinished(99 * SECOND, job.job, result, None))
 
 
 def posed() -> CalibrationSession:
     one = session()
     ask(one, 0, "static")
-    (job,) = only(wear(one, 0, 10), FitJob)
+    (job,) = only(feed(one, 0, 10), FitJob)
     done(one, job, quality={})
     return one
 
 
-def test_every_request_is_answered_exactly_once() -> None:
+def test_every_request_has_exactly_one_reply() -> None:
     one = session()
     for phase in ("nonsense", "functional", "align", "static", "abort"):
         assert len(only(ask(one, 0, phase), Reply)) == 1
 
 
-def test_a_functional_phase_without_a_static_pose_says_what_comes_first() -> None:
+def test_functional_phase_without_static_pose_is_refused_with_the_remedy() -> None:
     (reply,) = only(ask(session(), 0, "functional"), Reply)
     assert reply.status == "error"
     assert "static" in str(reply.error)
 
 
 @pytest.mark.parametrize("phase", ["align", "functional"])
-def test_without_cameras_the_phases_that_need_them_are_refused(phase: str) -> None:
+def test_phases_that_need_mocap_are_refused_without_it(phase: str) -> None:
     (reply,) = only(ask(session(mocap=False), 0, phase), Reply)
     assert "[mocap]" in str(reply.error)
 
 
-def test_standing_still_ends_the_static_phase_and_hands_over_only_the_still_part() -> None:
+def test_stillness_ends_the_static_phase_and_only_it_is_fitted() -> None:
     one = session()
     ask(one, 0, "static")
-    moving = wear(one, 0, 4, speed=0.5)
+    moving = feed(one, 0, 4, speed=0.5)
     assert not only(moving, FitJob)
-    (job,) = only(wear(one, 4, 12), FitJob)
+    (job,) = only(feed(one, 4, 12), FitJob)
     trial = job.payload["static"]
     assert isinstance(trial, CalibrationTrial)
     span_s = (trial.sensors["S1"].t_ns[-1] - trial.sensors["S1"].t_ns[0]) / SECOND
@@ -126,32 +126,32 @@ def test_standing_still_ends_the_static_phase_and_hands_over_only_the_still_part
     assert trial.sensors["S1"].t_ns[0] > 4 * SECOND
 
 
-def test_movement_restarts_the_static_clock_and_names_the_sensor() -> None:
+def test_movement_restarts_the_static_phase_and_names_the_sensor() -> None:
     one = session()
     ask(one, 0, "static")
-    wear(one, 0, 2.5)
-    told = wear(one, 2.5, 3.5, speed=1.0)
-    assert any(notice.id in SENSORS for notice in only(told, Notice))
-    assert not only(wear(one, 3.5, 5.0), FitJob)
+    feed(one, 0, 2.5)
+    outputs = feed(one, 2.5, 3.5, speed=1.0)
+    assert any(notice.id in SENSORS for notice in only(outputs, Notice))
+    assert not only(feed(one, 3.5, 5.0), FitJob)
 
 
-def test_a_wearer_who_never_stands_still_gets_the_reason() -> None:
+def test_static_phase_without_stillness_is_aborted_with_the_reason() -> None:
     one = session()
     ask(one, 0, "static")
-    statuses = only(wear(one, 0, 125, speed=0.5), CalibrationStatus)
+    statuses = only(feed(one, 0, 125, speed=0.5), CalibrationStatus)
     assert statuses[-1].phase == "aborted"
     assert "moving" in statuses[-1].text
 
 
-def test_progress_is_told_at_most_five_times_a_second() -> None:
+def test_progress_is_published_at_most_five_times_a_second() -> None:
     one = posed()
     ask(one, 10 * SECOND, "functional")
-    told = only(wear(one, 10, 13, speed=0.3), CalibrationProgress)
-    assert 10 <= len(told) <= 15
-    assert [p.progress for p in told] == sorted(p.progress for p in told)
+    outputs = only(feed(one, 10, 13, speed=0.3), CalibrationProgress)
+    assert 10 <= len(outputs) <= 15
+    assert [p.progress for p in outputs] == sorted(p.progress for p in outputs)
 
 
-def test_a_second_request_while_a_phase_runs_is_refused() -> None:
+def test_second_request_during_a_phase_is_refused() -> None:
     one = session()
     ask(one, 0, "align")
     (reply,) = only(ask(one, 1, "static"), Reply)
@@ -162,15 +162,15 @@ def test_a_second_request_while_a_phase_runs_is_refused() -> None:
 def test_abort_cancels_the_worker_and_its_late_result_is_ignored() -> None:
     one = session()
     ask(one, 0, "align")
-    (job,) = only(wear(one, 0, 6), FitJob)
+    (job,) = only(feed(one, 0, 6), FitJob)
     assert only(ask(one, 7 * SECOND, "abort"), CancelJob) == [CancelJob(job.job)]
     assert done(one, job, alignment={}, quality={}) == []
 
 
-def test_a_refusal_of_the_fit_aborts_with_its_reason() -> None:
+def test_refused_fit_aborts_with_its_reason() -> None:
     one = session()
     ask(one, 0, "align")
-    (job,) = only(wear(one, 0, 6), FitJob)
+    (job,) = only(feed(one, 0, 6), FitJob)
     statuses = only(
         done(one, job, refused="the plate turned about one axis only"), CalibrationStatus
     )
@@ -178,10 +178,10 @@ def test_a_refusal_of_the_fit_aborts_with_its_reason() -> None:
     assert "one axis" in statuses[-1].text
 
 
-def test_a_worse_calibration_is_not_taken_and_the_reason_is_told() -> None:
+def test_worse_calibration_is_rejected_with_the_reason() -> None:
     one = posed()
     ask(one, 10 * SECOND, "functional")
-    (job,) = only(wear(one, 10, 16, speed=0.3), FitJob)
+    (job,) = only(feed(one, 10, 16, speed=0.3), FitJob)
     outputs = done(
         one, job, calibration={"schema": 1}, worse="knee 3.0 against 1.0 deg", quality={}
     )
@@ -193,58 +193,58 @@ def test_a_worse_calibration_is_not_taken_and_the_reason_is_told() -> None:
     assert not only(outputs, Notice)  # the status is an event, too
 
 
-def test_the_payload_carries_the_alignment_of_this_session() -> None:
+def test_job_contains_the_alignment_of_the_session() -> None:
     one = session()
     ask(one, 0, "align")
-    (job,) = only(wear(one, 0, 6), FitJob)
+    (job,) = only(feed(one, 0, 6), FitJob)
     done(one, job, alignment={"sensors": {}, "notes": []}, quality={})
     ask(one, 6 * SECOND, "static")
-    (job,) = only(wear(one, 6, 16), FitJob)
+    (job,) = only(feed(one, 6, 16), FitJob)
     assert job.payload["alignment"] == {"sensors": {}, "notes": []}
 
 
-# --- what is missing, said in time ----------------------------------------------------------------
+# --- missing data --------------------------------------------------------------------------------
 
 
-def test_a_silent_sensor_is_no_still_one_and_is_named() -> None:
+def test_sensor_without_data_is_not_still_and_is_named() -> None:
     one = session()
     ask(one, 0, "static")
-    out = wear(one, 0, 10, sensors=("S1", "S3", "S4"))
+    out = feed(one, 0, 10, sensors=("S1", "S3", "S4"))
     assert not only(out, FitJob)
     assert "no data from S2" in only(out, CalibrationProgress)[-1].text
-    assert only(wear(one, 10, 16), FitJob), "it goes on once the sensor speaks"
+    assert only(feed(one, 10, 16), FitJob), "the phase continues with data of the sensor"
 
 
 def test_stillness_ends_with_the_data_of_all_sensors() -> None:
     one = session()
     ask(one, 0, "static")
-    wear(one, 0, 3)
-    out = wear(one, 3, 10, sensors=())
+    feed(one, 0, 3)
+    out = feed(one, 3, 10, sensors=())
     assert not only(out, FitJob)
     assert only(out, CalibrationProgress)[-1].progress == 0.0
 
 
-def test_what_is_silent_while_moving_is_named() -> None:
+def test_missing_data_during_movement_is_named() -> None:
     one = posed()
     ask(one, 10 * SECOND, "functional")
-    out = wear(one, 10, 12, 0.3, sensors=("S1", "S2", "S3"), cameras=False)
-    assert "no data from S4, the cameras" in only(out, CalibrationProgress)[-1].text
+    out = feed(one, 10, 12, 0.3, sensors=("S1", "S2", "S3"), cameras=False)
+    assert "no data from S4, the mocap system" in only(out, CalibrationProgress)[-1].text
 
 
-def test_a_pose_that_no_camera_saw_is_no_ground_for_a_movement() -> None:
+def test_functional_phase_needs_mocap_data_of_the_static_pose() -> None:
     one = session()
     ask(one, 0, "static")
-    (job,) = only(wear(one, 0, 10, cameras=False), FitJob)
+    (job,) = only(feed(one, 0, 10, cameras=False), FitJob)
     done(one, job, quality={})
     (reply,) = only(ask(one, 11 * SECOND, "functional"), Reply)
     assert "cameras" in str(reply.error)
 
 
-# --- requests that the edge ought to have refused -------------------------------------------------
+# --- invalid requests ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seconds", ["soon", "5", True, 0, -1.0, math.nan, math.inf, 601, [5]])
-def test_odd_seconds_are_refused(seconds: object) -> None:
+def test_invalid_seconds_are_refused(seconds: object) -> None:
     (reply,) = only(ask(session(), 0, "static", seconds=seconds), Reply)
     assert reply.status == "error"
     assert reply.error is not None
@@ -252,49 +252,49 @@ def test_odd_seconds_are_refused(seconds: object) -> None:
 
 
 @pytest.mark.parametrize("phase", [None, 7, ["static"], {"phase": 1}])
-def test_odd_phases_are_refused(phase: Any) -> None:
+def test_invalid_phases_are_refused(phase: Any) -> None:
     (reply,) = only(ask(session(), 0, phase), Reply)
     assert reply.status == "error"
 
 
-def test_the_pose_is_judged_by_the_length_that_was_asked_for() -> None:
+def test_static_fit_uses_the_requested_length() -> None:
     one = session()
     ask(one, 0, "static", seconds=1.5)
-    (job,) = only(wear(one, 0, 5), FitJob)
+    (job,) = only(feed(one, 0, 5), FitJob)
     settings: Any = job.payload["settings"]
     assert settings.static_s == 1.5
 
 
-def test_the_movement_after_a_short_pose_judges_it_by_that_length_too() -> None:
-    """A pose that was accepted must not be refused a minute later."""
+def test_functional_fit_uses_the_requested_length_of_the_pose() -> None:
+    """An accepted pose must not be refused later."""
     one = session()
     ask(one, 0, "static", seconds=1.5)
-    (job,) = only(wear(one, 0, 5), FitJob)
+    (job,) = only(feed(one, 0, 5), FitJob)
     done(one, job, quality={})
     reloaded = session()
-    reloaded.take_over(one, same_rig=True)
+    reloaded.resume(one, same_rig=True)
     for after in (one, reloaded):
         ask(after, 5 * SECOND, "functional")
-        (job,) = only(wear(after, 5, 12), FitJob)
+        (job,) = only(feed(after, 5, 12), FitJob)
         settings: Any = job.payload["settings"]
         assert settings.static_s == 1.5
 
 
-# --- what is left over ----------------------------------------------------------------------------
+# --- restarts and reloads ------------------------------------------------------------------------
 
 
-def test_a_pose_whose_fit_was_aborted_is_no_pose() -> None:
+def test_pose_of_an_aborted_fit_is_discarded() -> None:
     one = session()
     ask(one, 0, "static")
-    wear(one, 0, 10)
+    feed(one, 0, 10)
     ask(one, 11 * SECOND, "abort")
     (reply,) = only(ask(one, 12 * SECOND, "functional"), Reply)
     assert reply.status == "error"
 
 
-def test_a_sensor_that_restarts_takes_the_pose_along_and_says_so() -> None:
+def test_sensor_restart_discards_the_pose_with_a_notice() -> None:
     one = posed()
-    (notice,) = one.restarted(11 * SECOND, "S2")
+    (notice,) = one.restart_sensor(11 * SECOND, "S2")
     assert isinstance(notice, Notice)
     assert notice.level == "warning"
     assert "S2" in notice.text
@@ -302,56 +302,56 @@ def test_a_sensor_that_restarts_takes_the_pose_along_and_says_so() -> None:
     assert "static" in str(reply.error)
 
 
-def test_a_sensor_that_restarts_while_it_is_moved_ends_the_phase() -> None:
+def test_sensor_restart_aborts_the_phase() -> None:
     one = session()
     ask(one, 0, "align")
-    wear(one, 0, 2)
-    (status,) = only(one.restarted(2 * SECOND, "S1"), CalibrationStatus)
+    feed(one, 0, 2)
+    (status,) = only(one.restart_sensor(2 * SECOND, "S1"), CalibrationStatus)
     assert status.phase == "aborted"
     assert "S1 restarted" in status.text
 
 
-def test_a_sensor_that_restarts_before_anything_was_calibrated_is_no_news() -> None:
-    assert session().restarted(0, "S1") == []
+def test_sensor_restart_without_calibration_gives_no_notice() -> None:
+    assert session().restart_sensor(0, "S1") == []
 
 
 @pytest.mark.parametrize("same_rig", [True, False])
-def test_a_reload_keeps_worlds_and_pose_of_the_same_rig_only(same_rig: bool) -> None:
+def test_reload_preserves_alignment_and_pose_of_an_equal_rig(same_rig: bool) -> None:
     one, after = posed(), session()
     ask(one, 11 * SECOND, "align")
-    (job,) = only(wear(one, 11, 17), FitJob)
+    (job,) = only(feed(one, 11, 17), FitJob)
     done(one, job, alignment={"sensors": {}, "notes": []}, quality={})
-    after.take_over(one, same_rig=same_rig)
+    after.resume(one, same_rig=same_rig)
     (reply, *_) = only(ask(after, 18 * SECOND, "functional"), Reply)
     assert reply.status == ("accepted" if same_rig else "error")
     if same_rig:
-        (job,) = only(wear(after, 18, 24, 0.3), FitJob)
+        (job,) = only(feed(after, 18, 24, 0.3), FitJob)
         assert job.payload["alignment"] is not None
 
 
-def test_job_numbers_are_never_used_twice() -> None:
+def test_job_numbers_are_unique_across_reloads() -> None:
     one, after = posed(), session()
-    after.take_over(one, same_rig=False)
+    after.resume(one, same_rig=False)
     ask(after, 0, "static")
-    (job,) = only(wear(after, 0, 10), FitJob)
+    (job,) = only(feed(after, 0, 10), FitJob)
     assert job.job == 2
 
 
-def test_a_calibration_has_no_version_until_it_is_stored() -> None:
+def test_version_is_unknown_until_the_calibration_is_stored() -> None:
     one = CalibrationSession(CHAIN, SETTINGS, mocap=False, calibration=PLAIN, version=3)
     ask(one, 0, "static")
-    (job,) = only(wear(one, 0, 10), FitJob)
+    (job,) = only(feed(one, 0, 10), FitJob)
     outputs = done(one, job, calibration=PLAIN.to_dict(), quality={})
     assert only(outputs, CalibrationStatus)[-1].version is None
-    (status,) = only(one.stored(CalibrationStored(100 * SECOND, 4)), CalibrationStatus)
+    (status,) = only(one.set_stored_version(CalibrationStored(100 * SECOND, 4)), CalibrationStatus)
     assert status.version == 4
     assert status.quality == PLAIN.quality
 
 
-def test_what_the_plate_did_not_show_is_told() -> None:
+def test_notes_of_the_alignment_are_published() -> None:
     one = session()
     ask(one, 0, "align")
-    (job,) = only(wear(one, 0, 6), FitJob)
+    (job,) = only(feed(one, 0, 6), FitJob)
     notes = ["S1: heading only; turn the plate about more axes"]
     outputs = done(one, job, alignment={"sensors": {}, "notes": notes}, quality={})
     assert [notice.text for notice in only(outputs, Notice)] == notes

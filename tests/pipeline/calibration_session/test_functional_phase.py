@@ -1,4 +1,4 @@
-"""The movement phase: ends itself when it knows enough, else at its longest, naming what lacks."""
+"""The functional phase: its end, its progress, and the movements it reports as missing."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ QUICK = replace(
 
 
 @cache
-def worn() -> tuple[CalibrationTrial, CalibrationTrial]:
+def trials() -> tuple[CalibrationTrial, CalibrationTrial]:
     static, functional, _ = static_and_functional(Subject(flaws=Imperfections(skin_m=0.002)))
     return static, functional
 
 
 def play(one: CalibrationSession, trial: CalibrationTrial, begin_ns: int) -> list[Output]:
-    """Feed a trial from an instant on, everything in order of time, until its phase ends."""
+    """Feed a trial in order of time, from `begin_ns` on, until its phase ends."""
     assert trial.optical is not None
     track, layout = trial.optical, MocapLayout(trial.optical.markers, ())
     events: list[tuple[int, str, Quaternion | MocapFrame]] = [
@@ -82,8 +82,8 @@ def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
 def posed(settings: CalibrationSettings) -> CalibrationSession:
     one = CalibrationSession(CHAIN, settings, mocap=True, calibration=None)
     ask(one, 0, phase="static")
-    (job,) = only(play(one, worn()[0], 0), FitJob)
-    one.job_finished(JobFinished(10 * SECOND, job.job, {"quality": {}}, None))
+    (job,) = only(play(one, trials()[0], 0), FitJob)
+    one.finish_job(JobFinished(10 * SECOND, job.job, {"quality": {}}, None))
     return one
 
 
@@ -91,14 +91,14 @@ def moved(settings: CalibrationSettings, **arguments: object) -> list[Output]:
     one = posed(settings)
     begun = ask(one, 10 * SECOND, phase="functional", **arguments)
     assert only(begun, Reply)[0].status == "accepted"
-    return play(one, worn()[1], 10 * SECOND)
+    return play(one, trials()[1], 10 * SECOND)
 
 
 def length_s(outputs: list[Output]) -> float:
     return float((only(outputs, CalibrationProgress)[-1].t_ns - 10 * SECOND) / SECOND)
 
 
-def test_the_phase_ends_itself_when_every_joint_is_known() -> None:
+def test_phase_ends_when_every_joint_is_known() -> None:
     out = moved(QUICK)
     assert only(out, FitJob)
     assert QUICK.functional_min_s <= length_s(out) < 30.0
@@ -111,23 +111,23 @@ def test_the_phase_ends_itself_when_every_joint_is_known() -> None:
         assert joint["noise_error_mm"] <= 10.0
 
 
-def test_the_least_length_is_kept_however_good_the_joints_are() -> None:
+def test_phase_lasts_at_least_its_minimum() -> None:
     eager = replace(QUICK, center_target_m=0.1)
     assert length_s(moved(eager)) >= QUICK.functional_min_s
     assert length_s(moved(replace(eager, functional_min_s=26.0))) >= 26.0
 
 
-def test_at_its_longest_it_goes_on_to_the_fit_and_names_joint_and_movement() -> None:
+def test_longest_phase_ends_with_a_fit_and_names_missing_movements() -> None:
     out = moved(replace(QUICK, center_target_m=0.0001), seconds=8.0)
     assert only(out, FitJob)
     assert length_s(out) == pytest.approx(8.0, abs=0.3)
-    told = [notice.text for notice in only(out, Notice)]
-    assert any(text.startswith("hip: ") and "swing the leg" in text for text in told)
+    notices = [notice.text for notice in only(out, Notice)]
+    assert any(text.startswith("hip: ") and "swing the leg" in text for text in notices)
     assert all(notice.level == "warning" for notice in only(out, Notice))
     assert "hip: " in only(out, CalibrationStatus)[-1].text
 
 
-def test_the_error_told_falls_and_no_payload_holds_what_json_cannot() -> None:
+def test_reported_error_decreases_and_payloads_are_valid_json() -> None:
     out = only(moved(QUICK), CalibrationProgress)
     errors = [p.data["joints"]["knee"]["noise_error_mm"] for p in out]
     known = [error for error in errors if error is not None]
@@ -138,9 +138,11 @@ def test_the_error_told_falls_and_no_payload_holds_what_json_cannot() -> None:
         json.dumps(progress.data, allow_nan=False)
 
 
-def test_the_same_movement_gives_the_same_figures() -> None:
-    told = [[(p.t_ns, p.data) for p in only(moved(QUICK), CalibrationProgress)] for _ in range(2)]
-    assert told[0] == told[1]
+def test_same_movement_gives_the_same_progress() -> None:
+    notices = [
+        [(p.t_ns, p.data) for p in only(moved(QUICK), CalibrationProgress)] for _ in range(2)
+    ]
+    assert notices[0] == notices[1]
 
 
 @pytest.mark.parametrize(
@@ -150,23 +152,23 @@ def test_the_same_movement_gives_the_same_figures() -> None:
         ("functional", {"markers": {"thigh": SETTINGS.markers["thigh"]}}, "markers.shank"),
     ],
 )
-def test_what_cannot_succeed_is_refused_at_once(
+def test_phase_without_markers_is_refused_at_once(
     phase: str, lacks: dict[str, Any], remedy: str
 ) -> None:
     one = posed(QUICK)
     other = CalibrationSession(CHAIN, replace(QUICK, **lacks), mocap=True, calibration=None)
-    other.take_over(one, same_rig=True)
+    other.resume(one, same_rig=True)
     (reply,) = only(ask(other, 11 * SECOND, phase=phase), Reply)
     assert reply.status == "error"
     assert remedy in str(reply.error)
 
 
-def test_a_result_that_is_not_taken_says_why_in_the_status() -> None:
+def test_rejected_result_gives_its_reason_in_the_status() -> None:
     one = posed(QUICK)
     ask(one, 10 * SECOND, phase="functional", seconds=2.0)
-    (job,) = only(play(one, worn()[1], 10 * SECOND), FitJob)
+    (job,) = only(play(one, trials()[1], 10 * SECOND), FitJob)
     result = {"calibration": {}, "quality": {}, "worse": "knee: flexion error 5.0 deg, was 2.0"}
     (status,) = only(
-        one.job_finished(JobFinished(90 * SECOND, job.job, result, None)), CalibrationStatus
+        one.finish_job(JobFinished(90 * SECOND, job.job, result, None)), CalibrationStatus
     )
     assert status.kept == "knee: flexion error 5.0 deg, was 2.0"

@@ -1,4 +1,4 @@
-"""A functional phase whose worker refines the markers: what the session tells at its end."""
+"""A functional phase with marker refinement: status and notices at its end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.calibration.synthetic_limb import (
 )
 
 S = 1_000_000_000
-WORN = Subject(5, flaws=Imperfections(skin_m=0.002))
+SUBJECT = Subject(5, flaws=Imperfections(skin_m=0.002))
 REFINING = replace(SETTINGS, method="mean", static_s=3.0, functional_min_s=0.0)
 
 
@@ -36,7 +36,7 @@ def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
 
 
 def asked(one: CalibrationSession, t_ns: int, phase: str) -> FitJob:
-    """Ask for a phase and let its time pass; what it recorded is put in place by the caller."""
+    """Request a phase and let its time pass; return the job, whose trial the caller replaces."""
     one.request(Request(t_ns, "calibrate", "t", {"phase": phase, "seconds": 4.0}))
     out: list[Output] = []
     for k in range(600):
@@ -50,16 +50,16 @@ def asked(one: CalibrationSession, t_ns: int, phase: str) -> FitJob:
 
 
 @pytest.mark.timeout(90)
-def test_the_phase_ends_with_the_figures_of_the_markers() -> None:
-    static, functional, _ = static_and_functional(WORN, 20.0)
+def test_status_contains_the_quality_of_refined_markers() -> None:
+    static, functional, _ = static_and_functional(SUBJECT, 20.0)
     one = CalibrationSession(CHAIN, REFINING, mocap=True, calibration=None)
     job = asked(one, 0, "static")
     pose = fit_static(static, REFINING, CHAIN)
-    one.job_finished(JobFinished(30 * S, job.job, {"quality": pose.quality}, None))
-    one._static = static  # the cameras of this test saw it elsewhere
+    one.finish_job(JobFinished(30 * S, job.job, {"quality": pose.quality}, None))
+    one._static = static  # the recording of this test has no markers
     job = asked(one, 40 * S, "functional")
     result = run_job("functional", {**job.payload, "static": static, "functional": functional})
-    out = one.job_finished(JobFinished(90 * S, job.job, result, None))
+    out = one.finish_job(JobFinished(90 * S, job.job, result, None))
     (status,) = only(out, CalibrationStatus)
     assert status.phase == "calibrated"
     parts = status.quality["markers"]["parts"]

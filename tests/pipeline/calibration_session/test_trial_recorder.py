@@ -1,4 +1,4 @@
-"""The recorder keeps one phase, on one clock, in order."""
+"""Recording of one phase: order in time, windows, and mocap layouts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def frame(layout: MocapLayout, value: float) -> MocapFrame:
 
 
 @given(st.lists(st.integers(-1000, 1000), max_size=60))
-def test_tracks_are_strictly_increasing_whatever_order_samples_come_in(times: list[int]) -> None:
+def test_tracks_are_strictly_increasing_for_any_order_of_samples(times: list[int]) -> None:
     recorder = TrialRecorder()
     for t in times:
         recorder.add_sample("S1", t, IDENTITY)
@@ -38,7 +38,7 @@ def test_tracks_are_strictly_increasing_whatever_order_samples_come_in(times: li
     assert track.t_ns[-1] == max(times)
 
 
-def test_a_window_keeps_only_what_lies_in_it() -> None:
+def test_trial_can_be_limited_to_a_window() -> None:
     recorder = TrialRecorder()
     for t in range(10):
         recorder.add_sample("S1", t, IDENTITY)
@@ -49,7 +49,7 @@ def test_a_window_keeps_only_what_lies_in_it() -> None:
     assert trial.optical.positions[:, 0, 0].tolist() == [3, 4, 5, 6]
 
 
-def test_a_marker_that_appears_later_is_absent_before_and_not_zero() -> None:
+def test_marker_that_appears_later_is_nan_before() -> None:
     recorder = TrialRecorder()
     recorder.add_mocap(1, frame(MocapLayout(("A",), ("Body",)), 1.0))
     recorder.add_mocap(2, frame(MocapLayout(("B", "A"), ()), 2.0))
@@ -61,13 +61,13 @@ def test_a_marker_that_appears_later_is_absent_before_and_not_zero() -> None:
     assert np.isnan(optical.body_orientations[1]).all()
 
 
-def test_without_a_camera_there_is_no_optical_track() -> None:
+def test_without_mocap_there_is_no_optical_track() -> None:
     recorder = TrialRecorder()
     recorder.add_sample("S1", 1, IDENTITY)
     assert recorder.trial().optical is None
 
 
-def test_layouts_that_alternate_keep_every_value_in_its_place() -> None:
+def test_alternating_layouts_are_merged_by_name() -> None:
     one, other = MocapLayout(("a", "b"), ("T",)), MocapLayout(("c", "a"), ())
     recorder = TrialRecorder()
     for k in range(6):

@@ -1,4 +1,4 @@
-"""What the cameras teach while it runs: which frames are kept, and what becomes of a refit."""
+"""Online learning: selection of frames, outcome of refits, reversal."""
 
 from __future__ import annotations
 
@@ -23,14 +23,18 @@ from jointfit_daemon.pipeline.events import (
     Reply,
     Request,
 )
-from jointfit_daemon.pipeline.online_learning import OnlineLearner, _frame_collector, models_only
+from jointfit_daemon.pipeline.online_learning import (
+    OnlineFrameCollector,
+    _frame_collector,
+    only_models_differ,
+)
 from jointfit_daemon.timing.alignment import AlignedFrame
 from tests.calibration.calibrated_subject import CHAIN, calibration, fresh, moving
 
 MS, S = 1_000_000, 1_000_000_000
 SENSORS = ("S1", "S2", "S3")
 LAYOUT = MocapLayout(("A", "B", "C", "D"), ())
-NOBODY: frozenset[str] = frozenset()
+NO_SENSORS: frozenset[str] = frozenset()
 
 
 def turned(angle: float) -> tuple[float, float, float, float]:
@@ -46,15 +50,15 @@ def seen(t_ns: int, *, hidden: bool = False) -> MocapFrame:
 
 def aligned(t_ns: int, angle: float, *, synced: bool = True, missing: str = "") -> AlignedFrame:
     said = {name: turned(angle) for name in SENSORS if name != missing}
-    return AlignedFrame(t_ns, t_ns, said, NOBODY, NOBODY, synced)
+    return AlignedFrame(t_ns, t_ns, said, NO_SENSORS, NO_SENSORS, synced)
 
 
-def learner(*, wanted: bool = True, **changed: Any) -> OnlineLearner:
-    return OnlineLearner(CHAIN, replace(calibration(), **changed), wanted=wanted)
+def collector(*, wanted: bool = True, **changed: Any) -> OnlineFrameCollector:
+    return OnlineFrameCollector(CHAIN, replace(calibration(), **changed), wanted=wanted)
 
 
-def wear(one: OnlineLearner, seconds: float, begin_s: float = 0.0, **how: Any) -> None:
-    """Sensors at 100 Hz that turn by 1 rad/s, cameras at 100 Hz between them."""
+def feed(one: OnlineFrameCollector, seconds: float, begin_s: float = 0.0, **how: Any) -> None:
+    """Feed sensors at 100 Hz that turn by 1 rad/s, and mocap frames at 100 Hz between them."""
     flags, hidden = how.pop("flags", ()), how.pop("hidden", False)
     speed, cameras = how.pop("speed", 1.0), how.pop("cameras", True)
     for k in range(round(begin_s * 100), round((begin_s + seconds) * 100)):
@@ -64,24 +68,24 @@ def wear(one: OnlineLearner, seconds: float, begin_s: float = 0.0, **how: Any) -
         one.add_frame(aligned(t_ns, speed * t_ns / S, **how), flags)
 
 
-def test_ten_frames_a_second_are_kept_while_moving() -> None:
-    one = learner()
-    wear(one, 10.0)
+def test_ten_frames_a_second_are_collected_in_movement() -> None:
+    one = collector()
+    feed(one, 10.0)
     assert one.kept == pytest.approx(100, abs=2)
 
 
-def test_a_posture_held_is_kept_once_a_second() -> None:
-    one = learner()
-    wear(one, 10.0, speed=0.0)
+def test_held_posture_is_collected_once_a_second() -> None:
+    one = collector()
+    feed(one, 10.0, speed=0.0)
     assert one.kept == pytest.approx(10, abs=1)
 
 
-def test_sensors_are_read_at_the_instant_of_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_frame_collector, "ENOUGH", 10)
-    one = learner()
-    wear(one, 3.0)
-    assert one.due(3 * S) is None  # the rest begins
-    taken = one.due(3 * S + _frame_collector.REST_NS)
+def test_sensors_are_interpolated_at_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_frame_collector, "MIN_FRAMES", 10)
+    one = collector()
+    feed(one, 3.0)
+    assert one.take_due(3 * S) is None  # the waiting time starts
+    taken = one.take_due(3 * S + _frame_collector.REFIT_NS)
     assert taken is not None
     assert one.kept == 0
     for q, markers in zip(taken.sensors["S2"], taken.markers["thigh"], strict=True):
@@ -98,53 +102,53 @@ def test_sensors_are_read_at_the_instant_of_the_exposure(monkeypatch: pytest.Mon
         {"flags": ("untrained:thigh", "slipped:S1")},
     ],
 )
-def test_nothing_is_kept_of_frames_that_are_not_whole(how: dict[str, Any]) -> None:
-    one = learner()
-    wear(one, 3.0, **how)
+def test_incomplete_or_faulty_frames_are_not_collected(how: dict[str, Any]) -> None:
+    one = collector()
+    feed(one, 3.0, **how)
     assert one.kept == 0
 
 
-def test_untrained_postures_are_what_is_wanted() -> None:
-    one = learner()
-    wear(one, 3.0, flags=("untrained:thigh",))
+def test_postures_outside_the_training_range_are_collected() -> None:
+    one = collector()
+    feed(one, 3.0, flags=("untrained:thigh",))
     assert one.kept > 20
 
 
-def test_no_calibration_no_memory_no_wish_no_learning() -> None:
-    for one in (learner(wanted=False), learner(memory=""), learner(clusters={})):
-        wear(one, 2.0)
+def test_collector_is_inactive_without_calibration_memory_or_setting() -> None:
+    for one in (collector(wanted=False), collector(memory=""), collector(clusters={})):
+        feed(one, 2.0)
         assert not one.active
         assert one.kept == 0
-    assert not OnlineLearner(CHAIN, None, wanted=True).active
+    assert not OnlineFrameCollector(CHAIN, None, wanted=True).active
 
 
-def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_frame_collector, "MOST", 50)
-    one = learner()
-    wear(one, 10.0)
+def test_collection_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_frame_collector, "MAX_FRAMES", 50)
+    one = collector()
+    feed(one, 10.0)
     assert one.kept == 50
 
 
-def test_a_camera_clock_that_begins_anew_throws_away_what_was_kept() -> None:
-    one = learner()
-    wear(one, 3.0)
+def test_restart_of_the_mocap_clock_clears_the_collection() -> None:
+    one = collector()
+    feed(one, 3.0)
     one.add_mocap(3 * S + 200 * MS, seen(3 * S), epoch=1)
     assert one.kept == 0
 
 
-def test_refits_are_three_minutes_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_frame_collector, "ENOUGH", 10)
-    one = learner()
-    wear(one, 3.0)
+def test_refits_are_at_least_three_minutes_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_frame_collector, "MIN_FRAMES", 10)
+    one = collector()
+    feed(one, 3.0)
     asked = []
     for second in range(3, 400):
-        if one.due(second * S) is not None:
+        if one.take_due(second * S) is not None:
             asked.append(second)
-            wear(one, 2.0, 3.0 + 10 * len(asked))
+            feed(one, 2.0, 3.0 + 10 * len(asked))
     assert asked == [183, 363]
 
 
-# --- what becomes of a refit ------------------------------------------------------------------
+# --- outcome of a refit ------------------------------------------------------------------
 
 
 def session() -> CalibrationSession:
@@ -157,7 +161,7 @@ def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
 
 
 def asked(one: CalibrationSession) -> FitJob:
-    (job,) = only(one.learn(fresh(moving(50, 1.0))), FitJob)
+    (job,) = only(one.request_refit(fresh(moving(50, 1.0))), FitJob)
     assert isinstance(job, FitJob)
     return job
 
@@ -176,10 +180,10 @@ def better() -> dict[str, Any]:
 
 
 def finish(one: CalibrationSession, job: int, result: dict[str, Any]) -> list[Output]:
-    return one.job_finished(JobFinished(9 * S, job, result, None))
+    return one.finish_job(JobFinished(9 * S, job, result, None))
 
 
-def test_what_is_better_is_taken_told_and_stored_with_where_it_came_from() -> None:
+def test_better_models_are_used_reported_and_stored_with_their_origin() -> None:
     one = session()
     job = asked(one)
     assert job.kind == "online"
@@ -194,23 +198,23 @@ def test_what_is_better_is_taken_told_and_stored_with_where_it_came_from() -> No
     (notice,) = only(out, Notice)
     assert "7 frames" in notice.text
     assert one.calibration is not None
-    assert models_only(calibration(), one.calibration)
+    assert only_models_differ(calibration(), one.calibration)
     assert one.may_learn
 
 
 @pytest.mark.parametrize("result", [{"kept": "no better"}, {"refused": "markers"}, {}])
-def test_what_is_not_better_changes_nothing_and_says_why(result: dict[str, Any]) -> None:
+def test_models_that_are_not_better_are_rejected_with_the_reason(result: dict[str, Any]) -> None:
     one = session()
     before = one.calibration
     out = finish(one, asked(one).job, result)
     assert one.calibration is before
     assert one.version == 4
     (notice,) = only(out, Notice)
-    assert notice.text.startswith("nothing learned: ")
+    assert notice.text.startswith("models unchanged: ")
     assert one.may_learn
 
 
-def test_a_pose_that_is_fitted_meanwhile_cancels_the_refit() -> None:
+def test_static_fit_cancels_the_refit() -> None:
     one = session()
     job = asked(one)
     one.request(Request(S, "calibrate", "t", {"phase": "static", "seconds": 2.0}))
@@ -226,14 +230,14 @@ def test_a_pose_that_is_fitted_meanwhile_cancels_the_refit() -> None:
     assert one.calibration is before
 
 
-def unlearn(one: CalibrationSession) -> list[Output]:
-    return one.request(Request(S, "calibrate", "t", {"phase": "unlearn"}))
+def revert(one: CalibrationSession) -> list[Output]:
+    return one.request(Request(S, "calibrate", "t", {"phase": "revert"}))
 
 
-def test_what_was_learned_can_be_taken_back_and_stays_away() -> None:
+def test_online_learning_can_be_reverted_and_is_then_paused() -> None:
     one = session()
     finish(one, asked(one).job, better())
-    out = unlearn(one)
+    out = revert(one)
     (reply,) = only(out, Reply)
     assert reply.status == "ok"
     assert one.calibration == calibration()
@@ -242,6 +246,6 @@ def test_what_was_learned_can_be_taken_back_and_stays_away() -> None:
     assert not one.may_learn
 
 
-def test_where_nothing_was_learned_nothing_is_taken_back() -> None:
-    (reply,) = only(unlearn(session()), Reply)
+def test_revert_without_online_learning_is_refused() -> None:
+    (reply,) = only(revert(session()), Reply)
     assert reply.status == "error"

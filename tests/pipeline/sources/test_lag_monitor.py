@@ -1,4 +1,4 @@
-"""The lag while it runs: found, kept through restarts, and told when it steps."""
+"""Lag during operation: estimation, restarts of clocks, and notices of steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
 from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
-from jointfit_daemon.pipeline.sources import LagWatch
+from jointfit_daemon.pipeline.sources import LagMonitor
 from jointfit_daemon.pipeline.sources._lag_monitor import KnownLag
 
 if TYPE_CHECKING:
@@ -38,13 +38,13 @@ CALIBRATION = Calibration(
 MOUNT = rotation.exp(np.array([0.4, -0.9, 0.3]))
 
 
-class Told(NamedTuple):
+class TimedNotice(NamedTuple):
     t_s: float
     notice: Notice
 
 
 def orientations(t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turning about three axes, irregular; exact at any instant."""
+    """Return irregular rotations about three axes, exact at any instant."""
     parts = [
         rotation.exp(np.outer(1.1 * np.sin(2.9 * t_s + np.sin(0.7 * t_s)), [1.0, 0.0, 0.0])),
         rotation.exp(np.outer(0.9 * np.sin(4.3 * t_s + 1.3 * np.sin(0.5 * t_s)), [0.0, 1.0, 0.0])),
@@ -54,7 +54,7 @@ def orientations(t_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def play(
-    watch: LagWatch,
+    monitor: LagMonitor,
     seconds: float,
     lag_ms: float,
     *,
@@ -62,8 +62,8 @@ def play(
     epoch: int = 0,
     still: bool = False,
     named: int = len(NAMES),
-) -> list[Told]:
-    """Feed both streams at their rates, a step of work every 10 ms; `named` markers are sent."""
+) -> list[TimedNotice]:
+    """Feed both streams at their rates, with one step every 10 ms; `named` markers are sent."""
     rng = np.random.default_rng(5)
     t_ref = np.arange(start_s, start_s + seconds, 1 / 120)
     t_imu = np.arange(start_s + 0.003, start_s + seconds, 0.01)
@@ -71,87 +71,87 @@ def play(
     markers = rotation.rotate(q_ref[:, None], np.array(PLACES))
     markers = markers + rng.normal(scale=2e-4, size=markers.shape)
     q_imu = rotation.multiply(q_imu, rotation.conjugate(MOUNT))
-    told, at = [], 0
+    notices, at = [], 0
     for k, t in enumerate(t_imu):
         while at < len(t_ref) and t_ref[at] <= t:
             t_ns = round(t_ref[at] * 1e9)
             layout = MocapLayout(NAMES[:named], ())
             seen = markers[at, :named]
             frame = MocapFrame(t_ns, at, None, layout, seen, np.zeros((0, 3)), np.zeros((0, 4)))
-            watch.add_mocap(t_ns, frame)
+            monitor.add_mocap(t_ns, frame)
             at += 1
         stamp_ns = round(t * 1e9 + lag_ms * MS)
-        watch.add_sample("S1", stamp_ns, as_quaternion(q_imu[k].tolist()), epoch)
-        told += [Told(t, notice) for notice in watch.step(round(t * 1e9))]
-    return told
+        monitor.add_sample("S1", stamp_ns, as_quaternion(q_imu[k].tolist()), epoch)
+        notices += [TimedNotice(t, notice) for notice in monitor.step(round(t * 1e9))]
+    return notices
 
 
-def test_the_lag_is_found_while_the_wearer_moves() -> None:
-    watch = LagWatch(CHAIN, CALIBRATION)
-    assert watch.health()["S1"]["lag_source"] == "calibration"
-    assert play(watch, 16.0, 7.3) == []
-    found = watch.health()["S1"]
+def test_lag_is_estimated_during_movement() -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION)
+    assert monitor.health()["S1"]["lag_source"] == "calibration"
+    assert play(monitor, 16.0, 7.3) == []
+    found = monitor.health()["S1"]
     assert found["lag_source"] == "calibration"
-    assert found["lag_ms"] == 2.0  # in force: tracking only watches
+    assert found["lag_ms"] == 2.0  # in use: the estimate is not applied
     assert (found["lag_sigma_ms"], found["lag_found_by"]) == (0.2, "plate and movement")
     assert found["tracked_ms"] == pytest.approx(7.3, abs=0.1)
     assert found["tracked_refused"] is None
-    kept = LagWatch(CHAIN, replace(CALIBRATION, notes=("new",)), watch)
+    kept = LagMonitor(CHAIN, replace(CALIBRATION, notes=("new",)), monitor)
     assert kept.health()["S1"]["tracked_ms"] == found["tracked_ms"]
 
 
-def test_a_step_is_told_once_within_twenty_seconds_and_puts_the_calibration_in_doubt() -> None:
-    watch = LagWatch(CHAIN, CALIBRATION)
-    assert play(watch, 20.0, 4.0) == []
-    told = play(watch, 30.0, 7.0, start_s=20.0)
-    assert [(one.notice.kind, one.notice.id) for one in told] == [("calibration", "S1")]
-    assert told[0].t_s < 40.0
-    assert told[0].notice.data["step_ms"] == pytest.approx(3.0, abs=0.3)
-    assert watch.health()["S1"]["tracked_ms"] == pytest.approx(7.0, abs=0.1)
+def test_lag_step_is_reported_once_within_20_s_as_a_calibration_warning() -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION)
+    assert play(monitor, 20.0, 4.0) == []
+    notices = play(monitor, 30.0, 7.0, start_s=20.0)
+    assert [(one.notice.kind, one.notice.id) for one in notices] == [("calibration", "S1")]
+    assert notices[0].t_s < 40.0
+    assert notices[0].notice.data["step_ms"] == pytest.approx(3.0, abs=0.3)
+    assert monitor.health()["S1"]["tracked_ms"] == pytest.approx(7.0, abs=0.1)
 
 
-def test_a_clock_that_began_anew_moves_the_lag_by_no_more_than_its_sigma() -> None:
-    watch = LagWatch(CHAIN, CALIBRATION)
-    play(watch, 16.0, 4.0)
-    before = watch.health()["S1"]
-    assert play(watch, 16.0, 4.0, start_s=16.0, epoch=1) == []
-    after = watch.health()["S1"]
+def test_clock_restart_changes_the_lag_by_less_than_its_standard_deviation() -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION)
+    play(monitor, 16.0, 4.0)
+    before = monitor.health()["S1"]
+    assert play(monitor, 16.0, 4.0, start_s=16.0, epoch=1) == []
+    after = monitor.health()["S1"]
     assert abs(float(str(after["tracked_ms"])) - float(str(before["tracked_ms"]))) <= float(
         str(before["tracked_sigma_ms"])
     )
-    # settled elsewhere, within what a clock may: taken over, and no step
-    assert play(watch, 16.0, 4.8, start_s=32.0, epoch=2) == []
-    assert watch.health()["S1"]["tracked_ms"] == pytest.approx(4.8, abs=0.1)
+    # Settled elsewhere, within the accuracy of a clock: no step.
+    assert play(monitor, 16.0, 4.8, start_s=32.0, epoch=2) == []
+    assert monitor.health()["S1"]["tracked_ms"] == pytest.approx(4.8, abs=0.1)
 
 
-def test_standing_still_is_refused_with_the_remedy() -> None:
-    watch = LagWatch(CHAIN, CALIBRATION)
-    play(watch, 12.0, 4.0, still=True)
-    found = watch.health()["S1"]
+def test_standing_still_gives_no_estimate_and_the_remedy() -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION)
+    play(monitor, 12.0, 4.0, still=True)
+    found = monitor.health()["S1"]
     assert found["lag_source"] == "calibration"
     assert found["lag_ms"] == 2.0
     assert "move faster" in str(found["tracked_refused"])
 
 
 @pytest.mark.parametrize("named", [0, 1, 2])
-def test_lag_watch_refuses_a_stream_that_lacks_the_markers_of_the_segment(named: int) -> None:
-    watch = LagWatch(CHAIN, CALIBRATION)
-    play(watch, 14, 5.0, named=named)
-    health = watch.health()["S1"]
+def test_stream_without_markers_of_the_segment_gives_no_estimate(named: int) -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION)
+    play(monitor, 14, 5.0, named=named)
+    health = monitor.health()["S1"]
     assert health["tracked_ms"] is None
     assert "no gapless stretch of data" in str(health["tracked_refused"])
 
 
-def test_a_configured_lag_beats_the_motion_which_only_contradicts() -> None:
-    watch = LagWatch(CHAIN, CALIBRATION, known={"S1": KnownLag(1.0 * MS, 0.05 * MS)})
-    told = play(watch, 19.0, 4.0)
-    assert [one.notice.kind for one in told] == ["clock"]
-    assert "sigma apart" in told[0].notice.text
-    assert watch.health()["S1"]["lag_source"] == "configured"
-    assert watch.health()["S1"]["lag_ms"] == 1.0
+def test_configured_lag_is_used_and_only_checked_by_the_estimate() -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION, known={"S1": KnownLag(1.0 * MS, 0.05 * MS)})
+    notices = play(monitor, 19.0, 4.0)
+    assert [one.notice.kind for one in notices] == ["clock"]
+    assert "standard deviations apart" in notices[0].notice.text
+    assert monitor.health()["S1"]["lag_source"] == "configured"
+    assert monitor.health()["S1"]["lag_ms"] == 1.0
 
 
-def test_without_clusters_nothing_is_kept() -> None:
-    watch = LagWatch(CHAIN, None)
-    assert play(watch, 11.0, 4.0) == []
-    assert watch.health()["S1"]["lag_source"] == "none"
+def test_without_clusters_nothing_is_estimated() -> None:
+    monitor = LagMonitor(CHAIN, None)
+    assert play(monitor, 11.0, 4.0) == []
+    assert monitor.health()["S1"]["lag_source"] == "none"

@@ -1,4 +1,4 @@
-"""Sources of raw readings in the core: their health, and a warning where headings differ."""
+"""Sources with an orientation filter on the gateway: health and heading warnings."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def message(k: int) -> bytes:
 
 
 @pytest.mark.parametrize("alike", [(True, True), (False, False), (True,), (False,), ()])
-def test_headings_that_are_found_alike_are_no_matter(alike: tuple[bool, ...]) -> None:
+def test_equal_heading_references_give_no_warning(alike: tuple[bool, ...]) -> None:
     assert headings(rig(*alike).sources) is None
 
 
-def test_a_mixture_of_drifting_and_north_finding_headings_is_told_at_the_start() -> None:
+def test_mixed_heading_references_give_a_warning_at_the_start() -> None:
     mixed = rig(True, False)
     outputs = Core().feed(Configured(1, mixed, None))
     told = [out for out in outputs if isinstance(out, Notice) and out.level == "warning"]
@@ -52,7 +52,7 @@ def test_a_mixture_of_drifting_and_north_finding_headings_is_told_at_the_start()
     assert "by magnetometer on S1, but not on S3" in told[0].text
 
 
-def test_rest_and_bias_are_part_of_the_health_of_a_raw_source() -> None:
+def test_health_of_a_raw_source_contains_rest_and_bias() -> None:
     core = Core()
     core.feed(Configured(1, rig(False), None))
     core.feed(SourceOpened(2, "S1"))

@@ -1,4 +1,4 @@
-"""What a clock finds by itself comes out of the core; edges of a sync line meet there."""
+"""Clock events of sources, sync lines and latency priors in the core."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def sample(t_ns: int, ticks: int) -> ImuSample:
     return ImuSample(t_ns, UNIT, UNIT, ticks, None)
 
 
-def test_a_reboot_that_only_the_clock_shows_is_published_and_counted() -> None:
+def test_restart_seen_only_in_the_clock_is_published_and_counted() -> None:
     rig = Rig()
     for k in range(1000):
         t = START + k * PERIOD
@@ -105,7 +105,7 @@ def test_a_reboot_that_only_the_clock_shows_is_published_and_counted() -> None:
     assert health["latency_prior_us"] == [200, 200]
 
 
-def test_edges_of_one_line_put_two_sensors_on_one_time() -> None:
+def test_sync_line_ties_the_clocks_of_two_sensors() -> None:
     rig = Rig()
     for k in range(1500):
         t = START + k * PERIOD
@@ -121,7 +121,7 @@ def test_edges_of_one_line_put_two_sensors_on_one_time() -> None:
     assert zero_a + a["offset_us"] == pytest.approx(zero_b + b["offset_us"], abs=10)
 
 
-def test_the_least_delay_is_that_of_the_transport_unless_set() -> None:
+def test_latency_prior_depends_on_transport_unless_configured() -> None:
     rig = parse_rig(
         {
             "rig": {"name": "r"},

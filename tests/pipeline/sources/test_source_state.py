@@ -1,4 +1,4 @@
-"""A source stamps what its decoder yields, and believes no stamp from the future."""
+"""Stamping of samples, and rejection of arrival stamps in the future."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import load_rig
 from jointfit_daemon.model import Chunk
-from jointfit_daemon.pipeline.sources import SourceState, Stamped
+from jointfit_daemon.pipeline.sources import SourceState, StampedMeasurement
 from jointfit_protocols import xcdi
 from jointfit_protocols.can import CanFrame, pack_frames
 
@@ -32,14 +32,14 @@ def group(t_ns: int, stamp_ns: int, k: int) -> Chunk:
     return Chunk(t_ns, pack_frames(frames))
 
 
-def test_a_sample_stamped_an_hour_ahead_by_the_adapter_counts_as_arriving_now() -> None:
-    state = SourceState.of(can_source())
-    state.opened()
+def test_arrival_stamp_in_the_future_is_replaced_by_now() -> None:
+    state = SourceState.create(can_source())
+    state.start()
     for k in range(1, 40):
         t_ns = 5_000_000_000 + k * 10_000_000
         ahead = HOUR_NS if k == 20 else 0
         for item in state.feed(group(t_ns, t_ns + ahead, k)):
-            if isinstance(item, Stamped):
+            if isinstance(item, StampedMeasurement):
                 assert item.measurement.arrival_ns <= t_ns
                 assert item.stamp.t_ns <= t_ns + 1_000_000
     assert state.counts.received == 39
