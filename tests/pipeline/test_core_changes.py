@@ -257,7 +257,7 @@ def test_reconnect_with_changed_time_or_counter_discards_the_pose(
         ("S3", "clock"),
         ("S3", "calibration"),
     ]
-    assert "repeat the static pose" in notices[1].text
+    assert "Repeat the static pose" in notices[1].text
 
 
 @pytest.mark.parametrize(("params", "mode"), [(0, "imu+mocap"), (4, "imu")])

@@ -215,7 +215,7 @@ EXPECTED = {
     "gps": ("not an Xbus device", "set `port` to the right one, or `driver`"),
     "taken": ("is used by another program", "fuser", "ModemManager", "udev rule"),
     "absent": ("is not there", "plug it in, or set `port`"),
-    "modem": ("bytes made no message",),
+    "modem": ("bytes discarded: ",),
     "twin": ("two sensors send with the same CAN identifiers", "set `ids`"),
     "mute": ("no quaternion (0x321) comes", "check its power and wiring, and `ids`"),
     "mocap": ("marker 'Thigh3' (mocap.markers.thigh) is not in the stream", "The server has", "T3"),

@@ -33,8 +33,8 @@ class SessionEvent(StrEnum):
     ALIGNMENT_FITTED = "alignment fitted"
     POSE_FITTED = "pose fitted"
     CALIBRATION_FITTED = "calibration fitted"
-    RESULT_WORSE = "result worse than the calibration in force"
-    FAILED = "aborted, restarted sensor, or refused fit"
+    RESULT_WORSE = "result rejected as worse"
+    FAILED = "aborted or refused"
 
 
 START = {

@@ -70,7 +70,7 @@ class OnlineRefits:
         found = Calibration.from_dict(result["calibration"])
         online = {**found.quality["online"], "from_version": version}
         found = replace(found, quality={**found.quality, "online": online})
-        text = f"models refitted with {online['frames']} mocap frames"
+        text = f"models refitted with {online['frames']} frames of sensors and mocap"
         return RefitOutcome(found, Notice(event.t_ns, "calibration", "online", text, "info", data))
 
     def health(self, collector: OnlineFrameCollector, now_ns: int) -> dict[str, object]:

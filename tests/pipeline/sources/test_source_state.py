@@ -14,7 +14,7 @@ from jointfit_protocols.can import CanFrame, pack_frames
 if TYPE_CHECKING:
     from jointfit_daemon.config import Source
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "knee.toml"
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "knee.toml"
 HOUR_NS = 3_600_000_000_000
 
 

@@ -115,7 +115,7 @@ async def test_refused_request_suggests_the_abort_command(tmp_path: Path) -> Non
         ending = await calibrate(rig, "--abort")
         assert "aborted" in await rest_of(ending)
         assert ending.returncode == 0
-        assert "static was aborted: asked to" in await rest_of(leading)
+        assert "static was aborted: abort requested" in await rest_of(leading)
         assert leading.returncode == 1
 
 
