@@ -13,10 +13,10 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from jointfit_drivers.ports.udp_socket import StampedSocket
+from jointfit_drivers.ports.udp_socket import UdpSocket
 
 if TYPE_CHECKING:
-    from jointfit_drivers.ports.udp_socket import Arrival
+    from jointfit_drivers.ports.udp_socket import Datagram
 
 _STAMP = struct.Struct("<q")
 _SENDER = """
@@ -44,8 +44,8 @@ def delays_ns(count: int, blocked_s: float = 0.004) -> tuple[list[int], list[int
 
 
 async def _measure(count: int, blocked_s: float) -> tuple[list[int], list[int]]:
-    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
-    arrivals: list[Arrival] = []
+    opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
+    arrivals: list[Datagram] = []
     read_ns: list[int] = []
 
     def readable() -> None:

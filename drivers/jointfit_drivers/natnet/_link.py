@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import Chunk
-from jointfit_drivers.ports.udp_socket import StampedSocket
+from jointfit_drivers.ports.udp_socket import UdpSocket
 from jointfit_protocols.natnet import MessageId, encode
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from jointfit_drivers.ports.udp_socket import Arrival
+    from jointfit_drivers.ports.udp_socket import Datagram
     from jointfit_protocols.natnet import Message
 
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
@@ -53,7 +53,7 @@ class Link:
         self._local = local
         self._take = take
         self._loop = asyncio.get_running_loop()
-        self._sockets: list[StampedSocket] = []
+        self._sockets: list[UdpSocket] = []
         self._news = asyncio.Event()
         self._failure: Exception | None = None
         self._heard_ns = 0
@@ -61,7 +61,7 @@ class Link:
         """Datagrams dropped because of where they came from; the kernel drops most others."""
 
     def __enter__(self) -> Self:
-        self._command = self._open(StampedSocket(self._local, 0, sender=self._server[0]))
+        self._command = self._open(UdpSocket(self._local, 0, sender=self._server[0]))
         return self
 
     def __exit__(
@@ -76,7 +76,7 @@ class Link:
 
     def join(self, group: str, port: int) -> None:
         """Open the data socket of a multicast server; OSError as the system says."""
-        self._open(StampedSocket.in_group(group, port, self._local, sender=self._server[0]))
+        self._open(UdpSocket.in_group(group, port, self._local, sender=self._server[0]))
 
     def send(self, message: Message) -> None:
         """Send one message to the server's command port.
@@ -108,12 +108,12 @@ class Link:
         if self._failure is not None:
             raise self._failure
 
-    def _open(self, opened: StampedSocket) -> StampedSocket:
+    def _open(self, opened: UdpSocket) -> UdpSocket:
         self._sockets.append(opened)
         self._loop.add_reader(opened, self._readable, opened)
         return opened
 
-    def _readable(self, source: StampedSocket) -> None:
+    def _readable(self, source: UdpSocket) -> None:
         try:
             self._read(source)
         except Exception as error:  # noqa: BLE001 - a callback hands its error to the coroutine
@@ -121,7 +121,7 @@ class Link:
             self._loop.remove_reader(source)
             self._news.set()
 
-    def _read(self, source: StampedSocket) -> None:
+    def _read(self, source: UdpSocket) -> None:
         try:
             arrivals = source.receive()
         except OSError as error:
@@ -136,7 +136,7 @@ class Link:
             self._heard_ns = arrival.t_ns
             self._take(Chunk(arrival.t_ns, arrival.data))
 
-    def _commands(self, source: StampedSocket, arrival: Arrival) -> bool:
+    def _commands(self, source: UdpSocket, arrival: Datagram) -> bool:
         """Return whether a datagram may carry a control message."""
         return source is self._command and arrival.port == self._server[1]
 

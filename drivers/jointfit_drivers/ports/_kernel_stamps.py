@@ -1,7 +1,6 @@
-"""Kernel receive stamps of CAN frames, UNIX seconds, turned into host monotonic nanoseconds.
+"""Conversion of the kernel's receive stamps of CAN frames to host monotonic nanoseconds.
 
-Law: arithmetic on clock readings (``wall_clock``); no socket, no bus. The kernel stamps the end of
-a frame; what is wanted is its start.
+The kernel stamps the end of a frame, in UNIX seconds. The conversion returns its start.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ _NS = 1_000_000_000
 
 
 class KernelStamps:
-    """Converts the stamps of one bus; call ``pair`` at every wake-up.
+    """Converts the stamps of one bus; call `pair` at every wake-up.
 
     Parameters
     ----------
-    bitrate
-        Speed of the bus, bit/s: a frame's stamp is moved from its end to its start.
-    monotonic_ns, unix_ns
-        The two clocks; for tests.
+    bitrate : int
+        Bit rate of the bus, bit/s. It gives the duration of a frame.
+    monotonic_ns, unix_ns : callable
+        The two clocks, ns; replaced in tests.
     """
 
     def __init__(
@@ -41,19 +40,21 @@ class KernelStamps:
 
     @property
     def unusable(self) -> int:
-        """Stamps that fitted no clock and were replaced by the time of the read."""
-        return self._wall.soft
+        """Stamps that fitted neither clock difference and were replaced by the time of the read."""
+        return self._wall.replaced
 
     def pair(self) -> int:
         """Read both clocks; return the monotonic one, ns."""
         return self._wall.pair()
 
     def start_ns(self, unix_s: float, size: int, extended: bool) -> int:
-        """Return the start of a frame of `size` bytes that the kernel stamped `unix_s`.
+        """Return the start, ns, of a frame of `size` bytes from its kernel stamp `unix_s`.
 
-        Never after now. A stamp that lies more than 2 s before it, or after it by more than a
-        millisecond, whatever the offset, is replaced by now.
+        The start is ``t_end - frame_bits(size, extended) / bitrate``. It is never later than
+        now. A stamp more than 2 s in the past, or more than 1 ms in the future, is replaced by
+        the present time.
         """
-        # now, not at the wake-up: what came while this process was held up must not seem early
+        # The present time, not that of the wake-up: otherwise frames that arrive while this process
+        # is delayed would be stamped too early.
         end = self._wall.monotonic(round(unix_s * _NS), self._monotonic_ns())
         return end - round(frame_bits(size, extended) * self._bit_ns)

@@ -1,10 +1,9 @@
-"""A bus of any kind that python-can knows: SocketCAN on its descriptor, others as they can.
+"""A CAN bus of any kind that python-can supports: SocketCAN on its descriptor, others by a thread.
 
-Law: nothing of python-can leaves this module: whatever goes wrong becomes ``DeviceLostError``
-(may heal)
-or ``DeviceMisconfiguredError`` (cannot). Frames carry the kernel's stamp where there is one
-(SocketCAN),
-else the time of the read.
+Frames carry the kernel's stamp where there is one (SocketCAN), otherwise the time of the read.
+
+Invariant: no exception of python-can leaves this module. A fault that may clear by itself raises
+`DeviceLostError`; one that needs another configuration raises `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -32,26 +31,32 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import CanBusSettings
 
 log = logging.getLogger(__name__)
-# It reports each failed opening as an error, once a second while an interface is away; we raise it.
+# python-can logs each failed opening, once a second for an absent interface; it is raised here.
 logging.getLogger("can.interfaces.socketcan").setLevel(logging.CRITICAL)
 
-_BATCH = 64  # frames a wake-up, so that a flood on one bus does not starve the rest
-_WAITING = 64  # batches that a pump thread may be ahead of the loop
-_PUMP_S = 0.05  # how long a pump thread sleeps in one receive: bounds the time to close
-_RECEIVE_BYTES = 1 << 20  # holds about 1 400 frames; the default of 212 992 keeps 278
+_BATCH = 64
+"""Frames per wake-up, so that a flood on one bus does not delay the others."""
+_WAITING = 64
+"""Batches by which a reading thread may be ahead of the event loop."""
+_PUMP_S = 0.05
+"""Longest receive call of a reading thread, s: bounds the time to close."""
+_RECEIVE_BYTES = 1 << 20
+"""Receive buffer, bytes: about 1400 frames. The default of 212 992 bytes holds 278."""
 _DROPS_EVERY_NS = 250_000_000
+"""Period, ns, between two readings of the kernel's drop counter."""
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55
 _MEMINFO = struct.Struct("9I")
 _DROPS = 8
+"""Place of the drop counter in SO_MEMINFO."""
 
 
 class PythonCanBus:
-    """One bus, for ``can_bus.SharedBus``.
+    """One bus, for `can_bus.SharedBus`.
 
     Parameters
     ----------
-    settings
-        Its ``[can.NAME]`` table; keys we do not know go to python-can as they are.
+    settings : CanBusSettings
+        Its ``[can.NAME]`` table; unknown keys are passed to python-can unchanged.
     """
 
     def __init__(self, settings: CanBusSettings) -> None:
@@ -66,32 +71,39 @@ class PythonCanBus:
     async def open(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
     ) -> None:
-        """Open the bus and begin to read.
+        """Open the bus and start reading.
 
         Raises
         ------
         DeviceLostError
-            The interface is absent or taken.
+            The interface is absent or in use.
         DeviceMisconfiguredError
-            Unknown kind of interface, missing package, or a kernel without CAN.
+            The kind of interface is unknown, a package is missing, or the kernel has no CAN
+            support.
         """
-        bus = await self._opened()
+        bus = await self._open_bus()
         self._bus = bus
         try:
             self._fd = bus.fileno()
         except NotImplementedError:  # no descriptor: in-process buses, most vendors' libraries
-            self._pump = _Pump(bus, self._frame, deliver, lambda e: failed(self._broken(e)))
+            self._pump = _Pump(
+                bus, self._convert_frame, deliver, lambda e: failed(self._receive_error(e))
+            )
             return
+
         if self._kernel:
-            self._enlarge(bus)
+            self._enlarge_buffer(bus)
+
         loop, fd = asyncio.get_running_loop(), self._fd
 
         def readable() -> None:
             try:
                 self._drain(bus, deliver)
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
-                loop.remove_reader(fd)  # told once: whoever reads on is deaf for ever
-                failed(self._broken(error))
+                loop.remove_reader(
+                    fd
+                )  # errors are reported once: reading on would wait without end
+                failed(self._receive_error(error))
 
         loop.add_reader(fd, readable)
 
@@ -99,7 +111,9 @@ class PythonCanBus:
         """Filter in the kernel (or in python-can, where the backend has no filter)."""
         if self._bus is None:
             return
-        with suppress(can.CanError, OSError):  # a filter saves work; frames are sorted here as well
+        with suppress(
+            can.CanError, OSError
+        ):  # the filter only saves work: frames are also selected here
             self._bus.set_filters(
                 None
                 if ids is None
@@ -118,17 +132,18 @@ class PythonCanBus:
             return
         if self._fd >= 0:
             asyncio.get_running_loop().remove_reader(self._fd)
+
         pump, self._pump = self._pump, None
         if pump is not None:
             await pump.stop()
         with suppress(can.CanError, OSError):
             bus.shutdown()
 
-    async def _opened(self) -> can.BusABC:
-        """Open the bus, off the loop where that may take long; errors as the house names them."""
+    async def _open_bus(self) -> can.BusABC:
+        """Open the bus, outside the event loop where that may take long, and convert its errors."""
         try:
             if self._kernel:
-                _require_interface(self._settings.channel)  # else python-can leaks a socket
+                _require_interface(self._settings.channel)  # otherwise python-can leaks a socket
                 return self._make()
             if self._settings.interface == "virtual":
                 return self._make()
@@ -136,10 +151,12 @@ class PythonCanBus:
             try:
                 return await asyncio.shield(making)
             except asyncio.CancelledError:
-                making.add_done_callback(_shut)  # the thread cannot be cancelled: close its bus
+                making.add_done_callback(
+                    _close_late
+                )  # the thread cannot be cancelled: close its bus
                 raise
         except Exception as error:  # a missing vendor library gives even NameError
-            raise self._refused(error) from error
+            raise self._opening_error(error) from error
 
     def _make(self) -> can.BusABC:
         settings = self._settings
@@ -154,8 +171,8 @@ class PythonCanBus:
             **extras,
         )
 
-    def _enlarge(self, bus: can.BusABC) -> None:
-        """Make room for a stall of the loop: a full queue drops silently."""
+    def _enlarge_buffer(self, bus: can.BusABC) -> None:
+        """Enlarge the receive buffer, because a full queue drops frames without notice."""
         sock = self._socket(bus)
         try:
             sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BYTES)
@@ -167,7 +184,7 @@ class PythonCanBus:
         return sock
 
     def _drain(self, bus: can.BusABC, deliver: Callable[[int, list[CanFrame]], None]) -> None:
-        """Read up to 64 frames and hand them on, also those before an error."""
+        """Read up to 64 frames and deliver them, also those before an error."""
         frames: list[CanFrame] = []
         self._stamps.pair()
         try:
@@ -175,28 +192,28 @@ class PythonCanBus:
                 message = bus.recv(0)
                 if message is None:
                     break
-                if not message.is_fd:  # no device of ours sends CAN FD
-                    frames.append(self._frame(message))
+                if not message.is_fd:  # no supported device sends CAN FD
+                    frames.append(self._convert_frame(message))
         finally:
-            now = time.monotonic_ns()  # not before the reads: see `_frame`
+            now = time.monotonic_ns()  # not before the reads: see `_convert_frame`
             if self._kernel and now - self._drops_read_ns > _DROPS_EVERY_NS:
                 self._drops_read_ns = now
-                frames += self._dropped(bus, now)
+                frames += self._drop_notes(bus, now)
             if frames:
                 deliver(now, frames)
 
-    def _dropped(self, bus: can.BusABC, now: int) -> list[CanFrame]:
-        """Return a note of the frames the kernel threw away since the last one."""
+    def _drop_notes(self, bus: can.BusABC, now: int) -> list[CanFrame]:
+        """Return a note with the number of frames that the kernel dropped since the last one."""
         raw = self._socket(bus).getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
         drops = _MEMINFO.unpack(raw)[_DROPS]
         lost, self._drops = (drops - self._drops) % 2**32, drops
         return [host_dropped(now, lost)] if lost else []
 
-    def _frame(self, message: can.Message) -> CanFrame:
-        """Return the frame just read, stamped: by now, unless the kernel did.
+    def _convert_frame(self, message: can.Message) -> CanFrame:
+        """Convert the frame just read, stamped by the kernel or with the present time.
 
-        A time from before its read would stamp what came meanwhile too early, and clocks rest on
-        the earliest.
+        A time from before the read would stamp frames that arrived meanwhile too early, and
+        clocks are fitted to the earliest arrivals.
         """
         data, extended = bytes(message.data[:8]), message.is_extended_id
         t_ns = time.monotonic_ns()
@@ -211,37 +228,41 @@ class PythonCanBus:
             message.is_remote_frame,
         )
 
-    def _refused(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
-        """Name why the bus does not open: thing, found, expected, remedy."""
+    def _opening_error(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
+        """Return the error for a bus that cannot be opened, with its remedy."""
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
-            return DeviceMisconfiguredError(f"{channel}: {_unknown(kind, error)}")
+            return DeviceMisconfiguredError(
+                f"{channel}: {unknown_kind(kind) or _not_loadable(kind, error)}"
+            )
         if isinstance(error, (can.CanError, OSError)):
-            return self._numbered(error)
-        said = f"{type(error).__name__}: {error}"
+            return self._error_by_number(error)
+        reason = f"{type(error).__name__}: {error}"
         return DeviceMisconfiguredError(
-            f"{channel}: cannot be opened as {kind} ({said}): check its [can] table, and the "
+            f"{channel}: cannot be opened as {kind} ({reason}): check its [can] table, and the "
             "vendor's library"
         )
 
-    def _broken(self, error: Exception) -> Exception:
-        """Name why the bus stopped; bugs stay what they are."""
+    def _receive_error(self, error: Exception) -> Exception:
+        """Return the error for a bus that stopped; programming errors are returned unchanged."""
         if isinstance(error, (can.CanError, OSError, ValueError)):  # ValueError: a backend's parser
-            return self._numbered(error)
+            return self._error_by_number(error)
         return error
 
-    def _numbered(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
-        """Decide by the kernel's error number."""
+    def _error_by_number(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
+        """Choose the error by the kernel's error number."""
         channel = self._settings.channel
         number = getattr(error, "error_code", None) or getattr(error, "errno", None)
         if number == errno.EAFNOSUPPORT:
             return DeviceMisconfiguredError(
-                f"{channel}: no CAN in this kernel, or not allowed to this service: load the "
+                f"{channel}: no CAN in this kernel, or not permitted for this service: load the "
                 "modules can and can_raw, allow AF_CAN, or use an adapter with "
                 'interface = "slcan"'
             )
+
         if number in {errno.ENODEV, errno.ENXIO}:
             return DeviceLostError(f"{channel}: no such CAN interface: plug it in (see `ip link`)")
+
         if number == errno.ENETDOWN:
             return DeviceLostError(
                 f"{channel}: the interface is down: `ip link set {channel} up type can bitrate "
@@ -251,7 +272,7 @@ class PythonCanBus:
 
 
 def _require_interface(name: str) -> None:
-    """Raise the OSError that binding a socket to `name` would."""
+    """Raise the OSError that binding a socket to `name` would raise."""
     socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     try:
         socket.if_nametoindex(name)  # not if_nameindex: that asks netlink, which the unit refuses
@@ -259,26 +280,26 @@ def _require_interface(name: str) -> None:
         raise OSError(errno.ENODEV, "no such interface") from error
 
 
-def _unknown(kind: str, error: Exception) -> str:
-    """Say why the interface `kind` cannot be had."""
-    return unknown_kind(kind) or f"interface {kind!r} cannot be loaded: {error}"
+def _not_loadable(kind: str, error: Exception) -> str:
+    """Return the reason why an interface of a known kind failed."""
+    return f"interface {kind!r} cannot be loaded: {error}"
 
 
 def unknown_kind(kind: str) -> str | None:
-    """Return why no bus of this kind can be opened here, or None."""
+    """Return the reason why no bus of this kind can be opened here, or None."""
     if kind == "slcan" or kind in can.VALID_INTERFACES:
         return None
     return unknown_name("CAN interface", kind, sorted({*can.VALID_INTERFACES, "slcan"}))
 
 
-def _shut(making: asyncio.Future[can.BusABC]) -> None:
-    """Close a bus that was opened for nobody any more."""
+def _close_late(making: asyncio.Future[can.BusABC]) -> None:
+    """Close a bus that was opened after its request was cancelled."""
     if not making.cancelled() and making.exception() is None:
         making.result().shutdown()
 
 
 class _Pump:
-    """A thread that reads a bus without descriptor and hands batches to the loop."""
+    """A thread that reads a bus without descriptor and delivers batches to the event loop."""
 
     def __init__(
         self,
@@ -289,13 +310,15 @@ class _Pump:
     ) -> None:
         self._bus, self._convert, self._deliver, self._failed = bus, convert, deliver, failed
         self._loop = asyncio.get_running_loop()
-        self._room = threading.Semaphore(_WAITING)  # a stalled loop leaves frames to the backend
+        self._room = threading.Semaphore(
+            _WAITING
+        )  # while the loop stalls, frames stay in the backend
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="can pump", daemon=True)
         self._thread.start()
 
     async def stop(self) -> None:
-        """End the thread; takes about 0.1 s at most."""
+        """End the thread, which takes about 0.1 s at most."""
         self._stopped.set()
         await asyncio.to_thread(self._thread.join)
 
@@ -304,12 +327,12 @@ class _Pump:
             while not self._stopped.is_set():
                 message = self._bus.recv(_PUMP_S)
                 if message is not None:
-                    self._hand_on(message)
+                    self._read_batch(message)
         except Exception as error:  # noqa: BLE001 - handed to whoever awaits the bus
             if not self._stopped.is_set():
-                self._call(self._failed, error)
+                self._call_in_loop(self._failed, error)
 
-    def _hand_on(self, message: can.Message | None) -> None:
+    def _read_batch(self, message: can.Message | None) -> None:
         frames: list[CanFrame] = []
         while message is not None:
             if not message.is_fd:
@@ -319,13 +342,13 @@ class _Pump:
         while not self._room.acquire(timeout=_PUMP_S):
             if self._stopped.is_set():
                 return
-        self._call(self._took, now, frames)
+        self._call_in_loop(self._accept, now, frames)
 
-    def _took(self, now: int, frames: list[CanFrame]) -> None:
+    def _accept(self, now: int, frames: list[CanFrame]) -> None:
         self._room.release()
         if not self._stopped.is_set():
             self._deliver(now, frames)
 
-    def _call(self, function: Callable[..., None], *arguments: object) -> None:
-        with suppress(RuntimeError):  # the loop is closed: nobody listens any more
+    def _call_in_loop(self, function: Callable[..., None], *arguments: object) -> None:
+        with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(function, *arguments)

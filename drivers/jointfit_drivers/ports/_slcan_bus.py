@@ -1,9 +1,8 @@
-"""An SLCAN adapter on a serial port, as a bus: handshake, then frames.
+"""An SLCAN adapter on a serial port as a CAN bus: handshake, then frames.
 
-Law: knows SLCAN and serial ports, nothing of sensors or of python-can, whose own SLCAN costs
-hundreds of microseconds a frame. The adapter is opened as a normal node (``O``), not as a silent
-listener, for a lone sensor needs somebody to acknowledge its frames. Nothing is ever sent on the
-bus.
+python-can's own SLCAN backend takes hundreds of microseconds a frame. The adapter is opened as a
+normal node (``O``) and not as a silent listener, because a single sensor needs a second node that
+acknowledges its frames. No frame is ever sent on the bus.
 """
 
 from __future__ import annotations
@@ -27,18 +26,22 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_QUIET_S = 0.03  # nothing for so long: what an earlier session left in the adapter has come out
-_OLD_READS = 10  # but an adapter that never falls quiet is not waited for
-_ANSWER_S = 0.3  # adapters answer in milliseconds; some answer nothing at all
-_NOT_SLCAN = 8  # bytes that are no SLCAN, with nothing that is, show another kind of device
+_QUIET_S = 0.03
+"""Pause, s, after which output of an earlier session has been received completely."""
+_OLD_READS = 10
+"""Most reads of old output, for an adapter that never pauses."""
+_ANSWER_S = 0.3
+"""Longest wait for an answer, s. Adapters answer within milliseconds, or not at all."""
+_NOT_SLCAN = 8
+"""Bytes outside SLCAN lines, without a single valid line, that identify another kind of device."""
 
 
 class SlcanBus:
-    """One adapter, for ``can_bus.SharedBus``.
+    """One adapter, for `can_bus.SharedBus`.
 
     Parameters
     ----------
-    settings
+    settings : CanBusSettings
         Its ``[can.NAME]`` table; ``channel`` is the serial port.
     """
 
@@ -55,14 +58,15 @@ class SlcanBus:
     async def open(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
     ) -> None:
-        """Open the port, tell the adapter its bit rate, open the bus, begin to read.
+        """Open the port, set the bit rate, open the bus and start reading.
 
         Raises
         ------
         DeviceLostError
-            The port is absent or taken; the adapter refuses to open.
+            The port is absent or in use, or the adapter refuses to open the bus.
         DeviceMisconfiguredError
-            The port is none, what answers is not SLCAN, or the bit rate is not one of its nine.
+            The file is no serial port, the device does not answer in SLCAN, or the bit rate is
+            none of the nine SLCAN bit rates.
         """
         code = bitrate_code(self._settings.bitrate)
         if code is None:
@@ -78,15 +82,16 @@ class SlcanBus:
         except BaseException:
             self._exit_port()
             raise
+
         self._reading = asyncio.create_task(
             self._read(deliver, failed), name=f"slcan {self._settings.channel}"
         )
 
     def listen(self, ids: Collection[tuple[int, bool]] | None) -> None:
-        """Take everything: the acceptance filter of SLCAN cannot hold a list."""
+        """Accept all frames: the acceptance filter of SLCAN cannot hold a list."""
 
     async def close(self) -> None:
-        """Stop reading, close the bus and the port."""
+        """Stop reading, then close the bus and the port."""
         reading, self._reading = self._reading, None
         if reading is not None:
             reading.cancel()
@@ -97,7 +102,7 @@ class SlcanBus:
             with suppress(DeviceLostError, TimeoutError):
                 async with asyncio.timeout(0.1):
                     await self._port.write(b"C\r")
-                    # Closing the port throws away what is not sent yet.
+                    # Closing the port discards unsent bytes.
                     await asyncio.sleep(4 * 10 / self._settings.baud)
         finally:
             self._exit_port()
@@ -110,7 +115,7 @@ class SlcanBus:
     async def _read(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
     ) -> None:
-        """Hand on frames until cancelled or until the port fails."""
+        """Deliver frames until cancelled or until the port fails."""
         feed = self._decoder.feed
 
         def take(chunk: Chunk) -> None:
@@ -128,65 +133,68 @@ class SlcanBus:
         try:
             while self._early:
                 deliver(*self._early.pop(0))
-            await self._port.pump(take, None)  # silence is each subscriber's own matter
+            await self._port.pump(take, None)  # each subscriber checks its own silence
         except Exception as error:  # noqa: BLE001 - handed to every subscriber, who raises it
             failed(error)
 
     async def _handshake(self, code: int) -> None:
-        """Bring the adapter, whatever state it was left in, to an open bus."""
+        """Open the adapter's bus from any state that an earlier session left."""
         settings = self._settings
-        await self._port.write(b"\r\r\rC\r")  # ends a half-sent command, then closes the bus
+        await self._port.write(b"\r\r\rC\r")  # end an incomplete command, then close the bus
         for _ in range(_OLD_READS):
-            if not await self._heard(_QUIET_S):
+            if not await self._receive_answers(_QUIET_S):
                 break
+
         self._port.flush_input()
         self._decoder.flush()
         self._early.clear()
+
         await self._ask(b"V\r", "V")
         if await self._ask(b"S%d\r" % code) == "\a":
             raise DeviceMisconfiguredError(
                 f"{settings.channel}: the adapter refuses {settings.bitrate} bit/s: "
                 "set `bitrate` of the [can] table to what adapter and sensors share"
             )
+
         answer = await self._ask(b"O\r")
         self._check_is_slcan()
         if answer == "\a":
             raise DeviceLostError(f"{settings.channel}: the adapter refuses to open its bus")
         if answer is None:
-            log.debug("%s: the adapter answers nothing; reading all the same", settings.channel)
+            log.debug("%s: the adapter sends no answers; reading anyway", settings.channel)
 
     async def _ask(self, command: bytes, expected: str = "") -> str | None:
-        """Send `command`; return the letter of the answer, `expected` or BELL, or None."""
+        """Send `command`; return the letter of the answer: `expected`, BELL, or None."""
         await self._port.write(command)
         loop = asyncio.get_running_loop()
         until = loop.time() + _ANSWER_S
         while (left := until - loop.time()) > 0:
-            for line in await self._heard(left):
+            for line in await self._receive_answers(left):
                 if line.letter in {expected, "\a"}:
                     return line.letter
         return None
 
-    async def _heard(self, timeout_s: float) -> list[SlcanLine]:
-        """Return the answers in the next chunk; note what speaks for and against SLCAN."""
+    async def _receive_answers(self, timeout_s: float) -> list[SlcanLine]:
+        """Return the answers in the next chunk; count valid lines and store early frames."""
         chunk = await self._port.receive(timeout_s)
         if chunk is None:
             return []
         found = self._decoder.feed(chunk.data, chunk.t_ns)
         lines = [item for item in found if isinstance(item, SlcanLine)]
-        # A bare CR proves nothing: everything that answers in lines of text sends some.
+        # A bare CR is no evidence: every device that answers in lines of text sends some.
         frames = [item for item in found if isinstance(item, CanFrame)]
-        if frames:  # they follow the answer to `O`: the bus was closed before
+        if frames:  # frames that follow the answer to `O` in the same chunk
             self._early.append((chunk.t_ns, frames))
         self._understood += len(frames)
         self._understood += sum(line.letter != "" for line in lines)
         return lines
 
     def _check_is_slcan(self) -> None:
-        """Refuse a device that talks, but never SLCAN."""
+        """Refuse a device whose output contains no SLCAN line."""
         lost = self._decoder.discarded_bytes
         if lost > _NOT_SLCAN and not self._understood:
             raise DeviceMisconfiguredError(
-                f"{self._settings.channel}: no SLCAN adapter answers at {self._settings.baud} baud "
-                f"({lost} bytes came, no SLCAN among them): set `channel` to the adapter's port "
+                f"{self._settings.channel}: no SLCAN adapter found at {self._settings.baud} baud "
+                f"({lost} bytes received, none of them SLCAN): set `channel` to the adapter's port "
                 "and `baud` to its speed"
             )

@@ -1,10 +1,9 @@
-"""Kernel stamps, CLOCK_REALTIME, turned into CLOCK_MONOTONIC, whatever becomes of the wall clock.
+"""Conversion of kernel stamps (CLOCK_REALTIME) to CLOCK_MONOTONIC, across wall-clock steps.
 
-Law: arithmetic on readings of two clocks; no socket, no bus. Both clocks are slewed alike, so their
-difference changes only when the wall clock is stepped (or when the host was suspended). What was
-stamped before a step may be read after it: for as long as anything may wait in a socket a stamp is
-tried with the difference of now and with that before the step, and the one counts that gives an
-instant in the recent past.
+Both clocks are slewed alike, so their difference changes only when the wall clock is stepped or
+the host was suspended. A packet that was stamped before a step may be read after it. For
+`OLDEST_NS` after a step both the present difference and the one before the step are therefore
+tried. The one that yields an instant in the recent past is used.
 """
 
 from __future__ import annotations
@@ -16,19 +15,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 STEP_NS = 1_000_000
-"""A difference that moved more than this was stepped, not slewed."""
+"""A larger change of the difference, ns, is a step of the wall clock and not slewing."""
 OLDEST_NS = 2_000_000_000
-"""Nothing waits longer in a socket that is read."""
-_READINGS = 5  # of both clocks; the tightest counts
+"""Longest time, ns, that a packet waits in a socket that is being read."""
+_READINGS = 5
+"""Number of readings of both clocks; the reading with the shortest duration is used."""
 
 
 class WallClock:
-    """Takes kernel stamps to the monotonic clock; call ``pair`` at every wake-up.
+    """Converts kernel stamps to the monotonic clock; call `pair` at every wake-up.
 
     Parameters
     ----------
-    monotonic_ns, unix_ns
-        The two clocks; for tests.
+    monotonic_ns, unix_ns : callable
+        The two clocks, ns; replaced in tests.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class WallClock:
         self._monotonic_ns, self._unix_ns = monotonic_ns, unix_ns
         self._offset_ns = self._before_ns = self._difference()
         self._stepped_ns = monotonic_ns() - OLDEST_NS
-        self.soft = 0
-        """Stamps replaced by the time of reading, because no difference explained them."""
+        self.replaced = 0
+        """Stamps replaced by the time of the read, because no difference explained them."""
 
     def pair(self) -> int:
-        """Compare the clocks anew; return the monotonic one, ns."""
+        """Measure the difference of the clocks; return the monotonic time, ns."""
         offset_ns, now_ns = self._difference(), self._monotonic_ns()
         if abs(offset_ns - self._offset_ns) > STEP_NS:
             self._before_ns, self._stepped_ns = self._offset_ns, now_ns
@@ -51,17 +51,17 @@ class WallClock:
         return now_ns
 
     def monotonic(self, stamp_ns: int, now_ns: int) -> int:
-        """Return a wall-clock stamp as monotonic ns, never later than `now_ns`."""
-        found = self._explained(stamp_ns, now_ns)
-        if found is None:  # stepped since the last pairing, perhaps
+        """Return the monotonic time, ns, of a wall-clock stamp; at most `now_ns`."""
+        found = self._convert(stamp_ns, now_ns)
+        if found is None:  # the clock may have been stepped since the last pairing
             self.pair()
-            found = self._explained(stamp_ns, now_ns)
+            found = self._convert(stamp_ns, now_ns)
         if found is None:
-            self.soft += 1
+            self.replaced += 1
             return now_ns
         return found
 
-    def _explained(self, stamp_ns: int, now_ns: int) -> int | None:
+    def _convert(self, stamp_ns: int, now_ns: int) -> int | None:
         stepped = now_ns - self._stepped_ns < OLDEST_NS
         for offset_ns in (self._offset_ns, self._before_ns)[: 1 + stepped]:
             arrival_ns = stamp_ns - offset_ns
@@ -70,8 +70,9 @@ class WallClock:
         return None
 
     def _difference(self) -> int:
-        """Return UNIX minus monotonic time, ns, from the quickest of five readings."""
+        """Return UNIX time minus monotonic time, ns, from the quickest of five readings."""
         best_width, best = 1 << 62, 0
+
         for _ in range(_READINGS):
             before = self._monotonic_ns()
             unix = self._unix_ns()

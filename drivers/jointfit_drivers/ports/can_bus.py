@@ -1,13 +1,13 @@
 """CAN buses, each opened once and shared by all devices on it.
 
-Law: this is the only module that knows python-can, and nothing of python-can leaves it. A bus lives
-as long as somebody uses it. Every device gets chunks with its own frames only; when a bus fails,
-all its devices are lost, each by its own ``DeviceLostError``. No device and no message is named
-here.
+A bus is open while a device uses it. Every device receives chunks with its own frames only. When a
+bus fails, all its devices are lost, each by its own `DeviceLostError`.
 
-A bus is drained from ``loop.add_reader`` on its descriptor, up to 64 frames a wake-up; a backend
-without descriptor by one thread that hands over batches. python-can's own Notifier would ignore
-receive errors, and each error is told once only.
+A bus is drained from ``loop.add_reader`` on its descriptor, up to 64 frames per wake-up. A backend
+without descriptor is read by one thread that delivers batches. python-can's own Notifier is not
+used because it ignores receive errors.
+
+Invariant: python-can stays behind this module, which contains no device and no message format.
 """
 
 from __future__ import annotations
@@ -34,29 +34,37 @@ if TYPE_CHECKING:
 __all__ = ["Backend", "CanKey", "SharedBus", "shared_bus", "unknown_kind"]
 
 CanKey = tuple[int, bool]
-"""Identifier, and whether it is a 29-bit one."""
+"""Identifier of a frame, and whether it has 29 bits."""
 
-_UNCLAIMED = 512  # frames nobody wanted yet: a third of a second of four sensors at 400 Hz
-_CLAIM_NS = 300_000_000  # older ones belong to nobody; the devices of a rig begin together
-_SEEN = 64  # identifiers that are remembered of those no device claims
-_NAMED = 8  # of them in a message
-_SAMPLES = 4  # frames of each that are looked at
-_EARLY = 16  # chunks that wait for the first frame with data that a device cannot do without
+_UNCLAIMED = 512
+"""Stored frames without a subscriber: a third of a second of four sensors at 400 Hz."""
+_CLAIM_NS = 300_000_000
+"""Age, ns, up to which stored frames are delivered to a new subscriber. The devices of a rig start
+together.
+"""
+_SEEN = 64
+"""Number of unclaimed identifiers whose data are stored for messages."""
+_NAMED = 8
+"""Number of unclaimed identifiers listed in a message."""
+_SAMPLES = 4
+"""Stored frames of each unclaimed identifier."""
+_EARLY = 16
+"""Chunks that wait for the first frame with the required identifier."""
 
 
 class Backend(Protocol):
-    """What reads one bus."""
+    """Reader of one bus."""
 
     async def open(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
     ) -> None:
-        """Start reading; pass later errors to `failed`. Raises as `DeviceLostError` describes."""
+        """Start reading; raise if that fails. Later errors go to `failed`."""
 
     def listen(self, ids: Collection[CanKey] | None) -> None:
-        """Let these identifiers through; more may come. None: all."""
+        """Accept these identifiers (others may pass as well); None accepts all."""
 
     async def close(self) -> None:
-        """Release everything; also after a failure, also twice."""
+        """Release all resources; also after a failure, also twice."""
 
 
 @dataclass(eq=False, slots=True)
@@ -71,29 +79,31 @@ class _Subscriber:
     silence_s: float
     needed: CanKey
     others: int
-    """Frames of all devices that had come when it subscribed."""
+    """Frames of all devices that had arrived at the time of its subscription."""
     arrived: dict[CanKey, int] = field(default_factory=dict)
-    """Which of its identifiers came since it subscribed, and when the last time, ns."""
+    """Time of the last arrival, ns, of each of its identifiers since its subscription."""
     early: deque[Chunk] = field(default_factory=lambda: deque(maxlen=_EARLY))
 
     @property
     def is_complete(self) -> bool:
-        """Whether what it cannot do without has come."""
+        """Whether the required identifier has arrived."""
         return self.needed in self.arrived
 
     def take(self, t_ns: int, frames: list[CanFrame]) -> None:
-        """Hand `frames` on; what goes wrong there ends this device's pump and no other's.
+        """Emit `frames`; an exception of `emit` ends this device's pump and no other's.
 
-        Before the first frame that it needs only errors are handed on: the others wait.
+        Until the required identifier arrives only error frames are emitted; the others wait.
         """
         if self.ended.done():
             return
+
         keys = {(frame.can_id, frame.extended) for frame in frames if not frame.error}
         self.arrived |= dict.fromkeys(keys, t_ns)
         chunk = Chunk(t_ns, pack_frames(frames))
         if keys and not self.is_complete:
             self.early.append(chunk)
             return
+
         try:
             while self.is_complete and self.early:
                 self.emit(self.early.popleft())
@@ -106,18 +116,18 @@ class _Subscriber:
 
 
 class SharedBus:
-    """One bus and the devices on it; get it from ``shared_bus``."""
+    """One bus and the devices on it; created by `shared_bus`."""
 
     def __init__(self, settings: CanBusSettings) -> None:
         self.channel = settings.channel
         self.foreign = 0
-        """Frames that no device of the rig wanted."""
+        """Frames that no device of the rig subscribed to."""
         self._settings = settings
         self._backend: Backend | None = None
         self._failed: Exception | None = None
         self._unclaimed: deque[tuple[int, CanFrame]] = deque(maxlen=_UNCLAIMED)
-        self._others = 0  # frames that devices of the rig got
-        self._seen: dict[CanKey, deque[bytes]] = {}  # the last data of identifiers nobody claims
+        self._others = 0  # frames delivered to devices of the rig
+        self._seen: dict[CanKey, deque[bytes]] = {}  # last data of unclaimed identifiers
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
         self._users = 0
         self._subscribers: list[_Subscriber] = []
@@ -125,11 +135,11 @@ class SharedBus:
 
     @property
     def in_use(self) -> bool:
-        """Whether anybody holds the bus."""
+        """Whether a device uses the bus."""
         return self._users > 0
 
     async def enter(self) -> None:
-        """Take part: open the bus unless another device did."""
+        """Register a user; the first one opens the bus."""
         self._users += 1
         async with self._lock:
             if self._backend is None:
@@ -140,7 +150,7 @@ class SharedBus:
                 self._backend = backend
 
     async def leave(self) -> None:
-        """Part; the last one out closes the bus."""
+        """Unregister a user; the last one closes the bus."""
         self._users -= 1
         async with self._lock:
             if not self._users or self._failed is not None:
@@ -156,37 +166,39 @@ class SharedBus:
         needed: CanKey,
         resembles: Callable[[bytes], bool] = lambda _: False,
     ) -> None:
-        """Hand `emit` every frame with one of `ids`, in chunks of records, until cancelled.
+        """Emit every frame with one of `ids`, in chunks of records, until cancelled.
 
-        Error frames and the host's notes (``can_frame``) come as well; bytes lost on an adapter's
-        line are told to one device only, so that they are counted once.
+        Error frames and host notes (`host_dropped`, `host_corrupt`) are emitted as well. A note
+        about corrupt bytes goes to one device only, so that the bytes are counted once.
 
         Parameters
         ----------
-        name
-            The device, as messages name it.
-        ids
-            What each of its identifiers carries, for messages.
-        emit
-            What it raises ends the pump and reaches the caller.
-        silence_s
-            No frame with the identifier `needed` for this long is a lost device, s.
-        needed
+        name : str
+            The device, as named in messages.
+        ids : mapping
+            Content of each of its identifiers, for messages.
+        emit : callable
+            An exception of `emit` ends the pump and is raised to the caller.
+        silence_s : float
+            Time without a frame with the identifier `needed`, s, after which the device counts
+            as lost.
+        needed : CanKey
             The one of `ids` that carries measurements.
-        resembles
-            Whether the data of a frame look like those of `needed`, for a hint.
+        resembles : callable
+            Whether the data of a frame look like those of `needed`, for a hint in messages.
 
         Raises
         ------
         DeviceLostError
-            The bus failed, or nothing with the identifier `needed` comes while the bus is well.
+            The bus failed, or no frame with the identifier `needed` arrives while the bus works.
         DeviceMisconfiguredError
-            Another device of the rig claims one of the identifiers.
+            Another device of the rig uses one of the identifiers.
         """
         self._refuse_taken(name, ids)
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         limit = asyncio.timeout(silence_s)
         subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s, needed, self._others)
+
         if self._failed is not None:
             raise DeviceLostError(str(self._failed))
         self._subscribers.append(subscriber)
@@ -204,35 +216,46 @@ class SharedBus:
             self._subscribers.remove(subscriber)
             self._route()
             if ended.done() and not ended.cancelled():
-                ended.exception()  # seen, should a cancellation have overtaken it
+                ended.exception()  # mark as retrieved, in case a cancellation came first
 
     def _explain_silence(self, subscriber: _Subscriber, resembles: Callable[[bytes], bool]) -> str:
-        """Return what is missing and what comes instead; the same text as long as that is so."""
+        """Return the missing identifier of a silent device, and those that arrive instead.
+
+        The text is the same as long as the findings are the same.
+        """
         ids, needed = subscriber.ids, subscriber.needed
         what = ids[needed]
+
         since_ns = time.monotonic_ns() - round(subscriber.silence_s * 1e9)
         others = sorted(
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
-        if subscriber.is_complete and not others:  # its settings are right: it sent all it should
+
+        if (
+            subscriber.is_complete and not others
+        ):  # its settings are right: all identifiers arrived before
             return (
                 f"{subscriber.name} ({self.channel}): silent for {subscriber.silence_s:g} s: "
                 "check its power and wiring"
             )
+
         found = [f"{ids[key]} ({_hex(key)})" for key in others]
-        text = f"{subscriber.name} ({self.channel}): no {what} ({_hex(needed)}) comes"
+        text = f"{subscriber.name} ({self.channel}): no {what} ({_hex(needed)}) arrives"
         if found:
             text += f", though {', '.join(found)} {'do' if len(found) > 1 else 'does'}"
+
         unclaimed = sorted(self._seen)
         if unclaimed:
             named = ", ".join(map(_hex, unclaimed[:_NAMED]))
             more = f" and {len(unclaimed) - _NAMED} more" if len(unclaimed) > _NAMED else ""
             text += f"; identifiers on the bus that no sensor claims: {named}{more}"
+
         alike = [key for key in unclaimed if all(map(resembles, self._seen[key]))]
         if alike:
             return (
                 f"{text}; the data of {_hex(alike[0])} look like a {what}: set `ids.{what}` to it"
             )
+
         if found or unclaimed:
             return f"{text}: set `ids`, or switch this output on (over UART, Xsens MT Manager)"
         if self._others > subscriber.others:
@@ -255,17 +278,18 @@ class SharedBus:
         self._filter()
 
     def _filter(self) -> None:
-        """Leave frames that no device wants to the kernel, once every device has what it needs."""
+        """Filter unclaimed frames in the kernel once every device receives its frames."""
         if self._backend is not None and self._failed is None:
             complete = all(each.is_complete for each in self._subscribers)
             self._backend.listen(self._routes if complete else None)
 
     def _claim(self, subscriber: _Subscriber) -> None:
-        """Give a device what came for it just before it began to listen.
+        """Deliver frames that arrived shortly before this device subscribed.
 
-        The first device of a rig opens the bus, and the others' frames are there at once.
+        The first device of a rig opens the bus, and the frames of the others arrive immediately.
         """
         waiting, self._unclaimed = self._unclaimed, deque(maxlen=_UNCLAIMED)
+
         now_ns = time.monotonic_ns()
         for t_ns, frame in waiting:
             if now_ns - t_ns > _CLAIM_NS:
@@ -277,7 +301,7 @@ class SharedBus:
                 self._unclaimed.append((t_ns, frame))
 
     def _deliver(self, t_ns: int, frames: list[CanFrame]) -> None:
-        """Give every frame to whom it belongs."""
+        """Deliver every frame to its subscriber."""
         shares: dict[_Subscriber, list[CanFrame]] = {}
         for frame in frames:
             if frame.error:
@@ -285,6 +309,7 @@ class SharedBus:
                 for each in everyone:
                     shares.setdefault(each, []).append(frame)
                 continue
+
             subscriber = self._routes.get((frame.can_id, frame.extended))
             if subscriber is None or frame.remote:
                 self.foreign += 1
@@ -292,6 +317,7 @@ class SharedBus:
                 self._remember(frame)
             else:
                 shares.setdefault(subscriber, []).append(frame)
+
         for subscriber, mine in shares.items():
             self._others += len(mine)
             was_complete = subscriber.is_complete
@@ -300,7 +326,7 @@ class SharedBus:
                 self._filter()
 
     def _remember(self, frame: CanFrame) -> None:
-        """Keep the last data of an identifier that no device claims, for messages."""
+        """Store the last data of an unclaimed identifier, for messages."""
         key = (frame.can_id, frame.extended)
         seen = self._seen.get(key)
         if seen is None:
@@ -310,7 +336,7 @@ class SharedBus:
         seen.append(frame.data)
 
     def _fail(self, error: Exception) -> None:
-        """End every device's pump; the bus is closed by the first to leave."""
+        """End every device's pump; the first device to leave closes the bus."""
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():
@@ -333,14 +359,14 @@ _BUSES: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, SharedBus]] = Wea
 
 @asynccontextmanager
 async def shared_bus(settings: CanBusSettings) -> AsyncIterator[SharedBus]:
-    """Yield the bus of this ``[can.NAME]`` table, open, one for all its devices.
+    """Yield the open bus of this ``[can.NAME]`` table, one instance for all its devices.
 
     Raises
     ------
     DeviceLostError
-        Absent, down or taken: may heal.
+        The interface is absent, down or in use; it may recover.
     DeviceMisconfiguredError
-        No such kind of bus here, or one that cannot run like this.
+        This kind of bus is not available here, or the bus cannot run with these settings.
     """
     buses = _BUSES.setdefault(asyncio.get_running_loop(), {})
     key = settings.model_dump_json()

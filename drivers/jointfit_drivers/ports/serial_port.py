@@ -1,10 +1,9 @@
 """Serial ports: opened and configured by pyserial, read and written by the event loop.
 
-Law: this is the only module that knows pyserial, and nothing of pyserial leaves it: whatever goes
-wrong becomes ``DeviceLostError`` (may heal) or ``DeviceMisconfiguredError`` (cannot). Bytes are
-stamped with
-the monotonic clock as soon as they are read, before anything else happens to them, for a tty has no
-kernel stamp. No device and no protocol is named here.
+A tty has no kernel stamp. Bytes are stamped with the monotonic clock immediately after the read.
+
+Invariant: no exception of pyserial leaves this module. A fault that may clear by itself raises
+`DeviceLostError`; one that needs another configuration raises `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -30,48 +29,51 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_READ_BYTES = 65536  # more than any tty buffer holds (4095), so one read empties it
-_WRITE_TIMEOUT_S = 2.0  # 100 bytes at 9600 baud take 0.1 s; a port that takes longer is stuck
+_READ_BYTES = 65536
+"""Bytes per read. A tty buffer holds at most 4095 bytes, so one read empties it."""
+_WRITE_TIMEOUT_S = 2.0
+"""Longest wait for a full port, s. At 9600 baud, 100 bytes take 0.1 s."""
 
 _NOT_A_PORT = frozenset(
     {errno.ENOTTY, errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG}
 )
-"""What a file that is no terminal gives. Any other error is of the system or the hardware."""
+"""Error numbers of a file that is no terminal; all others concern the system or the hardware."""
 
 _LOST: dict[int, str] = {
     errno.ENOENT: "is not there",
-    errno.ENODEV: "is gone",
-    errno.ENXIO: "is gone",
-    errno.EIO: "gives an input/output error",
+    errno.ENODEV: "no longer exists",
+    errno.ENXIO: "no longer exists",
+    errno.EIO: "returns an input/output error",
     errno.EAGAIN: "is used by another program",
     errno.EBUSY: "is used by another program",
-    errno.EACCES: "may not be opened by this user",
-    errno.EPERM: "may not be opened by this user",
+    errno.EACCES: "cannot be opened by this user (permission denied)",
+    errno.EPERM: "cannot be opened by this user (permission denied)",
     errno.EMFILE: "cannot be opened: this process has no file descriptor left",
     errno.ENFILE: "cannot be opened: this host has no file descriptor left",
-    errno.EPROTO: "gives a USB protocol error",
+    errno.EPROTO: "returns a USB protocol error",
     errno.ETIMEDOUT: "does not answer the USB host in time",
 }
-"""Common errors in words. All may pass by themselves, even EACCES: a re-plugged port exists before
-udev has set its group."""
+"""Texts of common errors. All of them may clear by themselves; EACCES does, because a port that is
+plugged in exists before udev has set its group.
+"""
 
 
 class SerialPort:
-    """One serial port, 8N1, raw, exclusive, while the ``with`` block lasts.
+    """One serial port: 8N1, raw, exclusive, open inside its ``with`` block.
 
     Parameters
     ----------
-    path
-        Device file, best a link under ``/dev/serial/by-id``.
-    baud
-        Speed, bit/s.
+    path : str
+        Device file, preferably a link under ``/dev/serial/by-id``.
+    baud : int
+        Line speed, bit/s.
 
     Raises
     ------
     DeviceLostError
-        On entry: absent, taken or not permitted (yet). Later: unplugged or silent.
+        On entry: the port is absent, in use, or not permitted (yet). Later: unplugged or silent.
     DeviceMisconfiguredError
-        On entry: not a serial port, or a speed it cannot run at.
+        On entry: the file is no serial port, or the port does not support the speed.
     """
 
     def __init__(self, path: str, baud: int) -> None:
@@ -80,7 +82,7 @@ class SerialPort:
         self._port: serial.Serial | None = None
 
     def __enter__(self) -> Self:
-        self._port = _opened(self.path, self._baud)
+        self._port = _open(self.path, self._baud)
         os.set_blocking(self._fd, False)
         try:
             self._port.set_low_latency_mode(True)
@@ -94,65 +96,67 @@ class SerialPort:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+
         port, self._port = self._port, None
         if port is None:
             return
-        with suppress(termios.error, OSError):  # else close waits up to 30 s for a stuck line
+
+        with suppress(termios.error, OSError):  # otherwise close waits up to 30 s for a stuck line
             termios.tcflush(port.fileno(), termios.TCOFLUSH)
         with suppress(OSError):
             port.close()
 
     @property
     def baud(self) -> int:
-        """Speed the port runs at, bit/s."""
+        """Line speed, bit/s."""
         return self._baud
 
     @property
     def _fd(self) -> int:
         if self._port is None:
-            raise ValueError(f"{self.path}: used outside its with block")
+            raise ValueError(f"{self.path}: is not open: use it inside its `with` block")
         return int(self._port.fileno())
 
     def set_baud(self, baud: int) -> None:
-        """Run at another speed from now on.
+        """Change the line speed.
 
         Raises
         ------
         DeviceMisconfiguredError
-            The port cannot run at it.
+            The port does not support the speed.
         DeviceLostError
-            The port is gone.
+            The port no longer exists.
         """
         if self._port is None:
-            raise ValueError(f"{self.path}: used outside its with block")
+            raise ValueError(f"{self.path}: is not open: use it inside its `with` block")
         try:
             self._port.baudrate = baud
         except (serial.SerialException, termios.error, OSError, ValueError) as error:
-            raise _typed(self.path, baud, error) from error
+            raise _device_error(self.path, baud, error) from error
         self._baud = baud
 
     def flush_input(self) -> None:
-        """Throw away what the system holds unread: it may be minutes old."""
+        """Discard unread bytes of the system's buffer, which may be minutes old."""
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
             raise DeviceLostError(f"{self.path}: unplugged ({error.args[-1]})") from error
 
     async def pump(self, emit: Callable[[Chunk], None], silence_s: float | None) -> None:
-        """Hand every chunk to `emit` until cancelled.
+        """Pass every chunk to `emit` until cancelled.
 
         Parameters
         ----------
-        emit
-            Called from the event loop with each chunk. What it raises ends the pump and reaches
-            the caller.
-        silence_s
-            No byte for this long is a lost device, s; None waits for ever.
+        emit : callable
+            Called from the event loop with each chunk. An exception of `emit` ends the pump and
+            is raised to the caller.
+        silence_s : float, optional
+            Time without a byte, s, after which the device counts as lost; None waits without limit.
 
         Raises
         ------
         DeviceLostError
-            Unplugged, or silent for `silence_s`.
+            The port was unplugged, or was silent for `silence_s`.
         """
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[None] = loop.create_future()
@@ -174,24 +178,24 @@ class SerialPort:
         finally:
             loop.remove_reader(self._fd)
             if ended.done() and not ended.cancelled():
-                ended.exception()  # seen, should a cancellation have overtaken it
+                ended.exception()  # mark as retrieved, in case a cancellation came first
 
     async def receive(self, timeout_s: float) -> Chunk | None:
-        """Return the next chunk, or None if nothing came in `timeout_s` seconds.
+        """Return the next chunk, or None if no byte arrives within `timeout_s` seconds.
 
-        For handshakes, before ``pump``: what arrives between two calls waits in the system and is
-        not lost.
+        For handshakes, before `pump`. Bytes that arrive between two calls stay in the system's
+        buffer.
 
         Raises
         ------
         DeviceLostError
-            Unplugged.
+            The port was unplugged.
         """
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[Chunk] = loop.create_future()
 
         def take(chunk: Chunk) -> None:
-            loop.remove_reader(self._fd)  # one chunk; the rest waits for the next call
+            loop.remove_reader(self._fd)  # one chunk; later bytes are for the next call
             if not arrived.done():
                 arrived.set_result(chunk)
 
@@ -207,14 +211,14 @@ class SerialPort:
     def _reader(
         self, take: Callable[[Chunk], None], ended: asyncio.Future[Any]
     ) -> Callable[[], None]:
-        """Return a loop callback that stamps, reads and hands on; its errors go to `ended`."""
+        """Return a loop callback that reads and stamps a chunk; its errors go to `ended`."""
         loop, fd = asyncio.get_running_loop(), self._fd
 
         def readable() -> None:
             try:
                 data = self._read(fd)
-                # A tty has no kernel stamp. Not before the read: bytes that come while this process
-                # is held up between the two would be stamped early, and no clock forgives that.
+                # Stamp after the read: a stamp from before it would be too early for bytes that
+                # arrive while this process is delayed, and clocks are fitted to the earliest.
                 t_ns = time.monotonic_ns()
                 if data is not None:
                     take(Chunk(t_ns, data))
@@ -226,12 +230,12 @@ class SerialPort:
         return readable
 
     async def write(self, data: bytes) -> None:
-        """Write all of `data`, waiting where the port is full.
+        """Write all of `data`; wait while the port is full.
 
         Raises
         ------
         DeviceLostError
-            Unplugged, or the port takes no byte for 2 s.
+            The port was unplugged, or accepted no byte for 2 s.
         """
         fd, rest = self._fd, memoryview(data)
         while rest:
@@ -243,7 +247,7 @@ class SerialPort:
                 raise DeviceLostError(f"{self.path}: unplugged ({error.strerror})") from error
 
     async def _writable(self, fd: int) -> None:
-        """Wait until the port takes bytes again."""
+        """Wait until the port accepts bytes again."""
         loop = asyncio.get_running_loop()
         ready = asyncio.Event()
         loop.add_writer(fd, ready.set)
@@ -252,18 +256,18 @@ class SerialPort:
                 await ready.wait()
         except TimeoutError as error:
             raise DeviceLostError(
-                f"{self.path}: takes no byte for {_WRITE_TIMEOUT_S:g} s"
+                f"{self.path}: accepted no byte for {_WRITE_TIMEOUT_S:g} s"
             ) from error
         finally:
             loop.remove_writer(fd)
 
     def _read(self, fd: int) -> bytes | None:
-        """Return what is there; None if the wake-up was for nothing.
+        """Return the available bytes; None if there are none.
 
         Raises
         ------
         DeviceLostError
-            Hang-up: end of file, or an error of the port.
+            The port was closed by the system (end of file), or returned an error.
         """
         try:
             data = os.read(fd, _READ_BYTES)
@@ -276,20 +280,23 @@ class SerialPort:
         return data
 
 
-def _opened(path: str, baud: int) -> serial.Serial:
-    """Open `path`; errors as the house names them."""
+def _open(path: str, baud: int) -> serial.Serial:
+    """Open `path` and convert pyserial's errors."""
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
     except (serial.SerialException, termios.error, OSError, ValueError) as error:
-        raise _typed(path, baud, error) from error
+        raise _device_error(path, baud, error) from error
 
 
-def _typed(path: str, baud: int, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
-    """Name what happened: thing, found, expected, remedy."""
-    number = _errno(error)
+def _device_error(
+    path: str, baud: int, error: Exception
+) -> DeviceLostError | DeviceMisconfiguredError:
+    """Return the error to raise: object, finding, expectation and remedy."""
+    number = _error_number(error)
     if number is not None and number not in _NOT_A_PORT:
         found = _LOST.get(number, f"cannot be opened ({os.strerror(number)})")
         return DeviceLostError(f"{path}: {found}{_remedy(path, number)}")
+
     if isinstance(error, ValueError):  # pyserial: the driver of this port refused the speed
         return DeviceMisconfiguredError(
             f"{path}: cannot run at {baud} baud: set `baud` to a speed that port and device share"
@@ -299,8 +306,8 @@ def _typed(path: str, baud: int, error: Exception) -> DeviceLostError | DeviceMi
     )
 
 
-def _errno(error: BaseException | None) -> int | None:
-    """Return the number behind `error`: pyserial hides that of termios in the context."""
+def _error_number(error: BaseException | None) -> int | None:
+    """Return the error number of `error`; pyserial leaves that of termios in the context."""
     while error is not None:
         number = getattr(error, "errno", None)
         if isinstance(error, termios.error) and error.args:
@@ -312,23 +319,26 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def _remedy(path: str, number: int) -> str:
-    """Say what to do about a port that did not open."""
+    """Return the remedy for a port that cannot be opened."""
     if number in {errno.EACCES, errno.EPERM}:
         return (
             ": add the user to the group dialout (usermod -aG dialout USER) "
             "and install the udev rule 70-jointfitd.rules"
         )
+
     if number in {errno.EAGAIN, errno.EBUSY}:
         return (
             f": stop it (`fuser {path}` names it); "
             "against ModemManager install the udev rule 70-jointfitd.rules"
         )
+
     if number == errno.ENOENT:
         there = ", ".join(sorted(map(str, Path("/dev/serial/by-id").glob("*"))))
         return (
-            ": plug it in, or set `port` (of an SLCAN adapter: `channel`) to one that is there: "
+            ": plug it in, or set `port` (of an SLCAN adapter: `channel`) to an existing one: "
             f"{there or '/dev/serial/by-id is empty'}"
         )
+
     if number in {errno.EMFILE, errno.ENFILE}:
         return ": raise LimitNOFILE (`ulimit -n`) or find the program that keeps files open"
     return ": check the cable"

@@ -1,8 +1,8 @@
-"""UDP sockets that know when a datagram arrived. Law: the one place of this driver that does I/O.
+"""UDP sockets that stamp every datagram with its arrival.
 
-The kernel stamps datagrams on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; ``wall_clock`` takes the
-stamp to CLOCK_MONOTONIC. `asyncio`'s datagram endpoint hides ancillary data, so the sockets are our
-own.
+The kernel stamps datagrams on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; `WallClock` converts the
+stamps to CLOCK_MONOTONIC. asyncio's datagram endpoint does not return ancillary data, so this
+module reads its sockets itself.
 """
 
 from __future__ import annotations
@@ -18,49 +18,54 @@ from typing import NamedTuple
 from jointfit_drivers.ports._wall_clock import WallClock
 
 MAX_DATAGRAM = 65_507
+"""Largest payload of a UDP datagram over IPv4, bytes."""
 DRAIN = 64
-"""Datagrams taken at one wake-up; the rest waits for the next, so that others get their turn."""
+"""Datagrams read at one wake-up; others stay in the queue, so that other sockets are served too."""
 RECEIVE_BUFFER = 1 << 20
-"""Asked for, bytes: half a second of large frames while the host is busy."""
+"""Requested receive buffer, bytes: half a second of large frames while the host is busy."""
 
-_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)  # x86-64 and ARM alike
-_IP_RECVERR = 11  # an ICMP refusal becomes an error of this socket, connected or not
-_IP_MULTICAST_ALL = 49  # 0: only groups that this socket joined
+_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
+"""Socket option of the kernel stamps; the same number on x86-64 and ARM."""
+_IP_RECVERR = 11
+"""Socket option: an ICMP refusal becomes an error of this socket, connected or not."""
+_IP_MULTICAST_ALL = 49
+"""Socket option: 0 restricts reception to groups that this socket joined."""
 _SIOCGIFADDR = 0x8915
 _ATTACH_FILTER = getattr(socket, "SO_ATTACH_FILTER", 26)
 _INSTRUCTION = struct.Struct("@HBBI")
 _PROGRAM = struct.Struct("@HL")
 _LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # classic BPF
-_SOURCE_ADDRESS = 0xFFF00000 + 12  # SKF_NET_OFF: offset from the IPv4 header
+_SOURCE_ADDRESS = 0xFFF00000 + 12
+"""Offset of the source address in a packet filter: SKF_NET_OFF plus that in the header."""
 _WHOLE_PACKET = 0xFFFFFFFF
 _STAMP = struct.Struct("@ll")
 _ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
 
 
-class Arrival(NamedTuple):
-    """One datagram."""
+class Datagram(NamedTuple):
+    """One received datagram."""
 
     t_ns: int
-    """CLOCK_MONOTONIC when it reached the kernel."""
+    """CLOCK_MONOTONIC at its arrival in the kernel, ns."""
     data: bytes
     host: str
-    """Address it came from."""
+    """Source address."""
     port: int
-    """Port it came from."""
+    """Source port."""
 
 
-class StampedSocket:
-    """A non-blocking UDP socket whose datagrams carry their arrival.
+class UdpSocket:
+    """A non-blocking UDP socket whose datagrams carry their arrival time.
 
     Parameters
     ----------
-    address, port
-        Where it is bound.
+    address, port : str, int
+        Local address and port to bind.
     sender : str
-        Numeric address; the kernel drops datagrams from any other one, so that a flood of them
+        Numeric address. The kernel drops datagrams of other senders, so that a flood of them
         costs the daemon no time.
     shared : bool
-        Other programs of this host may be bound to the same address and port.
+        Whether other programs of this host may bind the same address and port.
     """
 
     def __init__(self, address: str, port: int, *, sender: str, shared: bool = False) -> None:
@@ -80,7 +85,7 @@ class StampedSocket:
         self._wall = WallClock()
 
     def _filter(self, sender: str) -> None:
-        """Have the kernel drop what `sender` did not send; whoever reads checks once more."""
+        """Let the kernel drop datagrams of other senders; the reader checks them again."""
         (address,) = struct.unpack("!I", socket.inet_aton(sender))
         program = array.array(
             "B",
@@ -89,16 +94,17 @@ class StampedSocket:
             + _INSTRUCTION.pack(_RETURN, 0, 0, _WHOLE_PACKET)
             + _INSTRUCTION.pack(_RETURN, 0, 0, 0),
         )
+
         start, size = program.buffer_info()
         described = _PROGRAM.pack(size // _INSTRUCTION.size, start)
         with contextlib.suppress(OSError):  # a kernel without socket filters
             self._socket.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, described)
 
     @classmethod
-    def in_group(cls, group: str, port: int, local: str, *, sender: str) -> StampedSocket:
-        """Open a socket that receives one multicast group on the network card of `local`.
+    def in_group(cls, group: str, port: int, local: str, *, sender: str) -> UdpSocket:
+        """Open a socket that receives one multicast group on the network card with address `local`.
 
-        It is bound to the group itself, so that other groups on the same port stay out.
+        It is bound to the group itself, which excludes other groups on the same port.
         """
         opened = cls(group, port, sender=sender, shared=True)
         try:
@@ -111,35 +117,36 @@ class StampedSocket:
         return opened
 
     def fileno(self) -> int:
-        """Return the descriptor, for ``loop.add_reader``."""
+        """Return the file descriptor, for ``loop.add_reader``."""
         return self._socket.fileno()
 
     @property
     def port(self) -> int:
-        """Port it is bound to."""
+        """Bound local port."""
         return int(self._socket.getsockname()[1])
 
     def close(self) -> None:
-        """Close; the group is left with it."""
+        """Close the socket, which also leaves its multicast group."""
         self._socket.close()
 
     def send(self, data: bytes, address: tuple[str, int]) -> None:
-        """Send one datagram. A full queue of the network card loses it, as the network may."""
+        """Send one datagram; it is dropped if the queue of the network card is full."""
         try:
             self._socket.sendto(data, address)
         except BlockingIOError:
             return
 
-    def receive(self) -> list[Arrival]:
-        """Return what is there, at most `DRAIN` datagrams.
+    def receive(self) -> list[Datagram]:
+        """Return the available datagrams, at most `DRAIN`.
 
         Raises
         ------
         OSError
-            Above all ConnectionRefusedError: nobody listens where we sent to.
+            In particular ConnectionRefusedError: no program listens at the destination of a
+            datagram that was sent.
         """
         self._wall.pair()
-        found: list[Arrival] = []
+        found: list[Datagram] = []
         for _ in range(DRAIN):
             try:
                 data, ancillary, _, address = self._socket.recvmsg(MAX_DATAGRAM, _ANCILLARY)
@@ -147,17 +154,19 @@ class StampedSocket:
                 break
             except OSError:
                 self._drop_errors()
-                if found:  # a refusal beside datagrams that arrive is forged or stale
+                if found:  # a refusal together with datagrams is forged or stale
                     break
                 raise
+
             now_ns = time.monotonic_ns()
-            found.append(Arrival(self._arrival(ancillary, now_ns), data, *address))
+            found.append(Datagram(self._arrival(ancillary, now_ns), data, *address))
+
         if not found:
-            self._drop_errors()  # woken by a refusal that sending has reported already
+            self._drop_errors()  # woken by a refusal that `send` has already reported
         return found
 
     def _drop_errors(self) -> None:
-        """Empty the error queue of the socket; until then it counts as readable."""
+        """Empty the error queue of the socket, which otherwise stays readable."""
         with contextlib.suppress(OSError):
             while True:
                 self._socket.recvmsg(1, 0, socket.MSG_ERRQUEUE)
@@ -167,7 +176,7 @@ class StampedSocket:
             if level == socket.SOL_SOCKET and kind == _TIMESTAMPNS and len(value) == _STAMP.size:
                 seconds, ns = _STAMP.unpack(value)
                 return self._wall.monotonic(seconds * 10**9 + ns, now_ns)
-        self._wall.soft += 1
+        self._wall.replaced += 1
         return now_ns
 
 
@@ -179,16 +188,16 @@ def local_address(server: str, interface: str | None) -> str:
     server : str
         Numeric address of the server.
     interface : str, optional
-        Address or name of the card; None: the card that leads to the server.
+        Address or name of the card. None selects the card that routes to the server.
 
     Raises
     ------
     OSError
-        No such card, or no way to the server.
+        There is no such card, or no route to the server.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         if interface is None:
-            probe.connect((server, 9))  # sends nothing: asks the routing table
+            probe.connect((server, 9))  # sends no packet: reads the routing table
             return str(probe.getsockname()[0])
         try:
             return socket.inet_ntoa(socket.inet_aton(interface))

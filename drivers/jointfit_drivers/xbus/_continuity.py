@@ -1,23 +1,24 @@
-"""Counter and clock of an Xbus device: lost messages, restarts, and messages damaged unseen.
+"""Counter and clock of an Xbus device: lost messages, restarts, and undetected corruption.
 
-Invariant: integers in, steps out; any input is accepted. An orientation *follows* another if
-counter and device time moved together, or if what is known moved by a few periods only. Every
-MTData2 takes a counter value. Only those with an orientation are compared, for others may carry
-foreign time (GNSS).
+An orientation *follows* another one if counter and device time advanced together, or, where only
+one of them is sent, if it advanced by a few periods. Every MTData2 increments the counter. Only
+messages with an orientation are compared, because others may carry foreign time (GNSS).
 
-| orientation                                        | outcome                                    |
-|----------------------------------------------------|--------------------------------------------|
-| follows the last accepted one                      | accepted; what the counter passed is lost  |
-| does not follow                                    | held until the next one                    |
-| the next one follows the last accepted one         | the held one was damaged and is dropped    |
-| the next one follows the held one                  | both accepted; a restart if time leapt,    |
-|                                                    | against the counter and the arrivals; a    |
-|                                                    | counter jump if time went on by one period |
-| the next one follows neither                       | the held one is dropped, the next one held |
+| orientation                                   | outcome                                         |
+|-----------------------------------------------|-------------------------------------------------|
+| follows the last accepted one                 | accepted; skipped counter values were lost      |
+| does not follow                               | held until the next one                         |
+| the next one follows the last accepted one    | the held one was corrupt and is dropped         |
+| the next one follows the held one             | both accepted; a restart if time jumped against |
+|                                               | the counter and the arrivals; a counter jump if |
+|                                               | time advanced by one period                     |
+| the next one follows neither                  | the held one is dropped, the next one held      |
 
-An eight-bit checksum passes one damaged message in 256, so a single message proves neither a loss
-nor a restart. Agreement is within 2 % and a few counts of the stream's own rate, modulo the width
-of the counter. The nominal rate is used for the first samples only.
+An eight-bit checksum passes one corrupt message in 256, so a single message proves neither a loss
+nor a restart. Counter and time agree if they differ by less than 2 % plus a few counts at the
+measured rate, modulo the width of the counter. The nominal rate is used for the first samples only.
+
+Invariant: integers in, steps out; every input is accepted.
 """
 
 from __future__ import annotations
@@ -28,16 +29,21 @@ from jointfit_protocols.xbus.configuration import TICK_NS, WRAP_32_BIT, WRAP_DAY
 
 _COUNTS = 1 << 16
 _GAP = 1.5
-_PLAUSIBLE_GAP = 3600 * 1_000_000_000 // TICK_NS  # an hour: no stall or stale buffer is older
+"""Periods of time, at most, between two messages of which only the counter jumped."""
+_PLAUSIBLE_GAP = 3600 * 1_000_000_000 // TICK_NS
+"""Longest plausible gap, ticks: one hour, longer than any stall or buffered data."""
 _SLACK_COUNTS = 4
 _SLACK_SHARE = 0.02
-_LEARNED = 10  # counts after which the stream knows its own rate
-_PACE_NS = 250_000_000  # between time passed and arrivals: no bunch of samples is later
-_DISTINCT = 50_000  # counts: over more the slack and the width of the counter let any pair agree
+_LEARNED = 10
+"""Counts after which the measured rate replaces the nominal one."""
+_PACE_NS = 250_000_000
+"""Largest difference, ns, of elapsed device and arrival time without a restart."""
+_DISTINCT = 50_000
+"""Counts up to which counter and time can disagree; beyond, the slack allows any pair."""
 
 
-class Step(NamedTuple):
-    """What one orientation means for the stream."""
+class XbusStep(NamedTuple):
+    """Classification of one orientation."""
 
     lost: int = 0
     """Messages lost before it, or before the held one that it confirms."""
@@ -46,15 +52,15 @@ class Step(NamedTuple):
     held: bool = False
     """Hold this one until the next."""
     confirmed: bool = False
-    """The held one is good and comes first; else a held one is dropped."""
+    """The held one is valid and comes first; otherwise a held one is dropped."""
     lost_since: int = 0
-    """Messages lost between a confirmed one and this one."""
+    """Messages lost between the confirmed one and this one."""
     counter_jumped: bool = False
-    """The counter alone jumped before the held one: nothing was lost."""
+    """Only the counter jumped before the held one; no message was lost."""
 
 
 class _Point(NamedTuple):
-    """An orientation: counter, time, arrival, and the number of messages that had come by then."""
+    """One orientation: counter, time, arrival, and the number of messages received by then."""
 
     counter: int | None
     ticks: int | None
@@ -62,94 +68,110 @@ class _Point(NamedTuple):
     messages: int
 
 
-_GOES_ON = Step()
-_HELD = Step(held=True)
+_CONTINUES = XbusStep()
+_HELD = XbusStep(held=True)
 
 
-class Continuity:
-    """Follows one device.
+class XbusContinuity:
+    """Tracks counter and time of one device.
 
     Parameters
     ----------
-    rate_hz
-        Nominal rate, used until the stream has shown its own.
+    rate_hz : float
+        Nominal rate, Hz, used until the stream has shown its own.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self.modulus: int | None = None
-        """Ticks after which time starts again; None until the model or a wrap shows it."""
+        """Ticks after which device time restarts at 0; None until the model or a wrap shows it."""
         self._nominal = 1_000_000_000 / TICK_NS / rate_hz
         self._messages = 0
         self._last: _Point | None = None
         self._held: _Point | None = None
-        self._trusted = False  # whether anything followed the last one
+        self._trusted = False  # whether a message followed the last one
         self._sum_ticks = self._sum_counts = 0
 
     def other(self) -> None:
-        """Count an MTData2 without orientation: it takes a value of the counter."""
+        """Count an MTData2 without orientation, which also increments the counter."""
         self._messages += 1
 
-    def orientation(self, counter: int | None, ticks: int | None, arrival_ns: int) -> Step:
-        """Take counter, time (ticks of 100 us) and arrival of a message with an orientation."""
+    def orientation(self, counter: int | None, ticks: int | None, arrival_ns: int) -> XbusStep:
+        """Return the step for a message with an orientation.
+
+        Parameters
+        ----------
+        counter : int, optional
+            Its packet counter.
+        ticks : int, optional
+            Its device time, in units of 100 us.
+        arrival_ns : int
+            Its arrival, host monotonic ns.
+        """
         self._messages += 1
         point = _Point(counter, ticks, arrival_ns, self._messages)
+
         last, held = self._last, self._held
         if last is None:
             self._last = point
-            return _GOES_ON
+            return _CONTINUES
+
         if self._follows(last, point):
             self._held = None
             return self._accept(last, point)
+
         if held is None or not self._follows(held, point):
             self._held = point
             return _HELD
         return self._confirm(last, held, point)
 
     def forget(self) -> None:
-        """Begin anew: the device reported that it restarted."""
+        """Start again with the next message: the device reported a restart."""
         self._last = self._held = None
         self._trusted = False
         self._sum_ticks = self._sum_counts = 0
 
-    def _accept(self, last: _Point, point: _Point) -> Step:
-        """Make `point` the last one and learn the rate from the step to it."""
+    def _accept(self, last: _Point, point: _Point) -> XbusStep:
+        """Make `point` the last one and update the measured rate."""
         self._last, self._trusted = point, True
+
         counts, ticks = _counts(last, point), self._ticks(last, point)
-        if counts and ticks and counts <= _DISTINCT:  # time that stands still shows no rate
+        if counts and ticks and counts <= _DISTINCT:  # a clock that does not advance shows no rate
             self._sum_ticks += ticks
             self._sum_counts += counts
         lost = _lost(last, point)
-        return Step(lost) if lost else _GOES_ON
+        return XbusStep(lost) if lost else _CONTINUES
 
-    def _confirm(self, last: _Point, held: _Point, point: _Point) -> Step:
-        """Accept `held` and `point`, which belong together and not to `last`."""
+    def _confirm(self, last: _Point, held: _Point, point: _Point) -> XbusStep:
+        """Accept `held` and `point`, which follow each other and not `last`."""
         trusted, self._held = self._trusted, None
-        step = self._classify(last, held) if trusted else _GOES_ON
+        step = self._classify(last, held) if trusted else _CONTINUES
         if step.restarted or not trusted:
             self._sum_ticks = self._sum_counts = 0
         since = self._accept(held, point).lost
         return step._replace(confirmed=True, lost_since=since)
 
-    def _classify(self, last: _Point, held: _Point) -> Step:
-        """Return what happened between two that do not follow."""
+    def _classify(self, last: _Point, held: _Point) -> XbusStep:
+        """Return the step between two points that do not follow."""
         ticks, counts = self._ticks(last, held), _counts(last, held)
-        if ticks is None:  # the counter alone: it may fall only by a restart
+        if ticks is None:  # counter only: it decreases at a restart only
             fell = counts is not None and counts > _DISTINCT
-            return Step(restarted=True) if fell else Step(_lost(last, held))
+            return XbusStep(restarted=True) if fell else XbusStep(_lost(last, held))
+
         plausible = 0 <= ticks <= _PLAUSIBLE_GAP
         if counts is not None and plausible and self._agree(ticks, counts):
             turns = round((ticks / self._period - counts) / _COUNTS)
-            return Step(_lost(last, held) + max(turns, 0) * _COUNTS)
+            return XbusStep(_lost(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
-            return Step(counter_jumped=counts is not None)
-        # Both ends may be damaged a little. A clock that kept pace with the arrivals went on.
+            return XbusStep(counter_jumped=counts is not None)
+        # Either message may be corrupt in a few bits; a clock in step with the arrivals goes on.
         off_ns = abs(held.arrival_ns - last.arrival_ns - ticks * TICK_NS)
-        return Step(restarted=off_ns > _PACE_NS)
+        return XbusStep(restarted=off_ns > _PACE_NS)
 
     def _follows(self, last: _Point, point: _Point) -> bool:
         ticks, counts = self._ticks(last, point), _counts(last, point)
         if (ticks is None) != (last.ticks is None) or (counts is None) != (last.counter is None):
-            return False  # it lacks what the stream has, or has what the stream lacks
+            return False  # the set of fields differs from the stream's
+
         few = _SLACK_COUNTS + 1
         if ticks is None:
             return counts is None or counts <= few + point.messages - last.messages
@@ -159,18 +181,19 @@ class Continuity:
 
     @property
     def _period(self) -> float:
-        """Ticks a count; never 0."""
+        """Ticks per count; never 0."""
         if self._sum_counts < _LEARNED:
             return self._nominal
         return self._sum_ticks / self._sum_counts
 
     def _ticks(self, last: _Point, point: _Point) -> int | None:
-        """Return the step of time with a wrap undone; None where either end has no time."""
+        """Return the step of time, a wrap undone; None where one of the points has no time."""
         if last.ticks is None or point.ticks is None:
             return None
         step = point.ticks - last.ticks
         if step >= 0:
             return step
+
         counts = _counts(last, point)
         moduli = (WRAP_DAY, WRAP_32_BIT) if self.modulus is None else (self.modulus,)
         for modulus in moduli:
@@ -181,21 +204,21 @@ class Continuity:
         return step
 
     def _agree(self, ticks: int, counts: int) -> bool:
-        """Whether `ticks` and `counts` passed together, as far as the counter can show."""
+        """Whether `ticks` and `counts` agree at this rate, modulo the counter's width."""
         expected = round(ticks / self._period)
         off = (counts - expected) % _COUNTS
         return min(off, _COUNTS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
 
 
 def _counts(last: _Point, point: _Point) -> int | None:
-    """Return the step of the counter; None where either end has none."""
+    """Return the step of the counter; None where one of the points has no counter."""
     if last.counter is None or point.counter is None:
         return None
     return (point.counter - last.counter) % _COUNTS
 
 
 def _lost(last: _Point, point: _Point) -> int:
-    """Return the messages between two that never came."""
+    """Return the number of messages that were lost between two points."""
     counts = _counts(last, point)
     if counts is None or counts > _DISTINCT:  # the counter went back by a few
         return 0

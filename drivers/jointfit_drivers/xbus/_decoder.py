@@ -1,8 +1,10 @@
-"""The pure half of the Xbus driver: chunks in, samples in SI and canonical orientation out.
+"""Decoder of the Xbus driver: chunks in, samples in SI units with canonical orientation out.
 
-Law: a function of the chunks fed; no clock, no port. A sample is stamped with the arrival of its
-first byte: that of the chunk, less the bytes that followed and its own, at ten bits each; on USB,
-where bytes take no time, that of the chunk.
+A sample is stamped with the arrival of its first byte. On a serial line this is the arrival of the
+chunk minus the duration of the message and of the bytes behind it, at ten bits per byte. On USB it
+is the arrival of the chunk.
+
+Invariant: a function of the chunks fed; no clock, no port.
 """
 
 from __future__ import annotations
@@ -10,9 +12,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
-from jointfit_drivers.xbus._continuity import Continuity, Step
-from jointfit_drivers.xbus._raw_orientation import RAW, Message
-from jointfit_drivers.xbus._sync_lines import describe
+from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
+from jointfit_drivers.xbus._raw_orientation import RAW, RawMessage
+from jointfit_drivers.xbus._sync_lines import describe_entry
 from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
 from jointfit_protocols.xbus import MAX_MESSAGE, Layout, MessageId, XbusCodec, XbusMessage
 from jointfit_protocols.xbus import configuration as setup
@@ -22,22 +24,26 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from jointfit_daemon.model import Chunk, Decoded
-    from jointfit_drivers.xbus._raw_orientation import XbusRaw
+    from jointfit_drivers.xbus._raw_orientation import RawOrientation
     from jointfit_protocols.corrupt import Corrupt as WireCorrupt
     from jointfit_protocols.xbus.mtdata2 import Value
 
-_BITS = 10  # of one byte on the line, 8N1
+_BITS = 10
+"""Bits of one byte on the line, 8N1."""
 _SILENCE_FLOOR_NS = 250_000_000
-"""At high speed 1.5 messages take so little that a stalled host would look like a silent line."""
+"""Shortest silence, ns, that ends a pending message. At high speed, 1.5 messages take so little
+time that a stalled host would look like a silent line.
+"""
 _COUNTER, _TIME = int(Item.PACKET_COUNTER), int(Item.SAMPLE_TIME_FINE)
 _QUATERNION = int(Item.QUATERNION)
 _STATUS_BYTE, _STATUS_WORD = int(Item.STATUS_BYTE), int(Item.STATUS_WORD)
 _WANTED = {_COUNTER, _TIME, _QUATERNION, _STATUS_BYTE, _STATUS_WORD}
+"""Items that are decoded."""
 _ALIGNED = ("sensor", "local")
 
 
 class _Orientation(NamedTuple):
-    """A message with an orientation, not judged yet."""
+    """A message with an orientation that has not been classified yet."""
 
     message: XbusMessage
     arrived_ns: int
@@ -51,14 +57,14 @@ class XbusDecoder:
 
     Parameters
     ----------
-    baud
-        Speed of the line, for back-dating; None: USB.
-    rate_hz
-        Nominal rate, used until the stream has shown its own.
-    wires
-        Items that tell of edges, and the wire of the rig that each is about.
-    raw
-        Makes orientations of raw readings; None: the device sends them.
+    baud : int, optional
+        Line speed, bit/s, for back-dating of stamps; None for USB.
+    rate_hz : float
+        Nominal rate, Hz, used until the stream has shown its own.
+    wires : mapping, optional
+        Sync wire of the rig for each item that reports edges.
+    raw : RawOrientation, optional
+        Computes orientations from raw measurements; None if the device sends orientations.
     """
 
     def __init__(
@@ -66,29 +72,29 @@ class XbusDecoder:
         baud: int | None,
         rate_hz: float,
         wires: Mapping[int, int] | None = None,
-        raw: XbusRaw | None = None,
+        raw: RawOrientation | None = None,
     ) -> None:
         self._wires = wires or {}
         self._raw = raw
         self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
         self._layouts: dict[int, Layout | None] = {}
-        """How the first message of each length is laid out; a device sends one or two lengths."""
+        """Layout of the first message of each length; a device sends one or two lengths."""
         self._xbus = XbusCodec()
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
-        self._continuity = Continuity(rate_hz)
+        self._continuity = XbusContinuity(rate_hz)
         self._held: _Orientation | None = None
         self._tick_clock = TickClock(setup.TICK_NS, setup.WRAP_32_BIT)
         self._gate = OrientationGate()
         self._last_ns = self._arrival_ns = 0
         self._refused = self._refused_bytes = 0
-        self._measuring = self._judged = False
+        self._measuring = self._norm_checked = False
 
     @property
     def tick_clock(self) -> TickClock:
-        """100 us ticks; the modulus follows the model, or the first wrap seen."""
+        """Device time in ticks of 100 us; the modulus follows from the model, or the first wrap."""
         modulus = self._continuity.modulus or setup.WRAP_32_BIT
-        if modulus != self._tick_clock.modulus:  # asked for after every chunk, and changes once
+        if modulus != self._tick_clock.modulus:  # read after every chunk, and changes once
             self._tick_clock = TickClock(setup.TICK_NS, modulus)
         return self._tick_clock
 
@@ -99,22 +105,22 @@ class XbusDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes that belong to no message so far, or to one that made no sense."""
+        """Bytes so far that belong to no message, or to a message that was rejected."""
         return self._xbus.discarded + self._refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return what `chunk` completed, in wire order; never raises."""
+        """Return the content that `chunk` completed, in wire order; never raises."""
         out: list[Decoded] = []
         if self._xbus.pending:
             quiet_ns = chunk.t_ns - self._last_ns - len(chunk.data) * self._byte_ns
-            if quiet_ns > self._silence_ns:  # the rest of what waits will never come
+            if quiet_ns > self._silence_ns:  # the rest of the pending message was lost
                 out = self._take(self._xbus.flush())
         self._last_ns = chunk.t_ns
         found = self._xbus.feed(chunk.data)
         return out + self._take(found) if found else out
 
     def flush(self) -> list[Decoded]:
-        """Give up waiting: for the rest of a pending message, and for what would confirm one."""
+        """Discard a pending message and an orientation that waits for confirmation."""
         return self._take(self._xbus.flush()) + self._drop_held()
 
     def _take(self, found: list[XbusMessage | WireCorrupt]) -> list[Decoded]:
@@ -122,32 +128,34 @@ class XbusDecoder:
         for event in found:
             if isinstance(event, XbusMessage):
                 if event.mid == MessageId.MT_DATA2:
-                    out += self._measurement(event)
+                    out += self._decode_measurement(event)
                 else:
-                    out += self._told(event)
+                    out += self._device_events(event)
             else:
                 out.append(Corrupt(event.discarded, event.reason))
         return out
 
-    def _arrived(self, message: XbusMessage) -> int:
-        """Return when the first byte of `message` came, monotonic ns."""
+    def _arrival_of(self, message: XbusMessage) -> int:
+        """Return the arrival of the first byte of `message`, monotonic ns."""
         since = self._xbus.fed - message.end + message.size
         at_ns = self._last_ns - round(since * self._byte_ns)
-        # a line cannot be faster than its speed, but USB devices and ptys are: never backwards
+        # USB devices and ptys are faster than the configured speed: keep the stamps in order
         self._arrival_ns = max(self._arrival_ns, at_ns)
         return self._arrival_ns
 
-    def _measurement(self, message: XbusMessage) -> list[Decoded]:
-        """Return what an MTData2 holds, or what is wrong with it."""
+    def _decode_measurement(self, message: XbusMessage) -> list[Decoded]:
+        """Return the content of an MTData2, or the reason of its rejection."""
         data = message.data
         layout = self._layouts.get(len(data))
         if layout is not None:
             known = layout.read(data)
             if known is not None:
-                return self._said(message, known, layout.world_id)
+                return self._decode_values(message, known, layout.world_id)
+
         items = split(data)
         if items is None:
             return [self._refuse(message, "MTData2 items do not fill the message")]
+
         values: dict[int, Value] = {}
         world_id = 0
         for data_id, raw in items:
@@ -158,87 +166,100 @@ class XbusDecoder:
                     return [self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
                 values[kind] = value
                 world_id = data_id if kind == _QUATERNION else world_id
+
         if len(data) not in self._layouts:
             self._layouts[len(data)] = Layout.of(items, self._wanted)
-        return self._said(message, values, world_id)
+        return self._decode_values(message, values, world_id)
 
-    def _said(
+    def _decode_values(
         self, message: XbusMessage, values: Mapping[int, Any], world_id: int
     ) -> list[Decoded]:
-        """Return what the items of an MTData2 give, after what its counter and time show."""
+        """Return the content of an MTData2 after the check of its counter and time."""
         raw = self._raw
         pulses = self._pulses(message, values) if self._wires else []
+
         ticks: int | None = values.get(_TIME)
         if raw is None:
             is_orientation = _QUATERNION in values
-        else:  # a message without either, as of a receiver, gives no orientation
+        else:  # a message of a GNSS receiver has neither
             is_orientation = ticks is not None and raw.is_complete(values)
+
         if not is_orientation:
             self._continuity.other()
             return pulses
+
         self._measuring = True
-        arrived_ns = self._arrived(message)
+        arrived_ns = self._arrival_of(message)
         step = self._continuity.orientation(values.get(_COUNTER), ticks, arrived_ns)
         orientation = _Orientation(message, arrived_ns, values, world_id, pulses)
         return self._continue(step, orientation)
 
-    def _continue(self, step: Step, orientation: _Orientation) -> list[Decoded]:
-        """Return `orientation`, and what becomes of the one that was held for it."""
+    def _continue(self, step: XbusStep, orientation: _Orientation) -> list[Decoded]:
+        """Return `orientation` after the orientation that was held for it, if confirmed."""
         held, self._held = self._held, orientation if step.held else None
         out: list[Decoded] = []
         if held is not None and not step.confirmed:
-            out.append(self._refuse(held.message, "counter and time contradict the others"))
+            out.append(
+                self._refuse(held.message, "counter and time disagree with the other messages")
+            )
+
         if step.held:
             return out
         if step.restarted and held is not None:
             self._forget_orientation()
-            text = f"its clock began anew at {held.values.get(_TIME)} ticks"
+            text = f"device clock restarted at {held.values.get(_TIME)} ticks"
             out.append(DeviceEvent("restart", text))
+
         if step.counter_jumped and held is not None:
-            text = f"its counter jumped to {held.values.get(_COUNTER)} while its time went on"
+            text = f"packet counter jumped to {held.values.get(_COUNTER)}, device time did not"
             out.append(DeviceEvent("counter", text))
+
         out += _gap(step.lost)
         if held is not None and step.confirmed:
-            out += self._measured(held)
+            out += self._sample(held)
             out += _gap(step.lost_since)
-        return out + self._measured(orientation)
+        return out + self._sample(orientation)
 
-    def _measured(self, orientation: _Orientation) -> list[Decoded]:
-        """Return the sample of an orientation that belongs to the stream."""
+    def _sample(self, orientation: _Orientation) -> list[Decoded]:
+        """Return the sample of an accepted orientation."""
         message, arrived_ns, values, world_id, pulses = orientation
         ticks: int | None = values.get(_TIME)
         counter: int | None = values.get(_COUNTER)
+
         if self._raw is not None and ticks is not None:
-            return pulses + self._felt(orientation, ticks, self._raw)
+            return pulses + self._raw_samples(orientation, ticks, self._raw)
         native: Quaternion = values[_QUATERNION]
         status: int | None = values.get(_STATUS_WORD, values.get(_STATUS_BYTE))
         out = pulses
+
         world = world_of(world_id) or "ENU"
         q = self._gate.admit(native if world == "ENU" else canonical(native, world))
         if q is None:
             out.append(self._refuse(message, "quaternion norm is not 1"))
         else:
             out.append(ImuSample(arrived_ns, q, native, ticks, counter, status))
-        if not self._judged:
-            out += self._judge()
+        if not self._norm_checked:
+            out += self._norm_warning()
         return out
 
-    def _felt(self, orientation: _Orientation, ticks: int, raw: XbusRaw) -> list[Decoded]:
-        """Return what raw readings give."""
+    def _raw_samples(
+        self, orientation: _Orientation, ticks: int, raw: RawOrientation
+    ) -> list[Decoded]:
+        """Return the samples of raw measurements."""
         values = orientation.values
-        said = Message(
+        message_fields = RawMessage(
             orientation.arrived_ns, ticks, values.get(_COUNTER), values.get(_STATUS_WORD)
         )
-        found = raw.samples(said, values, self.tick_clock.modulus or setup.WRAP_32_BIT)
+        found = raw.samples(message_fields, values, self.tick_clock.modulus or setup.WRAP_32_BIT)
         if found is None:
-            return [self._refuse(orientation.message, "raw readings that no sensor gives")]
+            return [self._refuse(orientation.message, "raw measurements out of range")]
         return found
 
     def _pulses(self, message: XbusMessage, values: Mapping[int, object]) -> list[Decoded]:
-        """Return the edges that a message tells of."""
+        """Return the sync edges that a message reports."""
         found = [(wire, values.get(item)) for item, wire in self._wires.items()]
         return [
-            SyncPulse(self._arrived(message), edge.time, wire, edge.frame)
+            SyncPulse(self._arrival_of(message), edge.time, wire, edge.frame)
             for wire, edge in found
             if isinstance(edge, Trigger)
         ]
@@ -248,9 +269,9 @@ class XbusDecoder:
         if self._raw is not None:
             self._raw.forget()
 
-    def _judge(self) -> list[Decoded]:
-        """Return one warning where hardly any quaternion has norm 1."""
-        self._judged, norm = self._gate.judged, self._gate.misconfigured_norm
+    def _norm_warning(self) -> list[Decoded]:
+        """Return one warning if hardly any quaternion has norm 1."""
+        self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
         if norm is None:
             return []
         text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
@@ -261,53 +282,57 @@ class XbusDecoder:
         self._refused_bytes += message.size
         return Corrupt(message.size, reason)
 
-    def _told(self, message: XbusMessage) -> list[Decoded]:
-        """Return what a message other than a measurement says."""
+    def _device_events(self, message: XbusMessage) -> list[Decoded]:
+        """Return the events of a message other than a measurement."""
         mid, data = message.mid, message.data
         if mid == MessageId.WAKE_UP:
-            return [] if data else self._woke()  # a damaged measurement has data
+            return [] if data else self._wake_up_events()  # a corrupt measurement has data
+
         if mid in {MessageId.ERROR, MessageId.WARNING}:
             code = data[0] if data else 0
             kind = "error" if mid == MessageId.ERROR else "warning"
             return [DeviceEvent(kind, setup.error_text(code), {"code": code})]
+
         if mid == MessageId.PRODUCT_CODE:
             self._continuity.modulus = setup.fine_time_modulus(setup.decode_text(data))
-        known = _info(mid, data)
+
+        known = _device_property(mid, data)
         text = ", ".join(f"{key} {value}" for key, value in known.items())
         return [DeviceEvent("info", text, known)] if known else []
 
-    def _woke(self) -> list[Decoded]:
+    def _wake_up_events(self) -> list[Decoded]:
         """Return a restart if the device had been measuring: it lost power, or was reset."""
         out = self._drop_held()
         self._continuity.forget()
         self._forget_orientation()
         if self._measuring:
             self._measuring = False
-            out.append(DeviceEvent("restart", "it woke up anew"))
+            out.append(DeviceEvent("restart", "device restarted (WakeUp received)"))
         return out
 
     def _drop_held(self) -> list[Decoded]:
-        """Return the loss of an orientation that nothing confirmed."""
+        """Reject an orientation that no later message confirmed."""
         held, self._held = self._held, None
         if held is None:
             return []
-        return [self._refuse(held.message, "counter and time contradict the others")]
+        return [self._refuse(held.message, "counter and time disagree with the other messages")]
 
 
 def _gap(lost: int) -> list[Decoded]:
     return [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})] if lost else []
 
 
-def _info(mid: int, data: bytes) -> dict[str, object]:
-    """Return what a reply says of the device; empty for other messages and malformed ones."""
+def _device_property(mid: int, data: bytes) -> dict[str, object]:
+    """Return the device property in a reply; empty for other and malformed messages."""
     if mid == MessageId.ALIGNMENT_ROTATION_ACK:
         rotation = setup.decode_alignment(data)
         if rotation is None or rotation.frame >= len(_ALIGNED):
             return {}
         return {f"alignment_{_ALIGNED[rotation.frame]}": list(rotation.q)}
-    if mid not in _TOLD or not data:
+
+    if mid not in _PROPERTIES or not data:
         return {}
-    key, read = _TOLD[mid]
+    key, read = _PROPERTIES[mid]
     value = read(data)
     return {} if value is None else {key: value}
 
@@ -324,10 +349,10 @@ def _outputs(data: bytes) -> dict[str, int] | None:
 
 def _sync(data: bytes) -> list[str] | None:
     entries = setup.decode_sync(data)
-    return None if entries is None else [describe(entry) for entry in entries]
+    return None if entries is None else [describe_entry(entry) for entry in entries]
 
 
-_TOLD: dict[int, tuple[str, Callable[[bytes], object]]] = {
+_PROPERTIES: dict[int, tuple[str, Callable[[bytes], object]]] = {
     MessageId.DEVICE_ID: ("serial", setup.decode_device_id),
     MessageId.PRODUCT_CODE: ("model", setup.decode_text),
     MessageId.FIRMWARE: ("firmware", _firmware),

@@ -1,7 +1,7 @@
-"""Xsens / Movella IMUs that speak Xbus on a serial port or USB.
+"""Driver of Xsens / Movella IMUs that use Xbus on a serial port or USB.
 
-Law: two halves. ``XbusDecoder`` is pure; ``run`` opens the port, brings the device to measure and
-reads until cancelled. Between them nothing but chunks.
+`XbusDecoder` is the pure part. `XbusImu.run` opens the port, brings the device into measurement
+mode and reads until cancelled. Only chunks pass from one to the other.
 """
 
 from __future__ import annotations
@@ -10,20 +10,24 @@ from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_drivers.xbus._decoder import XbusDecoder
-from jointfit_drivers.xbus._handshake import Handshake
-from jointfit_drivers.xbus._raw_orientation import XbusRaw
+from jointfit_drivers.xbus._handshake import XbusHandshake
+from jointfit_drivers.xbus._raw_orientation import RawOrientation
 from jointfit_drivers.xbus._settings import XbusSettings
-from jointfit_drivers.xbus._sync_lines import wires
+from jointfit_drivers.xbus._sync_lines import trigger_wires
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
 
-_PERIODS_OF_SILENCE = 3  # a slow device may be silent for two periods and be well
-_HUNT_EVERY = 10  # attempts: a device that is off need not be looked for at nine speeds each second
+_PERIODS_OF_SILENCE = 3
+"""Sample periods without data, at least, before a device counts as silent: a slow device may be
+silent for two periods.
+"""
+_HUNT_EVERY = 10
+"""Attempts to connect per search at other speeds, which takes longer than an attempt."""
 
 
 class XbusImu:
-    """One Xbus device: orientation, its own 100 us clock, a counter over all it sends."""
+    """One Xbus device: orientation, device time in units of 100 us, message counter."""
 
     Settings: ClassVar[type[XbusSettings]] = XbusSettings
     wire: ClassVar[Wire] = "stream"
@@ -33,34 +37,38 @@ class XbusImu:
         self._attempts = 0
 
     def decoder(self) -> XbusDecoder:
-        """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
+        """Return the decoder from chunks to samples, for live data and replay."""
         settings = self._settings
         baud = settings.baud if settings.transport == "uart" else None
         raw = None
         if settings.orientation == "gateway":
-            raw = XbusRaw(
+            raw = RawOrientation(
                 settings.rate_hz,
                 magnetometer=settings.magnetometer,
                 settle_s=settings.settle_s,
             )
-        return XbusDecoder(baud, settings.rate_hz, wires(settings.sync or ()), raw)
+
+        return XbusDecoder(baud, settings.rate_hz, trigger_wires(settings.sync or ()), raw)
 
     async def run(self, emit: Emit) -> None:
-        """Open the port, bring the device to measure, read until cancelled.
+        """Open the port, bring the device into measurement mode, and read until cancelled.
 
         Raises
         ------
         DeviceLostError
-            Port absent, taken, unplugged or silent for ``silence_s``; worth another try.
+            The port is absent, in use, unplugged, or silent for ``silence_s``; worth another
+            attempt.
         DeviceMisconfiguredError
-            Not a serial port, another speed, no Xbus device, or an output configuration that
-            differs while ``persist`` is false.
+            The file is no serial port, the speed is another, no Xbus device answers, or the output
+            configuration differs while ``persist`` is false.
         """
         settings = self._settings
+
         with SerialPort(settings.port, settings.baud) as port:
             hunt = self._attempts % _HUNT_EVERY == 0
             self._attempts += 1
-            await Handshake(port, emit, settings, hunt=hunt).ensure_measuring()
+            await XbusHandshake(port, emit, settings, hunt=hunt).ensure_measuring()
             self._attempts = 0
+
             silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
             await port.pump(emit, silence_s)

@@ -1,9 +1,10 @@
-"""An Xbus device that only feels: its raw readings, and the orientation the gateway makes of them.
+"""Orientation on the gateway from the raw measurements of an Xbus device.
 
-Law: a function of the messages fed. Rates come as RateOfTurn or DeltaQ, specific force as
-Acceleration or DeltaV, all three vectors in the axes of the housing; increments are divided by the
-mean interval of the device's own clock. One sample leaves for each complete message once the filter
-has settled.
+Angular rate arrives as RateOfTurn or DeltaQ, specific force as Acceleration or DeltaV, all in
+sensor axes. Increments are divided by the mean interval of the device clock. Every complete message
+yields one sample once the filter has settled.
+
+Invariant: a function of the messages fed.
 """
 
 from __future__ import annotations
@@ -31,19 +32,20 @@ RATES = (int(Item.RATE_OF_TURN), int(Item.DELTA_Q))
 FORCES = (int(Item.ACCELERATION), int(Item.DELTA_V))
 FIELD = int(Item.MAGNETIC_FIELD)
 RAW = frozenset((*RATES, *FORCES, FIELD))
-_TELL_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
-"""How often the filter's state is told, and how soon after that where it changed."""
+_REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
+"""Period, ns, of the filter's state events: in general, and after a change."""
 _TINY = 1e-12
+"""Smallest vector part, rad/2, for which the angle is divided by it."""
 FAST = 5.0
-"""Slower rates than this, rad/s, are within the range of every gyroscope."""
+"""Angular rate, rad/s, below which no gyroscope saturates."""
 _NEW_HEADING = (
-    "orientation by gyroscope and accelerometer begins: its heading is another than before; "
+    "orientation from gyroscope and accelerometer started with an arbitrary heading: "
     "repeat the static pose"
 )
 
 
-class Message(NamedTuple):
-    """What a raw MTData2 says beside its readings."""
+class RawMessage(NamedTuple):
+    """Fields of a raw MTData2 besides its measurements."""
 
     arrival_ns: int
     ticks: int
@@ -51,70 +53,74 @@ class Message(NamedTuple):
     status: int | None
 
 
-class XbusRaw:
-    """From raw items to samples.
+class RawOrientation:
+    """Computes samples from raw items.
 
     Parameters
     ----------
-    rate_hz
-        Nominal rate.
-    magnetometer
+    rate_hz : float
+        Nominal rate, Hz.
+    magnetometer : bool
         Whether heading comes from the magnetometer.
-    settle_s
-        For how long at most a filter that has begun gives nothing out, s.
+    settle_s : float
+        Longest time without output after the start of the filter, s.
     """
 
     def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
         self._made = (rate_hz, magnetometer, settle_s)
         self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
-        self._waiting: tuple[Message, Reading] | None = None
+        self._waiting: tuple[RawMessage, Reading] | None = None
         self._ticks: int | None = None
         self._t_ns = 0
-        self._told_ns, self._told = -_TELL_NS, (False, False)
-        self._clipped_ns = -_TELL_NS
+        self._reported_ns, self._reported = -_REPORT_NS, (False, False)
+        self._clipped_ns = -_REPORT_NS
         self._rate: Vector = (0.0, 0.0, 0.0)
-        self._begun = False
+        self._started = False
 
     def forget(self) -> None:
-        """Begin anew: the device restarted, its clock with it."""
+        """Start again: the device and its clock restarted."""
         rate_hz, magnetometer, settle_s = self._made
-        self.__init__(  # type: ignore[misc] # as if new
+        self.__init__(  # type: ignore[misc] # the state of a new filter
             rate_hz, magnetometer=magnetometer, settle_s=settle_s
         )
 
     def is_complete(self, values: Mapping[int, object]) -> bool:
-        """Return whether a message holds a rate and a specific force."""
+        """Return whether a message contains an angular rate and a specific force."""
         return (RATES[0] in values or RATES[1] in values) and (
             FORCES[0] in values or FORCES[1] in values
         )
 
     def samples(
-        self, message: Message, values: Mapping[int, object], modulus: int
+        self, message: RawMessage, values: Mapping[int, object], modulus: int
     ) -> list[Decoded] | None:
-        """Return what a complete message gives, warnings first; None if it is not plausible."""
-        reading = self._reading(message.ticks, values, modulus)
+        """Return warnings and samples of a complete message; None if it is not plausible."""
+        reading = self._convert(message.ticks, values, modulus)
         if message.ticks == self._ticks or not is_plausible(reading):
             return None
+
         self._ticks, self._t_ns = message.ticks, reading.t_ns
         step = self._filter.take(reading)
-        out = self._doubts(message, values, began_anew=step.began_anew, missing=step.missing)
+        out = self._warnings(message, values, began_anew=step.began_anew, missing=step.missing)
+
         first, self._waiting = self._waiting, (message, reading)
         if len(step.oriented) > 1 and first is not None:
             out.append(_sample(*first, step.oriented[0]))
         if step.oriented:
-            out += self._news()
+            out += self._state_events()
             out.append(_sample(message, reading, step.oriented[-1]))
         return out
 
-    def _reading(self, ticks: int, values: Mapping[int, object], modulus: int) -> Reading:
+    def _convert(self, ticks: int, values: Mapping[int, object], modulus: int) -> Reading:
         passed = 0 if self._ticks is None else (ticks - self._ticks) % modulus
         period_s = self._filter.period_ns * 1e-9
+
         rate, force = values.get(RATES[0]), values.get(FORCES[0])
         if rate is None:
             turn = cast("tuple[float, float, float, float]", values[RATES[1]])
             rate = _scaled(_rotation_vector(turn), 1.0 / period_s)
         if force is None:
             force = _scaled(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
+
         field = values.get(FIELD) if self._made[1] else None
         return Reading(
             self._t_ns + passed * TICK_NS,
@@ -123,26 +129,29 @@ class XbusRaw:
             cast("Vector | None", field),
         )
 
-    def _doubts(
-        self, message: Message, values: Mapping[int, object], *, began_anew: bool, missing: int
+    def _warnings(
+        self, message: RawMessage, values: Mapping[int, object], *, began_anew: bool, missing: int
     ) -> list[Decoded]:
-        """Return warnings of what makes an orientation doubtful."""
+        """Return warnings about missing measurements and saturation."""
         out: list[Decoded] = []
         if began_anew:
-            text = f"{missing} readings missing: the orientation began anew, its heading is a guess"
+            text = (
+                f"{missing} measurements missing: orientation filter restarted, heading uncertain"
+            )
             out.append(DeviceEvent("warning", text, {"missing": missing}))
+
         clipped = message.status is not None and bool(message.status & CLIPPING)
         clipped |= self._saturated(values)
-        if clipped and self._t_ns - self._clipped_ns >= _TELL_NS:
+        if clipped and self._t_ns - self._clipped_ns >= _REPORT_NS:
             self._clipped_ns = self._t_ns
-            text = "a reading was out of range: heading is lost until the next static pose"
+            text = "a measurement was out of range: heading is uncertain until the next static pose"
             out.append(DeviceEvent("warning", text, {"status": message.status}))
         return out
 
     def _saturated(self, values: Mapping[int, object]) -> bool:
-        """Tell whether a fast rate repeats itself to the last bit: it is at the end of its range.
+        """Return whether a fast rate repeats bit by bit, at the end of its range.
 
-        Devices need not send their status; and noise sees to it that no two rates are the same.
+        Devices need not send their status word, and noise makes two equal rates improbable.
         """
         before, rate = self._rate, cast("Vector | None", values.get(RATES[0]))
         self._rate = rate or (0.0, 0.0, 0.0)
@@ -150,20 +159,24 @@ class XbusRaw:
             now == then and abs(now) > FAST for now, then in zip(self._rate, before, strict=True)
         )
 
-    def _news(self) -> list[Decoded]:
+    def _state_events(self) -> list[Decoded]:
         """Return the filter's state where it is due."""
         out: list[Decoded] = []
-        if not self._begun:
-            self._begun = True
+        if not self._started:
+            self._started = True
             if not self._made[1]:
                 out.append(DeviceEvent("warning", _NEW_HEADING))
-        since_ns = self._t_ns - self._told_ns
+        since_ns = self._t_ns - self._reported_ns
         if since_ns < _SOON_NS:
             return out
+
         state = self._filter.state
-        if state is None or (since_ns < _TELL_NS and (state.rest, state.disturbed) == self._told):
+        if state is None or (
+            since_ns < _REPORT_NS and (state.rest, state.disturbed) == self._reported
+        ):
             return out
-        self._told_ns, self._told = self._t_ns, (state.rest, state.disturbed)
+        self._reported_ns, self._reported = self._t_ns, (state.rest, state.disturbed)
+
         data: dict[str, object] = {
             "rest": state.rest,
             "bias_rad_s": [round(value, 7) for value in state.bias],
@@ -177,7 +190,7 @@ class XbusRaw:
         return out
 
 
-def _sample(message: Message, reading: Reading, oriented: Oriented) -> ImuSample:
+def _sample(message: RawMessage, reading: Reading, oriented: Oriented) -> ImuSample:
     q = oriented.q_world_sensor
     return ImuSample(
         message.arrival_ns,
@@ -186,14 +199,14 @@ def _sample(message: Message, reading: Reading, oriented: Oriented) -> ImuSample
         message.ticks,
         message.counter,
         message.status,
-        None,  # what is read is the mean since the sample before, and not the rate at its instant
+        None,  # the device sends the mean rate since the previous sample
         reading.force,
         reading.magnetic,
     )
 
 
 def _rotation_vector(q: tuple[float, float, float, float]) -> Vector:
-    """Return log(q), rad: |log(q)| <= pi."""
+    """Return the rotation vector 2 log(q), rad, of norm at most pi."""
     w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     length = sqrt(x * x + y * y + z * z)
     scale = 2.0 * atan2(length, w) / length if length > _TINY else 2.0

@@ -1,7 +1,7 @@
-"""Which outputs an Xbus device must have, by what its orientation is made of.
+"""Outputs that an Xbus device must send, by the source of its orientation.
 
-Law: a table. Any item of a need will do; the first is what is asked for. Increments (DeltaQ,
-DeltaV) serve as well as rates where the device is set to them already.
+Any item of an entry is sufficient; the first one is requested. Increments (DeltaQ, DeltaV) are
+accepted in place of rates if the device is already configured for them.
 """
 
 from __future__ import annotations
@@ -10,28 +10,29 @@ from typing import NamedTuple, Protocol
 
 from jointfit_protocols.xbus.mtdata2 import Item, reals_in
 
-_FRAME_BYTES = 5 + 5 + 7  # frame, packet counter, time
+_FRAME_BYTES = 5 + 5 + 7
+"""Framing, packet counter and time, bytes."""
 _ITEM_HEAD, _FLOAT = 3, 4
 
 
-class Need(NamedTuple):
-    """One kind of output."""
+class RequiredOutput(NamedTuple):
+    """One required output."""
 
     items: tuple[Item, ...]
     one: str
     many: str
 
 
-ORIENTATION = (Need((Item.QUATERNION,), "quaternion", "quaternions"),)
-_FELT = (
-    Need((Item.RATE_OF_TURN, Item.DELTA_Q), "rate of turn", "rates of turn"),
-    Need((Item.ACCELERATION, Item.DELTA_V), "acceleration", "accelerations"),
+ORIENTATION = (RequiredOutput((Item.QUATERNION,), "quaternion", "quaternions"),)
+_INERTIAL = (
+    RequiredOutput((Item.RATE_OF_TURN, Item.DELTA_Q), "rate of turn", "rates of turn"),
+    RequiredOutput((Item.ACCELERATION, Item.DELTA_V), "acceleration", "accelerations"),
 )
-_FIELD = Need((Item.MAGNETIC_FIELD,), "magnetic field", "magnetic fields")
+_FIELD = RequiredOutput((Item.MAGNETIC_FIELD,), "magnetic field", "magnetic fields")
 
 
 class OrientationSettings(Protocol):
-    """The keys of a device's table that decide which outputs it needs."""
+    """The keys of a device's table that determine its required outputs."""
 
     @property
     def orientation(self) -> str:
@@ -39,17 +40,17 @@ class OrientationSettings(Protocol):
 
     @property
     def magnetometer(self) -> bool:
-        """Whether the gateway reads it."""
+        """Whether the gateway uses the magnetometer."""
 
 
-def needs_of(settings: OrientationSettings) -> tuple[Need, ...]:
-    """Return what a device with these settings must send."""
+def required_outputs(settings: OrientationSettings) -> tuple[RequiredOutput, ...]:
+    """Return the outputs that a device with these settings must send."""
     if settings.orientation == "device":
         return ORIENTATION
-    return (*_FELT, _FIELD) if settings.magnetometer else _FELT
+    return (*_INERTIAL, _FIELD) if settings.magnetometer else _INERTIAL
 
 
-def message_bytes(needs: tuple[Need, ...]) -> int:
-    """Return the size of the smallest message that will do, floats of 32 bit."""
+def message_bytes(needs: tuple[RequiredOutput, ...]) -> int:
+    """Return the size of the smallest sufficient message, bytes, with 32-bit floats."""
     reals = [reals_in(need.items[0]) or 0 for need in needs]
     return _FRAME_BYTES + sum(_ITEM_HEAD + _FLOAT * count for count in reals)

@@ -1,4 +1,4 @@
-"""The ``[[imu]]`` table of an Xbus device. Law: what a user may set, and nothing that runs."""
+"""The ``[[imu]]`` table of an Xbus device."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing_extensions import override
 
 from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings
 from jointfit_drivers import gateway_orientation
-from jointfit_drivers.xbus._required_outputs import message_bytes, needs_of
+from jointfit_drivers.xbus._required_outputs import message_bytes, required_outputs
 from jointfit_drivers.xbus._sync_lines import XbusSyncSettings  # noqa: TC001 - pydantic reads it
 
 MAX_RATE_HZ = 400
+"""Highest output rate of orientation of the supported devices, Hz."""
 
 
 class XbusSettings(ImuSettings):
     """One Xsens / Movella IMU on a serial port or USB."""
 
-    port: str = Field(description="serial port, best a link under /dev/serial/by-id")
+    port: str = Field(description="serial port, preferably a link under /dev/serial/by-id")
     baud: int = Field(
         115_200, ge=SLOWEST_BAUD, le=FASTEST_BAUD, description="speed the device runs at, baud"
     )
@@ -34,18 +35,18 @@ class XbusSettings(ImuSettings):
     )
     world: Literal["ENU", "NED", "NWU"] = Field(
         "ENU",
-        description="world asked of the device when `persist` writes; every message says its own, "
-        "so any is understood",
+        description="world that `persist` writes into the device; every message names its own, "
+        "so any is decoded",
     )
     sync: tuple[XbusSyncSettings, ...] | None = Field(
         None,
-        description="what its sync lines do, all of them; written only where they differ and "
-        "`persist` allows it. Left out: they stay as they are",
+        description="functions of all its sync lines; written only where they differ and "
+        "`persist` allows it. Default: unchanged",
     )
     orientation: Literal["device", "gateway"] = Field(
         "device",
-        description="who computes it: the `device`, or the `gateway` from raw rates of turn and "
-        "accelerations (needs the extra `vqf`); one answer for all IMUs of a rig is best",
+        description="computed by the `device`, or by the `gateway` from raw rates of turn and "
+        "accelerations (needs the extra `vqf`); the same choice for all IMUs of a rig is best",
     )
     magnetometer: bool = Field(
         False,
@@ -57,7 +58,7 @@ class XbusSettings(ImuSettings):
         ge=0,
         le=60,
         description='with `orientation = "gateway"`: longest time, s, after the start (or a gap) '
-        "for which nothing is given out while the filter finds the vertical; at rest half of it",
+        "without output while the filter finds the vertical; half of it at rest",
     )
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"
@@ -68,7 +69,7 @@ class XbusSettings(ImuSettings):
     def serial_bits_per_s(self) -> float | None:
         if self.transport == "usb":
             return None
-        return self.rate_hz * 10 * message_bytes(needs_of(self))
+        return self.rate_hz * 10 * message_bytes(required_outputs(self))
 
     @field_validator("port")
     @classmethod
@@ -80,7 +81,7 @@ class XbusSettings(ImuSettings):
     @field_validator("rate_hz")
     @classmethod
     def _rate_the_device_can_run_at(cls, rate_hz: float) -> float:
-        """Refuse what cannot be written as whole Hz."""
+        """Refuse rates that are no whole number of Hz."""
         if rate_hz != int(rate_hz) or rate_hz > MAX_RATE_HZ:
             raise ValueError(f"whole Hz up to {MAX_RATE_HZ}, found {rate_hz:g}")
         return rate_hz
@@ -88,7 +89,7 @@ class XbusSettings(ImuSettings):
     @field_validator("orientation")
     @classmethod
     def _filter_that_is_installed(cls, orientation: str) -> str:
-        """Refuse before anything opens what would fail at the first sample."""
+        """Refuse a missing package before the port is opened."""
         if orientation == "gateway" and not gateway_orientation.is_installed():
             raise ValueError(gateway_orientation.PACKAGE_MISSING)
         return orientation
@@ -96,7 +97,7 @@ class XbusSettings(ImuSettings):
     @field_validator("magnetometer")
     @classmethod
     def _magnetometer_of_a_filter(cls, magnetometer: bool, info: ValidationInfo) -> bool:
-        """Refuse a magnetometer that nobody would read."""
+        """Refuse a magnetometer without a filter on the gateway."""
         if magnetometer and info.data.get("orientation") == "device":
             raise ValueError('needs orientation = "gateway": a device uses its own as it is set')
         return magnetometer

@@ -1,7 +1,6 @@
-"""Sync lines of an Xbus device: what rig.toml asks, as what the device stores.
+"""Sync lines of an Xbus device: the settings of rig.toml as the entries that the device stores.
 
-Law: pure; settings in, entries and words out. Order does not matter to a device, so it does not
-matter here either.
+The order of entries is irrelevant to the device, and therefore to the comparison.
 """
 
 from __future__ import annotations
@@ -26,9 +25,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 _MOST = 0xFFFF
-_UNITS_PER_MS = 10  # pulse width and delay are in 100 us
+"""Largest value of a 16-bit field."""
+_UNITS_PER_MS = 10
+"""Pulse width and delay are sent in units of 100 us."""
 TRIGGERS = {"in1": Item.TRIGGER_IN1, "in2": Item.TRIGGER_IN2}
-"""Item that tells of edges on a line."""
+"""Item that reports edges of a line."""
 
 Function = Literal[
     "trigger_indication",
@@ -41,16 +42,16 @@ Function = Literal[
 
 
 class XbusSyncSettings(Settings):
-    """One line of one device."""
+    """Function of one sync line of one device."""
 
     function: Function = Field(
-        description="`trigger_indication` (edges are told), `clock_bias_estimation` (edges every "
+        description="`trigger_indication` (reports edges), `clock_bias_estimation` (edges every "
         "`period_ms` discipline its clock), `start_sampling`, `send_latest`, `gnss_1pps`; on an "
         "output `interval_transition_measurement` (a pulse a sample)"
     )
-    line: Literal["clock_in", "in1", "in2", "out1"] = Field(description="which of its lines")
-    polarity: Literal["rising", "falling", "both"] = Field("rising", description="which edge")
-    once: bool = Field(False, description="only the first time")
+    line: Literal["clock_in", "in1", "in2", "out1"] = Field(description="line of the device")
+    polarity: Literal["rising", "falling", "both"] = Field("rising", description="edge that counts")
+    once: bool = Field(False, description="only the first edge")
     skip_first: int = Field(0, ge=0, le=_MOST, description="edges ignored at first")
     skip_factor: int = Field(0, ge=0, le=_MOST, description="edges ignored between two that count")
     pulse_width_ms: float = Field(
@@ -63,16 +64,19 @@ class XbusSyncSettings(Settings):
         0, ge=0, le=_MOST, description="of the reference of `clock_bias_estimation`, ms"
     )
     wire: int = Field(
-        0, ge=0, description="which wire of the rig: devices on one wire say the same number"
+        0,
+        ge=0,
+        description="number of the wire in the rig: devices on one wire have the same number",
     )
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        """Refuse what no device can do."""
+        """Refuse combinations that no device supports."""
         out = self.function == "interval_transition_measurement"
         if out != (self.line == "out1"):
             kind = "an output (out1)" if out else "an input (clock_in, in1, in2)"
             raise ValueError(f"{self.function} is a function of {kind}, found {self.line}")
+
         if (self.function == "clock_bias_estimation") != (self.period_ms > 0):
             raise ValueError("period_ms belongs to clock_bias_estimation, which needs it")
         if self.function == "trigger_indication" and self.line not in TRIGGERS:
@@ -80,8 +84,10 @@ class XbusSyncSettings(Settings):
         return self
 
 
-def wanted(settings: Iterable[XbusSyncSettings], product_code: str) -> tuple[SyncSetting, ...]:
-    """Return the entries that `settings` mean to a device of this product code."""
+def sync_entries(
+    settings: Iterable[XbusSyncSettings], product_code: str
+) -> tuple[SyncSetting, ...]:
+    """Return the entries of `settings` for a device of this product code."""
     return tuple(
         SyncSetting(
             SyncFunction[one.function.upper()],
@@ -97,14 +103,14 @@ def wanted(settings: Iterable[XbusSyncSettings], product_code: str) -> tuple[Syn
     )
 
 
-def differences(found: Sequence[SyncSetting], asked: Sequence[SyncSetting]) -> list[str]:
-    """Return in words what the stored entries lack and what they have too much."""
-    lacks = [f"it does not have {describe(one)}" for one in asked if one not in found]
-    return lacks + [f"it has {describe(one)}" for one in found if one not in asked]
+def sync_differences(found: Sequence[SyncSetting], asked: Sequence[SyncSetting]) -> list[str]:
+    """Return the entries that the device lacks, and those that were not requested."""
+    lacks = [f"it does not have {describe_entry(one)}" for one in asked if one not in found]
+    return lacks + [f"it has {describe_entry(one)}" for one in found if one not in asked]
 
 
-def describe(one: SyncSetting) -> str:
-    """Return an entry in words."""
+def describe_entry(one: SyncSetting) -> str:
+    """Return a description of an entry."""
     words = [function_name(one.function), "on", line_name(one.line), polarity_name(one.polarity)]
     more = {
         "once": one.once,
@@ -113,12 +119,13 @@ def describe(one: SyncSetting) -> str:
         "pulse_width_ms": one.pulse_width / _UNITS_PER_MS,
     }
     clocked = one.function == SyncFunction.CLOCK_BIAS_ESTIMATION
+
     more |= {"period_ms": one.delay} if clocked else {"delay_ms": one.delay / _UNITS_PER_MS}
     return " ".join([*words, *(f"{name} {value:g}" for name, value in more.items() if value)])
 
 
-def wires(settings: Iterable[XbusSyncSettings]) -> dict[int, int]:
-    """Return the wire of the rig for every item that tells of edges."""
+def trigger_wires(settings: Iterable[XbusSyncSettings]) -> dict[int, int]:
+    """Return the sync wire of the rig for every item that reports edges."""
     return {
         int(TRIGGERS[one.line]): one.wire
         for one in settings

@@ -153,7 +153,7 @@ class XcdiDecoder:
         if step.restarted:
             self._gate.forget()
             self._unit.restart()
-            out.append(DeviceEvent("restart", f"its clock began anew at {first.ticks} ticks"))
+            out.append(DeviceEvent("restart", f"device clock restarted at {first.ticks} ticks"))
         if first is not group:
             self._sample(first, out)
         if step.lost:
@@ -166,7 +166,7 @@ class XcdiDecoder:
         if held is not None:
             self._gate.admit(_native(held))  # a wrong byte order makes time and counter leap, too
             self._judge_norm(out)
-            self._refuse("counter and time contradict the others", out)
+            self._refuse("counter and time disagree with the other messages", out)
 
     def _sample(self, group: XcdiGroup, out: list[Decoded]) -> None:
         """Append the sample of a group that belongs to the stream."""

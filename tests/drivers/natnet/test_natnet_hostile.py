@@ -19,7 +19,7 @@ from jointfit_drivers.natnet._server_checks import (
     check_group,
     check_server,
 )
-from jointfit_drivers.ports.udp_socket import StampedSocket
+from jointfit_drivers.ports.udp_socket import UdpSocket
 from jointfit_protocols.natnet import (
     Bare,
     BodyDescription,
@@ -187,11 +187,11 @@ def test_corrupt_control_datagrams_reach_the_decoder_and_are_counted_there() -> 
 
 
 @pytest.fixture
-def listening() -> StampedSocket:
-    return StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+def listening() -> UdpSocket:
+    return UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
 
 
-def wait_readable(opened: StampedSocket, seconds: float) -> bool:
+def wait_readable(opened: UdpSocket, seconds: float) -> bool:
     poll = select.poll()
     poll.register(opened.fileno(), select.POLLIN | select.POLLERR)
     return bool(poll.poll(round(1000 * seconds)))
@@ -205,7 +205,7 @@ def _from(address: str, target: int, *data: bytes) -> None:
 
 
 def test_a_flood_from_another_address_does_not_push_out_the_servers_datagrams(
-    listening: StampedSocket,
+    listening: UdpSocket,
 ) -> None:
     try:
         _from("127.0.0.2", listening.port, *[bytes(1400)] * 5_000)
@@ -216,7 +216,7 @@ def test_a_flood_from_another_address_does_not_push_out_the_servers_datagrams(
 
 
 def test_a_refusal_is_reported_once_and_does_not_keep_the_socket_readable(
-    listening: StampedSocket,
+    listening: UdpSocket,
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
         gone.bind(("127.0.0.1", 0))

@@ -17,7 +17,7 @@ from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.model import ClockEcho, MocapFrame
 from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _session
-from jointfit_drivers.ports.udp_socket import StampedSocket, local_address
+from jointfit_drivers.ports.udp_socket import UdpSocket, local_address
 from jointfit_protocols.natnet import MessageId, ServerInfo, encode
 from jointfit_simulators.contract_scene import Listener
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
@@ -256,7 +256,7 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
 
 
 def test_the_kernel_stamps_datagrams_on_loopback() -> None:
-    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+    opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
     try:
         address = opened._socket.getsockname()
         before = time.monotonic_ns()
@@ -266,12 +266,12 @@ def test_the_kernel_stamps_datagrams_on_loopback() -> None:
         (arrival,) = opened.receive()
     finally:
         opened.close()
-    assert (arrival.data, arrival.host, opened._wall.soft) == (b"x", "127.0.0.1", 0)
+    assert (arrival.data, arrival.host, opened._wall.replaced) == (b"x", "127.0.0.1", 0)
     assert before - 200_000 <= arrival.t_ns <= after + 5_000_000
 
 
 def test_a_wake_up_drains_at_most_64_datagrams() -> None:
-    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+    opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
     try:
         for _ in range(70):
             opened.send(b"x", opened._socket.getsockname())

@@ -366,7 +366,5 @@ class Chatter:
 
 async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> None:
     async with serving(Chatter(tmp_path / "adapter")):
-        with pytest.raises(
-            DeviceMisconfiguredError, match="no SLCAN adapter answers at 115200 baud"
-        ):
+        with pytest.raises(DeviceMisconfiguredError, match="no SLCAN adapter found at 115200 baud"):
             await driver_of("S3", bus_at(tmp_path)).run(lambda _: None)

@@ -22,7 +22,7 @@ from typing_extensions import override
 from jointfit_daemon.driver import CanBusSettings
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
 from jointfit_drivers.ports.serial_port import SerialPort
-from jointfit_drivers.ports.udp_socket import StampedSocket
+from jointfit_drivers.ports.udp_socket import UdpSocket
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -148,7 +148,7 @@ class WithoutStamps:
 
 
 def test_datagrams_that_the_kernel_does_not_stamp() -> None:
-    opened = StampedSocket("127.0.0.1", 0, sender="127.0.0.1")
+    opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
     actual = opened._socket
     unstamped = WithoutStamps(actual)
     try:

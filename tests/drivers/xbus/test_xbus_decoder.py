@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusDecoder
-from jointfit_drivers.xbus._continuity import Continuity, Step
+from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
 from jointfit_protocols.xbus import MessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
@@ -194,18 +194,18 @@ def test_waking_up_is_a_restart_once_it_has_measured() -> None:
 
 @given(st.integers(0, 65535), st.integers(0, 2**31), st.lists(st.integers(0, 400), max_size=60))
 def test_whatever_is_lost_is_counted_exactly(counter: int, ticks: int, losses: list[int]) -> None:
-    follow = Continuity(100.0)
-    assert follow.orientation(counter, ticks, 0) == Step()
+    follow = XbusContinuity(100.0)
+    assert follow.orientation(counter, ticks, 0) == XbusStep()
     for lost in losses:
         counter, ticks = (counter + lost + 1) % 65536, ticks + 100 * (lost + 1)
-        assert follow.orientation(counter, ticks, 0) == Step(lost)
+        assert follow.orientation(counter, ticks, 0) == XbusStep(lost)
 
 
 @given(st.integers(0, 10_000), st.integers(13_000, 2**31))
 def test_a_reset_clock_is_a_restart_as_soon_as_a_second_message_says_so(
     after: int, before: int
 ) -> None:
-    follow = Continuity(100.0)
+    follow = XbusContinuity(100.0)
     ticks = (before - 100, before, after, after + 100)
     steps = [follow.orientation(counter, at, 0) for counter, at in enumerate(ticks)]
     assert [step.restarted for step in steps] == [False, False, False, True]
@@ -214,10 +214,10 @@ def test_a_reset_clock_is_a_restart_as_soon_as_a_second_message_says_so(
 
 
 def test_a_device_at_another_rate_than_asked_does_not_restart() -> None:
-    follow = Continuity(100.0)
+    follow = XbusContinuity(100.0)
     for number in range(100):
         assert not follow.orientation(number, 200 * number, 0).restarted
-    assert follow.orientation(1099, 200 * 1099, 0) == Step(999)
+    assert follow.orientation(1099, 200 * 1099, 0) == XbusStep(999)
 
 
 def test_time_that_stands_still_and_goes_on_is_no_bug() -> None:
@@ -281,7 +281,7 @@ def test_a_wake_up_with_data_is_a_damaged_measurement() -> None:
 
 @given(st.lists(st.tuples(st.none() | st.integers(0, 65535), st.none() | st.integers(0, 2**32))))
 def test_any_counters_and_times_are_accepted(steps: list[tuple[int | None, int | None]]) -> None:
-    follow = Continuity(100.0)
+    follow = XbusContinuity(100.0)
     held = False
     for counter, ticks in steps:
         step = follow.orientation(counter, ticks, 0)

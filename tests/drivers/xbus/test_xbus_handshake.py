@@ -13,8 +13,8 @@ from typing_extensions import override
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusImu, XbusSettings
-from jointfit_drivers.xbus._handshake import differences
-from jointfit_drivers.xbus._required_outputs import needs_of
+from jointfit_drivers.xbus._handshake import output_differences
+from jointfit_drivers.xbus._required_outputs import required_outputs
 from jointfit_protocols.xbus import MessageId, XbusCodec, XbusMessage
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
@@ -172,8 +172,8 @@ def test_increments_will_do_where_the_device_sends_them_already() -> None:
     asked = XbusSettings(
         id="S1", segment="thigh", driver="xbus", port="p", orientation="gateway"
     )  # fmt: skip
-    assert differences(found, 100, (), needs_of(asked)) == []
-    assert differences(found, 50, (), needs_of(asked)) == [
+    assert output_differences(found, 100, (), required_outputs(asked)) == []
+    assert output_differences(found, 50, (), required_outputs(asked)) == [
         "it sends rates of turn at 100 Hz, not 50 Hz",
         "it sends accelerations at 100 Hz, not 50 Hz",
     ]
@@ -350,4 +350,4 @@ def test_any_precision_world_and_company_will_do(precision: Precision) -> None:
         setup.Output(real_id(Item.QUATERNION, precision, "NWU"), 100),
         setup.Output(real_id(Item.ACCELERATION), 100),
     )
-    assert differences(outputs, 100) == []
+    assert output_differences(outputs, 100) == []

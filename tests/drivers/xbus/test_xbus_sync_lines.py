@@ -14,7 +14,12 @@ from pydantic import ValidationError
 from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample, SyncPulse
 from jointfit_drivers.xbus import XbusImu, XbusSettings
-from jointfit_drivers.xbus._sync_lines import XbusSyncSettings, describe, differences, wanted
+from jointfit_drivers.xbus._sync_lines import (
+    XbusSyncSettings,
+    describe_entry,
+    sync_differences,
+    sync_entries,
+)
 from jointfit_protocols.xbus import MessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.configuration import SyncSetting
@@ -127,14 +132,14 @@ async def test_an_empty_list_turns_everything_off(tmp_path: Path) -> None:
 
 
 def test_a_request_is_what_the_vendor_would_send() -> None:
-    asked = wanted([XbusSyncSettings(**CLOCKED)], "MTi-630-8A1G6")
+    asked = sync_entries([XbusSyncSettings(**CLOCKED)], "MTi-630-8A1G6")
     wire = encode(MessageId.SYNC_SETTINGS, setup.encode_sync(asked))
     assert wire.hex() == "faff2c0c0902010000000000000003e8d2"
 
 
 @pytest.mark.parametrize(("product", "line"), [("MTi-30-2A5G4", 4), ("MTi-630-8A1G6", 7)])
 def test_the_output_line_has_the_number_of_its_series(product: str, line: int) -> None:
-    (entry,) = wanted([XbusSyncSettings(**OUT)], product)
+    (entry,) = sync_entries([XbusSyncSettings(**OUT)], product)
     assert entry.line == line
 
 
@@ -165,10 +170,10 @@ entries = st.builds(
 def test_order_matters_to_no_device(stored: list[SyncSetting], dice: Any) -> None:
     shuffled = list(stored)
     dice.shuffle(shuffled)
-    assert differences(stored, shuffled) == []
+    assert sync_differences(stored, shuffled) == []
     for one in stored:
-        assert differences([e for e in stored if e != one], stored) == [
-            f"it does not have {describe(one)}"
+        assert sync_differences([e for e in stored if e != one], stored) == [
+            f"it does not have {describe_entry(one)}"
         ]
 
 

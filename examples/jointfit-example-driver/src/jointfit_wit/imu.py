@@ -31,7 +31,7 @@ _COMMAND_PAUSE_S = 0.1  # the vendor asks for it
 class WitSettings(ImuSettings):
     """One ``[[imu]]`` table of rig.toml."""
 
-    port: str = Field(description="serial port, best a link under /dev/serial/by-id")
+    port: str = Field(description="serial port, preferably a link under /dev/serial/by-id")
     baud: int = Field(115_200, gt=0, description="speed the device runs at, baud")
     world: Literal["ENU", "NED", "NWU"] = Field("ENU", description="world of its quaternion")
     world_to_sensor: bool = Field(False, description="its quaternion is the inverse")
