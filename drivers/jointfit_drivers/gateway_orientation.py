@@ -1,23 +1,22 @@
-r"""Orientation on the gateway, from the raw readings of one IMU, by the VQF filter.
+r"""Orientation on the gateway, from the raw measurements of one IMU, by the VQF filter.
 
-Law: pure and deterministic: a function of the readings fed, with no clock of its own, so that a
-replay gives the same orientations bit by bit. This module alone imports ``vqf`` (an extra), and no
-driver is named here: any driver whose device sends raw readings may use it.
-
-A wrong sample time is as wrong a rotation: 1 % of one is 1 % of the other. So the time between
-readings is the device's own (`Reading.t_ns`). The filter works with steps of the first interval
-seen; where the mean interval turns out to be another (ticks too coarse for one interval), angular
-rates are scaled so that every step turns by what really passed:
+A relative error of the sample time causes the same relative error of every rotation. The time
+between measurements is therefore the device's own (`RawReading.t_ns`). The filter works with
+steps of the first interval. If the mean interval differs from it (ticks too coarse for one
+interval), angular rates are scaled so that every step turns by the true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
-Up to three missing readings are interpolated. After a longer gap the filter begins anew: it keeps
-the gyroscope's bias and, without a magnetometer, goes on at the heading it had, which is a guess.
+Up to three missing measurements are interpolated. After a longer gap the filter restarts: it keeps
+the gyroscope bias and, without a magnetometer, continues with the last heading, which is uncertain.
 
-A filter that has just begun takes one reading of the accelerometer for the vertical: in fast motion
-20 degrees are wrong with that in the first second, 4 in the next two, then no more than ever
-(``bench/fusion.py E-2``). So nothing is given out before it has settled: found rest, or worked for
-`SETTLE_S`.
+A filter that has just started takes its vertical from one accelerometer measurement. In fast
+motion the error is 20 degrees in the first second and 4 degrees in the next two, and normal
+afterwards (``bench/fusion.py E-2``). No orientation is therefore returned until the filter has
+detected rest or has run for `SETTLE_S`.
+
+Invariant: a function of the readings fed, without a clock of its own: a replay yields identical
+orientations. Only this module imports ``vqf`` (an extra), and it contains no device.
 
 Source: Laidig and Seel 2023, Information Fusion 91, 187-204, and their package ``vqf``.
 """
@@ -39,70 +38,71 @@ PACKAGE_MISSING = (
     'orientation = "device"'
 )
 MOST_MISSING = 3
-"""Readings in a row that are interpolated; more begin the filter anew."""
+"""Consecutive missing readings that are interpolated; more restart the filter."""
 SETTLE_S = 3.0
-"""Time constant of the filter's accelerometer: its vertical is a mean over as long."""
+"""Time constant of the filter's accelerometer, s: its vertical is a mean over this time."""
 FASTEST = 200.0
-"""No gyroscope reads more, rad/s: 11 000 degrees a second."""
+"""Largest plausible angular rate, rad/s: 11 000 degrees per second."""
 HARDEST = 5000.0
-"""No accelerometer reads more, m/s^2: 500 g."""
+"""Largest plausible specific force, m/s^2: 500 g."""
 _NS = 1e9
 
 
-class Reading(NamedTuple):
-    """What one IMU felt at one instant, in its own axes."""
+class RawReading(NamedTuple):
+    """Measurements of one IMU at one instant, in sensor axes."""
 
     t_ns: int
-    """Device time, never wrapping, ns."""
+    """Device time without wrap, ns."""
     rate: Vector
-    """Angular rate, rad/s; bias included."""
+    """Angular rate, rad/s, bias included."""
     force: Vector
-    """Specific force, m/s^2: +9.81 upwards at rest."""
+    """Specific force, m/s^2; +9.81 upwards at rest."""
     magnetic: Vector | None = None
     """Magnetic field, any unit."""
 
 
-class Oriented(NamedTuple):
-    """What the filter makes of a reading."""
+class FilterOutput(NamedTuple):
+    """Output of the filter for one reading."""
 
     q_world_sensor: Quaternion
-    """ENU; y is magnetic north with a magnetometer, else anywhere."""
+    """World ENU; y is magnetic north with a magnetometer, otherwise arbitrary."""
     rate: Vector
-    """Angular rate without its bias, sensor axes, rad/s."""
+    """Angular rate without bias, sensor axes, rad/s."""
 
 
 class FilterStep(NamedTuple):
-    """What one reading gave."""
+    """Result of one reading."""
 
-    oriented: tuple[Oriented, ...]
-    """None while the filter settles; then one a reading. Where it need not settle, none for the
-    very first reading, which waits for the second; then two; then one each."""
+    oriented: tuple[FilterOutput, ...]
+    """Empty while the filter settles, then one per reading. Without a settling time, the first
+    reading waits for the second, which returns both.
+    """
     missing: int = 0
-    """Readings that did not come in between."""
-    began_anew: bool = False
-    """The gap was too long: heading is a guess, inclination comes from the accelerometer."""
+    """Readings missing before this one."""
+    restarted: bool = False
+    """The gap was too long: heading is uncertain, inclination comes from the accelerometer."""
 
 
 class FilterState(NamedTuple):
-    """How the filter is doing."""
+    """State of the filter."""
 
     rest: bool
-    """The sensor is at rest: its bias is being measured."""
+    """The sensor is at rest, and its bias is being estimated."""
     bias: Vector
-    """Of the gyroscope, rad/s."""
+    """Gyroscope bias, rad/s."""
     bias_sd: float
-    """Upper bound of its standard deviation, rad/s."""
+    """Upper bound of the bias standard deviation, rad/s."""
     disturbed: bool
-    """The magnetic field is not the earth's: heading comes from the gyroscope alone."""
+    """Magnetic disturbance: heading comes from the gyroscope alone."""
 
 
 def is_installed() -> bool:
-    """Return whether the filter's package is there; nothing is imported."""
+    """Return whether the filter's package is installed, without importing it."""
     return find_spec("vqf") is not None
 
 
-def is_plausible(reading: Reading) -> bool:
-    """Return whether a filter may see a reading: one NaN would never leave it again."""
+def is_plausible(reading: RawReading) -> bool:
+    """Return whether a reading is finite and in range; one NaN would stay in the filter."""
     if not all(-FASTEST < value < FASTEST for value in reading.rate):
         return False
     if not all(-HARDEST < value < HARDEST for value in reading.force):
@@ -115,21 +115,21 @@ class GatewayOrientation:
 
     Parameters
     ----------
-    rate_hz
-        Nominal rate: only how many readings are missing before the second depends on it.
-    magnetometer
-        Whether heading comes from the magnetometer (9D) or drifts freely (6D).
-    settle_s
-        For how long at most nothing is given out after the filter has begun, s.
+    rate_hz : float
+        Nominal rate, Hz, used before the second reading only.
+    magnetometer : bool
+        Whether heading comes from the magnetometer (9D) or drifts (6D).
+    settle_s : float
+        Longest time without output after a start of the filter, s.
     """
 
     def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
         self._nominal_ns = 1e9 / rate_hz
         self._settle_ns = round(settle_s * _NS)
-        self._began_ns: int | None = None  # None: it has settled
+        self._started_ns: int | None = None  # None: it has settled
         self._magnetic = magnetometer
         self._filter: Any = None
-        self._last: Reading | None = None
+        self._last: RawReading | None = None
         self._period_ns = 0.0  # what the filter was built for
         self._passed_ns = self._steps = 0
         self._turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -138,17 +138,17 @@ class GatewayOrientation:
 
     @property
     def period_ns(self) -> float:
-        """Mean interval of the readings so far, ns; the nominal one before the second."""
+        """Mean interval of the readings so far, ns; the nominal one before the second reading."""
         return self._passed_ns / self._steps if self._steps else self._nominal_ns
 
     @property
     def settling(self) -> bool:
-        """Whether the filter has begun and is not to be believed yet."""
-        return self._began_ns is not None
+        """Whether the filter has started and has not settled yet."""
+        return self._started_ns is not None
 
     @property
     def state(self) -> FilterState | None:
-        """How the filter is doing; None before it began."""
+        """State of the filter; None before its start."""
         if self._filter is None:
             return None
         bias, sd = self._filter.getBiasEstimate()
@@ -156,92 +156,103 @@ class GatewayOrientation:
         rest, disturbed = self._filter.getRestDetected(), self._filter.getMagDistDetected()
         return FilterState(bool(rest), (x, y, z), float(sd), self._magnetic and bool(disturbed))
 
-    def take(self, reading: Reading) -> FilterStep:
-        """Take the next plausible reading, in order of time."""
+    def take(self, reading: RawReading) -> FilterStep:
+        """Update the filter with the next plausible reading, in order of time."""
         last, self._last = self._last, reading
         if last is None:
             return FilterStep(())
+
         passed_ns = reading.t_ns - last.t_ns
         steps = max(1, round(passed_ns / self.period_ns))
+
         followed = steps <= 1 + MOST_MISSING
+
         if followed:
             self._passed_ns += passed_ns
             self._steps += steps
-        first: tuple[Oriented, ...] = ()
+
+        first: tuple[FilterOutput, ...] = ()
         if self._filter is None:
-            self._begin(self.period_ns, last.t_ns)
+            self._start(self.period_ns, last.t_ns)
             first = (self._update(last),)
+
         if not followed:
-            self._begin_anew(reading.t_ns)
+            self._restart(reading.t_ns)
             return self._step((self._update(reading, follows=False),), reading, steps - 1, True)
+
         for k in range(1, steps):
-            self._update(_between(last, reading, k / steps))
+            self._update(_interpolate(last, reading, k / steps))
         return self._step((*first, self._update(reading)), reading, steps - 1)
 
     def _step(
         self,
-        oriented: tuple[Oriented, ...],
-        reading: Reading,
+        oriented: tuple[FilterOutput, ...],
+        reading: RawReading,
         missing: int,
-        began_anew: bool = False,
+        restarted: bool = False,
     ) -> FilterStep:
-        """Return what is given out: nothing before the filter has settled."""
-        if self._began_ns is None:
-            return FilterStep(oriented, missing, began_anew)
-        waited_ns = reading.t_ns - self._began_ns
-        if waited_ns < self._settle_ns and not self._filter.getRestDetected():
-            return FilterStep((), missing, began_anew)
-        self._began_ns = None
-        return FilterStep(oriented[-1:], missing, began_anew)
+        """Return the output: none before the filter has settled."""
+        if self._started_ns is None:
+            return FilterStep(oriented, missing, restarted)
 
-    def _begin(self, period_ns: float, t_ns: int) -> None:
+        waited_ns = reading.t_ns - self._started_ns
+        if waited_ns < self._settle_ns and not self._filter.getRestDetected():
+            return FilterStep((), missing, restarted)
+        self._started_ns = None
+        return FilterStep(oriented[-1:], missing, restarted)
+
+    def _start(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns
-        self._began_ns = t_ns if self._settle_ns else None
+        self._started_ns = t_ns if self._settle_ns else None
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
 
-    def _begin_anew(self, t_ns: int) -> None:
-        """Forget the inclination; keep the bias, which is the sensor's own."""
+    def _restart(self, t_ns: int) -> None:
+        """Restart with a new inclination and the same gyroscope bias."""
         bias, sd = self._filter.getBiasEstimate()
-        self._begin(self._period_ns, t_ns)
+        self._start(self._period_ns, t_ns)
         self._filter.setBiasEstimate(bias, sd)
 
-    def _update(self, reading: Reading, *, follows: bool = True) -> Oriented:
-        """Feed one reading; where it does not follow the last one, go on at the same heading."""
+    def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
+        """Update with one reading; after a gap, continue with the same heading."""
+        # w_fed = w T_mean / T_s: every step turns by the true angle
         scale = self.period_ns / self._period_ns
         x, y, z = reading.rate
         self._rate[:] = (x * scale, y * scale, z * scale)
         self._force[:] = reading.force
+
         vqf = self._filter
         if self._magnetic and reading.magnetic is not None:
             self._field[:] = reading.magnetic
             vqf.update(self._rate, self._force, self._field)
         else:
             vqf.update(self._rate, self._force)
+
         w, i, j, k = (vqf.getQuat9D() if self._magnetic else vqf.getQuat6D()).tolist()
         if not follows and not self._magnetic:
             self._turn = _heading_between((w, i, j, k), self._q)
         c, s = self._turn[0], self._turn[3]
         self._q = (w, i, j, k) if s == 0.0 else _turned(c, s, (w, i, j, k))
+
         bx, by, bz = vqf.getBiasEstimate()[0].tolist()
-        return Oriented(self._q, (x - bx, y - by, z - bz))
+        return FilterOutput(self._q, (x - bx, y - by, z - bz))
 
 
 def _turned(c: float, s: float, q: Quaternion) -> Quaternion:
-    """Return (c, 0, 0, s) times q: a turn about the vertical."""
+    """Return (c, 0, 0, s) ⊗ q: a rotation about the vertical."""
     w, x, y, z = q
     return (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
 
 
 def _heading_between(q_from: Quaternion, q_to: Quaternion) -> Quaternion:
-    """Return the turn about the vertical that brings `q_from` nearest to `q_to`."""
+    """Return the rotation about the vertical that brings `q_from` nearest to `q_to`."""
     w, x, y, z = q_from
     a, b, c, d = q_to
     half = atan2(d * w - a * z - b * y + c * x, a * w + b * x + c * y + d * z)
     return (cos(half), 0.0, 0.0, sin(half))
 
 
-def _between(before: Reading, after: Reading, share: float) -> Reading:
-    """Return the reading at `share` of the way, by straight lines."""
+def _interpolate(before: RawReading, after: RawReading, share: float) -> RawReading:
+    """Return the linear interpolation at `share` of the interval."""
 
     def mix(a: Vector, b: Vector) -> Vector:
         return (
@@ -254,4 +265,4 @@ def _between(before: Reading, after: Reading, share: float) -> Reading:
     if before.magnetic is not None and after.magnetic is not None:
         field = mix(before.magnetic, after.magnetic)
     t_ns = before.t_ns + round(share * (after.t_ns - before.t_ns))
-    return Reading(t_ns, mix(before.rate, after.rate), mix(before.force, after.force), field)
+    return RawReading(t_ns, mix(before.rate, after.rate), mix(before.force, after.force), field)

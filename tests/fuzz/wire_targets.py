@@ -15,7 +15,7 @@ from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
 from jointfit_daemon.pipeline.sources import SourceState
-from jointfit_drivers.natnet._open_requests import OpenQuestions
+from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 VERSIONS = ((3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
 ANSWERS = (0x01, 0x0D, 0x13, 0x1D, 0x2D, 0x3E, 0x42, 0x43, 0xC1, 0xED)
-"""Xbus messages that a device sends unasked or as answers."""
+"""Xbus messages that a device sends unsolicited or as answers."""
 _MS = 1_000_000
 
 
@@ -256,8 +256,8 @@ def run_natnet_core(data: bytes) -> None:
 
 
 def _datagrams(data: bytes) -> list[bytes]:
-    questions = OpenQuestions()
-    questions.ask(Bare(MessageId.REQUEST_MODELDEF), BEGIN_NS)
+    questions = OpenRequests()
+    questions.register(Bare(MessageId.REQUEST_MODELDEF), BEGIN_NS)
     datagrams, at = [], 0
     while at + 3 <= len(data):
         kind, size = struct.unpack_from("<BH", data, at)

@@ -1,18 +1,17 @@
-"""Which id in the frames is which name in rig.toml.
+"""Binding of the ids in frames to the names in rig.toml.
 
-Invariant: pure; names count, ids and orders do not. The time grows linearly with the model, and
-the number of columns is bounded, because a model of one datagram can name 65 000 markers.
-
-A labeled marker has id ``model << 16 | member``. The model is a rigid body, a skeleton or an asset;
-the name of its member is, in this order: the marker name in the description (bitstream 4.0 on), the
+A labeled marker has id ``model << 16 | member``. The model is a rigid body, a skeleton or an asset.
+The name of its member is, in this order: the marker name in the description (bitstream 4.0 on), the
 name at that place in the marker set of the model's name, or ``Marker1``, ``Marker2`` and so on.
-Markers of a set that belongs to no model are found by set and place; the set ``all`` repeats
-others.
+Markers of a set without a model are identified by set and place; the set ``all`` repeats others.
 
-A marker may be written plainly (``T1``) where only one model has that name, and always with its
-model: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or as the server's list of all markers does,
-``Thigh_1``. The same holds for bones and bodies of assets. A column is called as rig.toml spells
-it, else plainly where that is unique, else ``Thigh/T1``.
+The plain marker name (``T1``) is sufficient where only one model has that name. A name with its
+model is always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or, as in the server's list
+of all markers, ``Thigh_1``. The same holds for bones and for bodies of assets. A column has the
+name in rig.toml, otherwise the plain name if it is unique, otherwise ``Thigh/T1``.
+
+Invariant: pure; only names matter, not ids and orders. The time grows linearly with the model, and
+the number of columns is bounded, because a model of one datagram can contain 65 000 markers.
 """
 
 from __future__ import annotations
@@ -43,31 +42,32 @@ Key = int | tuple[str, int]
 _MODELS = BodyDescription | SkeletonDescription | AssetDescription
 _EVERY = "all"
 _MOST_COLUMNS = 2000
-"""Columns beside those that rig.toml names; further ones are dropped, for each costs every frame
-its time, and no camera system labels as many."""
+"""Columns besides those named in rig.toml. Further ones are dropped, because each costs time in
+every frame, and no camera system labels as many.
+"""
 _MOST_NAMED = 50
-"""Names of the server that a complaint lists."""
+"""Names of the server that a warning lists."""
 _MOST_COMPARED = 500
-"""Names of the server that a misspelt one is compared with."""
+"""Names of the server that are compared with a misspelt one."""
 _MOST_SUGGESTED = 3
-"""Misspelt names that are compared."""
+"""Misspelt names for which a similar one is suggested."""
 _MEMBER_BITS = 16
 _MEMBER = (1 << _MEMBER_BITS) - 1
 
 
-class Entry(NamedTuple):
-    """One marker or body that the server knows."""
+class ModelEntry(NamedTuple):
+    """One marker or body of the server's model."""
 
     key: Key
     owner: str
-    """Model or set it belongs to; empty for a rigid body."""
+    """Its model or set; empty for a rigid body."""
     name: str
     member: int
     """Number in its owner, from 1."""
 
     @property
     def aliases(self) -> tuple[str, ...]:
-        """Other spellings than the plain name."""
+        """Spellings besides the plain name."""
         if not self.owner:
             return ()
         joined = tuple(f"{self.owner}{mark}{self.name}" for mark in "/:_")
@@ -76,7 +76,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """Columns of the frames to come, until the model changes again."""
+    """Columns of the frames, until the model changes."""
 
     layout: MocapLayout
     markers: tuple[Key, ...]
@@ -84,16 +84,18 @@ class Binding:
     bodies: tuple[Key, ...]
     """Key of each body column."""
     known: frozenset[Key]
-    """Every id the model explains, refused ones included."""
+    """Every id in the model, refused ones included."""
     loose_sets: frozenset[str]
-    """Marker sets whose positions must be taken from the sets themselves."""
-    complaints: tuple[str, ...]
-    """What a person must know: names of rig.toml that are unknown, ids given twice."""
+    """Marker sets whose positions are read from the sets themselves."""
+    warnings: tuple[str, ...]
+    """Warnings: unknown names of rig.toml, and ids that occur twice."""
     unknown: tuple[str, ...]
     """Names of rig.toml without a column."""
 
 
-def bind(model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str, str]) -> Binding:
+def bind_model(
+    model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str, str]
+) -> Binding:
     """Return the columns for a model.
 
     Parameters
@@ -101,55 +103,59 @@ def bind(model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str
     model : ModelDefinition
         The server's latest description.
     markers, bodies : mapping of str to str
-        Names that rig.toml uses, and the key that does.
+        Names in rig.toml, and the key of each.
     """
     shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, BodyDescription)
     all_bodies, all_markers = _body_entries(model), _marker_entries(model)
     bodies_found = [e for e in all_bodies if e.owner or e.key not in shared_bodies]
     markers_found = [e for e in all_markers if _model_of(e.key) not in shared]
+
     marker_columns = _columns("marker", markers_found, markers)
     body_columns = _columns("rigid body", bodies_found, bodies)
+
     loose = frozenset(entry.key[0] for entry in markers_found if isinstance(entry.key, tuple))
     known = frozenset(entry.key for entry in (*all_bodies, *all_markers))
     for names in list(shared.values())[:_MOST_NAMED]:
         text = f"streaming id shared by {' and '.join(names[:_MOST_NAMED])}: refused"
-        marker_columns.complaints.append(f"{text}; give each its own")
+        marker_columns.warnings.append(f"{text}; give each its own")
+
     return Binding(
         MocapLayout(tuple(marker_columns.names), tuple(body_columns.names)),
         tuple(marker_columns.keys),
         tuple(body_columns.keys),
         known,
         loose,
-        (*marker_columns.complaints, *body_columns.complaints),
+        (*marker_columns.warnings, *body_columns.warnings),
         (*marker_columns.unknown, *body_columns.unknown),
     )
 
 
 def body_key(owner: int, member: int) -> int:
-    """Return the id of a bone or of an asset's body or marker as frames carry it."""
+    """Return the id in frames of a bone, or of a body or marker of an asset."""
     return owner << _MEMBER_BITS | (member & _MEMBER)
 
 
-# --- what the model holds ---------------------------------------------------------------------
+# --- entries of the model ---------------------------------------------------------------------
 
 
-def _body_entries(model: ModelDefinition) -> list[Entry]:
-    found: list[Entry] = []
+def _body_entries(model: ModelDefinition) -> list[ModelEntry]:
+    found: list[ModelEntry] = []
     for item in model.descriptions:
         if isinstance(item, BodyDescription):
-            found.append(Entry(item.id, "", item.name, 1))
+            found.append(ModelEntry(item.id, "", item.name, 1))
         elif isinstance(item, SkeletonDescription | AssetDescription):
             inner = item.bones if isinstance(item, SkeletonDescription) else item.bodies
             found += [
-                Entry(body_key(item.id, body.id), item.name, body.name, number)
+                ModelEntry(body_key(item.id, body.id), item.name, body.name, number)
                 for number, body in enumerate(inner, 1)
             ]
     return found
 
 
-def _marker_entries(model: ModelDefinition) -> list[Entry]:
+def _marker_entries(model: ModelDefinition) -> list[ModelEntry]:
     sets = {m.name: m.markers for m in model.descriptions if isinstance(m, MarkerSetDescription)}
-    found: list[Entry] = []
+    found: list[ModelEntry] = []
+
     owners = {_EVERY}
     for item in model.descriptions:
         if isinstance(item, BodyDescription):
@@ -162,11 +168,12 @@ def _marker_entries(model: ModelDefinition) -> list[Entry]:
         elif isinstance(item, AssetDescription):
             owners.add(item.name)
             found += [
-                Entry(body_key(item.id, m.id), item.name, m.name, number)
+                ModelEntry(body_key(item.id, m.id), item.name, m.name, number)
                 for number, m in enumerate(item.markers, 1)
             ]
+
     for name in sets.keys() - owners:
-        found += [Entry((name, i), name, text, i + 1) for i, text in enumerate(sets[name])]
+        found += [ModelEntry((name, i), name, text, i + 1) for i, text in enumerate(sets[name])]
     return found
 
 
@@ -179,12 +186,12 @@ def _member_names(body: BodyDescription, of_set: tuple[str, ...]) -> list[str]:
     ]
 
 
-def _members(model: int, owner: str, names: Iterable[str]) -> list[Entry]:
-    return [Entry(body_key(model, i), owner, name, i) for i, name in enumerate(names, 1)]
+def _members(model: int, owner: str, names: Iterable[str]) -> list[ModelEntry]:
+    return [ModelEntry(body_key(model, i), owner, name, i) for i, name in enumerate(names, 1)]
 
 
 def _shared_ids(model: ModelDefinition, kinds: type | UnionType) -> dict[Key | None, list[str]]:
-    """Return the ids that several models of these kinds have, and whose they are."""
+    """Return the ids that several models of these kinds have, and the names of the models."""
     names: defaultdict[Key | None, list[str]] = defaultdict(list)
     for item in model.descriptions:
         if isinstance(item, kinds) and isinstance(item, _MODELS):
@@ -196,24 +203,25 @@ def _model_of(key: Key) -> int | None:
     return key >> _MEMBER_BITS if isinstance(key, int) else None
 
 
-# --- what rig.toml calls them -----------------------------------------------------------------
+# --- names of the columns ---------------------------------------------------------------------
 
 
 class _Columns(NamedTuple):
     names: list[str]
     keys: list[Key]
-    complaints: list[str]
+    warnings: list[str]
     unknown: list[str]
 
 
-def _columns(what: str, entries: Sequence[Entry], wanted: Mapping[str, str]) -> _Columns:
+def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]) -> _Columns:
     found = _Columns([], [], [], [])
-    plain: defaultdict[str, list[Entry]] = defaultdict(list)
-    alias: defaultdict[str, list[Entry]] = defaultdict(list)
+    plain: defaultdict[str, list[ModelEntry]] = defaultdict(list)
+    alias: defaultdict[str, list[ModelEntry]] = defaultdict(list)
     for entry in entries:
         plain[entry.name].append(entry)
         for spelling in entry.aliases:
             alias[spelling].append(entry)
+
     taken: set[Key] = set()
     problems: list[str] = []
     for name, key in wanted.items():
@@ -231,11 +239,11 @@ def _columns(what: str, entries: Sequence[Entry], wanted: Mapping[str, str]) -> 
     most = _MOST_COLUMNS + len(used)
     for entry in entries:
         if len(used) >= most:
-            text = f"the server names {len(entries)} columns ({what}); {len(used)} are used"
-            found.complaints.append(text)
+            text = f"the server has {len(entries)} columns ({what}); {len(used)} are used"
+            found.warnings.append(text)
             break
         free = None if entry.key in taken else _unused_name(entry, plain, used)
-        if free is not None:  # else its id is given twice, which columns() refuses in frames
+        if free is not None:  # otherwise its id occurs twice, and frames with it are refused
             found.names.append(free)
             found.keys.append(entry.key)
             used.add(free)
@@ -244,11 +252,11 @@ def _columns(what: str, entries: Sequence[Entry], wanted: Mapping[str, str]) -> 
     if problems:
         server = ", ".join(sorted(plain)[:_MOST_NAMED]) or "none"
         more = f" and {len(plain) - _MOST_NAMED} more" if len(plain) > _MOST_NAMED else ""
-        found.complaints.append(f"{'; '.join(problems)}. The server has: {server}{more}")
+        found.warnings.append(f"{'; '.join(problems)}. The server has: {server}{more}")
     return found
 
 
-def _problem(name: str, fitting: list[Entry], plain: Mapping[str, list[Entry]]) -> str:
+def _problem(name: str, fitting: list[ModelEntry], plain: Mapping[str, list[ModelEntry]]) -> str:
     if fitting:
         choices = [repr(e.aliases[0]) if e.owner else repr(e.name) for e in fitting[:_MOST_NAMED]]
         return f"is ambiguous: write {' or '.join(choices)}"
@@ -256,8 +264,10 @@ def _problem(name: str, fitting: list[Entry], plain: Mapping[str, list[Entry]]) 
     return "; ".join(filter(None, ("is not in the stream", hint)))
 
 
-def _unused_name(entry: Entry, plain: Mapping[str, list[Entry]], used: set[str]) -> str | None:
-    """Return the plain name where it is unique, else one with the owner in it; None: all used."""
+def _unused_name(
+    entry: ModelEntry, plain: Mapping[str, list[ModelEntry]], used: set[str]
+) -> str | None:
+    """Return the plain name if it is unique, otherwise one with its owner; None if all are used."""
     full = f"{entry.owner}/{entry.name}" if entry.owner else entry.name
     choices = [entry.name] if len(plain[entry.name]) == 1 else []
     choices += [full, f"{full}#{entry.member}", f"{full}#{entry.key}"]

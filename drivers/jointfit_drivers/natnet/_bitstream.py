@@ -1,8 +1,10 @@
 """Bitstream version of one NatNet server, changed only by a datagram that proves the new one.
 
-Invariant: pure. An announced version is a candidate. It is adopted when a frame or a model cannot
-be decoded with the version in use and decodes exactly with the candidate. A forged announcement
-alone therefore changes nothing.
+An announced version is a candidate. It is adopted when a frame or a model cannot be decoded
+with the version in use and decodes exactly with the candidate. A forged announcement alone
+therefore changes nothing.
+
+Invariant: pure.
 """
 
 from __future__ import annotations
@@ -18,13 +20,13 @@ if TYPE_CHECKING:
 UNKNOWN: Version = (0, 0)
 
 
-class Bitstream:
-    """Decodes datagrams with the version in use and tracks changes of it.
+class BitstreamTracker:
+    """Decodes datagrams with the version in use and tracks its changes.
 
     Parameters
     ----------
     wanted : tuple of int, optional
-        Version that rig.toml asks the server for; always a candidate.
+        Version that rig.toml requests from the server; always a candidate.
     """
 
     def __init__(self, wanted: Version | None = None) -> None:
@@ -35,17 +37,17 @@ class Bitstream:
 
     @property
     def known(self) -> bool:
-        """Whether the server has named its version."""
+        """Whether the server has announced its version."""
         return self.version != UNKNOWN
 
     def announce(self, version: Version) -> None:
-        """Take the version of a SERVERINFO: the first one is used, later ones are candidates."""
+        """Process the version of a SERVERINFO: the first one is used, later ones are candidates."""
         self._announced = version
         if not self.known or not supported(self.version):
             self.version = version
 
     def confirm(self, version: Version) -> None:
-        """Take the version of a RESPONSE as a candidate."""
+        """Add the version of a RESPONSE as a candidate."""
         self._confirmed = version
 
     def restart(self, version: Version) -> None:
@@ -54,7 +56,7 @@ class Bitstream:
         self._confirmed = None
 
     def decode(self, datagram: bytes) -> Message | Corrupt:
-        """Return the message in `datagram`; adopt a candidate that alone can decode it."""
+        """Return the message in `datagram`; adopt a candidate that alone decodes it."""
         message = decode(datagram, self.version)
         if not isinstance(message, Corrupt) or not self.known or not is_versioned(datagram):
             return message

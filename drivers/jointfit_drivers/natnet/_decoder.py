@@ -1,9 +1,10 @@
-"""The pure half of the NatNet driver: datagrams in, optical frames and clock echoes out.
+"""Decoder of the NatNet driver: datagrams in, optical frames and clock echoes out.
 
-Invariant: a function of the chunks fed; no clock, no socket. A capture holds datagrams of both
-directions. Those of a client have no effect, except that the arrival of an echo request is the
-sending time of its answer. A frame that arrives before its model is counted in `unpublished` and
-dropped. No number is used before its range was checked.
+A capture contains datagrams of both directions. Those of a client have no effect, except that the
+arrival of an echo request is the sending time of its answer. A frame that arrives before its model
+is counted in `unpublished` and dropped. Every number is checked against its range before use.
+
+Invariant: a function of the chunks fed; no clock, no socket.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
-from jointfit_drivers.natnet._binding import bind
-from jointfit_drivers.natnet._bitstream import Bitstream
-from jointfit_drivers.natnet._continuity import Continuity
+from jointfit_drivers.natnet._binding import bind_model
+from jointfit_drivers.natnet._bitstream import BitstreamTracker
+from jointfit_drivers.natnet._continuity import NatNetContinuity
 from jointfit_drivers.natnet._frame_time import FrameTime
-from jointfit_drivers.natnet._poses import Poses
+from jointfit_drivers.natnet._poses import PoseConverter
 from jointfit_drivers.natnet._server_checks import bitstream_response, same_instance, usable_hz
 from jointfit_protocols.corrupt import Corrupt as WireCorrupt
 from jointfit_protocols.natnet import (
@@ -43,14 +44,14 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message
 
 _ECHO_LIMIT_NS = 10**9
-"""An answer older than this says nothing about the clock."""
+"""Age of an echo answer, ns, after which it is useless for the clock."""
 _PENDING_ECHOES = 8
 _NAMED_UNKNOWN = 16
-"""So many unknown ids are named in warnings; the rest is only counted."""
+"""Unknown ids that are listed in warnings; further ones are only counted."""
 _MOST_SECONDS = 2**63 // 10**9
-"""Stamps beyond this, s, are no uptime: their nanoseconds exceed 64 bits."""
+"""Largest plausible stamp, s: its nanoseconds still fit 64 bits."""
 _MOST_LISTED = 200
-"""Names of markers or bodies that an event lists; the count beside them is exact."""
+"""Names of markers or bodies that an event lists; the count in its text is exact."""
 _FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
 _ANNOUNCED = {
     FRAME_MODEL_CHANGED: "the model list changed",
@@ -64,11 +65,11 @@ class NatNetDecoder:
     Parameters
     ----------
     settings : NatNetSettings
-        The names that rig.toml uses, the up axis, the latency of cameras without exposure stamp.
+        Names in rig.toml, up axis, and latency of cameras without exposure stamp.
     """
 
     def __init__(self, settings: NatNetSettings) -> None:
-        self._bitstream = Bitstream(settings.wanted_version)
+        self._bitstream = BitstreamTracker(settings.wanted_version)
         self._latency_ms = settings.latency_ms
         self._time = FrameTime(settings)
         self._wanted_markers = {
@@ -76,8 +77,8 @@ class NatNetDecoder:
         }
         bodies = {name: f"rigid_body.{part}" for part, name in settings.rigid_body.items()}
         self._wanted_bodies = bodies | ({settings.plate: "plate"} if settings.plate else {})
-        self._poses = Poses(settings.up_axis)
-        self._continuity = Continuity()
+        self._poses = PoseConverter(settings.up_axis)
+        self._continuity = NatNetContinuity()
         self._info: ServerInfo | None = None
         self._hz: int | None = None
         self._binding: Binding | None = None
@@ -87,11 +88,11 @@ class NatNetDecoder:
         self._named_unknown: set[int] = set()
         self._messages = self._discarded = 0
         self.unpublished = 0
-        """Frames that came before the model or the server's version was known."""
+        """Frames that arrived before the model or the server's version was known."""
         self.unknown_ids = 0
-        """Markers and bodies dropped because the model does not have their id."""
+        """Markers and bodies dropped because the model has no such id."""
         self.suspicious = 0
-        """Poses, stamps and echoes refused because their numbers cannot be true."""
+        """Poses, stamps and echoes rejected because their numbers are implausible."""
         self._handlers: dict[type, Callable[[Chunk, Message], list[Decoded]]] = {
             ServerInfo: self._server,
             ModelDefinition: self._model,
@@ -117,17 +118,17 @@ class NatNetDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes of datagrams that were no message."""
+        """Bytes of datagrams that contained no message."""
         return self._discarded
 
     @property
     def duplicates(self) -> int:
-        """Frames dropped because their number had been the last one's."""
+        """Frames dropped because their number was that of the last one."""
         return self._continuity.duplicates
 
     @property
     def late(self) -> int:
-        """Frames dropped because a later one had come."""
+        """Frames dropped because a later one had arrived."""
         return self._continuity.late
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -145,11 +146,11 @@ class NatNetDecoder:
         return adopted if handler is None else adopted + handler(chunk, message)
 
     def flush(self) -> list[Decoded]:
-        """Return nothing: datagrams are whole."""
+        """Return nothing: datagrams are complete."""
         return []
 
     def _unreadable(self, chunk: Chunk, corrupt: WireCorrupt) -> list[Decoded]:
-        """Count a datagram as corrupt, unless the server has not named its bitstream yet."""
+        """Count a datagram as corrupt, unless the bitstream is not known yet."""
         if not self._bitstream.known and is_versioned(chunk.data):
             self._messages += 1
             self.unpublished += chunk.data.startswith(_FRAME)
@@ -164,9 +165,9 @@ class NatNetDecoder:
         if info == before:
             return []
 
-        # A frequency that no counter has would make every stamp of the frames wrong.
+        # An implausible frequency would make every stamp of the frames wrong.
         self._info, self._hz = info, usable_hz(info)
-        out: list[Decoded] = [_introduced(info, self._hz)]
+        out: list[Decoded] = [_server_event(info, self._hz)]
         if before is None or same_instance(info, before):
             self._bitstream.announce(info.bitstream)
         else:
@@ -177,16 +178,16 @@ class NatNetDecoder:
 
         if not supported(info.bitstream):
             name = "{}.{}".format(*info.bitstream)
-            text = f"the server speaks NatNet {name}, 3.0 or newer is needed"
+            text = f"the server uses NatNet {name}, 3.0 or newer is required"
             out.append(DeviceEvent("error", text, {"bitstream": name}))
         return out
 
     def _adopted(self) -> list[Decoded]:
         name = "{}.{}".format(*self._bitstream.version)
-        return [DeviceEvent("setting", f"bitstream is {name} now", {"bitstream": name})]
+        return [DeviceEvent("setting", f"bitstream changed to {name}", {"bitstream": name})]
 
     def _response(self, _: Chunk, message: Message) -> list[Decoded]:
-        """Take the answer to ``Bitstream,x.y``; nothing else that is answered concerns us."""
+        """Process the answer to ``Bitstream,x.y``; other answers are ignored."""
         version = bitstream_response(cast("Response", message).text)
         if version is not None:
             self._bitstream.confirm(version)
@@ -194,30 +195,34 @@ class NatNetDecoder:
 
     def _model(self, _: Chunk, message: Message) -> list[Decoded]:
         model = cast("ModelDefinition", message)
-        binding = bind(model, self._wanted_markers, self._wanted_bodies)
+        binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
         before, self._binding = self._binding, binding
         if before is not None and before.layout == binding.layout:
-            self._binding = binding = _sharing(binding, before)
-        if before is not None and before.complaints == binding.complaints:
-            complaints: tuple[str, ...] = ()
+            self._binding = binding = _share_layout(binding, before)
+        if before is not None and before.warnings == binding.warnings:
+            warnings: tuple[str, ...] = ()
         else:
-            complaints = binding.complaints
+            warnings = binding.warnings
+
         out: list[Decoded] = []
         if before is None or before.layout is not binding.layout:
-            out.append(_described(binding, self.unpublished))
+            out.append(_model_event(binding, self.unpublished))
+
         if not model.complete:
-            out.append(DeviceEvent("warning", "a description of unknown type ends the model list"))
+            out.append(
+                DeviceEvent("warning", "the model list ends at a description of unknown type")
+            )
         unknown = {
             "unknown": list(binding.unknown),
             "known": list(binding.layout.markers[:_MOST_LISTED]),
         }
         self._named_unknown.clear()
-        return out + [DeviceEvent("warning", text, unknown) for text in complaints]
+        return out + [DeviceEvent("warning", text, unknown) for text in warnings]
 
     # --- time ---------------------------------------------------------------------------------
 
     def _echo_request(self, chunk: Chunk, message: Message) -> list[Decoded]:
-        """Remember when a recorded client asked; ours are not among the chunks."""
+        """Store the sending time of a recorded client's request."""
         if len(self._asked) >= _PENDING_ECHOES:
             del self._asked[next(iter(self._asked))]
         self._asked[cast("EchoRequest", message).stamp] = chunk.t_ns
@@ -240,20 +245,23 @@ class NatNetDecoder:
         if not step.use:
             return []
         out: list[Decoded] = []
+
         if step.restarted:
-            out.append(DeviceEvent("restart", f"frame numbers began anew at {frame.number}"))
+            out.append(DeviceEvent("restart", f"frame numbers restarted at {frame.number}"))
         elif step.lost:
             out.append(DeviceEvent("gap", f"{step.lost} frames lost", {"lost": step.lost}))
         if frame.params != self._announced:
             out += self._announce(frame.params)
+
         binding = self._binding
         if binding is None:
             self.unpublished += 1
             return out
-        self._time.tell_timecode(frame, out)
+
+        self._time.report_timecode(frame, out)
         found = self._poses.columns(frame, binding)
         if found.suspicious or found.unknown:
-            out += self._doubts(found.suspicious, found.unknown)
+            out += self._unknown_id_warning(found.suspicious, found.unknown)
         out.append(
             MocapFrame(
                 chunk.t_ns,
@@ -269,7 +277,7 @@ class NatNetDecoder:
         return out
 
     def _instant(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return when the frame was exposed, in ticks of the clock that counts."""
+        """Return the exposure in ticks of the clock in use."""
         if self._time.precise:
             return self._time.unix_ns(frame, out)
         if self._hz is not None and max(frame.exposure, frame.transmit) > _MOST_SECONDS * self._hz:
@@ -278,7 +286,7 @@ class NatNetDecoder:
         return frame.exposure or self._exposure(frame, out)
 
     def _exposure(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the exposure as configured, where the cameras do not stamp it."""
+        """Return the exposure from the configured latency, where the cameras do not stamp it."""
         hz = self._hz
         if hz is None or not frame.transmit:
             return None
@@ -289,36 +297,38 @@ class NatNetDecoder:
         return max(0, frame.transmit - round(self._latency_ms * hz / 1000))
 
     def _announce(self, params: int) -> list[Decoded]:
-        """Say what the frame's flags newly announce."""
+        """Return events for newly set flags of the frame."""
         risen, self._announced = params & ~self._announced, params
-        told: list[Decoded] = [
+        events: list[Decoded] = [
             DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit
         ]
+
         live = not params & FRAME_EDIT_MODE
         if live != self._live:
             self._live = live
-            text = "live again" if live else "edit mode: what it plays is a recording"
-            told.append(DeviceEvent("setting", text, {"live": live}))
-        return told
+            text = "live again" if live else "edit mode: the frames are a recording"
+            events.append(DeviceEvent("setting", text, {"live": live}))
+        return events
 
-    def _doubts(self, suspicious: int, unknown: tuple[int, ...]) -> list[Decoded]:
+    def _unknown_id_warning(self, suspicious: int, unknown: tuple[int, ...]) -> list[Decoded]:
         self.suspicious += suspicious
         self.unknown_ids += len(unknown)
         new = [i for i in unknown if i not in self._named_unknown]
         if not new or len(self._named_unknown) >= _NAMED_UNKNOWN:
             return []
+
         self._named_unknown.update(new)
         names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
-        text = f"ids the model list does not have are dropped: {names}"
+        text = f"ids that are not in the model list are dropped: {names}"
         return [DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]})]
 
 
-def _sharing(binding: Binding, before: Binding) -> Binding:
-    """Return `binding` with the layout object of `before`, which equals its own."""
+def _share_layout(binding: Binding, before: Binding) -> Binding:
+    """Return `binding` with the equal layout object of `before`."""
     return replace(binding, layout=before.layout)
 
 
-def _introduced(info: ServerInfo, hz: int | None) -> DeviceEvent:
+def _server_event(info: ServerInfo, hz: int | None) -> DeviceEvent:
     firmware = ".".join(map(str, info.application_version))
     natnet = ".".join(map(str, info.natnet_version))
     transport = "multicast" if info.multicast else "unicast"
@@ -335,7 +345,7 @@ def _introduced(info: ServerInfo, hz: int | None) -> DeviceEvent:
     return DeviceEvent("info", text, data)
 
 
-def _described(binding: Binding, unpublished: int) -> DeviceEvent:
+def _model_event(binding: Binding, unpublished: int) -> DeviceEvent:
     layout = binding.layout
     text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
     data = {

@@ -1,7 +1,8 @@
-"""OptiTrack Motive, and whatever else speaks NatNet 3 or 4 over UDP.
+"""Driver of OptiTrack Motive and other NatNet 3 or 4 servers, over UDP.
 
-Law: two halves. `NatNetDecoder` is pure; `run` connects and hands on every datagram of the server,
-answers to the handshake included, so that a replay of the chunks sees all that was seen live.
+`NatNetDecoder` is the pure part. `NatNetMocap.run` connects and emits every accepted datagram
+of the server, answers of the handshake included, so that a replay has the same input as the
+live decoder.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.natnet._decoder import NatNetDecoder
-from jointfit_drivers.natnet._session import Session
+from jointfit_drivers.natnet._session import NatNetSession
 from jointfit_drivers.natnet._settings import NatNetSettings
 from jointfit_drivers.ports.udp_socket import local_address
 
@@ -30,7 +31,7 @@ class NatNetMocap:
         self._settings = settings
 
     def decoder(self) -> NatNetDecoder:
-        """Return the pure half: datagrams in, optical frames in SI out."""
+        """Return the decoder from datagrams to optical frames in SI units."""
         return NatNetDecoder(self._settings)
 
     async def run(self, emit: Emit) -> None:
@@ -39,13 +40,14 @@ class NatNetMocap:
         Raises
         ------
         DeviceLostError
-            No such host, no answer, nobody listening, no frame for ``silence_s``, another server
-            in its place; worth another try.
+            The host is unknown, does not answer, has no listening server, sends no frame for
+            ``silence_s``, or another server has taken its place; worth another attempt.
         DeviceMisconfiguredError
-            Not a NatNet server, a bitstream that cannot be read, no such network card.
+            The host is no NatNet server, its bitstream is not supported, or the network card is
+            unknown.
         """
         host = await self._resolve()
-        await Session(self._settings, host, self._local(host), emit).run()
+        await NatNetSession(self._settings, host, self._local(host), emit).run()
 
     async def _resolve(self) -> str:
         """Return the numeric address of the server."""
@@ -66,5 +68,5 @@ class NatNetMocap:
             if interface is None:
                 raise DeviceLostError(f"NatNet server {host}: {error.strerror or error}") from error
             raise DeviceMisconfiguredError(
-                f"mocap.interface = {interface!r}: no such network card with an IPv4 address"
+                f"mocap.interface = {interface!r}: no network card with this name or IPv4 address"
             ) from error

@@ -1,6 +1,6 @@
-"""Which clock a frame is stamped by, and the timecode beside it.
+"""Clock of the frame stamps, and the timecode of frames.
 
-Law: pure; a frame in, ticks out.
+Invariant: pure; a frame in, ticks out.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _UNIX = TickClock(1, None, None, "unix")
 
 
 class FrameTime:
-    """Precision timestamps where rig.toml wants them, and timecodes where there are any.
+    """Reads precision timestamps if rig.toml selects them, and timecodes if there are any.
 
     Parameters
     ----------
-    settings
-        Which clock counts.
+    settings : NatNetSettings
+        Selects the clock.
     """
 
     def __init__(self, settings: NatNetSettings) -> None:
@@ -35,20 +35,22 @@ class FrameTime:
 
     @property
     def precise(self) -> bool:
-        """Whether frames are stamped by PTP, and the server's counter means nothing."""
+        """Whether frames are stamped by PTP and the server's counter is ignored."""
         return self._precise is not None
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """UNIX time in ns, once it is certain how frames tell it."""
+        """UNIX time in ns, once its representation in the frames is known."""
         return _UNIX if self._precise is not None and self._precise.decided else None
 
     def unix_ns(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the frame's UNIX time; None where it has none, which is told once."""
+        """Return the frame's UNIX time; None if it has none, which is reported once."""
         precise = self._precise
         if precise is None:
             return None
+
         found = precise.ns(frame.precision)
+
         if precise.absent == DECIDING:
             text = (
                 "frames have no precision timestamp: switch PTP on at the cameras and stream "
@@ -57,13 +59,14 @@ class FrameTime:
             out.append(DeviceEvent("warning", text))
         return None if found is None else found - self._ahead_ns
 
-    def tell_timecode(self, frame: FrameOfData, out: list[Decoded]) -> None:
-        """Tell the timecode of the first frame that has one, and when it is gone."""
+    def report_timecode(self, frame: FrameOfData, out: list[Decoded]) -> None:
+        """Report the timecode of the first frame that has one, and its loss."""
         code = timecode_of(frame)
         if (code is not None) == self._coded:
             return
+
         self._coded = code is not None
-        text = "no timecode any more" if code is None else f"timecode {code.text}"
+        text = "timecode lost" if code is None else f"timecode {code.text}"
         data = {
             "timecode": None if code is None else code.text,
             "timecode_frame": None if code is None else frame.number,

@@ -1,8 +1,7 @@
-"""Sockets to one NatNet server inside the event loop.
+"""Sockets to one NatNet server in the event loop.
 
-Invariant: what fails in a callback is raised in `pause`. A reader callback has no caller to raise
-to, so its failure is stored and raised where the driver's coroutine waits: `DeviceLostError` for
-failures of the network, the exception itself for a bug.
+A reader callback has no caller, so its error is stored and raised in `NatNetLink.pause`, where the
+driver's coroutine waits: `DeviceLostError` for failures of the network, other exceptions unchanged.
 
 Frames are accepted from any port of the server, because multicast frames leave its data port.
 Control messages are accepted on the command socket only, and only from the server's command port.
@@ -31,19 +30,19 @@ if TYPE_CHECKING:
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
 """Errors that concern one datagram and not the connection."""
 _FORGED_NS = 100_000_000
-"""An ICMP refusal this soon after a datagram of the server is forged or stale, ns."""
+"""Interval, ns, after a datagram of the server in which an ICMP refusal is forged or stale."""
 _FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
-class Link:
-    """Command socket, and data socket where frames have their own.
+class NatNetLink:
+    """Command socket, and a data socket for multicast frames.
 
     Parameters
     ----------
-    host, port
+    host, port : str, int
         Numeric address and command port of the server.
     local : str
-        Address of our network card.
+        Address of this host's network card.
     take : callable
         Called with every chunk from the server, in order of arrival.
     """
@@ -54,11 +53,11 @@ class Link:
         self._take = take
         self._loop = asyncio.get_running_loop()
         self._sockets: list[UdpSocket] = []
-        self._news = asyncio.Event()
+        self._arrived = asyncio.Event()
         self._failure: Exception | None = None
-        self._heard_ns = 0
+        self._received_ns = 0
         self.foreign = 0
-        """Datagrams dropped because of where they came from; the kernel drops most others."""
+        """Datagrams dropped because of their source; the kernel drops most others."""
 
     def __enter__(self) -> Self:
         self._command = self._open(UdpSocket(self._local, 0, sender=self._server[0]))
@@ -75,7 +74,7 @@ class Link:
             opened.close()
 
     def join(self, group: str, port: int) -> None:
-        """Open the data socket of a multicast server; OSError as the system says."""
+        """Open the data socket of a multicast server; raises the system's OSError."""
         self._open(UdpSocket.in_group(group, port, self._local, sender=self._server[0]))
 
     def send(self, message: Message) -> None:
@@ -84,7 +83,7 @@ class Link:
         Raises
         ------
         DeviceLostError
-            There is no way to the server.
+            There is no route to the server.
         """
         try:
             self._command.send(encode(message), self._server)
@@ -93,18 +92,19 @@ class Link:
                 raise self._lost(error) from error
 
     def wake(self) -> None:
-        """End the current `pause`: something was said that the coroutine waits for."""
-        self._news.set()
+        """End the current `pause`: a message arrived."""
+        self._arrived.set()
 
     async def pause(self, seconds: float) -> None:
-        """Wait until something was said, at most `seconds`; raise what failed meanwhile."""
+        """Wait for a message, at most `seconds`; raise errors of the callbacks."""
         if seconds > 0:
             try:
                 async with asyncio.timeout(seconds):
-                    await self._news.wait()
+                    await self._arrived.wait()
             except TimeoutError:
                 pass
-        self._news.clear()
+
+        self._arrived.clear()
         if self._failure is not None:
             raise self._failure
 
@@ -116,10 +116,10 @@ class Link:
     def _readable(self, source: UdpSocket) -> None:
         try:
             self._read(source)
-        except Exception as error:  # noqa: BLE001 - a callback hands its error to the coroutine
+        except Exception as error:  # noqa: BLE001 - a callback passes its error to the coroutine
             self._failure = self._failure or error
             self._loop.remove_reader(source)
-            self._news.set()
+            self._arrived.set()
 
     def _read(self, source: UdpSocket) -> None:
         try:
@@ -128,12 +128,13 @@ class Link:
             if self._forged(error):
                 return
             raise self._lost(error) from error
+
         for arrival in arrivals:
             frame = arrival.data.startswith(_FRAME)
             if arrival.host != self._server[0] or not (frame or self._commands(source, arrival)):
                 self.foreign += 1
                 continue
-            self._heard_ns = arrival.t_ns
+            self._received_ns = arrival.t_ns
             self._take(Chunk(arrival.t_ns, arrival.data))
 
     def _commands(self, source: UdpSocket, arrival: Datagram) -> bool:
@@ -142,13 +143,13 @@ class Link:
 
     def _forged(self, error: OSError) -> bool:
         """Return whether an ICMP refusal contradicts datagrams that have just arrived."""
-        recent = time.monotonic_ns() - self._heard_ns < _FORGED_NS
+        recent = time.monotonic_ns() - self._received_ns < _FORGED_NS
         return recent and isinstance(error, ConnectionRefusedError)
 
     def _lost(self, error: OSError) -> DeviceLostError:
         host, port = self._server
         if isinstance(error, ConnectionRefusedError):
-            text = "nothing listens there: is Motive running, and streaming switched on?"
+            text = "no program listens on this port: start Motive and switch streaming on"
         else:
             text = error.strerror or str(error)
         return DeviceLostError(f"NatNet server {host}:{port}: {text}")

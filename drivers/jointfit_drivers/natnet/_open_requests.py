@@ -1,7 +1,9 @@
-"""Which datagrams of a NatNet server are accepted: frames, and answers to open questions.
+"""Requests to a NatNet server that await an answer; they decide which datagrams are accepted.
 
-Invariant: pure; host times are arguments. UDP knows no connection, and a source address can be
-forged. A SERVERINFO, MODELDEF, RESPONSE or ECHORESPONSE that answers no open question is dropped.
+UDP has no connections, and source addresses can be forged. A SERVERINFO, MODELDEF, RESPONSE or
+ECHORESPONSE that answers no open request is dropped.
+
+Invariant: pure; host times are arguments.
 """
 
 from __future__ import annotations
@@ -23,60 +25,60 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message
 
 ANSWER_NS = 5_000_000_000
-"""An answer that takes longer is dropped: as long as MODELDEF is waited for, ns."""
+"""Age of a request, ns, after which its answer is dropped; as long as the wait for MODELDEF."""
 ECHO_NS = 1_000_000_000
-"""An echo that takes longer says nothing about the clock, ns."""
+"""Age of an echo request, ns, after which its answer is useless for the clock."""
 OPEN_ECHOES = 32
-"""Echo requests without an answer that are remembered; the burst at connection sends ten."""
+"""Stored echo requests without an answer; the burst at connection sends ten."""
 
-_QUESTIONS = {
+_REQUEST_OF_ANSWER = {
     MessageId.SERVERINFO: MessageId.CONNECT,
     MessageId.MODELDEF: MessageId.REQUEST_MODELDEF,
     MessageId.RESPONSE: MessageId.REQUEST,
 }
-_QUESTION_IDS: dict[type, MessageId] = {Connect: MessageId.CONNECT, Request: MessageId.REQUEST}
+_REQUEST_IDS: dict[type, MessageId] = {Connect: MessageId.CONNECT, Request: MessageId.REQUEST}
 
 
-class OpenQuestions:
-    """Questions to the server that are not answered yet."""
+class OpenRequests:
+    """Requests to the server without an answer so far."""
 
     def __init__(self) -> None:
         self._asked_ns: dict[MessageId, int] = {}
         self._echoes: dict[int, None] = {}
-        self.unasked = 0
-        """Messages dropped because they answered no open question."""
+        self.unsolicited = 0
+        """Messages dropped because they answered no open request."""
 
-    def ask(self, message: Message, now_ns: int) -> None:
-        """Take note of a message sent at `now_ns`; the stamp of an echo is its sending time."""
+    def register(self, message: Message, now_ns: int) -> None:
+        """Register a message sent at `now_ns`; the stamp of an echo is its sending time."""
         if isinstance(message, EchoRequest):
             if len(self._echoes) >= OPEN_ECHOES:
                 del self._echoes[next(iter(self._echoes))]
             self._echoes[message.stamp] = None
             return
 
-        kind = message.id if isinstance(message, Bare) else _QUESTION_IDS.get(type(message))
+        kind = message.id if isinstance(message, Bare) else _REQUEST_IDS.get(type(message))
         if kind is not None:
             self._asked_ns[kind] = now_ns
 
     def accept(self, datagram: bytes, now_ns: int) -> bool:
-        """Return whether a control datagram answers an open question, or needs none.
+        """Return whether a control datagram answers an open request, or needs none.
 
-        The first answer closes the question; one that was of no use makes the caller ask again.
+        The first answer closes the request. If it is unusable, the caller sends another request.
         """
         kind = int.from_bytes(datagram[:2], "little") if len(datagram) >= HEADER.size else None
         if kind == MessageId.ECHORESPONSE:
             accepted = self._accept_echo(datagram, now_ns)
-        elif kind in _QUESTIONS:
-            asked_ns = self._asked_ns.pop(_QUESTIONS[MessageId(kind)], None)
+        elif kind in _REQUEST_OF_ANSWER:
+            asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[MessageId(kind)], None)
             accepted = asked_ns is not None and now_ns - asked_ns <= ANSWER_NS
         else:
-            accepted = True  # has no effect, whoever sent it; corrupt bytes are counted
+            accepted = True  # has no effect; corrupt bytes are counted
 
-        self.unasked += not accepted
+        self.unsolicited += not accepted
         return accepted
 
     def _accept_echo(self, datagram: bytes, now_ns: int) -> bool:
-        """Accept each stamp once: a duplicate with other ticks would bend the clock."""
+        """Accept each stamp once: a duplicate with other ticks would distort the clock."""
         echo = decode(datagram, (0, 0))
         if not isinstance(echo, EchoResponse):
             return True  # malformed: counted as corrupt by the decoder

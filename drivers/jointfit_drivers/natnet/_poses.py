@@ -1,8 +1,8 @@
-"""One NatNet frame in columns: SI, world Z up, NaN for what was not seen. Law: pure.
+"""Conversion of one NatNet frame to columns: SI units, world z up, NaN for missing data.
 
-"Not seen" is the wire's, never a guess of ours: a body whose bit 0 is clear repeats its last good
-pose; a labeled marker is missing, or occluded with a plausible filled position; a position in a
-marker set is (0, 0, 0). A usable marker is not occluded **and** point-cloud solved.
+Missing data are marked by the server. A body whose bit 0 is clear repeats its last valid pose.
+A labeled marker is absent, or occluded with a plausible filled position. A position in a marker
+set is (0, 0, 0). A usable marker is not occluded **and** point-cloud solved.
 """
 
 from __future__ import annotations
@@ -25,47 +25,51 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet import Body, FrameOfData, Marker
 
 _HALF = math.sqrt(0.5)
-_NOWHERE: Vector = (math.nan, math.nan, math.nan)
-_UNTURNED: Quaternion = (math.nan, math.nan, math.nan, math.nan)
+_NO_POSITION: Vector = (math.nan, math.nan, math.nan)
+_NO_ORIENTATION: Quaternion = (math.nan, math.nan, math.nan, math.nan)
 _NORM_TOLERANCE = 1e-3
+"""Largest deviation of a quaternion's norm from 1."""
 _FARTHEST_M = 10_000.0
-"""Coordinates beyond this, m, were measured by no camera; NaN compares as beyond."""
-_JUDGED = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
+"""Largest plausible coordinate, m; NaN compares as larger."""
+_QUALITY_BITS = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
 
 
-class Columns(NamedTuple):
-    """The arrays of one `MocapFrame`, and what had to be left out of them."""
+class FrameColumns(NamedTuple):
+    """Arrays of one `MocapFrame`, and the data left out of them."""
 
     markers: NDArray[np.float64]
     body_positions: NDArray[np.float64]
     body_orientations: NDArray[np.float64]
     suspicious: int
-    """Bodies refused because their rotation was none, or their numbers were not finite."""
+    """Bodies rejected because their quaternion is not normalised or their numbers are not finite.
+    """
     unknown: tuple[int, ...]
-    """Ids that the model does not explain."""
+    """Ids that are not in the model."""
 
 
-class Poses:
-    """Turns frames of one server into columns.
+class PoseConverter:
+    """Converts frames of one server to columns.
 
     Parameters
     ----------
     up_axis : {"x", "y", "z"}
-        The stream's up axis. The **world** is turned, p' = R p and q' = q_R q; the axes of a body
-        stay as the vendor defined them.
+        The stream's up axis. The **world** is rotated, p' = R p and q' = q_R q; the axes of a
+        body are those of the vendor.
     """
 
     def __init__(self, up_axis: str) -> None:
         self._place, self._turn = _WORLDS[up_axis]
 
-    def columns(self, frame: FrameOfData, binding: Binding) -> Columns:
+    def columns(self, frame: FrameOfData, binding: Binding) -> FrameColumns:
         """Return `frame` in the columns of `binding`."""
         unknown: list[int] = []
         markers = self._markers(frame, binding, unknown)
+
         bodies, suspicious = self._bodies(frame, binding, unknown)
         places = [bodies.get(key, _ABSENT) for key in binding.bodies]
-        return Columns(
-            _array([markers.get(key, _NOWHERE) for key in binding.markers], 3),
+
+        return FrameColumns(
+            _array([markers.get(key, _NO_POSITION) for key in binding.markers], 3),
             _array([place for place, _ in places], 3),
             _array([turn for _, turn in places], 4),
             suspicious,
@@ -90,12 +94,13 @@ class Poses:
         place = self._place
         for number, x, y, z, _, params, _ in markers:
             if number not in known:
-                if number >> 16:  # model 0: seen by the cameras, claimed by no model
+                if number >> 16:  # model 0: a marker without a model
                     unknown.append(number)
-            elif params & _JUDGED == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
+            elif params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
                 if number in seen:
                     twice.add(number)
                 seen[number] = place(x, y, z)
+
         for number in twice:
             del seen[number]
         return seen
@@ -126,7 +131,7 @@ class Poses:
             if key not in binding.known:
                 unknown.append(key)
             elif key in met:
-                seen.pop(key, None)  # two bodies with one id: which is which cannot be known
+                seen.pop(key, None)  # two bodies with one id cannot be distinguished
             elif body.params & BODY_TRACKED:
                 pose = self._pose(body)
                 if pose is None:
@@ -145,16 +150,16 @@ class Poses:
         return self._place(x, y, z), turned
 
 
-_ABSENT = (_NOWHERE, _UNTURNED)
+_ABSENT = (_NO_POSITION, _NO_ORIENTATION)
 
 
 def _usable(marker: Marker) -> bool:
-    solved = marker.params & _JUDGED == MARKER_POINT_CLOUD_SOLVED
+    solved = marker.params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED
     return solved and _near(marker.x, marker.y, marker.z)
 
 
 def _near(x: float, y: float, z: float) -> bool:
-    """Return whether a position is finite and where cameras can be."""
+    """Return whether a position is finite and plausible."""
     return abs(x) <= _FARTHEST_M and abs(y) <= _FARTHEST_M and abs(z) <= _FARTHEST_M
 
 
@@ -204,5 +209,6 @@ _WORLDS: dict[
         Callable[[float, float, float], Vector], Callable[[float, float, float, float], Quaternion]
     ],
 ] = {"x": (_place_x, _turn_x), "y": (_place_y, _turn_y), "z": (_place_z, _turn_z)}
-"""For each up axis the rotation of the world that makes z up: -90 deg about y for x, +90 deg about
-x for y; on positions, and from the left on quaternions."""
+"""Rotation of the world that makes z up, for each up axis: -90 deg about y for x, +90 deg about x
+for y; applied to positions, and from the left to quaternions.
+"""

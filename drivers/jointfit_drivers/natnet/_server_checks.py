@@ -1,4 +1,4 @@
-"""Servers that the driver can work with, and the messages for those it cannot.
+"""Checks whether the driver can work with a server, and their error messages.
 
 Invariant: pure. Every number of a SERVERINFO that is used later is checked here.
 """
@@ -17,84 +17,84 @@ if TYPE_CHECKING:
 
 NEWEST_MAJOR = 4
 LEAST_CLOCK_HZ = 1_000
-"""A slower counter stamps frames too coarsely to be of use."""
+"""Lowest usable frequency of the server's counter, Hz; a slower one stamps too coarsely."""
 MOST_CLOCK_HZ = 100_000_000_000
-"""Ten times the fastest processor counter."""
+"""Highest plausible frequency, Hz: ten times the fastest processor counter."""
 _PLAIN_FORM = 264
-_WANTING_FORM = 271
+_BITSTREAM_FORM = 271
 _LONGEST_VERSION = len("99.99")
 
 
-def greeting(settings: NatNetSettings) -> Connect:
-    """Return the CONNECT to send: the form real servers are known to answer.
+def connect_request(settings: NatNetSettings) -> Connect:
+    """Return the CONNECT to send: the form that real servers are known to answer.
 
-    Only to choose the bitstream of a unicast 4.x server does it take the form of the vendor's
-    own sample.
+    Only a request for another bitstream of a unicast 4.x server has the form of the vendor's
+    sample.
     """
     wanted = settings.wanted_version
     if wanted is None:
         return Connect(_PLAIN_FORM, "jointfitd", (1, 0, 0, 0), (3, 0, 0, 0))
-    return Connect(_WANTING_FORM, "Ping", bitstream=(*wanted, 0, 0))
+    return Connect(_BITSTREAM_FORM, "Ping", bitstream=(*wanted, 0, 0))
 
 
 def is_unicast(settings: NatNetSettings, info: ServerInfo) -> bool:
-    """Tell whether frames will come to the command socket."""
+    """Return whether frames arrive on the command socket."""
     if settings.transport == "auto":
         return not info.multicast
     return settings.transport == "unicast"
 
 
 def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
-    """Refuse a server that can never work with these settings.
+    """Refuse a server that cannot work with these settings.
 
     Raises
     ------
     DeviceMisconfiguredError
-        Too old, too new, without a clock, or asked for what multicast cannot give.
+        The server is too old, too new, has no clock, or cannot change its bitstream in multicast.
     """
-    said = f"{name} ({info.application}) speaks NatNet {info.bitstream[0]}.{info.bitstream[1]}"
+    found = f"{name} ({info.application}) uses NatNet {info.bitstream[0]}.{info.bitstream[1]}"
     if not supported(info.bitstream):
         raise DeviceMisconfiguredError(
-            f"{said}; {OLDEST[0]}.{OLDEST[1]} or newer is needed: update Motive to 2.0 or later"
+            f"{found}; {OLDEST[0]}.{OLDEST[1]} or newer is required: update Motive to 2.0 or later"
         )
     if not info.clock_hz:
         raise DeviceMisconfiguredError(
-            f"{said} but names no clock frequency: its stamps mean nothing"
+            f"{found} but announces no clock frequency: its stamps cannot be used"
         )
     if usable_hz(info) is None:
         raise DeviceMisconfiguredError(
-            f"{said} and names a clock frequency of {info.clock_hz} Hz, expected {LEAST_CLOCK_HZ}"
-            f" to {MOST_CLOCK_HZ}: check that server and command_port lead to Motive"
+            f"{found} and announces a clock of {info.clock_hz} Hz, expected "
+            f"{LEAST_CLOCK_HZ} to {MOST_CLOCK_HZ}: check that server and command_port lead to Motive"
         )
     if info.bitstream[0] > NEWEST_MAJOR and settings.wanted_version is None:
         raise DeviceMisconfiguredError(
-            f"{said}, which is newer than this driver:"
+            f"{found}, which is newer than this driver:"
             " switch Motive to unicast and set bitstream = '4.1'"
         )
     if settings.wanted_version not in (None, info.bitstream) and not is_unicast(settings, info):
         raise DeviceMisconfiguredError(
-            f"{said} in multicast, where a client cannot choose: remove bitstream ="
+            f"{found} in multicast, where a client cannot choose: remove bitstream ="
             f" {settings.bitstream!r}, or switch Motive to unicast"
         )
 
 
 def usable_hz(info: ServerInfo) -> int | None:
-    """Return the frequency of the server's counter, Hz; None where no counter has it."""
+    """Return the frequency of the server's counter, Hz; None if it is implausible."""
     hz = info.clock_hz
     return hz if hz is not None and LEAST_CLOCK_HZ <= hz <= MOST_CLOCK_HZ else None
 
 
 def check_group(name: str, info: ServerInfo, port: int) -> None:
-    """Refuse a multicast address or port that is none.
+    """Refuse an invalid multicast address or port.
 
     Raises
     ------
     DeviceMisconfiguredError
-        The server announces it so.
+        The server announces an invalid address or port.
     """
     if not IPv4Address(info.group).is_multicast:
         raise DeviceMisconfiguredError(
-            f"{name} announces {info.group}, which is no multicast address:"
+            f"{name} announces {info.group}, which is not a multicast address:"
             " set Motive's multicast interface, or transport = 'unicast'"
         )
     if not port:
@@ -103,16 +103,16 @@ def check_group(name: str, info: ServerInfo, port: int) -> None:
         )
 
 
-def misheard(name: str) -> str:
-    """Return the words for a port where something else than NatNet answers."""
+def not_natnet_text(name: str) -> str:
+    """Return the message for a port where a program other than a NatNet server answers."""
     return (
-        f"{name}: what answers there does not speak NatNet: check server and command_port"
+        f"{name}: the program that answers is not a NatNet server: check server and command_port"
         " (Motive: Streaming pane, command port, 1510 unless changed)"
     )
 
 
 def same_instance(a: ServerInfo, b: ServerInfo) -> bool:
-    """Tell whether two answers are the same server, its bitstream aside."""
+    """Return whether two answers are from the same server, its bitstream aside."""
     return a._replace(natnet_version=b.natnet_version) == b
 
 

@@ -1,13 +1,16 @@
 """One connection to a NatNet server, from CONNECT to silence.
 
-CONNECT, every 0.5 s until SERVERINFO; data socket by what it announces; ten echoes 50 ms apart;
-REQUEST_MODELDEF, every 0.5 s until MODELDEF; then frames, one echo a second, and in unicast one
-KEEPALIVE a second. Every accepted datagram is emitted first and read afterwards, so a replay gets
-the same input. Whoever takes the chunks decodes the frames. Here only their flags are read, and
-one frame a second is decoded, to see that it can be, and that its ids are known.
+1. CONNECT every 0.5 s until SERVERINFO, which determines the data socket.
+2. Ten echo requests, 50 ms apart, for the clock.
+3. REQUEST_MODELDEF every 0.5 s until MODELDEF.
+4. Frames; one echo request a second, and in unicast one KEEPALIVE a second.
 
-Invariant: control messages are accepted as answers to open questions only (`natnet_answers`), and
-a server none of whose frames can be decoded is lost, like a silent one.
+Every accepted datagram is emitted before it is processed here, so that a replay has the same input.
+The receiver of the chunks decodes the frames. This module reads only their flags, and decodes one
+frame a second to check that it can be decoded and that its ids are known.
+
+Invariant: control messages are accepted as answers to open requests only (`OpenRequests`). A server
+none of whose frames can be decoded is lost, like a silent one.
 """
 
 from __future__ import annotations
@@ -19,16 +22,16 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_drivers.natnet._bitstream import Bitstream
-from jointfit_drivers.natnet._link import Link
-from jointfit_drivers.natnet._open_requests import OpenQuestions
+from jointfit_drivers.natnet._bitstream import BitstreamTracker
+from jointfit_drivers.natnet._link import NatNetLink
+from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.natnet._server_checks import (
     bitstream_response,
     check_group,
     check_server,
-    greeting,
+    connect_request,
     is_unicast,
-    misheard,
+    not_natnet_text,
     same_instance,
 )
 from jointfit_protocols.corrupt import Corrupt
@@ -57,25 +60,27 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message
 
 RETRY_S = 0.5
+"""Interval between requests, s."""
 CONNECT_S = 3.0
-"""No SERVERINFO for this long: the server is not there."""
+"""Longest wait for SERVERINFO, s."""
 MODEL_S = 5.0
+"""Longest wait for MODELDEF, s."""
 FIRST_ECHOES, FIRST_ECHO_S = 10, 0.05
 ECHO_S = (0.8, 1.2)
-"""Random, so that echoes do not lock to the frame rate."""
+"""Range of the interval between echoes, s; random, so that they do not lock to the frame rate."""
 EVERY_S = 1.0
-"""Between keep-alives, between requests for a changed model, between looks at a whole frame."""
+"""Interval, s, between keep-alives, requests for a changed model, and checks of a whole frame."""
 MISFITS = 3
-"""Frames in a row that do not parse: ask the server again what it speaks."""
+"""Consecutive frames that cannot be decoded before the server is asked for its bitstream again."""
 
 _PARAMS = struct.Struct("<h")
 _PARAMS_FROM_END = 6
-"""Flags and end tag close every frame, whatever its bitstream."""
+"""Place of the flags: they and the end tag close every frame, in every bitstream."""
 _SHORTEST_FRAME = 4 + 78
 _FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
-class Session:
+class NatNetSession:
     """One connection; after a loss, a new one is made.
 
     Parameters
@@ -83,53 +88,54 @@ class Session:
     settings : NatNetSettings
         The ``[mocap]`` table.
     host, local : str
-        Numeric addresses of the server and of our network card.
+        Numeric addresses of the server and of this host's network card.
     emit : Emit
-        Takes every datagram of the server.
+        Receives every accepted datagram of the server.
     """
 
     def __init__(self, settings: NatNetSettings, host: str, local: str, emit: Emit) -> None:
         self._settings = settings
         self._name = f"NatNet server {settings.server}:{settings.command_port}"
         self._emit = emit
-        self._link = Link(host, settings.command_port, local, self._take)
-        self._questions = OpenQuestions()
+        self._link = NatNetLink(host, settings.command_port, local, self._take)
+        self._open_requests = OpenRequests()
         self._info: ServerInfo | None = None
-        self._bitstream = Bitstream(settings.wanted_version)
+        self._bitstream = BitstreamTracker(settings.wanted_version)
         self._confirmed = False
         self._known: frozenset[int] | None = None
-        self._strange = 0
+        self._foreign_answers = 0
         self._echoed = 0
-        self._model_wanted = self._greeting_wanted = False
+        self._model_wanted = self._info_wanted = False
         self._misfits = 0
-        self._look_ns = self._frame_ns = 0
+        self._next_check_ns = self._frame_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled; raises what `NatNetMocap.run` says."""
+        """Connect and read until cancelled; raises the errors of `NatNetMocap.run`."""
         with self._link as link:
-            info = await self._greet()
+            info = await self._connect()
             check_server(self._name, self._settings, info)
+
             unicast = is_unicast(self._settings, info)
             try:
                 if not unicast:
                     self._join(info)
                 await self._choose_bitstream()
                 await self._first_echoes()
-                await self._learn_model()
+                await self._request_model()
                 await self._stream(info, unicast)
             finally:
                 with contextlib.suppress(
                     DeviceLostError
-                ):  # whatever ends this must not be replaced
+                ):  # keep the exception that ended the connection
                     link.send(Bare(MessageId.DISCONNECT))
 
-    # --- what arrives -------------------------------------------------------------------------
+    # --- received messages --------------------------------------------------------------------
 
     def _take(self, chunk: Chunk) -> None:
         if chunk.data.startswith(_FRAME):
             self._emit(chunk)
             self._frame(chunk)
-        elif self._questions.accept(chunk.data, chunk.t_ns):
+        elif self._open_requests.accept(chunk.data, chunk.t_ns):
             self._emit(chunk)
             self._message(chunk)
 
@@ -137,21 +143,21 @@ class Session:
         if len(chunk.data) >= _SHORTEST_FRAME:
             (params,) = _PARAMS.unpack_from(chunk.data, len(chunk.data) - _PARAMS_FROM_END)
             self._model_wanted |= bool(params & FRAME_MODEL_CHANGED)
-            self._greeting_wanted |= bool(params & FRAME_BITSTREAM_CHANGED)
-        if chunk.t_ns < self._look_ns or not self._bitstream.known:
+            self._info_wanted |= bool(params & FRAME_BITSTREAM_CHANGED)
+        if chunk.t_ns < self._next_check_ns or not self._bitstream.known:
             self._frame_ns = chunk.t_ns
             return
 
         frame = self._bitstream.decode(chunk.data)
         if isinstance(frame, FrameOfData):
             self._misfits, self._frame_ns = 0, chunk.t_ns
-            self._look_ns = chunk.t_ns + int(EVERY_S * 1e9)
-            self._look(frame)
+            self._next_check_ns = chunk.t_ns + int(EVERY_S * 1e9)
+            self._check_ids(frame)
         else:
             self._misfits += 1
-            self._greeting_wanted |= self._misfits >= MISFITS
+            self._info_wanted |= self._misfits >= MISFITS
 
-    def _look(self, frame: FrameOfData) -> None:
+    def _check_ids(self, frame: FrameOfData) -> None:
         if self._known is not None and any(body.id not in self._known for body in frame.bodies):
             self._model_wanted = True
 
@@ -161,7 +167,7 @@ class Session:
                 self._model_wanted |= self._info not in (None, info)
                 self._info = info
                 self._bitstream.announce(info.bitstream)
-                self._greeting_wanted = False
+                self._info_wanted = False
             case ModelDefinition() as model:
                 self._known = frozenset(
                     item.id for item in model.descriptions if isinstance(item, BodyDescription)
@@ -175,14 +181,16 @@ class Session:
                     self._bitstream.confirm(version)
                     self._confirmed = True
             case Corrupt() | Connect():
-                self._strange += 1
+                self._foreign_answers += 1
             case _:
                 return
         self._link.wake()
 
-    # --- what is asked ------------------------------------------------------------------------
+    # --- requests -----------------------------------------------------------------------------
 
-    async def _ask(self, message: Message, within_s: float, answered: Callable[[], bool]) -> None:
+    async def _request(
+        self, message: Message, within_s: float, answered: Callable[[], bool]
+    ) -> None:
         """Send `message` every half second until it is answered, at most for `within_s`."""
         until = time.monotonic() + within_s
         while not answered() and time.monotonic() < until:
@@ -192,15 +200,17 @@ class Session:
                 await self._link.pause(left)
 
     def _send(self, message: Message) -> None:
-        self._questions.ask(message, time.monotonic_ns())
+        self._open_requests.register(message, time.monotonic_ns())
         self._link.send(message)
 
-    async def _greet(self) -> ServerInfo:
-        await self._ask(greeting(self._settings), CONNECT_S, lambda: self._info is not None)
+    async def _connect(self) -> ServerInfo:
+        await self._request(
+            connect_request(self._settings), CONNECT_S, lambda: self._info is not None
+        )
         if self._info is not None:
             return self._info
-        if self._strange:
-            raise DeviceMisconfiguredError(misheard(self._name))
+        if self._foreign_answers:
+            raise DeviceMisconfiguredError(not_natnet_text(self._name))
         raise DeviceLostError(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
 
     def _join(self, info: ServerInfo) -> None:
@@ -213,25 +223,25 @@ class Session:
             raise DeviceLostError(f"{self._name}: {text}") from error
 
     async def _choose_bitstream(self) -> None:
-        """Ask a server that starts with another bitstream than wanted, once, and go on anyway."""
+        """Request another bitstream than the server's own; continue without it if refused."""
         wanted = self._settings.wanted_version
         if wanted is not None:
             asked = Request(f"Bitstream,{self._settings.bitstream}")
-            await self._ask(asked, RETRY_S, lambda: self._confirmed)
+            await self._request(asked, RETRY_S, lambda: self._confirmed)
 
     async def _first_echoes(self) -> None:
         for _ in range(FIRST_ECHOES):
             next_at = time.monotonic() + FIRST_ECHO_S
-            self._ask_time()
+            self._request_echo()
             while (left := next_at - time.monotonic()) > 0:
                 await self._link.pause(left)
 
-    def _ask_time(self) -> None:
+    def _request_echo(self) -> None:
         self._send(EchoRequest(time.monotonic_ns()))
 
-    async def _learn_model(self) -> None:
+    async def _request_model(self) -> None:
         asked = Bare(MessageId.REQUEST_MODELDEF)
-        await self._ask(asked, MODEL_S, lambda: self._known is not None)
+        await self._request(asked, MODEL_S, lambda: self._known is not None)
         if self._known is None:
             raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
 
@@ -241,40 +251,47 @@ class Session:
         while True:
             now = time.monotonic()
             self._check_alive(info, unicast, max(self._frame_ns, began_ns))
+
             if now >= echo_at:
-                self._ask_time()
+                self._request_echo()
                 echo_at = now + random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
+
             if unicast and now >= alive_at:
                 self._link.send(Bare(MessageId.KEEPALIVE))
                 alive_at = now + EVERY_S
-            if now >= ask_at and (self._model_wanted or self._greeting_wanted):
+
+            if now >= ask_at and (self._model_wanted or self._info_wanted):
                 ask_at = now + EVERY_S
-                self._ask_again()
+                self._request_again()
+
             due = [echo_at, now + self._settings.silence_s / 4]
             await self._link.pause(min(due + [alive_at] * unicast) - now)
 
-    def _ask_again(self) -> None:
-        """Ask for what a frame has announced or made doubtful, until it is answered."""
-        if self._greeting_wanted:
-            self._send(greeting(self._settings))
+    def _request_again(self) -> None:
+        """Request data that a frame has announced or made doubtful, until answered."""
+        if self._info_wanted:
+            self._send(connect_request(self._settings))
         if self._model_wanted:
             self._send(Bare(MessageId.REQUEST_MODELDEF))
 
     def _check_alive(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
-        """Raise DeviceLostError if frames are unreadable or another server answers."""
+        """Raise DeviceLostError without decodable frames, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(
                 f"{self._name}: another instance answers: {self._info.application}"
             )
+
         silent_s = (time.monotonic_ns() - heard_ns) / 1e9
         if silent_s < self._settings.silence_s:
             return
+
         if self._misfits:
             version = "{}.{}".format(*self._bitstream.version)
             raise DeviceLostError(
                 f"{self._name}: frames arrive, but for {silent_s:.1f} s none could be decoded as "
                 f"NatNet {version}: check that Motive streams the bitstream it announces"
             )
+
         hint = ""
         if unicast == info.multicast:
             announced = "multicast" if info.multicast else "unicast"

@@ -1,4 +1,4 @@
-"""What rig.toml says about a NatNet server. Law: a pydantic model and nothing else."""
+"""The ``[mocap]`` table of a NatNet server."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from jointfit_daemon.driver import INTERFACE_NAME_EXPECTED, MocapSettings, is_in
 
 
 class NatNetSettings(MocapSettings):
-    """The ``[mocap]`` table for OptiTrack Motive, or whatever else speaks NatNet 3 or 4."""
+    """The ``[mocap]`` table for OptiTrack Motive and other servers of NatNet 3 or 4."""
 
     server: str = Field(description="address or name of the PC that runs Motive")
     interface: str | None = Field(
         None,
-        description="IPv4 address or name of our network card towards the cameras;"
-        " default: the one that leads to the server",
+        description="IPv4 address or name of this host's network card towards the cameras;"
+        " default: the card that routes to the server",
     )
     transport: Literal["auto", "unicast", "multicast"] = Field(
-        "auto", description="how frames come; `auto` does as the server announces"
+        "auto", description="transport of the frames; `auto` follows the announcement of the server"
     )
     command_port: int = Field(1510, ge=1, le=65535, description="command port of the server")
     data_port: int | None = Field(
@@ -37,9 +37,9 @@ class NatNetSettings(MocapSettings):
     )
     time: Literal["server", "ptp", "utc"] = Field(
         "server",
-        description="clock of the frames: the `server`'s own counter, asked by echoes; or the "
-        "precision timestamp of cameras on PTP (bitstream 4.1), where PTP keeps this host's clock, "
-        "too: `ptp` counts as PTP does (TAI), `utc` as UNIX time does",
+        description="clock of the frames: the `server`'s own counter, measured by echoes; or the "
+        "precision timestamp of cameras on PTP (bitstream 4.1), if PTP also sets this host's "
+        "clock: `ptp` counts as PTP does (TAI), `utc` as UNIX time does",
     )
     tai_minus_utc_s: int = Field(
         37, ge=0, le=100, description="leap seconds by which PTP time is ahead of UTC"
@@ -49,7 +49,7 @@ class NatNetSettings(MocapSettings):
     @field_validator("interface")
     @classmethod
     def _interface_that_can_exist(cls, interface: str | None) -> str | None:
-        """Refuse what is neither an address nor a name the kernel allows."""
+        """Refuse a value that is neither an address nor a name that the kernel allows."""
         if interface is not None and not is_interface_name(interface):
             raise ValueError(f"{INTERFACE_NAME_EXPECTED}; or an IPv4 address")
         return interface
@@ -64,8 +64,9 @@ class NatNetSettings(MocapSettings):
 
     @property
     def usual_delay_ms(self) -> tuple[float, float] | None:
-        """From exposure to arrival, mean and sd, where frames are stamped by PTP; else the usual.
+        """Mean and standard deviation, ms, of the delay from exposure to arrival.
 
-        Cameras and server take their time, and no echo tells of it then.
+        For frames stamped by PTP. None for frames stamped by the server, whose echoes measure
+        its clock.
         """
         return None if self.time == "server" else (self.latency_ms, self.latency_ms / 2)

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import (
     SETTLE_S,
+    FilterOutput,
     GatewayOrientation,
-    Oriented,
-    Reading,
+    RawReading,
     is_plausible,
 )
 from jointfit_protocols.xbus.configuration import TICK_NS
@@ -69,7 +69,7 @@ class RawOrientation:
     def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
         self._made = (rate_hz, magnetometer, settle_s)
         self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
-        self._waiting: tuple[RawMessage, Reading] | None = None
+        self._waiting: tuple[RawMessage, RawReading] | None = None
         self._ticks: int | None = None
         self._t_ns = 0
         self._reported_ns, self._reported = -_REPORT_NS, (False, False)
@@ -100,7 +100,7 @@ class RawOrientation:
 
         self._ticks, self._t_ns = message.ticks, reading.t_ns
         step = self._filter.take(reading)
-        out = self._warnings(message, values, began_anew=step.began_anew, missing=step.missing)
+        out = self._warnings(message, values, restarted=step.restarted, missing=step.missing)
 
         first, self._waiting = self._waiting, (message, reading)
         if len(step.oriented) > 1 and first is not None:
@@ -110,7 +110,7 @@ class RawOrientation:
             out.append(_sample(message, reading, step.oriented[-1]))
         return out
 
-    def _convert(self, ticks: int, values: Mapping[int, object], modulus: int) -> Reading:
+    def _convert(self, ticks: int, values: Mapping[int, object], modulus: int) -> RawReading:
         passed = 0 if self._ticks is None else (ticks - self._ticks) % modulus
         period_s = self._filter.period_ns * 1e-9
 
@@ -122,7 +122,7 @@ class RawOrientation:
             force = _scaled(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
 
         field = values.get(FIELD) if self._made[1] else None
-        return Reading(
+        return RawReading(
             self._t_ns + passed * TICK_NS,
             cast("Vector", rate),
             cast("Vector", force),
@@ -130,11 +130,11 @@ class RawOrientation:
         )
 
     def _warnings(
-        self, message: RawMessage, values: Mapping[int, object], *, began_anew: bool, missing: int
+        self, message: RawMessage, values: Mapping[int, object], *, restarted: bool, missing: int
     ) -> list[Decoded]:
         """Return warnings about missing measurements and saturation."""
         out: list[Decoded] = []
-        if began_anew:
+        if restarted:
             text = (
                 f"{missing} measurements missing: orientation filter restarted, heading uncertain"
             )
@@ -190,7 +190,7 @@ class RawOrientation:
         return out
 
 
-def _sample(message: RawMessage, reading: Reading, oriented: Oriented) -> ImuSample:
+def _sample(message: RawMessage, reading: RawReading, oriented: FilterOutput) -> ImuSample:
     q = oriented.q_world_sensor
     return ImuSample(
         message.arrival_ns,

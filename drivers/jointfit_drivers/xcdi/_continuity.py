@@ -1,22 +1,23 @@
-"""Counter and time of an XCDI sensor: lost groups, restarts, and two sensors on one identifier.
+"""Counter and time of an XCDI sensor: lost groups, restarts, and shared identifiers.
 
-Invariant: integers in, steps out; any input is accepted. With d the step of SampleTime and c the
-step of GroupCounter since the previous group, both modulo their widths, and P the step of one group
-as the stream showed it:
+With d the step of SampleTime and c the step of GroupCounter since the previous group, both modulo
+their widths, and P the measured step of SampleTime per group:
 
-| found                                                   | outcome                             |
+| finding                                                 | outcome                             |
 |---------------------------------------------------------|-------------------------------------|
 | c = round(d / P) within 1 % and a few counts            | same clock; c - 1 groups were lost  |
 | no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
-| d or c backward, one still and the other not, or at odds| contradiction: the group is held    |
-| the next group goes on from the held one                | restart, unless time went on        |
-| the next group goes on from the last accepted one       | the held one was damaged            |
-| three contradictions that go on from each other, or     | two sensors share the identifiers   |
+| d or c backward, only one of them 0, or disagreement    | contradiction: the group is held    |
+| the next group continues the held one                   | restart, unless time continued      |
+| the next group continues the last accepted one          | the held one was corrupt            |
+| three contradictions that continue each other, or       | two sensors share the identifiers   |
 | 14 broken groups, within 20 groups                      |                                     |
 
-A line to an adapter has no checksum, so a single group proves no restart. A sensor that is reset
-contradicts what was before once. Two sensors contradict each other for ever: their groups cannot be
-told apart, so nothing of them may be used.
+The line of an adapter has no checksum, so a single group proves no restart. A sensor that is reset
+contradicts the previous groups once. Two sensors contradict each other continuously. Their groups
+cannot be separated, so none of them is used.
+
+Invariant: integers in, steps out; every input is accepted.
 """
 
 from __future__ import annotations
@@ -27,80 +28,97 @@ from typing import NamedTuple
 
 from jointfit_protocols.xcdi import COUNTER_MODULUS, TICKS_MODULUS
 
-_LEARNED = 10  # steps that show the stream's own period
+_LEARNED = 10
+"""Steps after which the measured period is used."""
 _SLACK_COUNTS = 2
-_NEAR = 10  # counts that damage of counter and time may seem to take
+_NEAR = 10
+"""Counts that corruption of counter and time may appear to skip."""
 _SLACK_SHARE = 0.01
-_LONGEST = 20_000  # groups of a gap: over more the slack would let any pair agree
-_BLIND = 100  # groups of a gap that time alone may show, once the next group confirms it
-_WINDOW = 20  # groups
+_LONGEST = 20_000
+"""Longest gap, groups: beyond, the slack would let any pair agree."""
+_BLIND = 100
+"""Longest gap, groups, that time alone may show, once the next group confirms it."""
+_WINDOW = 20
+"""Groups over which contradictions are counted."""
 _CONTRADICTIONS = 3
 _BROKEN = 14
-_ASTRAY = 8  # contradictions in a row that no sensor explains: the period is another than it was
+_ASTRAY = 8
+"""Consecutive contradictions that no sensor explains; the period has then changed."""
 
 
-class Step(NamedTuple):
-    """What happened since the previous group."""
+class XcdiStep(NamedTuple):
+    """Classification of one group."""
 
     lost: int = 0
     restarted: bool = False
     """The sensor restarted before the held group."""
     shared: bool = False
-    """Two sensors send: this group may be a mixture."""
+    """Two sensors send with the same identifiers: this group may be a mixture."""
     held: bool = False
     """Hold this group until the next."""
     confirmed: bool = False
-    """The held group is good and comes first; else a held one is dropped."""
+    """The held group is valid and comes first; otherwise a held one is dropped."""
 
 
-_GOES_ON = Step()
-_HELD = Step(held=True)
+_CONTINUES = XcdiStep()
+_HELD = XcdiStep(held=True)
 
 
-class Continuity:
-    """Follows the groups of one sensor."""
+class XcdiContinuity:
+    """Tracks the groups of one sensor."""
 
     def __init__(self) -> None:
         self._track = _Track()
         self._held: _Track | None = None
-        self._rival: _Track | None = None  # of the contradictions before
+        self._rival: _Track | None = None  # the previous contradictions
         self._astray = 0
         self._contradictions: deque[bool] = deque(maxlen=_WINDOW)
         self._broken: deque[bool] = deque(maxlen=_WINDOW)
         self._quiet = 0  # groups since a contradiction or a broken one
         self.shared = False
 
-    def group(self, ticks: int | None, counter: int | None, *, broken: bool) -> Step:
-        """Take one group; `broken`: it, or what came before it, was incomplete."""
+    def group(self, ticks: int | None, counter: int | None, *, broken: bool) -> XcdiStep:
+        """Return the step for one group.
+
+        Parameters
+        ----------
+        ticks, counter : int, optional
+            Its SampleTime and GroupCounter.
+        broken : bool
+            Whether it, or the group before it, was incomplete.
+        """
         step, rivals = self._step(ticks, counter)
         self._contradictions.append(rivals)
         self._broken.append(broken)
         self._quiet = 0 if rivals or broken else self._quiet + 1
         was_shared = self.shared
         if self._quiet >= _WINDOW and not was_shared:
-            return step  # as nearly always: both windows hold nothing
+            return step  # the usual case: both windows are empty
+
         contradictions = sum(self._contradictions)
         if contradictions >= _CONTRADICTIONS or sum(self._broken) >= _BROKEN:
             self.shared = True
         elif not contradictions and not any(self._broken):
             self.shared = False
-        if self.shared:
-            return Step(shared=True)
-        return Step(restarted=True) if was_shared else step  # what comes now is one sensor again
 
-    def _step(self, ticks: int | None, counter: int | None) -> tuple[Step, bool]:
+        if self.shared:
+            return XcdiStep(shared=True)
+        return XcdiStep(restarted=True) if was_shared else step  # one sensor remains
+
+    def _step(self, ticks: int | None, counter: int | None) -> tuple[XcdiStep, bool]:
         """Return the step, and whether the group continues earlier contradictions."""
         if self._track.continues(ticks, counter):
             self._held, self._astray = None, 0
             lost = self._track.take(ticks, counter)
-            return (Step(lost) if lost else _GOES_ON), False
+            return (XcdiStep(lost) if lost else _CONTINUES), False
+
         held, self._held = self._held, None
         if held is not None and held.continues(ticks, counter):
             self._astray = 0
             groups, settled = self._track.groups_to(held), self._track.settled
             lost = held.take(ticks, counter) + (groups or 1) - 1
             self._track, self._rival = held, None
-            return Step(lost, restarted=groups is None and settled, confirmed=True), False
+            return XcdiStep(lost, restarted=groups is None and settled, confirmed=True), False
 
         self._astray += 1
         rival = self._rival
@@ -108,34 +126,36 @@ class Continuity:
         if rival is None or not rivals:
             rival = self._rival = _Track(self._track.period)
         rival.take(ticks, counter)
+
         if self._astray >= _ASTRAY:
             self._astray = 0
             self._track = _Track()
             self._track.take(ticks, counter)
-            return Step(restarted=True), rivals
+            return XcdiStep(restarted=True), rivals
+
         self._held = _Track(self._track.period)
         self._held.take(ticks, counter)
         return _HELD, rivals
 
 
 class _Track:
-    """Groups that go on from each other.
+    """Groups that continue each other.
 
     Parameters
     ----------
-    period
-        Ticks of one group, where it is known beforehand.
+    period : float, optional
+        Ticks per group, if known.
     """
 
     def __init__(self, period: float | None = None) -> None:
         self.period = period
         self.settled = period is not None
-        """Whether enough steps showed the period."""
+        """Whether enough steps have shown the period."""
         self._ticks: int | None = None
         self._counter: int | None = None
         self._groups = 0  # since the last group that had time, as the counter says
-        self._uncounted = 0  # groups that came, or are known lost, since the last counter
-        self._counted = False  # every group since then had a counter
+        self._uncounted = 0  # groups received, or known to be lost, since the last counter
+        self._counted = False  # whether every group since then had a counter
         self._steps: list[float] = []
 
     def continues(self, ticks: int | None, counter: int | None) -> bool:
@@ -146,31 +166,36 @@ class _Track:
         if ticks is None or self._ticks is None:
             few = self._uncounted + (_BLIND if self._ticks is None else _SLACK_COUNTS)
             return count is None or count <= 1 + few
+
         d = (ticks - self._ticks) % TICKS_MODULUS
         groups = self._groups + count if self._counted and count is not None else None
         if d >= TICKS_MODULUS // 2 or (groups is not None and (d == 0) != (groups == 0)):
             return False
         if self.period is None:
             return count is None or count <= 1 + self._uncounted + _SLACK_COUNTS
+
         expected = round(d / self.period)
         if groups is None and count is not None:
             groups = count - self._uncounted
         if groups is None:
             return expected <= 1 + _SLACK_COUNTS
+
         off = abs(groups - expected) % COUNTER_MODULUS
         near = min(off, COUNTER_MODULUS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
         return near and expected <= _LONGEST
 
     def groups_to(self, later: _Track) -> int | None:
-        """Return the groups between this track and a later one that does not continue it.
+        """Return the groups from this track to a later one that does not continue it.
 
-        None where time leapt, or the counter did: small differences of either are damage.
+        None if time or counter jumped; small differences of either are corruption.
         """
         if self._ticks is None or later._ticks is None or self.period is None:
             return None
+
         half = TICKS_MODULUS // 2
         passed = round(((later._ticks - self._ticks + half) % TICKS_MODULUS - half) / self.period)
         count = self._count(later._counter)
+
         off = 0 if count is None else abs(count - passed) % COUNTER_MODULUS
         is_near = min(off, COUNTER_MODULUS - off) <= _NEAR
         if abs(passed) > _BLIND or not is_near:
@@ -178,9 +203,10 @@ class _Track:
         return max(passed, 1) if count is None else 1
 
     def take(self, ticks: int | None, counter: int | None) -> int:
-        """Take a group that continues this track; return the groups lost before it."""
+        """Add a group that continues this track; return the groups lost before it."""
         count = self._count(counter)
         lost = 0 if count is None else max(count - 1 - self._uncounted, 0)
+
         self._groups += count or 0
         self._counted = self._counted and count is not None
         if ticks is not None and self._ticks is not None:
@@ -193,7 +219,7 @@ class _Track:
         return lost
 
     def _count(self, counter: int | None) -> int | None:
-        """Return the step of the counter; None where either end is missing."""
+        """Return the step of the counter; None where one of the groups has none."""
         if counter is None or self._counter is None:
             return None
         return (counter - self._counter) % COUNTER_MODULUS

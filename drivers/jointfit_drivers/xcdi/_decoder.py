@@ -1,8 +1,10 @@
-"""The pure half of the XCDI driver: records of CAN frames in, samples in SI out.
+"""Decoder of the XCDI driver: records of CAN frames in, samples in SI units out.
 
-Law: a function of the chunks fed; no clock, no bus. A sample is stamped with the first frame of its
-group, for arbitration delays the later ones by whatever else is on the bus. Every record of 24
-bytes is a message, a frame of somebody else's, a note of the host, or discarded.
+A sample is stamped with the first frame of its group, because arbitration delays the later ones.
+Every record of 24 bytes is a message of this sensor, a foreign frame, a note of the host, or
+discarded.
+
+Invariant: a function of the chunks fed; no clock, no bus.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
-from jointfit_drivers.xcdi._continuity import Continuity
+from jointfit_drivers.xcdi._continuity import XcdiContinuity
 from jointfit_protocols.can import (
     HOST_CORRUPT,
     HOST_DROPPED,
@@ -37,9 +39,12 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import Quaternion
     from jointfit_protocols.xcdi import ByteOrder, XcdiIds
 
-_UNDECIDED = 100  # groups after which an undecided unit is worth a warning
-_TIMELESS = 20  # quaternions without any SampleTime that are worth one
-_REPEAT_NS = 1_000_000_000  # the same error is told once a second at most
+_UNDECIDED = 100
+"""Groups after which an undecided unit of SampleTime is reported."""
+_TIMELESS = 20
+"""Quaternions after which a missing SampleTime is reported."""
+_REPEAT_NS = 1_000_000_000
+"""Shortest interval, ns, between reports of the same error."""
 
 
 class XcdiDecoder:
@@ -47,17 +52,17 @@ class XcdiDecoder:
 
     Parameters
     ----------
-    ids
+    ids : XcdiIds
         Its identifiers.
-    unit
-        ``100us`` or ``1us``, or ``auto``: decided from what arrives.
-    byte_order
-        Of the payloads.
+    unit : str
+        ``100us`` or ``1us``, or ``auto``: determined from the data.
+    byte_order : ByteOrder
+        Byte order of the payloads.
     """
 
     def __init__(self, ids: XcdiIds, unit: str, byte_order: ByteOrder) -> None:
         self._xcdi = XcdiCodec(ids, byte_order)
-        self._continuity = Continuity()
+        self._continuity = XcdiContinuity()
         self._held: XcdiGroup | None = None
         self._gate = OrientationGate()
         self._unit = TickUnit()
@@ -66,15 +71,15 @@ class XcdiDecoder:
             None if self._configured is None else TickClock(self._configured, TICKS_MODULUS)
         )
         self._measured = self._has_time = self._has_counter = False
-        self._incomplete = self._timed = self._told_at_ns = 0
+        self._incomplete = self._timed = self._reported_at_ns = 0
         self._refused = 0
         self._discarded = 0
-        self._said: set[str] = set()
+        self._reported_topics: set[str] = set()
         self._error_text = ""
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Unit of SampleTime; None until it is decided."""
+        """Unit of SampleTime; None until it is determined."""
         return self._tick_clock
 
     @property
@@ -84,32 +89,32 @@ class XcdiDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes of records that are no frame or make no sense, and of lost adapter lines."""
+        """Bytes of rejected records, and of lost lines of an adapter."""
         return self._discarded
 
     @property
     def incomplete(self) -> int:
-        """Groups that never got their quaternion."""
+        """Groups without a quaternion."""
         return self._xcdi.incomplete
 
     @property
     def ungrouped(self) -> int:
-        """Quaternions that came without device time."""
+        """Quaternions without device time."""
         return self._xcdi.ungrouped
 
     @property
     def foreign(self) -> int:
-        """Frames that are not this sensor's."""
+        """Frames of other devices."""
         return self._xcdi.foreign
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return what `chunk` completed, in wire order; never raises."""
+        """Return the content that `chunk` completed, in wire order; never raises."""
         out: list[Decoded] = []
         for item in unpack_frames(chunk.data):
             if not isinstance(item, CanFrame):
                 out.append(self._lose(item.discarded, item.reason))
             elif item.error:
-                out += self._note(item)
+                out += self._error_frame_events(item)
             else:
                 message = self._xcdi.feed(item)
                 if message is None:
@@ -117,43 +122,49 @@ class XcdiDecoder:
                 if isinstance(message, XcdiGroup):
                     self._group(message, out)
                 elif isinstance(message, XcdiError):
-                    out += self._reported(message)
+                    out += self._device_error_events(message)
                 else:
                     out.append(self._lose(RECORD_BYTES, message.reason))
         return out
 
     def flush(self) -> list[Decoded]:
-        """Give up waiting for the rest of a group, and for what would confirm one."""
+        """Discard an incomplete group and one that waits for confirmation."""
         self._xcdi.flush()
         out: list[Decoded] = []
         self._drop_held(out)
         return out
 
     def _group(self, group: XcdiGroup, out: list[Decoded]) -> None:
-        """Append the sample of `group`, after what its counter and time show."""
+        """Append the sample of `group` after the check of its counter and time."""
         ticks, counter = group.ticks, group.counter
         self._has_time = self._has_time or ticks is not None
         self._has_counter = self._has_counter or counter is not None
+
         torn = ticks is None and (self._has_time or (counter is None and self._has_counter))
         broken = torn or self._xcdi.incomplete != self._incomplete
         self._incomplete = self._xcdi.incomplete
+
         step = self._continuity.group(ticks, counter, broken=broken)
+
         held = self._held
         if held is not None and not step.confirmed:
             self._drop_held(out)
+
         if step.shared:
             self._refuse("two sensors share these identifiers", out)
             out += self._once("warning", "shared", _SHARED)
             return
-        self._said.discard("shared")
+        self._reported_topics.discard("shared")
         self._held = group if step.held else None
         if step.held:
             return
+
         first = held if held is not None and step.confirmed else group
         if step.restarted:
             self._gate.forget()
             self._unit.restart()
             out.append(DeviceEvent("restart", f"device clock restarted at {first.ticks} ticks"))
+
         if first is not group:
             self._sample(first, out)
         if step.lost:
@@ -161,22 +172,24 @@ class XcdiDecoder:
         self._sample(group, out)
 
     def _drop_held(self, out: list[Decoded]) -> None:
-        """Discard a group that nothing confirmed."""
+        """Discard a group that no later group confirmed."""
         held, self._held = self._held, None
         if held is not None:
-            self._gate.admit(_native(held))  # a wrong byte order makes time and counter leap, too
-            self._judge_norm(out)
+            self._gate.admit(_native(held))  # a wrong byte order also makes time and counter jump
+            self._check_norm(out)
             self._refuse("counter and time disagree with the other messages", out)
 
     def _sample(self, group: XcdiGroup, out: list[Decoded]) -> None:
-        """Append the sample of a group that belongs to the stream."""
+        """Append the sample of an accepted group."""
         ticks = group.ticks
+
         native = _native(group)
         q = self._gate.admit(native)
         if q is None:
             self._refuse("quaternion norm is not 1", out)
-            self._judge_norm(out)
+            self._check_norm(out)
             return
+
         if ticks is None:
             self._timeless(out)
         elif not self._measured:
@@ -184,9 +197,10 @@ class XcdiDecoder:
         out.append(ImuSample(group.t_ns, q, native, ticks, group.counter, group.status))
 
     def _measure(self, ticks: int, t_ns: int, out: list[Decoded]) -> None:
-        """Decide the unit of SampleTime, or check the one that was configured."""
+        """Determine the unit of SampleTime, or check the configured one."""
         self._timed += 1
         tick_ns = self._unit.feed(ticks, t_ns)
+
         rate = self._unit.ticks_per_s
         if tick_ns is None:
             if self._timed == _UNDECIDED and rate is not None:
@@ -194,12 +208,14 @@ class XcdiDecoder:
                 text = f"SampleTime counts {rate:.4g} ticks a second, expected {known}"
                 out += self._once("warning", "unit", text)
             return
+
         self._measured = True
         name = next(key for key, value in TICK_NS.items() if value == tick_ns)
         if self._configured not in {None, tick_ns}:
             text = f"SampleTime counts {rate:.4g} ticks a second: set `sample_time_unit` = {name!r}"
             out += self._once("warning", "unit", text)
             return
+
         self._tick_clock = TickClock(tick_ns, TICKS_MODULUS)
         data = {"sample_time_unit": name, "ticks_per_s": rate}
         out.append(DeviceEvent("info", f"SampleTime counts in {name}", data))
@@ -212,43 +228,44 @@ class XcdiDecoder:
             )
             out += self._once("warning", "timeless", text)
 
-    def _judge_norm(self, out: list[Decoded]) -> None:
+    def _check_norm(self, out: list[Decoded]) -> None:
         norm = self._gate.misconfigured_norm
         if norm is not None:
             text = f"median quaternion norm is {norm:.4g}, expected 1: change `byte_order`"
             out += self._once("warning", "norm", text, {"median_norm": norm})
 
-    def _note(self, frame: CanFrame) -> list[Decoded]:
-        """Return what the controller, its driver or the host has to say."""
+    def _error_frame_events(self, frame: CanFrame) -> list[Decoded]:
+        """Return the events of an error frame of the controller, its driver or the host."""
         if frame.can_id == HOST_CORRUPT:
             return [self._lose(host_count(frame), "no SLCAN line")]
         if frame.can_id == HOST_DROPPED:
             lost = host_count(frame)
             text = f"this host was too slow: the kernel dropped {lost} CAN frames"
             return [DeviceEvent("warning", text, {"dropped_frames": lost})]
+
         text, serious = describe_error(frame)
         return self._limited("error" if serious else "warning", text, frame.t_ns)
 
-    def _reported(self, error: XcdiError) -> list[Decoded]:
+    def _device_error_events(self, error: XcdiError) -> list[Decoded]:
         known = (
             "its output buffer overflowed, frames are lost: lower its rate or raise the bit rate"
         )
-        text = known if error.code == OVERFLOW else f"it reports error {error.code}"
+        text = known if error.code == OVERFLOW else f"device reports error {error.code}"
         return self._limited("error", text, error.t_ns)
 
     def _limited(self, kind: str, text: str, t_ns: int) -> list[Decoded]:
-        """Return the event unless the same was told within a second: a bad bus makes thousands."""
-        if text == self._error_text and 0 <= t_ns - self._told_at_ns < _REPEAT_NS:
+        """Return the event unless the same one was reported within a second."""
+        if text == self._error_text and 0 <= t_ns - self._reported_at_ns < _REPEAT_NS:
             return []
-        self._error_text, self._told_at_ns = text, t_ns
+        self._error_text, self._reported_at_ns = text, t_ns
         return [DeviceEvent(kind, text)]
 
     def _once(
         self, kind: str, topic: str, text: str, data: dict[str, object] | None = None
     ) -> list[Decoded]:
-        if topic in self._said:
+        if topic in self._reported_topics:
             return []
-        self._said.add(topic)
+        self._reported_topics.add(topic)
         return [DeviceEvent(kind, text, data or {})]
 
     def _refuse(self, reason: str, out: list[Decoded]) -> None:
@@ -268,7 +285,7 @@ def _native(group: XcdiGroup) -> Quaternion:
 
 
 _SHARED = (
-    "counters and times contradict each other: two sensors send with the same CAN identifiers, so "
-    "none of their samples is used: give each a block of its own (over UART, Xsens MT Manager) and "
-    "set `ids`"
+    "counters and times contradict each other: two sensors use the same CAN identifiers, so "
+    "none of their samples is used: give each sensor its own block (over UART, Xsens MT Manager) "
+    "and set `ids`"
 )

@@ -1,7 +1,7 @@
-"""Xsens MTi-600, Sirius and Avior on CAN ("XCDI").
+"""Driver of Xsens MTi-600, Sirius and Avior IMUs on CAN ("XCDI").
 
-Law: this driver only listens. The device is configured over its UART, once (CAN is off by factory
-default); over CAN nothing can be asked or set, so what is wrong is reported with what to change.
+This driver only receives. The device is configured once over its UART (CAN is off by factory
+default). Nothing can be requested or set over CAN, so faults are reported with their remedy.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_LONGEST_SILENCE_S = 30.0  # a sensor that is away stays on the bus's list, and is heard at once
+_LONGEST_SILENCE_S = 30.0
+"""Longest wait for an absent sensor, s. It stays subscribed, and its first frame is received at
+once."""
 _SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
-_RAW_FRAMES = 20  # logged at debug level, so that a first real device can be judged from its log
+_RAW_FRAMES = 20
+"""Frames logged at debug level, so that the log shows the raw data of a device."""
 
 
 class XcdiIdSettings(Settings):
-    """CAN identifiers of one sensor; give each sensor on a bus a block of its own."""
+    """CAN identifiers of one sensor; every sensor on a bus needs its own block."""
 
     sample_time: int = Field(DataId.SAMPLE_TIME, ge=0, le=EXTENDED_MAX, description="SampleTime")
     group_counter: int = Field(
@@ -54,8 +57,9 @@ class XcdiIdSettings(Settings):
 
     @model_validator(mode="after")
     def _usable(self) -> Self:
-        """Refuse identifiers that cannot be told apart or would tear groups apart."""
+        """Refuse identifiers that are not distinct, or whose order would split groups."""
         ids = self.resolved()
+
         given = [number for number in ids[:5] if number is not None]
         if len(set(given)) < len(given):
             raise ValueError("each identifier once: found one twice")
@@ -67,7 +71,7 @@ class XcdiIdSettings(Settings):
         return self
 
     def resolved(self, *, extended: bool = False) -> XcdiIds:
-        """Return all identifiers, those left out derived from a block if there is one."""
+        """Return all identifiers; those left out are derived from a block if there is one."""
         base = self.quaternion - DataId.QUATERNION
         block = base >= 0 and (
             self.sample_time - DataId.SAMPLE_TIME
@@ -108,7 +112,7 @@ class XcdiSettings(ImuSettings):
 
     @model_validator(mode="after")
     def _fits_its_identifiers(self) -> Self:
-        """Refuse 11-bit identifiers that no frame can carry."""
+        """Refuse 11-bit identifiers out of range."""
         for name, number in self.ids:
             if number is not None and number > STANDARD_MAX and not self.extended_ids:
                 raise ValueError(
@@ -137,7 +141,7 @@ class XcdiSettings(ImuSettings):
 
 
 class XcdiImu:
-    """Xsens IMU on a CAN bus: orientation, device time and counter, as three frames a sample."""
+    """Xsens IMU on a CAN bus: orientation, device time and counter, in three frames per sample."""
 
     Settings: ClassVar[type[XcdiSettings]] = XcdiSettings
     wire: ClassVar[Wire] = "can"
@@ -145,10 +149,10 @@ class XcdiImu:
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings
         self._ids = settings.ids.resolved(extended=settings.extended_ids)
-        self._silent_s = settings.silence_s  # listening on costs nothing; opening the bus anew does
+        self._silent_s = settings.silence_s  # waiting is cheap; opening the bus again is not
 
     def decoder(self) -> XcdiDecoder:
-        """Return the pure half: chunks in, samples in SI out. Live and replay use the same."""
+        """Return the decoder from chunks to samples, for live data and replay."""
         settings = self._settings
         return XcdiDecoder(self._ids, settings.sample_time_unit, settings.byte_order)
 
@@ -158,9 +162,10 @@ class XcdiImu:
         Raises
         ------
         DeviceLostError
-            Bus absent or down, adapter unplugged, or this sensor silent for `silence_s`.
+            The bus is absent or down, the adapter unplugged, or this sensor silent for `silence_s`.
         DeviceMisconfiguredError
-            No such bus here, or another sensor of the rig claims the same identifiers.
+            This kind of bus is not available, or another sensor of the rig uses the same
+            identifiers.
         """
         settings, by_id = self._settings, self._ids.by_id()
         ids = {key: data_id.name.lower() for key, data_id in by_id.items()}
@@ -172,6 +177,7 @@ class XcdiImu:
 
         silence_s = self._silent_s
         self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
+
         async with shared_bus(settings.can) as bus:
             await bus.pump(
                 settings.id,
@@ -191,7 +197,7 @@ class XcdiImu:
         return OrientationGate().admit((w, x, y, z)) is not None
 
     def _logged(self, emit: Emit) -> Emit:
-        """Return `emit`, with the first frames written to the log at debug level."""
+        """Return `emit`, which also logs the first frames at debug level."""
         if not log.isEnabledFor(logging.DEBUG):
             return emit
         left = _RAW_FRAMES

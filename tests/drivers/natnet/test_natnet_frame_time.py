@@ -109,7 +109,7 @@ def test_a_timecode_is_told_when_it_comes_and_when_it_goes() -> None:
         for event in feeder.events
         if isinstance(event, DeviceEvent) and "timecode" in event.data
     ]
-    assert said == [("timecode 10:20:30:04", 2), ("no timecode any more", None)]
+    assert said == [("timecode 10:20:30:04", 2), ("timecode lost", None)]
 
 
 @given(st.tuples(*[st.integers(0, 255)] * 4), st.integers(0, 100))

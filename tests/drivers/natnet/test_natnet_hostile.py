@@ -12,7 +12,7 @@ import pytest
 from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, ClockEcho, Corrupt, MocapFrame
 from jointfit_drivers.natnet import NatNetSettings
-from jointfit_drivers.natnet._open_requests import ANSWER_NS, ECHO_NS, OpenQuestions
+from jointfit_drivers.natnet._open_requests import ANSWER_NS, ECHO_NS, OpenRequests
 from jointfit_drivers.natnet._server_checks import (
     LEAST_CLOCK_HZ,
     MOST_CLOCK_HZ,
@@ -157,19 +157,19 @@ def test_a_model_of_one_datagram_costs_no_second_and_bounded_columns(
 def test_an_answer_is_accepted_once_in_time_and_only_when_asked_for(
     question: Message, answer: Message
 ) -> None:
-    questions, data = OpenQuestions(), encode(answer)
+    questions, data = OpenRequests(), encode(answer)
     assert not questions.accept(data, S)
-    questions.ask(question, S)
+    questions.register(question, S)
     assert questions.accept(data, S + 1)
     assert not questions.accept(data, S + 2)
-    questions.ask(question, S)
+    questions.register(question, S)
     assert not questions.accept(data, S + 1 + max(ANSWER_NS, ECHO_NS))
-    assert questions.unasked == 3
+    assert questions.unsolicited == 3
 
 
 def test_an_echo_with_a_forged_stamp_is_dropped() -> None:
-    questions = OpenQuestions()
-    questions.ask(EchoRequest(S), S)
+    questions = OpenRequests()
+    questions.register(EchoRequest(S), S)
     assert not questions.accept(encode(EchoResponse(S + 1, 5)), S + 2)
     assert questions.accept(encode(EchoResponse(S, 5)), S + 2)
 

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
 from jointfit_drivers import gateway_orientation
-from jointfit_drivers.gateway_orientation import GatewayOrientation, Reading
+from jointfit_drivers.gateway_orientation import GatewayOrientation, RawReading
 from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols import xbus
 from jointfit_protocols.xbus import mtdata2
@@ -112,7 +112,7 @@ def testicks_too_coarse_for_one_interval_do_not_change_the_turn() -> None:
     turned, before = 0.0, None
     for k in range(1201):
         t_ns = k * 500 // 3 * 100_000
-        for found in orientation.take(Reading(t_ns, (0.0, 0.0, 1.0), UP)).oriented:
+        for found in orientation.take(RawReading(t_ns, (0.0, 0.0, 1.0), UP)).oriented:
             q = found.q_world_sensor
             if before is not None:
                 turned += angle(before, q)
