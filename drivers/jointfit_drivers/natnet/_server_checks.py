@@ -63,8 +63,9 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         )
     if usable_hz(info) is None:
         raise DeviceMisconfiguredError(
-            f"{found} and announces a clock of {info.clock_hz} Hz, expected "
-            f"{LEAST_CLOCK_HZ} to {MOST_CLOCK_HZ}: check that server and command_port lead to Motive"
+            f"{found} and announces a clock frequency of {info.clock_hz} Hz, "
+            f"expected {LEAST_CLOCK_HZ} to {MOST_CLOCK_HZ}: "
+            "check that server and command_port lead to Motive"
         )
     if info.bitstream[0] > NEWEST_MAJOR and settings.wanted_version is None:
         raise DeviceMisconfiguredError(

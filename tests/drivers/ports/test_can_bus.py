@@ -196,7 +196,7 @@ async def test_a_silent_sensor_is_lost_alone_and_told_what_else_came(tmp_path: P
             await asyncio.sleep(0.01)
         told = await lost(silent)
         assert "S4" in told
-        assert "no quaternion (0x221) comes, while other sensors send" in told
+        assert "no quaternion (0x221) arrives, while other sensors send" in told
         assert not heard.task.done()
         await heard.cancel()
 
@@ -210,7 +210,7 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
         for number in range(10):
             device.push(number * 10_000_000, IDENTITY)
         told = await lost(run)
-    assert "no quaternion (0x321) comes" in told
+    assert "no quaternion (0x321) arrives" in told
     assert "that no sensor claims: 0x005, 0x006, 0x011, 0x021" in told
     assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
 
@@ -233,7 +233,9 @@ async def test_a_quaternion_that_never_comes_is_missed_though_time_and_counter_d
         again = Running(driver)
         assert await lost(again, 3.0) == told, "the same text, which is reported once"
         sending.cancel()
-    assert "no quaternion (0x121) comes, though sample_time (0x005), group_counter (0x006)" in told
+    assert (
+        "no quaternion (0x121) arrives, though sample_time (0x005), group_counter (0x006)" in told
+    )
     assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
 
 
@@ -266,7 +268,8 @@ async def test_a_quaternion_that_stops_is_missed_though_time_and_counter_go_on(
         told = await lost(run)
         assert len(run.samples) == 5
     assert (
-        "no quaternion (0x021) comes, though sample_time (0x005), group_counter (0x006) do" in told
+        "no quaternion (0x021) arrives, though sample_time (0x005), group_counter (0x006) do"
+        in told
     )
 
 

@@ -264,7 +264,7 @@ def test_a_counter_jump_is_reported_where_it_was_and_names_the_new_value() -> No
     follow = decoder()
     assert told(fed(follow, *wires[:-1])) == []
     jumped, *went_on = fed(follow, wires[-1])
-    assert jumped == DeviceEvent("counter", "its counter jumped to 520 while its time went on")
+    assert jumped == DeviceEvent("counter", "packet counter jumped to 520, device time did not")
     assert [sample.counter for sample in samples(went_on)] == [520, 521]
 
 

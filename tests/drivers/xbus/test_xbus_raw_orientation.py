@@ -138,7 +138,7 @@ def test_a_short_gap_is_interpolated(lost: int) -> None:
 def test_a_long_gap_begins_anew_at_the_same_heading_and_says_so() -> None:
     wires = [message(k, 100 * k, *items) for k, items in enumerate(turning(300))]
     events = decoded(wires[:150] + wires[160:])
-    told = [e for e in events if isinstance(e, DeviceEvent) and "began anew" in e.text]
+    told = [e for e in events if isinstance(e, DeviceEvent) and "filter restarted" in e.text]
     assert [(e.kind, e.data) for e in told] == [("warning", {"missing": 10})]
     found = samples(events)
     before, after = found[149].q_world_sensor, found[150].q_world_sensor
@@ -205,7 +205,7 @@ def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settle
     assert ticks[-1] == 1199 * TICKS
     gap = [(a, b) for a, b in pairwise(ticks) if a is not None and b is not None and b - a > TICKS]
     assert gap == [(599 * TICKS, 920 * TICKS)]
-    assert sum(isinstance(e, DeviceEvent) and "began anew" in e.text for e in events) == 1
+    assert sum(isinstance(e, DeviceEvent) and "filter restarted" in e.text for e in events) == 1
 
 
 def test_a_fast_rate_that_repeats_itself_is_at_the_end_of_its_range() -> None:
