@@ -217,7 +217,7 @@ EXPECTED = {
     "absent": ("is not there", "plug it in, or set `port`"),
     "modem": ("bytes discarded: ",),
     "twin": ("two sensors send with the same CAN identifiers", "set `ids`"),
-    "mute": ("no quaternion (0x321) comes", "check its power and wiring, and `ids`"),
+    "mute": ("no quaternion (0x321) arrives", "check its power and wiring, and `ids`"),
     "mocap": ("marker 'Thigh3' (mocap.markers.thigh) is not in the stream", "The server has", "T3"),
 }
 

@@ -255,7 +255,7 @@ async def test_a_silent_sensor_is_lost_alone_on_a_live_bus(wire: PythonCanWire) 
         for number in range(80):
             identity(device, 1, first=number)
             await asyncio.sleep(0.01)
-        missing = r"S4.*no quaternion \(0x221\) comes, while other sensors send"
+        missing = r"S4.*no quaternion \(0x221\) arrives, while other sensors send"
         with pytest.raises(DeviceLostError, match=missing):
             await task
         assert len(heard.samples) == 80
