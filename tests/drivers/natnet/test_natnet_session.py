@@ -179,7 +179,7 @@ async def test_a_port_where_nobody_listens_is_lost_at_once_and_named() -> None:
     )
     async with asyncio.timeout(1):
         with pytest.raises(
-            DeviceLostError, match=f"127.0.0.1:{server.command_port}: nothing listens"
+            DeviceLostError, match=f"127.0.0.1:{server.command_port}: no program listens"
         ):
             await driver.run(lambda _: None)
 
@@ -224,7 +224,7 @@ class Claimant(NatNetServer):
         (
             ServerInfo("M", (3, 0, 0, 0), (3, 0, 0, 0), 10**7, multicast=True, group="10.0.0.1"),
             {},
-            "no multicast address",
+            "not a multicast address",
         ),
     ],
 )

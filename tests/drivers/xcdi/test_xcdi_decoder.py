@@ -236,7 +236,7 @@ def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
     assert len(samples(found)) < 30
     (told,) = of_kind(found, "warning")
     assert "two sensors" in told.text
-    assert "block of its own" in told.text
+    assert "its own block" in told.text
     assert len(of_kind(found, "restart")) <= 3
 
 
