@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.center_of_rotation import circle_rms_bound
-from jointfit_daemon.center_of_rotation.planar import GATE, Method, ellipse_scale, fit_circles
+from jointfit_daemon.center_of_rotation.planar import GATE, CircleMethod, ellipse_scale, fit_circles
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -58,7 +58,7 @@ def runs_on(
     *,
     radius: float = 0.3,
     runs: int = 20_000,
-    method: Method = "hyper",
+    method: CircleMethod = "hyper",
     tempered: bool = True,
     correlated: bool = False,
 ) -> Runs:

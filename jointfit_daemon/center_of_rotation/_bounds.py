@@ -1,7 +1,7 @@
-r"""How well a center can be known at all: Cramér-Rao bounds.
+"""Cramér-Rao bounds of a circle's center.
 
-Law: a bound belongs to the movement and the noise, not to a method; no unbiased estimator is
-better, and infinite is the right answer where the movement shows nothing.
+A bound depends on the movement and the noise only. It is infinite where the movement carries no
+information about the center.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-r"""One center from several estimates of it: fused by information, robust against one that is off.
+"""Robust fusion of several estimates of one center.
 
-Law: estimates of one point are weighed by what each knows in every direction, so that each
-marker's weak direction is filled by the others; one that contradicts the rest beyond its own
-covariance loses its weight and is named.
+Each estimate is weighted by its information matrix, so that the weak direction of one marker is
+covered by the others. An estimate that contradicts the others by more than its covariance allows
+loses weight and is named in a flag.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
         Of one dimension, one parent, with independent errors (of the parent's own noise, which they
         share, `RunningSphere` knows more).
     robust : bool
-        Weigh down what contradicts the others.
+        Reduce the weight of estimates that contradict the others.
 
     Returns
     -------
@@ -60,15 +60,18 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     if not used:
         reasons = "; ".join(dict.fromkeys(e.refused or "" for e in estimates))
         return refusal("several", d, max(e.frames for e in estimates), reasons)
+
     centers = np.array([estimates[k].center for k in used])
     knowledge = np.array([_information(estimates[k]) for k in used])
     w, robustly = np.ones(len(used)), robust and len(used) > 2
+
     for _ in range(_PASSES if robustly else 0):
         again = np.array([_weight(i, w, knowledge, centers) for i in range(len(used))])
         done = bool(np.allclose(again, w, atol=1e-6))
         w = 0.5 * (w + again)
         if done:
             break
+
     return _fused([estimates[k] for k in used], used, w, knowledge, centers)
 
 
@@ -107,6 +110,7 @@ def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
     gap = P.T @ (centers[i] - m)
     square = float(gap @ np.linalg.solve(spread, gap)) / len(gap)
     distance = sqrt(max(square, 0.0))  # a nearly singular spread may round below zero
+
     return min(1.0, TOLERATED / max(distance, 1e-12)) ** 2
 
 
@@ -116,8 +120,9 @@ def _fused(
     total = np.einsum("k,kab->ab", w, knowledge)
     B = _seen(total)
     if B.shape[1] == 0:
-        reason = "no estimate shows a direction of the center: move the joint further"
+        reason = "no direction of the center was observable: increase the range of motion"
         return refusal("several", len(total), max(e.frames for e in estimates), reason)
+
     C = np.linalg.inv(B.T @ total @ B)
     d = len(total)
     m = B @ C @ B.T @ np.einsum("k,kab,kb->a", w, knowledge, centers)
@@ -134,6 +139,7 @@ def _fused(
     bounds = np.array([e.bound for e in estimates])
     ratio = np.array([e.bound / max(e.sd, 1e-12) if np.isfinite(e.sd) else 1.0 for e in estimates])
     sd = float(np.sqrt(np.trace(C)))
+
     return CenterEstimate(
         method="several",
         center=m,
@@ -157,5 +163,5 @@ def _fused(
         ),
         refused=None
         if B.shape[1] >= 2
-        else first.refused or "one direction only was seen: move the joint further",
+        else first.refused or "only one direction was observable: increase the range of motion",
     )

@@ -1,6 +1,6 @@
-"""One way in to every estimator of a center of rotation.
+"""Table of all estimators and one function that runs any of them.
 
-Law: a name, a movement, one `CenterEstimate`; what a method needs is said by `METHODS`.
+`METHODS` lists the inputs that each method needs.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from jointfit_daemon.center_of_rotation._movement import Movement
 from jointfit_daemon.center_of_rotation._result import refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     NOISE_FACTOR,
-    Limits,
     RunningSphere,
+    SphereLimits,
     SphereOptions,
     fit_axis,
     fit_score,
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 
 
 _ASK_EVERY = 50
-"""Frames after which a stream is asked, so that it knows what leaves its spheres."""
+"""Frames between two estimates of a stream, which update its outlier weights."""
 
 
 @dataclass(frozen=True, slots=True)
-class Method:
+class EstimationMethod:
     """One estimator by name."""
 
     name: str
     about: str
-    """One line for people who choose."""
+    """One-line description."""
     needs: tuple[str, ...]
     """Fields of `Movement` that must be given: ``points``, ``parent`` and ``child``, ``angles``."""
     planar: bool
@@ -72,7 +72,7 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     Raises
     ------
     ValueError
-        Unknown method, or the movement lacks what it needs: wrong calls, not bad data.
+        Unknown method, or the movement lacks a required field. Bad data never raise.
     """
     if not isinstance(movement, Movement):
         movement = Movement(np.asarray(movement, dtype=np.float64))
@@ -86,8 +86,9 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     if points is not None and not chosen.planar and points.shape[-1] != 3:
         raise ValueError(f"{chosen.name} needs points in space, shape (n, k, 3)")
     if points is not None and not np.isfinite(points).any():
-        reason = "no marker was seen in any frame: check marker names, cameras and what covers them"
+        reason = "all markers are missing in every frame: check marker names, cameras and occlusion"
         return refusal(chosen.name, points.shape[-1], 0, reason)
+
     return _beyond_parent(chosen.run(movement), movement.parent_markers)
 
 
@@ -138,7 +139,7 @@ def _bodies(movement: Movement) -> tuple[BodyPoses, BodyPoses]:
 
 def _stream(movement: Movement) -> CenterEstimate:
     points = _points(movement)
-    limits = Limits(min_direction=movement.least_turn)
+    limits = SphereLimits(min_direction=movement.least_turn)
     k, d = points.shape[1:]
     stream = RunningSphere(k, dimension=d, near=movement.near, limits=limits)
     for number, frame in enumerate(points, 1):
@@ -150,8 +151,10 @@ def _stream(movement: Movement) -> CenterEstimate:
 
 def _planar(
     name: str, about: str, run: Callable[[Array, Movement], CenterEstimate], *more: str
-) -> Method:
-    return Method(name, about, ("points", *more), True, _planar_methods.in_plane(run, name))
+) -> EstimationMethod:
+    return EstimationMethod(
+        name, about, ("points", *more), True, _planar_methods.in_plane(run, name)
+    )
 
 
 _ALL = (
@@ -170,47 +173,47 @@ _ALL = (
     ),
     _planar("grid", "search on a grid: the published baseline", _planar_methods.grid),
     _planar("three_frames", "closed form through three frames", _planar_methods.three_frames),
-    Method(
+    EstimationMethod(
         "gamage_lasenby",
         "linear sphere fit; biased on short arcs",
         ("points",),
         False,
         lambda m: gamage_lasenby(_points(m), m.least_turn),
     ),
-    Method(
+    EstimationMethod(
         "halvorsen",
         "linear sphere fit, bias taken out",
         ("points",),
         False,
         lambda m: halvorsen(_points(m), m.least_turn),
     ),
-    Method(
+    EstimationMethod(
         "sphere",
-        "geometric sphere fit of all markers, robust; tells a hinge from a ball joint",
+        "geometric sphere fit of all markers, robust; distinguishes a hinge from a ball joint",
         ("points",),
         False,
         lambda m: fit_sphere(
             _points(m),
             SphereOptions(start=m.near),
-            Limits(min_direction=m.least_turn),
+            SphereLimits(min_direction=m.least_turn),
             m.parent_markers,
         ),
     ),
-    Method(
+    EstimationMethod(
         "running_sphere",
-        "spheres of all markers one frame at a time; tells a hinge from a ball joint",
+        "spheres of all markers one frame at a time; distinguishes a hinge from a ball joint",
         ("points",),
         True,
         _stream,
     ),
-    Method(
+    EstimationMethod(
         "score",
         "both bodies treated alike; needs three markers on each",
         ("parent", "child"),
         False,
         lambda m: fit_score(*_bodies(m), near=m.near),
     ),
-    Method(
+    EstimationMethod(
         "sara",
         "axis of a hinge from both bodies",
         ("parent", "child"),
@@ -218,6 +221,6 @@ _ALL = (
         lambda m: fit_axis(*_bodies(m), near=m.near, toward=m.axis),
     ),
 )
-METHODS: dict[str, Method] = {method.name: method for method in _ALL}
+METHODS: dict[str, EstimationMethod] = {method.name: method for method in _ALL}
 """``kasa pratt taubin hyper geometric running_circle oriented grid three_frames`` (plane),
 ``gamage_lasenby halvorsen sphere running_sphere score sara`` (space), by name."""

@@ -1,6 +1,7 @@
-"""What the estimators of a center look at.
+"""Input of the estimators: marker positions, body poses and joint angles.
 
-Law: positions in meters; NaN is "not seen"; both body parts of a pair in one world.
+Positions are in meters, NaN where a marker was not visible. Both body poses of a pair are given in
+one world.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ look like the joint's own."""
 
 @dataclass(frozen=True, slots=True)
 class BodyPoses:
-    """Where one body part was over time: a point x of its own is at R(q) x + t in the world."""
+    """Pose of a body part over time: a point x of the body is at R(q) x + t in the world."""
 
     q: Array
     """q_world_body, scalar first, shape (n, 4); NaN where not known."""
     t: Array
-    """Where its origin was, m, shape (n, 3)."""
+    """Position of its origin, m, shape (n, 3)."""
 
     def to_world(self, x: Array) -> Array:
         """Take one point of the body, m, shape (3,), to the world, shape (n, 3)."""
@@ -39,7 +40,7 @@ class BodyPoses:
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """Everything that is known of a movement; a method says which of it it needs."""
+    """Data of a movement; `METHODS` lists the fields that each method needs."""
 
     points: Array | None = None
     """Markers of the child in the parent's coordinates, m, shape (n, k, 3), or (n, k, 2) in a
@@ -47,8 +48,8 @@ class Movement:
     parent: BodyPoses | None = None
     child: BodyPoses | None = None
     parent_markers: Array | None = None
-    """The parent's own markers in its coordinates, m, shape (m, 3): what their noise does to the
-    points is then told from the points' own."""
+    """The parent's own markers in its coordinates, m, shape (m, 3): the effect of their noise on
+    the points is then separated from their own."""
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
     inertial sensors: for ``oriented``."""

@@ -37,6 +37,7 @@ def arc_of_spread(spread: float) -> float:
     for _ in range(30):
         half = (low + high) / 2
         low, high = (half, high) if 1.0 - (sin(half) / half) ** 2 < spread else (low, half)
+
     return low + high
 
 

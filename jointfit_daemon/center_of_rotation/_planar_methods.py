@@ -1,8 +1,8 @@
-"""Planar methods on any number of markers, in a plane or in space.
+"""Planar methods for any number of markers, in a plane or in space.
 
-Law: points in space are looked at along the joint's axis, which is given or which the paths show; a
-movement that is not a hinge's is not pressed into a plane. The center found is one of a line: its
-place along the axis is unseen, and said to be.
+Points in space are projected along the joint axis, which is given or estimated from the paths. A
+movement about more than one axis is refused. The position of the center along the axis is reported
+as unseen.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from jointfit_daemon.center_of_rotation._fused_estimate import fuse_centers
 from jointfit_daemon.center_of_rotation._result import refusal
 from jointfit_daemon.center_of_rotation.planar import (
+    CircleLimits,
     Grid,
-    Limits,
     RunningCircle,
     circle_estimate,
     geometric_estimate,
@@ -26,8 +26,7 @@ from jointfit_daemon.center_of_rotation.planar import (
     plane_of,
     three_frame_estimate,
 )
-from jointfit_daemon.center_of_rotation.spatial import Limits as SphereLimits
-from jointfit_daemon.center_of_rotation.spatial import fit_running
+from jointfit_daemon.center_of_rotation.spatial import SphereLimits, fit_running
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,19 +34,19 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.center_of_rotation._movement import Movement
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
-    from jointfit_daemon.center_of_rotation.planar import Method
+    from jointfit_daemon.center_of_rotation.planar import CircleMethod
 
 
 OFF_AXIS = (
-    "the paths do not lie in planes, the joint turned about more than one axis: use sphere or "
-    "score, or give the axis"
+    "the marker paths are not planar, so the joint rotated about more than one axis: use sphere "
+    "or score, or give the axis"
 )
-LIMITS = Limits(sd=inf)
-"""A user who asks for one method is told its error, not denied its answer for it."""
+LIMITS = CircleLimits(sd=inf)
+"""No limit on the error: a user who chose a method gets its result with its uncertainty."""
 _GRID_STEP_M = 0.005
 
 
-def circle(method: Method) -> Callable[[Array, Movement], CenterEstimate]:
+def circle(method: CircleMethod) -> Callable[[Array, Movement], CenterEstimate]:
     """Return a closed-form fit as a function of points, shape (n, k, 2)."""
     return lambda points, _: _each(
         points, lambda p: circle_estimate(p, method=method, limits=LIMITS)
@@ -81,7 +80,7 @@ def oriented(points: Array, movement: Movement) -> CenterEstimate:
 
 
 def grid(points: Array, _: Movement) -> CenterEstimate:
-    """Search nodes about where the circle fit says: a baseline, no better than its step."""
+    """Search grid nodes around the circle fit; a baseline, no better than its step."""
 
     def one(p: Array) -> CenterEstimate:
         about = circle_estimate(p, limits=LIMITS)
@@ -91,6 +90,7 @@ def grid(points: Array, _: Movement) -> CenterEstimate:
         x, y = (float(v) for v in np.round(about.center / _GRID_STEP_M) * _GRID_STEP_M)
         node = grid_center(seen, Grid((x, y), step=_GRID_STEP_M))
         rounding = _GRID_STEP_M**2 / 12.0 * np.eye(2)
+
         return replace(about, method="grid", center=node, covariance=about.covariance + rounding)
 
     return _each(points, one)
@@ -108,6 +108,7 @@ def three_frames(points: Array, _: Movement) -> CenterEstimate:
         turn = np.unwrap(np.arctan2(*(seen - whole.center).T[::-1]))
         order = np.argsort(turn)
         middle = int(np.argmin(np.abs(turn - turn[order[[0, -1]]].mean())))
+
         return three_frame_estimate(seen[[order[0], middle, order[-1]]], whole.noise)
 
     return _each(points, one)
@@ -140,6 +141,7 @@ def in_plane(
             if shown.axis is None:
                 return refusal(name, 3, shown.frames, shown.refused or OFF_AXIS)
             axis = shown.axis
+
         plane = plane_of(axis)
         return _lifted(run(points @ plane, movement), plane, points, movement.near)
 

@@ -1,7 +1,7 @@
-"""What every estimator of a center of rotation answers.
+"""The result type of all estimators of a center of rotation.
 
-Law: one type for all methods, planar or spatial. What was not observed is said (`unseen`,
-`refused`), never hidden in a finite number, and never NaN.
+Invariant: directions without information are listed in `unseen`, an unusable center has a reason
+in `refused`, and no field of a usable estimate is NaN.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CenterEstimate:
-    """A point at rest in the parent segment and in the child, as far as the movement shows it."""
+    """Estimated point that is fixed in both the parent and the child segment."""
 
     method: str
     """Name of the estimator: ``hyper``, ``sphere``, ``score``, ..."""
     center: Array
     """m, shape (d,), d = 2 (plane) or 3 (space), in the parent's coordinates."""
     covariance: Array
-    """m², shape (d, d): of the observed directions; zero along those in `unseen`."""
+    """m², shape (d, d); zero along the directions in `unseen`."""
     noise: float
     """Standard deviation of a point per coordinate, estimated from the residuals, m."""
     residual: float
-    """RMS of what is left after the fit, m (radial; for SCoRE the gap between the two sides)."""
+    """RMS residual, m (radial; for SCoRE the distance between the two sides)."""
     radii: Array
     """Distance of each marker from the center, m, shape (k,)."""
     arc: float
-    """Angle the markers went through about the center, rad."""
+    """Angle covered by the markers about the center, rad."""
     bound: float
     """Cramér-Rao bound of the RMS error at `noise`, m; inf where a direction is unseen."""
     conditioning: float
-    """T, about the curvature over its standard error: below 6 a circle is not usable."""
+    """T, the curvature over its standard error; below 6 a circle is not usable."""
     frames: int
     effective_frames: float
     """`frames` after forgetting weights and correlation from frame to frame."""
@@ -46,12 +46,12 @@ class CenterEstimate:
     axis: Array | None = None
     """Unit axis of a hinge in the parent's coordinates, shape (3,), where one was found."""
     flags: tuple[str, ...] = ()
-    """What the user should know and what was done about it, e.g. ``orientation_inconsistent``."""
+    """Findings about the data, e.g. ``orientation_inconsistent``."""
     within95: float | None = None
     """Squared Mahalanobis distance eᵀC⁻¹e that 95 % of the centers published by this method stay
     within: the published ellipse. None: the quantile of chi-square is the best that is known."""
     refused: str | None = None
-    """Why the center must not be used and what to do; None if it may be used."""
+    """Cause and remedy if the center must not be used; None if it may."""
 
     @property
     def sd(self) -> float:
@@ -62,7 +62,7 @@ class CenterEstimate:
 
 
 def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
-    """Return an estimate that knows nothing, in any direction, and says why."""
+    """Return an estimate without information in any direction, with the reason."""
     return CenterEstimate(
         method=method,
         center=np.full(d, np.nan),

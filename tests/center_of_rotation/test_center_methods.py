@@ -1,4 +1,4 @@
-"""One way in: every method by name, the same center, no silent NaN."""
+"""Every estimator by name: same center, same refusals, no NaN."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_planar_method_finds_the_center(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", IN_A_PLANE)
-def test_planar_methods_take_a_hinge_in_space_and_say_what_they_do_not_see(name: str) -> None:
+def test_planar_methods_of_a_hinge_in_space_report_the_unseen_axis(name: str) -> None:
     found = estimate_center(whole("hinge"), name)
     assert found.refused is None
     assert found.sd == inf
@@ -55,7 +55,7 @@ def test_planar_methods_take_a_hinge_in_space_and_say_what_they_do_not_see(name:
 
 
 @pytest.mark.parametrize("name", [name for name in IN_A_PLANE if name != "running_sphere"])
-def test_planar_methods_do_not_press_a_ball_joint_into_a_plane(name: str) -> None:
+def test_planar_methods_refuse_a_ball_joint(name: str) -> None:
     found = estimate_center(whole("ball"), name)
     assert found.refused is not None
     assert "more than one axis" in found.refused
@@ -70,7 +70,7 @@ def test_every_spatial_method_finds_a_ball_joint(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["sphere", "running_sphere", "score", "sara"])
-def test_spatial_methods_tell_a_hinge(name: str) -> None:
+def test_spatial_methods_detect_a_hinge(name: str) -> None:
     found = estimate_center(whole("hinge"), name)
     assert found.refused is None
     assert found.sd == inf == found.bound
@@ -86,7 +86,7 @@ def test_linear_sphere_fits_refuse_a_hinge(name: str) -> None:
     assert "one axis" in found.refused
 
 
-def test_auto_takes_what_the_movement_offers() -> None:
+def test_auto_selects_a_method_for_the_given_data() -> None:
     ball = whole("ball")
     assert estimate_center(ball).method == "sphere"
     assert estimate_center(Movement(parent=ball.parent, child=ball.child)).method == "score"
@@ -94,7 +94,7 @@ def test_auto_takes_what_the_movement_offers() -> None:
     assert estimate_center(planar().points[:, 0]).method == "geometric"  # type: ignore[index]  # it has points
 
 
-def test_wrong_calls_are_bugs_not_data() -> None:
+def test_estimate_center_raises_for_invalid_arguments() -> None:
     with pytest.raises(ValueError, match=r"no method 'kaasa'; there are: .*kasa"):
         estimate_center(planar(), "kaasa")
     with pytest.raises(ValueError, match="needs parent and child"):
@@ -142,7 +142,7 @@ def test_a_marker_that_jumps_moves_no_robust_method_far(name: str) -> None:
 
 @given(st.integers(0, 1000), st.floats(0.0, 0.9), st.sampled_from([*IN_SPACE, "sara"]))
 @settings(max_examples=40, deadline=None)
-def test_no_method_is_silently_nan(seed: int, hidden: float, name: str) -> None:
+def test_no_method_returns_nan_without_a_refusal(seed: int, hidden: float, name: str) -> None:
     rng = np.random.default_rng(seed)
     rom = float(rng.choice([1.0, 20.0, 120.0]))
     turns = ball_turns(rng, rom, 60) if rng.integers(2) else hinge_turns(rom, 60)

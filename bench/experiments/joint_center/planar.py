@@ -16,7 +16,7 @@ from bench.subjects.planar_arcs import (
 )
 from jointfit_daemon.center_of_rotation import circle_rms_bound
 from jointfit_daemon.center_of_rotation.planar import (
-    Limits,
+    CircleLimits,
     RunningCircle,
     arbitrary_error,
     circle_estimate,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
 
-WIDE = Limits(0.0, (0.0, np.inf), 0.0, np.inf)
+WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
 def three_frames(_: Path) -> list[Figure]:

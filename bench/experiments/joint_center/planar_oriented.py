@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.planar_arcs import arc_points
-from jointfit_daemon.center_of_rotation.planar import Limits, fit_circles, oriented_estimate
+from jointfit_daemon.center_of_rotation.planar import CircleLimits, fit_circles, oriented_estimate
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Kind = Literal["white", "slow", "OU", "gain"]
 
 FRAMES, SECONDS, NOISE_M, RADIUS_M = 100, 2.0, 0.002, 0.3
-WIDE = Limits(0.0, (0.0, np.inf), 0.0, np.inf)
+WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 STATED: tuple[tuple[Kind, float], ...] = (
     ("white", 0.0),
     ("white", 1.0),

@@ -25,7 +25,7 @@ from bench.subjects.simulated_joints import (
     watched,
 )
 from jointfit_daemon.center_of_rotation import fuse_centers
-from jointfit_daemon.center_of_rotation.planar import Limits, circle_estimate
+from jointfit_daemon.center_of_rotation.planar import CircleLimits, circle_estimate
 from jointfit_daemon.center_of_rotation.spatial import (
     RunningSphere,
     SphereOptions,
@@ -65,7 +65,7 @@ def four_markers(_: Path) -> list[Figure]:
     rng = np.random.default_rng(7)
     truth, noise = fan(20.0), 2e-3
     bound = np.sqrt(sphere_bound(truth, noise))
-    anyhow = Limits(gate=0.0, arc=0.0, sd=inf)
+    anyhow = CircleLimits(gate=0.0, arc=0.0, sd=inf)
     fused, joint = [], []
     for _run in range(400):
         seen = truth + rng.normal(0, noise, truth.shape)

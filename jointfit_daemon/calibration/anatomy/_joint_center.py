@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.center_of_rotation.spatial import (
-    Limits,
+    SphereLimits,
     SphereOptions,
     judge_sphere,
     objection,
@@ -35,7 +35,7 @@ UNSEEN_SD_M = 0.03
 """Standard deviation given to the center along a direction that the movement did not show."""
 MAX_SD_M = 0.04
 """Standard deviation, in a direction that was observed, above which a center is refused."""
-LIMITS = Limits(min_arc=radians(10.0), reach=(0.02, 1.0))
+LIMITS = SphereLimits(min_arc=radians(10.0), reach=(0.02, 1.0))
 ON_SKIN = SphereOptions(
     smallest_scale=1e-4, hold=0.003, min_direction=MIN_DIRECTION_RAD, keep_one=True
 )

@@ -1,6 +1,6 @@
 r"""Anderson acceleration of a fixed-point iteration, to be taken only where it helps.
 
-Law: this proposes, the caller disposes. Without a safeguard it was seen to raise tracking errors.
+This proposes, the caller disposes. Without a safeguard it was seen to raise tracking errors.
 
 .. math::
 
@@ -44,6 +44,6 @@ class Anderson:
         return np.asarray(image - dG @ gamma)
 
     def forget(self) -> None:
-        """Start over: the last proposal was no good."""
+        """Discard the history after a rejected proposal."""
         self._images.clear()
         self._changes.clear()

@@ -1,6 +1,6 @@
 r"""Markers and poses in turns: block-coordinate descent, accelerated only where that helps.
 
-Law: it asks of a model nothing but to follow given markers, so it runs on any inverse kinematics.
+It asks of a model nothing but to follow given markers, so it runs on any inverse kinematics.
 Poses fixed, the best positions are a weighted mean of the measured ones in segment axes and of
 the nominal ones,
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.marker_refinement._objective import Problem
+    from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
 
 _TOLERANCE = 1e-4
 _MOST_ITERATIONS = 30
@@ -39,12 +39,12 @@ class Carriers(NamedTuple):
     origins: Array
     """m, shape (T, M, 3)."""
     overturning: float = 0.0
-    """What hinges beyond their limits add to F."""
+    """Part of F from hinges beyond their limits."""
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
-    """A place on the way: positions and the poses that follow them."""
+class AlternatingStep:
+    """One accepted iterate: positions and the poses that follow them."""
 
     positions: Array
     carriers: Carriers
@@ -52,14 +52,14 @@ class Turn:
 
 
 def solve_in_turns(
-    problem: Problem,
+    problem: RefinementProblem,
     follow: Callable[[Array, Array], Carriers],
-    on_step: Callable[[Turn], bool] | None = None,
+    on_step: Callable[[AlternatingStep], bool] | None = None,
     *,
     start: Array | None = None,
     tolerance: float = _TOLERANCE,
     most_iterations: int = _MOST_ITERATIONS,
-) -> list[Turn]:
+) -> list[AlternatingStep]:
     """Refine by turns of inverse kinematics and weighted means.
 
     Parameters
@@ -67,7 +67,7 @@ def solve_in_turns(
     follow
         Given positions, m, shape (M, 3), and weights of squared errors, shape (T, M): the poses.
     on_step
-        Told every accepted place; True ends the iteration.
+        Called with every accepted iterate; True ends the iteration.
     start
         Positions to begin with, m, shape (M, 3); the nominal ones if None.
     tolerance
@@ -78,7 +78,7 @@ def solve_in_turns(
     list of Turn
         Start and every accepted place; F falls along it.
     """
-    turns = _Turns(problem, follow)
+    turns = _AlternatingSolver(problem, follow)
     path, anderson = [turns.first(start)], Anderson()
     while len(path) <= most_iterations:
         last = path[-1]
@@ -89,32 +89,36 @@ def solve_in_turns(
             if guess is not None:
                 anderson.forget()
             new = turns.follow(plain, last)
+
         if new.cost >= last.cost:  # both halves are at their best, up to rounding
             break
         path.append(new)
         done = last.cost - new.cost < tolerance * last.cost
         if done or (on_step is not None and on_step(new)):
             break
+
     return path
 
 
-class _Turns:
+class _AlternatingSolver:
     """The two halves of a turn."""
 
-    def __init__(self, problem: Problem, follow: Callable[[Array, Array], Carriers]) -> None:
+    def __init__(
+        self, problem: RefinementProblem, follow: Callable[[Array, Array], Carriers]
+    ) -> None:
         self._problem = problem
         self._follow = follow
 
-    def first(self, start: Array | None) -> Turn:
+    def first(self, start: Array | None) -> AlternatingStep:
         begin = self._problem.model.positions if start is None else start
         return self._at(begin, self._follow(begin, self._problem.weights))
 
-    def follow(self, positions: Array, last: Turn) -> Turn:
+    def follow(self, positions: Array, last: AlternatingStep) -> AlternatingStep:
         """Return the poses for new positions, robust weights as at the last poses."""
         distances = np.linalg.norm(self._errors(positions, last.carriers), axis=-1)
         return self._at(positions, self._follow(positions, self._problem.robust(distances)))
 
-    def means(self, last: Turn) -> Array:
+    def means(self, last: AlternatingStep) -> Array:
         """Return the best positions at fixed poses."""
         problem = self._problem
         e = self._errors(last.positions, last.carriers)
@@ -132,10 +136,10 @@ class _Turns:
         positions[self._problem.free] = free
         return positions
 
-    def _at(self, positions: Array, carriers: Carriers) -> Turn:
+    def _at(self, positions: Array, carriers: Carriers) -> AlternatingStep:
         distances = np.linalg.norm(self._errors(positions, carriers), axis=-1)
         cost = self._problem.cost(distances, positions) + carriers.overturning
-        return Turn(positions, carriers, cost)
+        return AlternatingStep(positions, carriers, cost)
 
     def _errors(self, positions: Array, carriers: Carriers) -> Array:
         """Return errors in segment axes, shape (T, M, 3); zero where a marker is missing."""

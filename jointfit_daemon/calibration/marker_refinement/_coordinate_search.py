@@ -1,7 +1,7 @@
-r"""The published refinement: one marker coordinate after the other, judged by inverse kinematics.
+r"""Published coordinate search: one marker coordinate at a time, scored by inverse kinematics.
 
-Law: the search knows nothing but the tracking error of a set of marker positions, so it runs on any
-model whatever: ours, or another program's. Every unlocked coordinate has a step of its own::
+The search needs only the tracking error of a set of marker positions, so it runs on any model,
+also that of another program. Every unlocked coordinate has a step of its own::
 
     while any step is at or above the threshold:
         for every marker, for x, y, z whose step is:
@@ -9,8 +9,8 @@ model whatever: ours, or another program's. Every unlocked coordinate has a step
             if neither way helped: halve the step
 
 Source: Price, LaPrè, Johnson, Umberger and Sup, Int J Numer Method Biomed Eng 36 (2020) e3283,
-doi 10.1002/cnm.3283. The paper does not state the first step, the threshold, the order, nor what
-counts as a decrease; they are settings here.
+doi 10.1002/cnm.3283. The paper does not state the first step, the threshold, the order, nor the
+least decrease; they are settings here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SearchSettings:
-    """What the paper leaves open."""
+    """Parameters that the source does not state."""
 
     first_step_m: float = 0.008
     """Step of every coordinate at the start, m."""
@@ -71,7 +71,7 @@ def search(
     free
         False where a coordinate is locked, shape (M, 3).
     progress
-        Told the largest step left and the error, both m, after every pass.
+        Called with the largest remaining step and the error, both m, after every pass.
     """
     walk = _Walk(tracking_error, start)
     steps = np.where(free, settings.first_step_m, 0.0)
@@ -79,13 +79,15 @@ def search(
         for marker, axis in np.argwhere(steps >= settings.threshold_m):
             if not walk.along(marker, axis, steps[marker, axis], settings.least_gain_m):
                 steps[marker, axis] /= 2.0
+
         if progress is not None:
             progress(float(steps.max()), walk.errors[-1])
+
     return SearchResult(walk.positions, tuple(walk.errors), walk.runs)
 
 
 class _Walk:
-    """Marker positions on their way, and what they cost."""
+    """Current marker positions and their tracking errors."""
 
     def __init__(self, tracking_error: Callable[[Array], float], start: Array) -> None:
         self._tracking_error = tracking_error
@@ -98,7 +100,7 @@ class _Walk:
         return self._tracking_error(positions)
 
     def along(self, marker: int, axis: int, step: float, least_gain: float) -> bool:
-        """Go in one direction while that helps, else in the other; tell whether either did."""
+        """Go in one direction while that helps, else in the other; return whether either did."""
         for signed in (step, -step):
             moved = False
             while self._try(marker, axis, signed, least_gain):

@@ -1,6 +1,6 @@
-"""How well a model follows trials, and how far its joints turned by being refined.
+"""Tracking error of a model on a trial, and the change of joint angles by a refinement.
 
-Law: unit weights and plain squares, so that figures of different fits can be laid side by side.
+Errors are plain squares with unit weights, so that different fits can be compared.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement._refinement_result import (
-    Fit,
     MarkerOutcome,
+    TrackingStatistics,
     TrialOutcome,
 )
 from jointfit_daemon.kinematics.chains import step_between
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, IkResult
 
 
-def fit_of(residuals: Array) -> Fit:
+def tracking_statistics(residuals: Array) -> TrackingStatistics:
     """Return the figures of residuals, m, shape (T, M, 3), NaN where missing."""
     square = np.einsum("tmi,tmi->tm", residuals, residuals)
     seen = np.isfinite(square)
     square = np.where(seen, square, 0.0)
     frame = np.sqrt(_mean(square, seen, axis=1))
-    return Fit(
+    return TrackingStatistics(
         float(np.sqrt(square.sum() / max(seen.sum(), 1))),
         float(np.var(frame[seen.any(axis=1)])) if seen.any() else float("nan"),
         np.sqrt(_mean(square, seen, axis=0)),
@@ -55,7 +55,7 @@ def judge_trial(
     trained: bool,
     options: IkOptions | None = None,
 ) -> TrialOutcome:
-    """Return what a refinement did to one trial; both models follow it anew."""
+    """Return tracking errors and joint-angle changes of one trial; both models are solved again."""
     ones = np.ones(len(before.markers))
     old = solve_frames(before, trial.targets, ones, options=options)
     new = solve_frames(after, trial.targets, ones, start=old.state, options=options)
@@ -64,8 +64,8 @@ def judge_trial(
         trained,
         len(trial.targets),
         trial.rate_hz,
-        fit_of(old.residuals),
-        fit_of(new.residuals),
+        tracking_statistics(old.residuals),
+        tracking_statistics(new.residuals),
         turned(before, old, new),
     )
 
@@ -81,6 +81,7 @@ def turned(model: ChainModel, old: IkResult, new: IkResult) -> dict[str, tuple[f
         if segment.joint.kind != "free":
             angle = np.linalg.norm(step[:, columns], axis=-1)
             found[segment.name] = float(np.sqrt(np.mean(angle**2))), float(angle.max())
+
     return found
 
 
@@ -100,7 +101,7 @@ def marker_outcomes(
     )
 
 
-def _pooled(fits: Sequence[Fit], frames: Sequence[int]) -> Array:
+def _pooled(fits: Sequence[TrackingStatistics], frames: Sequence[int]) -> Array:
     square = np.array([fit.by_marker**2 for fit in fits])
     seen = np.isfinite(square)
     weight = seen * np.array(frames)[:, None]

@@ -1,12 +1,12 @@
-r"""What tracking cannot see: directions in which all markers may move at no cost.
+r"""Gauge freedom: directions in which markers may move without changing the tracking error.
 
-Law: a segment on a ball joint may be turned about the joint together with all its markers, and
+A segment on a ball joint may be turned about the joint together with all its markers, and
 inverse kinematics turns it back: the error stays, the joint angle is another. Such directions are
 the null space of the reduced normal matrix without a prior,
 
 .. math:: S = \sum_t C_t - B_t^T A_t^{-1} B_t
 
-divided by the frames. Locks and priors fix them; where nothing does, that is said.
+divided by the frames. Locks and priors fix them; otherwise `fixed_by` is "nothing".
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _ZERO = 1e-6
 """Eigenvalues of S/T are squared metres per squared metre, 1 for a marker nothing else depends on:
-what is below this is rounding."""
+values below this are rounding."""
 _WEAK = 0.01
 """Below this a movement of 10 mm costs less than 1 mm of error."""
 _NAMED = 0.1
@@ -35,7 +35,7 @@ class Gauge:
     """Freedom of the markers that the data of these trials leave open."""
 
     eigenvalues: Array
-    """Of S/T over the unlocked coordinates, ascending; 1 is a marker seen perfectly."""
+    """Eigenvalues of S/T over the unlocked coordinates, ascending; 1 is a fully observed marker."""
     free: int
     """How many are zero: moves that no tracking error shows."""
     weak: int
@@ -43,7 +43,7 @@ class Gauge:
     involved: tuple[str, ...]
     """Markers that the free moves carry, the most moved first."""
     fixed_by: str
-    """What holds the free moves: "locks", "prior" or "nothing"."""
+    """What fixes the free directions: "locks", "prior" or "nothing"."""
 
 
 def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float) -> Gauge:
@@ -66,6 +66,7 @@ def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float)
     free = int((values < _ZERO).sum())
     weak = int((values < _WEAK).sum()) - free
     held = "locks" if free == 0 else "prior" if prior > 0.0 else "nothing"
+
     return Gauge(values, free, weak, _involved(vectors[:, :free], coordinates), held)
 
 

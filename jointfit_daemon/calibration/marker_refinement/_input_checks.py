@@ -1,7 +1,7 @@
-"""What is looked at before markers are refined, because a fit would hide it.
+"""Checks of model and trials before a refinement.
 
-Law: a refinement moves markers to wherever errors are least, so wrong units, exchanged labels and
-unscaled models come out as a good fit. They are found here and named; nothing is mended in silence.
+A refinement moves markers to wherever the error is smallest. Wrong units, exchanged labels and
+unscaled models would therefore pass as a good fit. These faults are detected and reported.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.marker_refinement._motion_trial import MotionTrial, Unrefinable
+from jointfit_daemon.calibration.marker_refinement._motion_trial import MotionTrial, RefinementError
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
 if TYPE_CHECKING:
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
 
 _LEAST_FRAMES = 10
 _UNIT_FACTOR = 100.0
-"""No body is a hundred times as large as its model: another unit is."""
+"""Size ratio from which the length unit must be wrong."""
 _MOST_STRETCH = 1.3
 _TOLD_STRETCH = 1.1
 _APART_M = 0.04
 """Distances between markers of one segment are compared from here on."""
 _MOST_RMS_M = 0.08
 _SWAP_GAIN = 0.2
-"""Exchanged labels leave less than this share of the squared error when exchanged back."""
+"""Share of the squared error left after exchanging two labels back, below which they were
+exchanged."""
 _SWAP_LEAST_M = 0.05
 _SWAPPED_TRIAL = 0.5
 """Share of the frames from which a whole trial counts as labelled wrongly."""
@@ -40,8 +41,8 @@ _ROBUST = IkOptions(huber_m=0.02, reweightings=4)
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """Trials fit to learn from, coordinates that may move, and what had to be said."""
+class CheckedTrials:
+    """Usable trials, free coordinates and notes for the user."""
 
     trials: tuple[MotionTrial, ...]
     free: NDArray[np.bool_]
@@ -51,32 +52,34 @@ class Checked:
 
 def check(
     model: ChainModel, trials: Sequence[MotionTrial], validation: Sequence[MotionTrial] = ()
-) -> Checked:
-    """Return what of model and trials may be used.
+) -> CheckedTrials:
+    """Return the usable trials and the free coordinates.
 
     Raises
     ------
-    Unrefinable
-        Everything that rules the refinement out, all at once.
+    RefinementError
+        If a fault prevents the refinement; all faults are listed.
     """
     every = [*trials, *validation]
     faults = [f for trial in every for f in _wrong_size(model, trial)]
     free, held = _movable(model, trials)
     if not trials:
-        faults.append("no trial to learn from")
+        faults.append("no training trial given")
     elif not free.any():
         faults.append(_why_nothing_moves(model))
+
     if faults:
-        raise Unrefinable("; ".join(faults))
-    mended, notes = [], [*held, *_gaps(model, every), *_stretches(model, every)]
+        raise RefinementError("; ".join(faults))
+    usable, notes = [], [*held, *_gaps(model, every), *_stretches(model, every)]
     for trial in trials:
-        fixed, said, wrong = _labels(model, trial)
-        mended.append(fixed)
-        notes += said
+        cleaned, remarks, wrong = _labels(model, trial)
+        usable.append(cleaned)
+        notes += remarks
         faults += wrong
+
     if faults:
-        raise Unrefinable("; ".join(faults))
-    return Checked(tuple(mended), free, tuple(notes))
+        raise RefinementError("; ".join(faults))
+    return CheckedTrials(tuple(usable), free, tuple(notes))
 
 
 def _wrong_size(model: ChainModel, trial: MotionTrial) -> list[str]:
@@ -86,19 +89,22 @@ def _wrong_size(model: ChainModel, trial: MotionTrial) -> list[str]:
             f"{trial.name}: fewer than {_LEAST_FRAMES} frames show three or more of the model's"
             " markers: are the names the model's?"
         ]
+
     stretch = _stretch(model, trial)
     if not np.isfinite(stretch):
         return []
     if stretch > _UNIT_FACTOR or stretch < 1.0 / _UNIT_FACTOR:
         return [
-            f"{trial.name}: {stretch:.3g} times as large as the model: the file's unit is not what"
-            " it says (millimetres called metres?)"
+            f"{trial.name}: {stretch:.3g} times as large as the model: check the length unit of"
+            " the file (millimetres declared as metres?)"
         ]
+
     if not 1.0 / _MOST_STRETCH < stretch < _MOST_STRETCH:
         return [
             f"{trial.name}: {stretch:.2f} times as large as the model: scale the model first,"
             " or refinement would hide it"
         ]
+
     return []
 
 
@@ -117,8 +123,8 @@ def _stretch(model: ChainModel, trial: MotionTrial) -> float:
 
 def _stretches(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
     return [
-        f"{trial.name}: {stretch:.2f} times as large as the model: scale it, part of what moves is"
-        " size"
+        f"{trial.name}: {stretch:.2f} times as large as the model: scale the model, otherwise the"
+        " refinement compensates for its size"
         for trial in trials
         if np.isfinite(stretch := _stretch(model, trial))
         and not 1.0 / _TOLD_STRETCH < stretch < _TOLD_STRETCH
@@ -139,9 +145,9 @@ def _movable(
     notes = []
     absent = [m.name for m, there in zip(model.markers, seen, strict=True) if not there]
     if absent:
-        notes.append(f"not in any training trial, kept: {', '.join(absent)}")
+        notes.append(f"in no training trial, position kept: {', '.join(absent)}")
     notes += [
-        f"{m.name}: the only marker on {m.segment}, which would follow it anywhere: kept"
+        f"{m.name}: the only marker on {m.segment}, so its position is not observable: kept"
         for m, only in zip(model.markers, alone, strict=True)
         if only and not all(m.locked)
     ]
@@ -184,12 +190,14 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
         else:
             notes.append(f"{trial.name}: {pair} look exchanged in {frames.sum()} frames: left out")
             targets[frames, i] = targets[frames, j] = np.nan
+
     rms = tracking_error(found.residuals)
     if rms > _MOST_RMS_M and not faults:
         faults.append(
-            f"{trial.name}: the model is {1000 * rms:.0f} mm RMS off its markers: labels, scaling"
-            " or axes are wrong, which no marker should make up for"
+            f"{trial.name}: the model is {1000 * rms:.0f} mm RMS off its markers: check labels,"
+            " scaling and axes"
         )
+
     return replace(trial, targets=targets), notes, faults
 
 
@@ -198,6 +206,7 @@ def _exchanged(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray
     places = targets + residuals  # where the model has them
     own = np.einsum("tmi,tmi->tm", residuals, residuals)
     found = []
+
     for i, j in combinations(range(targets.shape[1]), 2):
         kept = own[:, i] + own[:, j]
         crossed = ((places[:, i] - targets[:, j]) ** 2).sum(axis=-1)
@@ -205,4 +214,5 @@ def _exchanged(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray
         frames = (crossed < _SWAP_GAIN * kept) & (kept > _SWAP_LEAST_M**2)
         if frames.any():
             found.append((i, j, frames))
+
     return found

@@ -1,6 +1,6 @@
-"""What a refinement learns from and is judged by: measured markers of movements, and its settings.
+"""Input of a refinement: trials with measured markers, and the settings.
 
-Law: plain data; positions in metres, in the order of the model's markers, NaN where missing.
+Positions are in meters, in the order of the model's markers, NaN where a marker is missing.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 RefinementMethod = Literal["joint", "block", "search"]
 
 
-class Unrefinable(ValueError):  # noqa: N818 - named for what happened
-    """Trials and model that no honest refinement can come from; the message lists all reasons."""
+class RefinementError(ValueError):
+    """Model and trials do not allow a refinement; the message lists all reasons."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class RefinementSettings:
 
     method: RefinementMethod = "joint"
     prior: float = 0.05
-    """lambda: what a metre away from the nominal position costs beside a metre of error."""
+    """λ: cost of one metre from the nominal position relative to one metre of error."""
     huber_m: float | None = 0.02
     """Errors beyond count by their length, not its square, m; None: all squares."""
     frames: int = 150

@@ -1,6 +1,6 @@
-r"""What every refinement minimizes: tracking errors of all frames, and distance from the start.
+r"""Objective of a refinement: tracking errors and distance from the nominal positions.
 
-Law: with the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weights w,
+With the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weights w,
 
 .. math::
 
@@ -9,7 +9,7 @@ Law: with the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and 
               + \tfrac12 \kappa \sum_{tk} x_{tk}^2, \qquad n_m = \sum_t w_{tm}
 
 where :math:`\rho(r) = r^2/2`, beyond c Huber's :math:`c (r - c/2)`. The prior grows with the frames
-in which a marker was seen, so thinning frames does not change what it means. Poses q are free in
+in which a marker was seen, so thinning frames does not change its meaning. Poses q are free in
 every frame, positions p are the same in all of them; x is how far hinges are beyond their limits,
 rad. A program that clamps its joints would else be given markers that it cannot follow.
 """
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """One refinement to be done; no slots, what follows from it is computed once.
+class RefinementProblem:
+    """Data of one refinement; without slots, because derived values are cached.
 
     The chain gives names, nominal positions and joints; measured positions beyond it are missing.
     """
@@ -44,7 +44,7 @@ class Problem:
     targets: Array
     """Measured markers in the order of the model's, world, m, shape (T, M, 3); NaN: missing."""
     weights: Array
-    """Of squared errors, shape (T, M); 0 where missing."""
+    """Weights of squared errors, shape (T, M); 0 where missing."""
     free: NDArray[np.bool_]
     """Coordinates that may move, shape (M, 3)."""
     prior: float
@@ -66,7 +66,7 @@ class Problem:
 
     @cached_property
     def pull(self) -> Array:
-        """Weight of the prior on every coordinate, shape (M, 3); none on what cannot move."""
+        """Weight of the prior on every coordinate, shape (M, 3); zero for locked coordinates."""
         return self.prior * self.counts[:, None] * self.free
 
     @cached_property
@@ -103,6 +103,6 @@ class Problem:
 
 
 def rms(distances: Array, present: NDArray[np.bool_]) -> float:
-    """Return the root of the mean square over what is present, m; NaN if nothing is."""
+    """Return the RMS over the present markers, m; NaN if there are none."""
     seen = distances[present]
     return float(np.sqrt(np.mean(seen**2))) if seen.size else float("nan")

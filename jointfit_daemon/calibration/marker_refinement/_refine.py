@@ -1,7 +1,6 @@
-"""From a model and trials to a refined model and the report of what that did.
+"""Refinement of the marker positions of a chain model, from trials to a report.
 
-Law: what is fitted, what decides when to stop, and what judges are kept apart: training frames, the
-hold-out at the end of each training trial, validation trials.
+Training frames, the hold-out that stops the iteration, and validation trials are separate.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ from jointfit_daemon.calibration.marker_refinement._block_descent import Carrier
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import search
 from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial, marker_outcomes
 from jointfit_daemon.calibration.marker_refinement._gauge import Gauge, gauge_of
-from jointfit_daemon.calibration.marker_refinement._input_checks import Checked, check
+from jointfit_daemon.calibration.marker_refinement._input_checks import CheckedTrials, check
 from jointfit_daemon.calibration.marker_refinement._motion_trial import RefinementSettings
-from jointfit_daemon.calibration.marker_refinement._objective import Problem
+from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
 from jointfit_daemon.calibration.marker_refinement._refinement_result import Refinement
 from jointfit_daemon.calibration.marker_refinement._simultaneous import (
     linearize,
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
     Progress = Callable[[float, float], None]
-    """Told how far the work is, 0 to 1, and the training error, m."""
+    """Called with the share done, 0 to 1, and the training error, m."""
 
 _FINE = 1e-9
 _RISES = 2
@@ -60,14 +59,14 @@ def refine_markers(
     model
         Nominal positions, locks, weights.
     trials
-        To learn from.
+        Training trials.
     validation
-        Only judged.
+        Evaluated, not fitted.
 
     Raises
     ------
-    Unrefinable
-        What `check` finds.
+    RefinementError
+        If `check` finds a fault.
     """
     settings = settings or RefinementSettings()
     thin = [trial.thinned(settings.frames) for trial in trials]
@@ -81,6 +80,7 @@ def refine_markers(
         judge_trial(model, after, t, trained=n < len(thin), options=within)
         for n, t in enumerate((*checked.trials, *unseen))
     )
+
     return Refinement(
         after,
         settings.method,
@@ -99,32 +99,34 @@ def _rates(trials: Sequence[MotionTrial]) -> list[str]:
     rates = sorted({round(trial.rate_hz, 6) for trial in trials})
     if len(rates) == 1:
         return []
-    told = ", ".join(f"{rate:g}" for rate in rates)
-    return [f"recorded at {told} Hz: every trial counts by its frames, not by its time"]
+    listed = ", ".join(f"{rate:g}" for rate in rates)
+    return [f"recorded at {listed} Hz: trials are weighted by frames, not by duration"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
-    problem: Problem
+class _RefinementTask:
+    problem: RefinementProblem
     first: IkResult
     """Poses of the training frames at the nominal positions."""
     holdout: _HoldOut | None
 
 
 @dataclass(frozen=True, slots=True)
-class _Ended:
+class _RefinementEnd:
     positions: Array
     costs: tuple[float, ...]
     runs: int
     stopped: str
 
 
-def _task(model: ChainModel, checked: Checked, settings: RefinementSettings) -> _Task:
+def _task(
+    model: ChainModel, checked: CheckedTrials, settings: RefinementSettings
+) -> _RefinementTask:
     parts = [trial.split(settings.holdout_share) for trial in checked.trials]
     targets = np.concatenate([part.targets for part, _ in parts])
     present = np.isfinite(targets).all(axis=-1)
     weights = present * model.weights
-    problem = Problem(
+    problem = RefinementProblem(
         model,
         targets,
         weights,
@@ -140,9 +142,12 @@ def _task(model: ChainModel, checked: Checked, settings: RefinementSettings) -> 
         problem = replace(
             problem, weights=weights * _even(first, lengths, settings.evenness)[:, None]
         )
+
     held = [part.targets for _, part in parts if len(part.targets)]
     within = IkOptions(limit_m2=settings.limit_m2)
-    return _Task(problem, first, _HoldOut(model, np.concatenate(held), within) if held else None)
+    return _RefinementTask(
+        problem, first, _HoldOut(model, np.concatenate(held), within) if held else None
+    )
 
 
 def _even(first: IkResult, lengths: Sequence[int], power: float) -> Array:
@@ -154,7 +159,7 @@ def _even(first: IkResult, lengths: Sequence[int], power: float) -> Array:
 
 
 class _HoldOut:
-    """Frames that only tell when to stop."""
+    """Hold-out frames that decide when to stop."""
 
     def __init__(self, model: ChainModel, targets: Array, options: IkOptions) -> None:
         self._model, self._targets, self._options = model, targets, options
@@ -164,7 +169,7 @@ class _HoldOut:
         self.positions = model.positions
 
     def enough(self, positions: Array) -> bool:
-        """Take note of a place; tell whether the error has risen twice running."""
+        """Record the error at new positions; return True if it has risen twice in a row."""
         model = self._model.with_markers(positions)
         self._last = solve_frames(
             model, self._targets, start=self._last.state, options=self._options
@@ -176,19 +181,23 @@ class _HoldOut:
         return self._rises >= _RISES
 
 
-def _jointly(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
+def _jointly(
+    task: _RefinementTask, settings: RefinementSettings, progress: Progress | None
+) -> _RefinementEnd:
     problem = task.problem
     start = place(problem, problem.model.positions, task.first.state)
-    watch = _Watch(task.holdout, problem, progress)
+    watch = _StopCriterion(task.holdout, problem, progress)
     tolerance = settings.tolerance or 1e-6
     steps = solve_jointly(problem, start, lambda s: watch(s.positions, s.cost), tolerance)
     return watch.ended(steps[-1].positions, [s.cost for s in steps], 1)
 
 
-def _in_turns(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
+def _in_turns(
+    task: _RefinementTask, settings: RefinementSettings, progress: Progress | None
+) -> _RefinementEnd:
     problem = task.problem
-    chain = Follower(problem, task.first)
-    watch = _Watch(task.holdout, problem, progress)
+    chain = ChainFollower(problem, task.first)
+    watch = _StopCriterion(task.holdout, problem, progress)
     tolerance = settings.tolerance or 1e-4
     turns = solve_in_turns(
         problem, chain, lambda t: watch(t.positions, t.cost), tolerance=tolerance
@@ -196,7 +205,9 @@ def _in_turns(task: _Task, settings: RefinementSettings, progress: Progress | No
     return watch.ended(turns[-1].positions, [t.cost for t in turns], chain.runs)
 
 
-def _searching(task: _Task, settings: RefinementSettings, progress: Progress | None) -> _Ended:
+def _searching(
+    task: _RefinementTask, settings: RefinementSettings, progress: Progress | None
+) -> _RefinementEnd:
     problem, last = task.problem, task.first
     present = problem.weights > 0.0
     within = IkOptions(limit_m2=settings.limit_m2)
@@ -208,28 +219,29 @@ def _searching(task: _Task, settings: RefinementSettings, progress: Progress | N
             model, problem.targets, problem.weights, start=last.state, options=within
         )
         distances = np.linalg.norm(last.residuals, axis=-1)
+
         return float(np.sqrt(np.mean(distances[present] ** 2)))
 
     first_step = settings.search.first_step_m
 
-    def told(step: float, at: float) -> None:
+    def report(step: float, at: float) -> None:
         if progress is not None:
             halvings = np.log2(first_step / step) if step > 0 else np.inf
             all_of_them = np.log2(first_step / settings.search.threshold_m) + 1.0
             progress(min(1.0, float(halvings / all_of_them)), at)
 
-    found = search(error, problem.model.positions, problem.free, settings.search, told)
+    found = search(error, problem.model.positions, problem.free, settings.search, report)
     stopped = "every step is below the threshold"
-    return _Ended(found.positions, found.errors, found.runs, stopped)
+    return _RefinementEnd(found.positions, found.errors, found.runs, stopped)
 
 
 _METHODS = {"joint": _jointly, "block": _in_turns, "search": _searching}
 
 
-class Follower:
+class ChainFollower:
     """Inverse kinematics of the chain as `solve_in_turns` asks for it, warm from run to run."""
 
-    def __init__(self, problem: Problem, first: IkResult) -> None:
+    def __init__(self, problem: RefinementProblem, first: IkResult) -> None:
         self._problem, self._state = problem, first.state
         self.runs = 0
 
@@ -245,11 +257,11 @@ class Follower:
         return Carriers(found.rotations[:, s], found.origins[:, s], beyond)
 
 
-class _Watch:
-    """What is asked after every step: whether to stop."""
+class _StopCriterion:
+    """Stop criterion, evaluated after every step."""
 
     def __init__(
-        self, holdout: _HoldOut | None, problem: Problem, progress: Progress | None
+        self, holdout: _HoldOut | None, problem: RefinementProblem, progress: Progress | None
     ) -> None:
         self._holdout, self._progress = holdout, progress
         self._total = float(problem.weights.sum())
@@ -263,14 +275,14 @@ class _Watch:
         self._early = self._holdout is not None and self._holdout.enough(positions)
         return self._early
 
-    def ended(self, positions: Array, costs: Sequence[float], runs: int) -> _Ended:
-        stopped = "the hold-out's error rose" if self._early else "nothing more to gain"
+    def ended(self, positions: Array, costs: Sequence[float], runs: int) -> _RefinementEnd:
+        stopped = "the hold-out error rose" if self._early else "converged"
         if self._holdout is not None:
             positions = self._holdout.positions
-        return _Ended(positions, tuple(costs), runs, stopped)
+        return _RefinementEnd(positions, tuple(costs), runs, stopped)
 
 
-def _gauge(task: _Task, positions: Array, settings: RefinementSettings) -> Gauge:
+def _gauge(task: _RefinementTask, positions: Array, settings: RefinementSettings) -> Gauge:
     plain = replace(task.problem, prior=0.0, huber_m=None, limit_m2=0.0)
     model = plain.model.with_markers(positions)
     state = solve_frames(model, plain.targets, plain.weights, start=task.first.state).state

@@ -1,7 +1,7 @@
-"""What a refinement found, and what it did to errors and joint angles.
+"""Result of a refinement: marker displacements, tracking errors and changes of joint angles.
 
-Law: plain data, SI. All errors have unit weights, whatever weights the fit used. Variances have
-divisor N: over the frames of one trial, and over trials.
+All values are SI. Errors have unit weights, whatever weights the fit used. Variances have divisor
+N: over the frames of one trial, and over trials.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
-    """How one model follows one trial."""
+class TrackingStatistics:
+    """Tracking error of one model on one trial."""
 
     rms: float
     """Over all markers and frames, m."""
@@ -41,8 +41,8 @@ class TrialOutcome:
     """False: the refinement never saw it."""
     frames: int
     rate_hz: float
-    before: Fit
-    after: Fit
+    before: TrackingStatistics
+    after: TrackingStatistics
     angles: dict[str, tuple[float, float]]
     """Change of each joint's turn, RMS and greatest, rad, by segment; the root left out."""
 
@@ -69,7 +69,7 @@ class MarkerOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """A refined model and what there is to know about it."""
+    """Refined model with marker, trial and gauge results."""
 
     model: ChainModel
     method: RefinementMethod
@@ -77,13 +77,13 @@ class Refinement:
     markers: tuple[MarkerOutcome, ...]
     trials: tuple[TrialOutcome, ...]
     costs: tuple[float, ...]
-    """What was minimized, at the start and after every step; it never rises."""
+    """Cost at the start and after every step; it never rises."""
     runs: int
     """Times inverse kinematics was run over all frames (`search`, `block`)."""
     stopped: str
     gauge: Gauge
     notes: tuple[str, ...] = ()
-    """What was handled and should be known."""
+    """Findings about the input that do not prevent the refinement."""
 
     def variance_of_trials(self, *, trained: bool) -> tuple[float, float]:
         """Return the variance of the trials' RMS before and after, m²; NaN below two trials."""

@@ -1,6 +1,6 @@
 r"""Markers and poses of all frames at once, the poses eliminated: Gauss, Newton and Schur.
 
-Law: frames touch each other only through the markers, so the normal equations fall into one small
+Frames touch each other only through the markers, so the normal equations fall into one small
 block a frame. With :math:`J_{tm} = \partial e/\partial q`, errors taken in segment axes,
 
 .. math::
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration.marker_refinement._objective import Problem
+    from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e9
 _FLOOR = 1e-11
-"""Added to A_t: what no marker holds stays."""
+"""Added to A_t, so that degrees of freedom without markers stay constant."""
 _TOLERANCE = 1e-6
 _MOST_ITERATIONS = 30
 _FRAMES_AT_ONCE = 128
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """A place on the way of an iteration."""
+class RefinementStep:
+    """One accepted iterate."""
 
     positions: Array
     state: ChainState
@@ -83,7 +83,7 @@ class NormalEquations:
         return solved, S, product[:, f]
 
 
-def errors(problem: Problem, positions: Array, state: ChainState) -> Array:
+def errors(problem: RefinementProblem, positions: Array, state: ChainState) -> Array:
     """Return the errors in segment axes, m, shape (T, M, 3); zero where a marker is missing."""
     R, t = segment_poses(problem.model, state)
     s = problem.model.marker_segments
@@ -91,13 +91,14 @@ def errors(problem: Problem, positions: Array, state: ChainState) -> Array:
     return np.where((problem.weights > 0.0)[..., None], positions - local, 0.0)
 
 
-def linearize(problem: Problem, positions: Array, state: ChainState) -> NormalEquations:
+def linearize(problem: RefinementProblem, positions: Array, state: ChainState) -> NormalEquations:
     """Return the normal equations at a place."""
     model = problem.model.with_markers(positions)
     e = errors(problem, positions, state)
     root = np.sqrt(problem.robust(np.linalg.norm(e, axis=-1)))
     free = problem.free.ravel()
     parts = []
+
     for start in range(0, len(state), _FRAMES_AT_ONCE):
         some = slice(start, start + _FRAMES_AT_ONCE)
         at = state.take(some)
@@ -107,24 +108,27 @@ def linearize(problem: Problem, positions: Array, state: ChainState) -> NormalEq
         w = np.repeat(root[some], 3, axis=1)
         A, B = X @ np.swapaxes(X, -1, -2), X[..., free] * w[:, None, free]
         parts.append((A, B, (X @ (w * e[some].reshape(len(at), -1))[..., None])[..., 0]))
+
     A, B, g = (np.concatenate(part) for part in zip(*parts, strict=True))
     excess = problem.excess(state)
     if excess is not None:
         np.einsum("tkk->tk", A)[...] += problem.limit_m2 * (excess != 0.0)
         g += problem.limit_m2 * excess
+
     total = (root**2).sum(axis=0)
     h = ((root**2)[..., None] * e).sum(axis=0)
     h += problem.pull * (positions - problem.model.positions)
     C = total[:, None] + problem.pull
+
     return NormalEquations(A, B, g, h.ravel()[free], C.ravel()[free])
 
 
 def solve_jointly(
-    problem: Problem,
-    start: Step,
-    on_step: Callable[[Step], bool] | None = None,
+    problem: RefinementProblem,
+    start: RefinementStep,
+    on_step: Callable[[RefinementStep], bool] | None = None,
     tolerance: float = _TOLERANCE,
-) -> list[Step]:
+) -> list[RefinementStep]:
     """Refine by Gauss-Newton steps that F never rises on.
 
     Parameters
@@ -132,7 +136,7 @@ def solve_jointly(
     start
         Nominal positions and the poses that fit them.
     on_step
-        Told every accepted place; True ends the iteration.
+        Called with every accepted iterate; True ends the iteration.
 
     Returns
     -------
@@ -149,18 +153,21 @@ def solve_jointly(
         done = last.cost - taken.cost < tolerance * last.cost
         if done or (on_step is not None and on_step(taken)):
             break
+
     return steps
 
 
-def place(problem: Problem, positions: Array, state: ChainState) -> Step:
-    """Return a place with its cost."""
+def place(problem: RefinementProblem, positions: Array, state: ChainState) -> RefinementStep:
+    """Return an iterate with its cost."""
     distances = np.linalg.norm(errors(problem, positions, state), axis=-1)
     cost = problem.cost(distances, positions) + problem.overturning(state)
-    return Step(positions, state, cost)
+    return RefinementStep(positions, state, cost)
 
 
-def _improve(problem: Problem, last: Step, damping: float) -> tuple[Step | None, float]:
-    """Return the next place, None where no step helps, and the damping to begin with there."""
+def _improve(
+    problem: RefinementProblem, last: RefinementStep, damping: float
+) -> tuple[RefinementStep | None, float]:
+    """Return the next iterate, None if no step lowers the cost, and its initial damping."""
     equations = linearize(problem, last.positions, last.state)
     while damping <= _MOST_DAMPING:
         dp, dq = equations.solve(damping)
@@ -170,4 +177,5 @@ def _improve(problem: Problem, last: Step, damping: float) -> tuple[Step | None,
         if new.cost < last.cost:
             return new, max(0.2 * damping, _LEAST_DAMPING)
         damping *= 10.0
+
     return None, damping

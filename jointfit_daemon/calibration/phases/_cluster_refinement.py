@@ -19,7 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration.marker_refinement import MotionTrial, Unrefinable, refine_markers
+from jointfit_daemon.calibration.marker_refinement import (
+    MotionTrial,
+    RefinementError,
+    refine_markers,
+)
 from jointfit_daemon.kinematics.chains import ChainModel, Marker, Segment
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames
 
@@ -79,7 +83,7 @@ def refine_clusters(
     learned, unseen = moving.split(holdout_share)
     try:
         found = refine_markers(model, [learned], validation=[unseen])
-    except Unrefinable as refusal:
+    except RefinementError as refusal:
         return RefinedClusters(clusters, None, (f"markers not refined: {refusal}",))
     return _judged(clusters, marked, model, found)
 

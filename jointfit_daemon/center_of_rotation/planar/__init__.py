@@ -1,9 +1,9 @@
 """Circle fits: centers of rotation in a plane."""
 
-from jointfit_daemon.center_of_rotation.planar._circle_estimate import Limits, circle_estimate
+from jointfit_daemon.center_of_rotation.planar._circle_estimate import CircleLimits, circle_estimate
 from jointfit_daemon.center_of_rotation.planar._circle_fit import (
+    CircleMethod,
     Circles,
-    Method,
     fit_circle,
     fit_circles,
 )
@@ -26,10 +26,10 @@ from jointfit_daemon.center_of_rotation.planar._three_frames import (
 __all__ = [
     "GATE",
     "AngleNoise",
+    "CircleLimits",
+    "CircleMethod",
     "Circles",
     "Grid",
-    "Limits",
-    "Method",
     "RunningCircle",
     "arbitrary_error",
     "circle_estimate",

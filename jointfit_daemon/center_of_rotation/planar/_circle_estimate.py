@@ -1,7 +1,6 @@
-r"""From a circle's moments to a published center: the error told, or why there is none.
+"""Center estimates from circle moments: covariance, bound, and acceptance.
 
-Law: one verdict for all planar estimators. A refusal names its cause and the remedy; nothing that
-is not known is given as a number.
+A refused estimate names the cause and the remedy.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of_spread
 from jointfit_daemon.center_of_rotation._result import CenterEstimate
 from jointfit_daemon.center_of_rotation.planar._circle_fit import (
-    Method,
+    CircleMethod,
     circle_of,
     temper,
 )
@@ -23,10 +22,10 @@ from jointfit_daemon.center_of_rotation.planar._moments import (
     GATE,
     ROUNDING,
     CircleMoments,
-    Judged,
+    CircleStatistics,
     arc_shows,
+    circle_statistics,
     ellipse_scale,
-    judge,
     moments_of_one,
     noise_of,
     seen_places,
@@ -45,8 +44,8 @@ STILL_M = 0.001
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """What a planar center must keep to be published."""
+class CircleLimits:
+    """Acceptance limits of a planar center."""
 
     gate: float = GATE
     """Least T."""
@@ -62,8 +61,8 @@ def circle_estimate(
     points: ArrayLike,
     weights: ArrayLike | None = None,
     *,
-    method: Method = "hyper",
-    limits: Limits | None = None,
+    method: CircleMethod = "hyper",
+    limits: CircleLimits | None = None,
 ) -> CenterEstimate:
     """Estimate the center one marker turns about from all its frames at once.
 
@@ -75,8 +74,8 @@ def circle_estimate(
         Not negative.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
-    limits : Limits, optional
-        When to refuse.
+    limits : CircleLimits, optional
+        Acceptance limits.
 
     Returns
     -------
@@ -96,18 +95,20 @@ def circle_estimate(
         pair = w[1:] * w[:-1]
         return float((pair * e[1:]) @ e[:-1] / (4.0 * square * max(float(pair.sum()), 1e-300)))
 
-    return publish(m, lagged, method=method, frames=int(seen.sum()), limits=limits or Limits())
+    return publish(
+        m, lagged, method=method, frames=int(seen.sum()), limits=limits or CircleLimits()
+    )
 
 
 def publish(
     m: CircleMoments[float],
     lagged: Callable[[float, float, float], float],
     *,
-    method: Method,
+    method: CircleMethod,
     frames: int,
-    limits: Limits,
+    limits: CircleLimits,
 ) -> CenterEstimate:
-    """Fit, judge and tell.
+    """Fit a circle and return its estimate, or the reason of a refusal.
 
     Parameters
     ----------
@@ -115,35 +116,36 @@ def publish(
         Of the points.
     lagged : callable
         Mean product of the radial residuals of neighbours in time, m², about the center (a, b) from
-        the centroid and for R²: what correlation is read from.
+        the centroid and for R²; the source of the correlation.
     method : str
         Of the circle.
     frames : int
         Points seen.
-    limits : Limits
-        When to refuse.
+    limits : CircleLimits
+        Acceptance limits.
     """
-    reason = _no_circle(m, frames)
+    reason = _reason_without_circle(m, frames)
     if reason is not None:
-        return nothing(method, (m.x, m.y), frames, reason)
+        return refused_circle(method, (m.x, m.y), frames, reason)
     circle = circle_of(m, method)
     if circle is None or not arc_shows(m, noise_of(m, *circle)[0]):
-        reason = "noise hides the arc: move the joint further, or bring the cameras closer"
-        return nothing(method, (m.x, m.y), frames, reason)
-    judged = judge(m, *circle)
+        reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
+        return refused_circle(method, (m.x, m.y), frames, reason)
+
+    judged = circle_statistics(m, *circle)
     wider = _persistence(lagged(*circle), judged.residual)
-    return _told(m, circle, judged, wider, method=method, frames=frames, limits=limits)
+    return _accept_estimate(m, circle, judged, wider, method=method, frames=frames, limits=limits)
 
 
-def _told(
+def _accept_estimate(
     m: CircleMoments[float],
     circle: tuple[float, float, float],
-    judged: Judged[float],
+    judged: CircleStatistics[float],
     wider: float,
     *,
-    method: Method,
+    method: CircleMethod,
     frames: int,
-    limits: Limits,
+    limits: CircleLimits,
 ) -> CenterEstimate:
     a, b, square = circle
     cov = (wider * judged.xx, wider * judged.xy, wider * judged.yy)
@@ -153,6 +155,7 @@ def _told(
     radius, arc = sqrt(square), arc_of_spread((m.xx + m.yy - 2.0 * judged.noise) / square)
     effective = m.effective / wider
     sd = sqrt(max(cov[0] + cov[2], 0.0))
+
     return CenterEstimate(
         method=method,
         center=np.array([m.x + a, m.y + b]),
@@ -170,32 +173,35 @@ def _told(
     )
 
 
-def objection(radius: float, arc: float, T: float, sd: float, limits: Limits) -> str | None:
-    """Return why a circle that was found must not be used, with the remedy; None if it may."""
+def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimits) -> str | None:
+    """Return why a circle must not be used, with the remedy; None if it may."""
     if not limits.reach[0] <= radius <= limits.reach[1]:
         return (
             f"the marker would be {radius:.2f} m from the center, not {limits.reach[0]:g} to "
-            f"{limits.reach[1]:g} m: check marker names, or move the joint further"
+            f"{limits.reach[1]:g} m: check marker names or increase the range of motion"
         )
+
     if arc < limits.arc:
-        return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
+        return f"the joint turned {degrees(arc):.0f}°: move it through at least 30°"
     if limits.gate > T:
         return (
             f"ill-conditioned: the arc's curvature is {T:.1f} times its standard error, at least "
-            f"{limits.gate:g} are needed: move the joint further"
+            f"{limits.gate:g} are required: increase the range of motion"
         )
+
     if sd > limits.sd:
         return (
             f"uncertain to {1000 * sd:.0f} mm, more than the {1000 * limits.sd:.0f} mm allowed: "
             "move the joint further or for longer"
         )
+
     return None
 
 
-def nothing(
+def refused_circle(
     method: str, at: tuple[float, float], frames: int, reason: str, flags: tuple[str, ...] = ()
 ) -> CenterEstimate:
-    """Return the estimate that says that there is none: every direction unseen."""
+    """Return a refused estimate in which every direction is unseen."""
     middle = np.array(at if isfinite(at[0]) and isfinite(at[1]) else (0.0, 0.0))
     return CenterEstimate(
         method=method,
@@ -215,16 +221,16 @@ def nothing(
     )
 
 
-def _no_circle(m: CircleMoments[float], frames: int) -> str | None:
+def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
     spread = m.xx + m.yy
     if frames == 0:
-        return "the marker was never seen: check its name, the cameras and what covers it"
+        return "the marker is missing in every frame: check its name, the cameras and occlusion"
     if frames < 4 or m.effective <= 3.0:
-        return f"{frames} usable frames, at least 4 are needed: record for longer"
+        return f"{frames} usable frames, at least 4 are required: record a longer trial"
     if spread < STILL_M**2:
         return f"no motion: the marker moved {1000 * sqrt(spread):.1f} mm RMS: move the joint"
     if m.xx * m.yy - m.xy**2 <= ROUNDING * spread**2:
-        return "the points are on a line, a straight path has no center: turn the joint"
+        return "the points lie on a straight line, which has no center: rotate the joint"
     return None
 
 

@@ -1,8 +1,7 @@
-r"""Circles through many points in closed form: Kåsa, Pratt, Taubin, Hyper.
+"""Algebraic circle fits in closed form: Kåsa, Pratt, Taubin and Hyper.
 
-Law: no start value, no iteration over points; one circle or a hundred thousand at once. Source:
-Al-Sharadqah and Chernov 2009. Hyper is the default: its bias has no part that more frames would not
-take away.
+The fits need no start value and no iteration over points, for one circle or for arrays of them.
+Hyper is the default because it has no essential bias. Source: Al-Sharadqah and Chernov 2009.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from jointfit_daemon.center_of_rotation.planar._moments import (
     CircleMoments,
     Number,
     arc_shows,
-    judge,
+    circle_statistics,
     moments_of,
     moments_of_one,
 )
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
 
-Method = Literal["kasa", "pratt", "taubin", "hyper"]
+CircleMethod = Literal["kasa", "pratt", "taubin", "hyper"]
 
 _STEPS = 20
 _SETTLED = 1e-14
@@ -40,13 +39,13 @@ class Circles(NamedTuple):
     radius: Array
     """m."""
     covariance: Array
-    """Of the center, m², shape (..., 2, 2)."""
+    """Covariance of the center, m², shape (..., 2, 2)."""
     noise: Array
     """Standard deviation of a point per coordinate, m."""
     conditioning: Array
     """T, the radius over the center's largest standard error."""
     valid: NDArray[np.bool_]
-    """There is a circle, and noise does not hide its arc."""
+    """True where a circle exists and the noise does not hide its arc."""
 
 
 def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, Number, float]:
@@ -77,6 +76,7 @@ def smallest_root(m: CircleMoments[float], method: str = "hyper") -> float:
     A0, A1, A2, A4 = polynomial(m, method)
     A3 = 4.0 * (m.xx + m.yy) if method == "taubin" else 0.0
     eta, value = 0.0, A0
+
     for _ in range(_STEPS):
         slope = A1 + eta * (2.0 * A2 + eta * (3.0 * A3 + 4.0 * A4 * eta))
         if slope == 0.0:
@@ -86,6 +86,7 @@ def smallest_root(m: CircleMoments[float], method: str = "hyper") -> float:
         if following == eta or abs(after) >= abs(value):
             break
         eta, value = following, after
+
     return eta
 
 
@@ -96,6 +97,7 @@ def smallest_roots(m: CircleMoments[Array], method: str = "hyper") -> Array:
     A0, A1, A2, A4 = polynomial(m, method)
     A3 = 4.0 * (m.xx + m.yy) if method == "taubin" else np.zeros_like(A0)
     eta, value, moving = np.zeros_like(A0), A0, np.ones(A0.shape, dtype=bool)
+
     for _ in range(_STEPS):
         slope = A1 + eta * (2.0 * A2 + eta * (3.0 * A3 + 4.0 * A4 * eta))
         step = value / np.where(slope == 0.0, np.inf, slope)
@@ -105,6 +107,7 @@ def smallest_roots(m: CircleMoments[Array], method: str = "hyper") -> Array:
         if not moving.any():
             break
         eta, value = np.where(moving, following, eta), np.where(moving, after, value)
+
     return eta
 
 
@@ -125,6 +128,7 @@ def circle_from_root(
     a = (m.xz * (m.yy - eta) - m.yz * m.xy) / twice
     b = (m.yz * (m.xx - eta) - m.xz * m.xy) / twice
     more = {"pratt": 2.0, "hyper": -2.0}.get(method, 0.0)
+
     return a, b, a * a + b * b + z + more * eta
 
 
@@ -140,7 +144,7 @@ def circle_of(m: CircleMoments[float], method: str = "hyper") -> tuple[float, fl
 def temper(
     a: Number, b: Number, square: Number, cov: tuple[Number, Number, Number]
 ) -> tuple[Number, Number, tuple[Number, Number, Number]]:
-    r"""Draw a center in by what its own uncertainty biases it outward.
+    r"""Shrink a center towards the centroid by the outward bias of its uncertainty.
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
@@ -155,6 +159,7 @@ def temper(
     p, q, r = 1.0 + xx / square, xy / square, 1.0 + yy / square
     determinant = p * r - q * q
     s, t, u = r / determinant, -q / determinant, p / determinant
+
     # S C = R² (I - S), so that S C S needs no third matrix
     k, m, n = square * (1.0 - s), -square * t, square * (1.0 - u)
     drawn = (k * s + m * t, k * t + m * u, m * t + n * u)
@@ -165,7 +170,7 @@ def fit_circles(
     points: ArrayLike,
     weights: ArrayLike | None = None,
     *,
-    method: Method = "hyper",
+    method: CircleMethod = "hyper",
     tempered: bool = True,
     correlated: bool = False,
 ) -> Circles:
@@ -180,7 +185,7 @@ def fit_circles(
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     tempered : bool
-        Draw centers in as `temper` says; False gives the textbook's.
+        Shrink centers with `temper`; False gives the textbook center.
     correlated : bool
         Points follow one another in time: widen the covariance by what their residuals' correlation
         from one to the next asks for.
@@ -192,10 +197,10 @@ def fit_circles(
         points at one place, and arcs that noise hides.
     """
     m = moments_of(points, weights)
-    with np.errstate(all="ignore"):  # what has no circle is masked below
+    with np.errstate(all="ignore"):  # sets without a circle are masked below
         eta = smallest_roots(m, method)
         a, b, square = circle_from_root(m, eta, method)
-        judged = judge(m, a, b, square)
+        judged = circle_statistics(m, a, b, square)
         wider = (
             persistence(_lagged(points, m, a, b, square) / judged.residual)
             if correlated
@@ -207,6 +212,7 @@ def fit_circles(
             a, b, cov = temper(a, b, square, cov)
         valid = usable(m, square) & arc_shows(m, judged.noise)
         valid &= np.isfinite(a) & np.isfinite(b)
+
     nan = np.nan
     center = np.where(valid[..., None], np.stack((m.x + a, m.y + b), axis=-1), nan)
     C = np.stack((np.stack((cov[0], cov[1]), -1), np.stack((cov[1], cov[2]), -1)), -1)
@@ -220,7 +226,7 @@ def fit_circles(
     )
 
 
-def fit_circle(points: ArrayLike, *, method: Method = "hyper") -> tuple[float, float, float]:
+def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[float, float, float]:
     """Return center and radius, m, of one plain circle, unjudged, as fast as can be.
 
     Parameters
@@ -264,7 +270,7 @@ def persistence(correlation: Array) -> Array:
 
 
 def usable(m: CircleMoments[Array], square: Array) -> NDArray[np.bool_]:
-    """Say of which moments a circle can be made: more than three points, not on a line."""
+    """Return which moments define a circle: more than three points, not on a line."""
     z = m.xx + m.yy
     flat = m.xx * m.yy - m.xy**2 <= ROUNDING * z**2
     return np.asarray((m.effective > 3.0) & ~flat & (square > 0.0))

@@ -1,7 +1,8 @@
-r"""How far a center from three frames will be off, told before it is measured.
+"""Predicted error of a center computed from three frames.
 
-Law: first order in the noise, which is also the Cramér-Rao bound of three points. Means of squares
-are squared here and their root is returned: the paper's equations 14 and 15 are mean *squares*.
+The predictions are of first order in the noise and equal the Cramér-Rao bound of three points.
+Each function returns the root of the mean square; equations 14 and 15 of the source are mean
+squares.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
         E^2 = \frac{2\sigma^2 (3 - \cos\theta_{12} - \cos\theta_{13} - \cos\theta_{23})}
                    {(\sin\theta_{12} - \sin\theta_{13} + \sin\theta_{23})^2}
 
-    Source: Akbarifar et al. 2021, equation 14 with its last cosine's sign mended.
+    Source: Akbarifar et al. 2021, equation 14 with the sign of the last cosine corrected.
 
     Parameters
     ----------
@@ -40,6 +41,7 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
     t = np.asarray(angles, dtype=np.float64)
     d12, d13, d23 = t[..., 0] - t[..., 1], t[..., 0] - t[..., 2], t[..., 1] - t[..., 2]
     Q = np.sin(d12) - np.sin(d13) + np.sin(d23)
+
     # 1 - cos by half angles: the difference of cosines has no digits on short arcs
     square = 4.0 * (np.sin(d12 / 2) ** 2 + np.sin(d13 / 2) ** 2 + np.sin(d23 / 2) ** 2)
     return _ratio(np.asarray(noise) * np.sqrt(square), np.abs(Q))
@@ -52,8 +54,8 @@ def component_errors(angles: ArrayLike, noise_x: float, noise_y: float) -> tuple
         E[\hat x^2] = \left\{ \sigma_x^2 \sum \cos^2\theta_i (\sin\theta_j - \sin\theta_k)^2
             + \sigma_y^2 \sum \sin^2\theta_i (\sin\theta_j - \sin\theta_k)^2 \right\} / Q^2
 
-    and with cosines in the brackets for y; i, j, k cyclic. Source: equations 11 to 13, mended: the
-    denominator of 11 has (x1 - x3), the second-order group of 13 the opposite sign.
+    and with cosines in the brackets for y; i, j, k cyclic. Source: equations 11 to 13, corrected:
+    the denominator of 11 has (x1 - x3), the second-order group of 13 the opposite sign.
 
     Parameters
     ----------
@@ -74,6 +76,7 @@ def component_errors(angles: ArrayLike, noise_x: float, noise_y: float) -> tuple
     across = np.roll(s, -1, axis=-1) - np.roll(s, -2, axis=-1)
     along = np.roll(c, -1, axis=-1) - np.roll(c, -2, axis=-1)
     errors = [np.sqrt((spoke * g**2).sum(axis=-1)) for g in (across, along)]
+
     return _ratio(errors[0], np.abs(Q)), _ratio(errors[1], np.abs(Q))
 
 
@@ -100,7 +103,8 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     a = np.asarray(step, dtype=np.float64)
     one_less = 2.0 * np.sin(a / 2) ** 2
     one_more = 2.0 * np.cos(a / 2) ** 2
-    # π itself is not a number of the machine: what is left of its cosine is rounding
+
+    # π is not representable: the remaining cosine is rounding
     one_more = np.where(one_more < 1e-30, 0.0, one_more)
     error = np.asarray(noise) * np.sqrt(1.0 + one_more)
     return _ratio(error, one_less * np.sqrt(one_more))
@@ -111,7 +115,7 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
 
     .. math:: E = \sigma \frac{R}{2A} \sqrt{a^2 + b^2 + c^2}, \qquad R = abc / 4A
 
-    with sides a, b, c and area A: no angles and no center are needed, so it can be told online,
+    with sides a, b, c and area A: no angles and no center are needed, so it can be computed online,
     for every triple, before the center is trusted.
 
     Parameters
@@ -131,6 +135,7 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
     sides = np.stack([(w**2).sum(axis=-1) for w in (u, v, u - v)], axis=-1)
     area = np.abs(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]) / 2
     error = np.asarray(noise) * np.sqrt(sides.prod(axis=-1) * sides.sum(axis=-1))
+
     return _ratio(error, 8.0 * area**2)
 
 
@@ -158,6 +163,7 @@ def needed_step(noise: float, target: float) -> float:
             low = middle
         else:
             high = middle
+
     return high
 
 

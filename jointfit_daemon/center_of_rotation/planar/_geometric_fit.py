@@ -1,7 +1,7 @@
-r"""Circles by least distance: the maximum-likelihood fit, for weights, outliers and known radii.
+"""Geometric circle fit: the maximum-likelihood estimate by Levenberg-Marquardt.
 
-Law: equal to Hyper on clean points; what it adds is Huber's loss, several markers that share one
-center, and a radius that is known.
+On clean points it equals Hyper. It adds Huber's loss, several markers with one center, and known
+radii.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from jointfit_daemon.center_of_rotation._path_statistics import lag_one_correlation
 from jointfit_daemon.center_of_rotation._result import CenterEstimate
 from jointfit_daemon.center_of_rotation.planar._circle_estimate import (
-    Limits,
+    CircleLimits,
     arc_about,
-    nothing,
     objection,
+    refused_circle,
 )
 from jointfit_daemon.center_of_rotation.planar._circle_fit import fit_circles
 from jointfit_daemon.center_of_rotation.planar._moments import ROUNDING, ellipse_scale, seen_places
@@ -40,7 +40,7 @@ def geometric_estimate(
     radii: ArrayLike | None = None,
     robust: bool = True,
     start: ArrayLike | None = None,
-    limits: Limits | None = None,
+    limits: CircleLimits | None = None,
 ) -> CenterEstimate:
     r"""Estimate the center that one marker or several turn about, by Levenberg-Marquardt.
 
@@ -61,8 +61,8 @@ def geometric_estimate(
         Huber's loss at 1.5 standard deviations, taken from the median residual.
     start : array_like, shape (2,), optional
         Where to begin, m; Hyper of the marker that shows most if None.
-    limits : Limits, optional
-        When to refuse.
+    limits : CircleLimits, optional
+        Acceptance limits.
     """
     p = np.asarray(points, dtype=np.float64)
     p = p[:, None, :] if p.ndim == 2 else p
@@ -70,13 +70,17 @@ def geometric_estimate(
     frames = int(seen.any(axis=1).sum())
     begin = _begin(p) if start is None else np.asarray(start, dtype=np.float64)
     if seen.sum() < 2 + p.shape[1] + 1 or begin is None:
-        reason = "no marker shows an arc: too few frames, no motion, or a straight path; move more"
+        reason = (
+            "no marker path is an arc (too few frames, no motion or a line): "
+            "increase the range of motion"
+        )
         middle = p[seen].mean(axis=0) if seen.any() else np.zeros(2)
-        return nothing(METHOD, (float(middle[0]), float(middle[1])), frames, reason)
+        return refused_circle(METHOD, (float(middle[0]), float(middle[1])), frames, reason)
+
     known = None if radii is None else np.asarray(radii, dtype=np.float64)
     x = np.where(seen[..., None], p, 0.0)
     c, weights = _descend(x, seen, begin, known, robust=robust)
-    return _told(x, seen, c, weights, known=known, limits=limits or Limits())
+    return _accept_estimate(x, seen, c, weights, known=known, limits=limits or CircleLimits())
 
 
 def _begin(p: Array) -> Array | None:
@@ -113,9 +117,11 @@ def _descend(
         if robust:
             weights = _huber(e, seen)
             e, J = _residual(x, weights, c, known)
+
         H = np.einsum("tk,tka,tkb->ab", weights, J, J)
         g = np.einsum("tk,tka,tk->a", weights, J, e)
         cost = float((weights * e**2).sum())
+
         for _ in range(12):
             step = -np.linalg.solve(H + mu * np.diag(np.diag(H)) + 1e-15 * np.eye(2), g)
             tried = _residual(x, weights, c + step, known)[0]
@@ -124,29 +130,33 @@ def _descend(
             mu *= 5.0
         else:
             break
+
         c, mu = c + step, max(0.2 * mu, 1e-12)
         if float(np.linalg.norm(step)) < 1e-10:
             break
+
     return c, weights
 
 
-def _told(
+def _accept_estimate(
     x: Array,
     seen: NDArray[np.bool_],
     c: Array,
     w: Array,
     *,
     known: Array | None,
-    limits: Limits,
+    limits: CircleLimits,
 ) -> CenterEstimate:
     e, J = _residual(x, w, c, known)
     count = int(seen.sum())
     free = 2 + (x.shape[1] if known is None else 0)
+
     # Huber's variance: mean of squared pull over squared share of points that pull freely
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     H = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
-    # noise turns directions, too: what it adds to H is no information
+
+    # noise also changes directions; its contribution to H is not information
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
     across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
         "tk,tka,tkb->ab", seen / u2**2, x - c, x - c
@@ -155,8 +165,9 @@ def _told(
     frames = int(seen.any(axis=1).sum())
     least, most = np.linalg.eigvalsh(H)
     if not least > ROUNDING * most:
-        reason = "noise hides the arc: move the joint further, or bring the cameras closer"
-        return nothing(METHOD, (float(c[0]), float(c[1])), frames, reason)
+        reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
+        return refused_circle(METHOD, (float(c[0]), float(c[1])), frames, reason)
+
     wider = _wider(lag_one_correlation(e, seen))
     C = np.asarray(wider * variance * np.linalg.inv(H))
     distance = np.linalg.norm(x - c, axis=-1)
@@ -166,6 +177,7 @@ def _told(
     T = radius / sqrt(largest) if largest > 0.0 else inf
     shown = [arc_about(np.where(s[:, None], x[:, k], np.nan), c) for k, s in enumerate(seen.T)]
     sd = sqrt(float(np.trace(C)))
+
     return CenterEstimate(
         method=METHOD,
         center=c,
@@ -184,7 +196,7 @@ def _told(
 
 
 def _wider(alike: float) -> float:
-    """Return by how much a correlation from frame to frame widens: skin moves slowly."""
+    """Return the variance factor of a lag-one correlation of the residuals."""
     return (1.0 + alike) / (1.0 - alike)
 
 

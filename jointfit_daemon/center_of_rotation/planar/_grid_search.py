@@ -1,7 +1,7 @@
-r"""The center of rotation by looking everywhere: least spread of the distances over a grid.
+"""Grid search for the center with the smallest variance of distances.
 
-Law: the baseline of the planar method, no more. On short arcs its accuracy is the box, on long ones
-the step; a box centered on the truth flatters it.
+This is the published baseline of the planar method. Its accuracy is limited by the box on short
+arcs and by the step on long ones.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
 
     .. math:: J(p) = \sum_n d_n^2 - \Big(\sum_n d_n\Big)^2 / N, \qquad d_n = |p - x_n|
 
-    Source: Akbarifar et al. 2021, section 2-1-2 and equation 9 with its index and mean mended.
+    Source: Akbarifar et al. 2021, section 2-1-2 and equation 9 with corrected index and mean.
 
     Parameters
     ----------
@@ -64,6 +64,7 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
     nodes = grid.nodes()
     size = max(1, _AT_ONCE // max(len(nodes) * p.shape[-2], 1))
     best = [_least(flat[i : i + size], nodes) for i in range(0, len(flat), size)]
+
     return np.concatenate(best).reshape(*p.shape[:-2], 2) if best else np.zeros((*p.shape[:-2], 2))
 
 

@@ -1,8 +1,7 @@
-r"""What a circle fit needs of its points: nine central moments, and what follows from them.
+"""Central moments of the points of a circle, and the fit statistics derived from them.
 
-Law: fit, noise, covariance and verdict come from the same moments, so that points kept, forgotten
-one by one or never stored give the same answer. Every formula takes floats (one circle, live) and
-arrays (many circles at once) alike.
+Invariant: fit, noise and covariance depend on nine moments only, so batch, windowed and forgetting
+fits give the same result. Every formula accepts floats (one circle) and arrays (many circles).
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ GATE = 6.0
 """T from which on a center is published: its error is within 15 % of the bound there."""
 LOG_20 = log(20.0)
 FARTHEST_M = 1e4
-"""Coordinates beyond are no measurement: "not seen", like NaN."""
+"""Coordinates beyond this, m, are treated as missing, like NaN."""
 ROUNDING = 1e-13
 """Share of the points' own variance below which a difference of moments is rounding."""
 
@@ -47,8 +46,8 @@ class CircleMoments(NamedTuple, Generic[Number]):
     zz: Number
 
 
-class Judged(NamedTuple, Generic[Number]):
-    """What the moments say of a circle about the centroid plus (a, b)."""
+class CircleStatistics(NamedTuple, Generic[Number]):
+    """Statistics of a circle about the centroid plus (a, b)."""
 
     noise: Number
     """Variance of a point per coordinate, m²."""
@@ -61,11 +60,11 @@ class Judged(NamedTuple, Generic[Number]):
     xy: Number
     yy: Number
     largest: Number
-    """Its larger eigenvalue, m²."""
+    """Larger eigenvalue of the covariance, m²."""
 
 
 def seen_places(points: Array) -> NDArray[np.bool_]:
-    """Say which of the points, shape (..., 2), are measurements at all, shape (...)."""
+    """Return which points, shape (..., 2), are measurements, shape (...)."""
     return np.asarray((np.abs(points) < FARTHEST_M).all(axis=-1))
 
 
@@ -99,6 +98,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     z = z - (share * z).sum(axis=-1)[..., None]
     pairs = ((x, x), (x, y), (y, y), (x, z), (y, z))
     means = [np.einsum("...n,...n,...n->...", share, u, v) for u, v in pairs]
+
     # about its mean z has only its variance left: Mzz = var z + (Mxx + Myy)², exact to rounding
     zz = np.einsum("...n,...n,...n->...", share, z, z) + (means[0] + means[2]) ** 2
     xx, xy, yy, xz, yz = means
@@ -120,6 +120,7 @@ def moments_of_one(points: Array, weights: Array | None = None) -> CircleMoments
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = ((columns * (w / total)) @ columns.T).tolist()
     effective = total * total / float(w @ w)
     x, y = middle.tolist()
+
     return CircleMoments(total, effective, x, y, xx, xy, yy, xz, yz, zz)
 
 
@@ -142,7 +143,7 @@ def noise_of(
 ) -> tuple[Number, Number]:
     """Return the noise of a coordinate and the mean square of the radial residuals, m².
 
-    Parameters are those of `judge`.
+    Parameters are those of `circle_statistics`.
     """
     u = sum_of_squares(m, a, b, square)
     u = (u + abs(u)) * 0.5  # rounding may take a perfect fit below zero
@@ -151,16 +152,18 @@ def noise_of(
 
 
 def arc_shows(m: CircleMoments[Number], noise: Number) -> Any:
-    """Tell whether the covariance of the points is positive definite without their noise.
+    """Return whether the covariance of the points is positive definite without their noise.
 
-    Where it is not, noise hides the arc and `judge` has no meaning: its variances may be negative.
+    Where it is not, noise hides the arc, and variances of `circle_statistics` may be negative.
     """
     sxx, syy = m.xx - noise, m.yy - noise
     trace = sxx + syy
     return (trace > 0.0) & (sxx * syy - m.xy * m.xy > ROUNDING * trace * trace)
 
 
-def judge(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Judged[Number]:
+def circle_statistics(
+    m: CircleMoments[Number], a: Number, b: Number, square: Number
+) -> CircleStatistics[Number]:
     r"""Return noise and covariance of a fitted circle.
 
     .. math::
@@ -172,7 +175,7 @@ def judge(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Jud
 
     with n the effective number. The noise is taken off the moments because it thickens the arc,
     which would pass for curvature: without it the claim on 20° is half the truth. The bracket is
-    noise along the arc, which blurs what the curvature is read against: 5 is exact for a parabola
+    noise along the arc, which blurs the reference of the curvature: 5 is exact for a parabola
     (noise on t adds 5σ²/var t to the variance of t² over evenly spread t), half of it is found by
     simulation for the whole circle. It matters from σ = R/30 on.
 
@@ -194,7 +197,8 @@ def judge(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Jud
     blurred = 1.0 + (5.0 - 2.5 * thin) * noise / long
     bound = noise * square / (m.effective * determinant)
     scale = blurred * bound
-    return Judged(
+
+    return CircleStatistics(
         noise,
         residual,
         bound * (sxx + syy),
@@ -206,7 +210,7 @@ def judge(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Jud
 
 
 def ellipse_scale(effective: float, conditioning: float) -> float:
-    r"""Return how large an error 95 % of the published centers stay within.
+    r"""Return the squared Mahalanobis distance that contains 95 % of the published centers.
 
     .. math:: e^T C^{-1} e \le g^2(T)\, \nu \left( 0.05^{-2/\nu} - 1 \right), \qquad \nu = n - 3
 

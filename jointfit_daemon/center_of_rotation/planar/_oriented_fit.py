@@ -1,7 +1,7 @@
-r"""The center from a marker's path and the child's angle together: errors in both.
+"""Center of rotation from a marker path and the measured angle of the child segment.
 
-Law: the angle helps where the arc is short, and can do little harm: however wrong it is, the answer
-stays within a bounded number of standard errors of what the path alone says.
+Both measurements have errors. Invariant: the result stays within a bounded number of standard
+errors of the circle fit, however wrong the angles are.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.center_of_rotation.planar._circle_estimate import (
-    Limits,
+    CircleLimits,
     arc_about,
     circle_estimate,
-    nothing,
     objection,
+    refused_circle,
 )
 from jointfit_daemon.center_of_rotation.planar._circle_fit import Circles, fit_circles
 from jointfit_daemon.center_of_rotation.planar._moments import GATE, seen_places
@@ -40,14 +40,14 @@ _FAR_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class AngleNoise:
-    """How wrong the child's angle may be; rad unless said otherwise."""
+    """Error model of the child's angle; rad unless stated otherwise."""
 
     slow: float = radians(1.5)
-    """Standard deviation of what wanders: soft tissue, heading."""
+    """Standard deviation of the slow part: soft-tissue artefact and heading drift."""
     time: float = 1.0
-    """Over which it wanders, s."""
+    """Correlation time of the slow part, s."""
     white: float = radians(1.0)
-    """Standard deviation of what is new in every frame."""
+    """Standard deviation of the white part."""
     gain: float = 0.02
     """Standard deviation of the scale, rad/rad."""
 
@@ -60,8 +60,8 @@ class AngleNoise:
         )
 
 
-class _Aided(NamedTuple):
-    """What the path and the angles say together."""
+class _AidedCircle(NamedTuple):
+    """Circle fitted to path and angles together."""
 
     center: Array
     covariance: Array
@@ -76,7 +76,7 @@ def oriented_estimate(
     *,
     noise: AngleNoise | None = None,
     near: tuple[Array, float] | None = None,
-    limits: Limits | None = None,
+    limits: CircleLimits | None = None,
 ) -> CenterEstimate:
     r"""Estimate the center of one marker whose segment's angle is measured, too.
 
@@ -86,17 +86,17 @@ def oriented_estimate(
             \qquad M = \left( (\sigma/\rho)^2 I + \Sigma_\theta \right)^{-1} \\
         q_t &= |x_t - c|, \quad e_t = q_t - \rho, \quad a_t = \arg(x_t - c) - \theta_t - \beta
 
-    Plain least squares on the first line is attenuated by δ; the last term of J takes away what
-    marker noise adds to aᵀMa, which shrinks with distance and would drive c outward.
+    Plain least squares on the first line is attenuated by δ; the last term of J subtracts the
+    contribution of marker noise to aᵀMa, which decreases with distance and would bias c outward.
 
     The guard is a limited translation (Efron and Morris 1971). With Δ = aided - circle, E its
-    covariance if the angles are as good as told, and s² = ΔᵀE⁻¹Δ, the answer is
+    covariance if the angles are as good as stated, and s² = ΔᵀE⁻¹Δ, the answer is
 
     .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
               \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
 
     so that an angle error of any size adds no more than λ²E to the mean square error. λ grows where
-    the circle's own error has a heavier tail than its covariance says.
+    the circle's own error has a heavier tail than its covariance.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ def oriented_estimate(
     interval : float
         From frame to frame, s.
     noise : AngleNoise, optional
-        How wrong the angles may be.
+        Error model of the angles.
     near : tuple of ndarray, shape (2,), and float, optional
         A place the center is known to be near, m, and how near: standard deviation, m.
-    limits : Limits, optional
-        When to refuse. T is the radius over the combined center's largest standard error.
+    limits : CircleLimits, optional
+        Acceptance limits. T is the radius over the combined center's largest standard error.
 
     Returns
     -------
@@ -119,15 +119,19 @@ def oriented_estimate(
         Flagged ``orientation_inconsistent`` where path and angles contradict each other.
     """
     x, theta, times = _thin(points, angles, interval)
-    allowed = limits or Limits()
+    allowed = limits or CircleLimits()
     if len(x) < 4:
-        reason = f"{len(x)} frames with marker and angle, at least 4 are needed: record for longer"
-        return nothing(METHOD, (0.0, 0.0), len(x), reason)
+        reason = (
+            f"{len(x)} frames with marker and angle, at least 4 are required: record a longer trial"
+        )
+        return refused_circle(METHOD, (0.0, 0.0), len(x), reason)
+
     if float(np.ptp(theta)) < allowed.arc:
         turned = np.degrees(np.ptp(theta))
-        reason = f"the joint turned {turned:.0f}° only: move through at least 30°"
-        return nothing(METHOD, (0.0, 0.0), len(x), reason)
-    alone = circle_estimate(x, limits=Limits(0.0, (0.0, inf), 0.0, inf))
+        reason = f"the joint turned {turned:.0f}°: move it through at least 30°"
+        return refused_circle(METHOD, (0.0, 0.0), len(x), reason)
+
+    alone = circle_estimate(x, limits=CircleLimits(0.0, (0.0, inf), 0.0, inf))
     if alone.refused and "motion" in alone.refused:
         return replace(alone, method=METHOD)
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
@@ -136,31 +140,35 @@ def oriented_estimate(
         aided = _solve(x, theta, sigma, Sigma, near)
     except np.linalg.LinAlgError:  # no information in some direction at all
         aided = None
+
     if aided is None and alone.refused is None:
         return replace(_path_alone(x, allowed), flags=("orientation_inconsistent",))
     if aided is None:
-        reason = "path and angles do not fit one center: check the axis, or move the joint further"
-        return nothing(METHOD, (0.0, 0.0), len(x), reason)
+        reason = (
+            "path and angles do not fit one center: check the axis or increase the range of motion"
+        )
+        return refused_circle(METHOD, (0.0, 0.0), len(x), reason)
+
     held = guarded(aided.center, aided.covariance, fit_circles(x))
-    return _told(x, held, aided, sigma=sigma, limits=allowed, alone=alone)
+    return _accept_estimate(x, held, aided, sigma=sigma, limits=allowed, alone=alone)
 
 
 def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
-    """Hold an aided center near what the path alone says.
+    """Limit the distance of an aided center from the circle fit of the path alone.
 
     Parameters
     ----------
     center : ndarray, shape (2,)
-        With the angles, m.
+        Estimated with the angles, m.
     C : ndarray, shape (2, 2)
-        Its covariance if the angles are as good as told, m².
+        Its covariance if the angles are as good as stated, m².
     circle : Circles
-        Without them; where it is not valid the path says nothing, and nothing is held.
+        Fit of the path alone; where it is not valid the center is returned unchanged.
 
     Returns
     -------
     center, covariance, s2 : ndarray, ndarray, float
-        The covariance counts what was let through of a contradiction.
+        The covariance includes the remaining part of a contradiction.
     """
     if not bool(circle.valid):
         return center, C, 0.0
@@ -175,11 +183,12 @@ def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, flo
     given = 1.0 - kept
     E = (axes * apart) @ axes.T
     covariance = C + given**2 * E + given * kept**2 * np.outer(delta, delta)
+
     return circle.center + kept * delta, covariance, s2
 
 
 def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array, Array, Array]:
-    """Drop what was not seen; average to at most `MAX_FRAMES`."""
+    """Drop missing frames and average to at most `MAX_FRAMES`."""
     x = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     theta = np.asarray(angles, dtype=np.float64).ravel()
     seen = seen_places(x) & np.isfinite(theta)
@@ -191,10 +200,11 @@ def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array,
     count = np.diff(parts, append=len(x))
     averaged: Array = np.add.reduceat(np.column_stack((x, theta, times)), parts, axis=0)
     averaged = averaged / count[:, None]
+
     return averaged[:, :2], averaged[:, 2], averaged[:, 3]
 
 
-def _path_alone(x: Array, limits: Limits) -> CenterEstimate:
+def _path_alone(x: Array, limits: CircleLimits) -> CenterEstimate:
     return replace(circle_estimate(x, limits=limits), method=METHOD)
 
 
@@ -223,33 +233,37 @@ def _path_noise(x: Array) -> float:
 
 def _solve(
     x: Array, theta: Array, sigma: float, Sigma: Array, near: tuple[Array, float] | None
-) -> _Aided | None:
+) -> _AidedCircle | None:
     """Minimize J by Gauss-Newton from plain least squares; None where it has no minimum."""
     z, start = _least_squares(x, theta), x.mean(axis=0)
     M: Array = np.eye(len(x))
     rho0 = -1.0
     prior = 0.0 if near is None else near[1] ** -2
     H = np.eye(4)
+
     for _ in range(_PASSES):
         if not (np.isfinite(z).all() and 1e-3 < z[2] < 2.0 * _FAR_M):
             return None
         if abs(z[2] / rho0 - 1.0) > 0.02:
             rho0 = float(z[2])
             M = np.asarray(np.linalg.inv((sigma / rho0) ** 2 * np.eye(len(x)) + Sigma))
+
         H, g = _normal(x, theta, z, M, sigma=sigma, rho0=rho0)
         if near is not None:
             H[:2, :2] += prior * np.eye(2)
             g[:2] += prior * (z[:2] - near[0])
+
         step = -np.linalg.solve(H, g)
         step *= min(1.0, 0.3 * z[2] / max(float(np.hypot(step[0], step[1])), 1e-12))
         z = z + step
         if float(np.abs(step[:3]).max()) < 1e-8:
             break
+
     C = np.asarray(np.linalg.inv(H)[:2, :2])
     if not (np.linalg.eigvalsh(C)[0] > 0.0 and np.linalg.norm(z[:2] - start) <= _FAR_M):
         return None
     e = np.linalg.norm(x - z[:2], axis=1) - z[2]
-    return _Aided(z[:2], C, float(z[2]), float(np.sqrt((e**2).mean())))
+    return _AidedCircle(z[:2], C, float(z[2]), float(np.sqrt((e**2).mean())))
 
 
 def _least_squares(x: Array, theta: Array) -> Array:
@@ -275,19 +289,20 @@ def _normal(
     MJ = M @ Ja
     H = Je.T @ Je / sigma**2 + Ja.T @ MJ
     g = Je.T @ e / sigma**2 + MJ.T @ a
+
     # capped from below: the compensation has no bound as a point comes to the center
     counted = np.where(q > rho0 / 2, np.diag(M) / q**4, 0.0)
     g[:2] -= sigma**2 * counted @ d
     return H, g
 
 
-def _told(
+def _accept_estimate(
     x: Array,
     held: tuple[Array, Array, float],
-    aided: _Aided,
+    aided: _AidedCircle,
     *,
     sigma: float,
-    limits: Limits,
+    limits: CircleLimits,
     alone: CenterEstimate,
 ) -> CenterEstimate:
     center, C, s2 = held
@@ -296,6 +311,7 @@ def _told(
     T = radius / sqrt(largest)
     arc = arc_about(x, center)
     sd = float(np.sqrt(np.trace(C)))
+
     return replace(
         alone,
         method=METHOD,

@@ -1,7 +1,4 @@
-r"""From markers of two segments to one point moving about a fixed center in a plane.
-
-Law: what the parent does is taken out first; its markers' noise comes in by that, and is told.
-"""
+"""Coordinates of markers in the plane of a segment, and the plane normal to a joint axis."""
 
 from __future__ import annotations
 
@@ -44,6 +41,7 @@ def in_segment_plane(first: ArrayLike, second: ArrayLike, marker: ArrayLike) -> 
     e = along / length
     x = (e * d).sum(axis=-1)
     y = e[..., 0] * d[..., 1] - e[..., 1] * d[..., 0]
+
     return np.stack((x, y), axis=-1)
 
 
@@ -85,6 +83,7 @@ def plane_of(axis: ArrayLike) -> Array:
     guide = np.eye(3)[1 if abs(n[1]) < 0.9 else 2]
     first = guide - n * (n @ guide)
     first /= np.linalg.norm(first)
+
     return np.column_stack((first, np.cross(n, first)))
 
 
@@ -132,4 +131,5 @@ def radial_noise(points: ArrayLike, center: ArrayLike, apart: float, noise: floa
     spoke = x - np.asarray(center, dtype=np.float64)
     spoke = spoke / np.linalg.norm(spoke, axis=-1, keepdims=True)
     S = parent_noise(x, apart, noise)
+
     return float(np.sqrt(np.einsum("ni,nij,nj->n", spoke, S, spoke).mean()))

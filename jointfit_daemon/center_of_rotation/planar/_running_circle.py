@@ -1,8 +1,8 @@
-r"""The center one marker turns about, one frame at a time, at a cost that does not grow.
+"""Circle fit of a stream of points at constant cost per frame.
 
-Law: ten sums hold all that a circle, its error and its residuals' correlation need; the answer
-equals that of all frames at once with the same weights. Plain floats: arrays of nine numbers cost
-more than the arithmetic.
+Invariant: the result equals the batch fit of all frames with the same weights. Ten sums hold the
+circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats
+because arrays of nine numbers cost more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation.planar._circle_estimate import Limits, publish
-from jointfit_daemon.center_of_rotation.planar._circle_fit import Method, circle_of
+from jointfit_daemon.center_of_rotation.planar._circle_estimate import CircleLimits, publish
+from jointfit_daemon.center_of_rotation.planar._circle_fit import CircleMethod, circle_of
 from jointfit_daemon.center_of_rotation.planar._moments import (
     FARTHEST_M,
     ROUNDING,
@@ -42,14 +42,14 @@ class RunningCircle:
     Parameters
     ----------
     forgetting : float
-        What is left of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) forgets over τ.
+        Remaining share of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) forgets over τ.
     window : int, optional
         Only the last so many seen frames count. Not together with forgetting.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     robust : bool
         Weigh a frame that leaves the circle found so far by Huber's 1.5 standard deviations.
-    limits : Limits, optional
+    limits : CircleLimits, optional
         When `estimate` refuses.
 
     Raises
@@ -63,22 +63,22 @@ class RunningCircle:
         *,
         forgetting: float = 1.0,
         window: int | None = None,
-        method: Method = "hyper",
+        method: CircleMethod = "hyper",
         robust: bool = False,
-        limits: Limits | None = None,
+        limits: CircleLimits | None = None,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"forgetting is {forgetting}: a factor in (0, 1] is needed")
         if window is not None and (window < 4 or forgetting < 1.0):
             raise ValueError("a window needs four frames or more and no forgetting beside it")
         self._forgetting, self._method, self._robust = forgetting, method, robust
-        self._limits = limits or Limits()
+        self._limits = limits or CircleLimits()
         self._window = window
         self._kept: deque[Kept] = deque()
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Discard all frames."""
         self._origin: tuple[float, float] | None = None
         self._sums = self._lagged = _NONE
         self._squares = 0.0
@@ -96,6 +96,7 @@ class RunningCircle:
         if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
             self._pass()
             return
+
         if self._origin is None:
             self._origin = (x, y)
         if self._robust:
@@ -133,7 +134,7 @@ class RunningCircle:
         self._before = (x, y, w)
 
     def _pass(self) -> None:
-        """Let time go by with nothing seen."""
+        """Advance one frame without a measurement."""
         mu = self._forgetting
         if mu < 1.0:
             self._sums = _scaled(self._sums, mu)
@@ -144,7 +145,7 @@ class RunningCircle:
             self._kept.append((0.0, 0.0, 0.0))  # weighs nothing, and parts its neighbours
 
     def _slide(self, frame: Kept) -> None:
-        """Let the oldest frame go; rounding is swept out every so often."""
+        """Remove the oldest frame; sums are recomputed every `_RESUM_FRAMES` against rounding."""
         kept = self._kept
         kept.append(frame)
         if self.frames <= (self._window or 0):
@@ -186,10 +187,11 @@ class RunningCircle:
         self._before = (bx - dx, by - dy, bw)
         self._kept = deque((kx - dx, ky - dy, kw) for kx, ky, kw in self._kept)
         self._origin = (self._origin[0] + dx, self._origin[1] + dy)
+
         return x - dx, y - dy
 
     def moments(self) -> CircleMoments[float]:
-        """Return the central moments of what was seen, forgotten and weighted."""
+        """Return the weighted central moments of the visible frames."""
         zz, zx, zy, _, xx, xy, yy, xb, yb, w = self._sums
         if w <= 0.0 or self._origin is None:
             return CircleMoments(*(0.0,) * 10)
@@ -198,6 +200,7 @@ class RunningCircle:
         xb, yb = xb * i, yb * i
         beta, zeta = xb * xb + yb * yb, xx + yy
         cxx, cxy, cyy = xx - xb * xb, xy - xb * yb, yy - yb * yb
+
         return CircleMoments(
             w,
             w * w / self._squares if self._squares > 0.0 else 0.0,  # forgotten for too long
@@ -228,7 +231,7 @@ class RunningCircle:
         return m.x + a, m.y + b, sqrt(square)
 
     def estimate(self) -> CenterEstimate:
-        """Return center, covariance, predicted error and verdict of all frames so far.
+        """Return center, covariance, predicted error and acceptance from all frames.
 
         Never raises; refused, with cause and remedy, where there is no center to be had.
         """
@@ -255,6 +258,7 @@ class RunningCircle:
             - 4.0 * (a * zx + b * zy)
             + 2.0 * c * (z - 2.0 * (a * x + b * y))
         )
+
         return total / (4.0 * square * w)
 
     def _trust(self, x: float, y: float) -> float:
@@ -266,7 +270,7 @@ class RunningCircle:
         return 1.0 if off <= allowed else allowed / off
 
     def _look(self) -> None:
-        """Keep the circle and the noise found so far for the next frame to be judged by."""
+        """Store circle and noise for weighting the next frame."""
         found = self.circle()
         if found is None:
             return
@@ -288,6 +292,7 @@ def _paired(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
     w *= weight
     z, r = x * x + y * y, u * u + v * v
     half = 0.5 * w
+
     return (
         mu * a + w * z * r,
         mu * b + half * (z * u + r * x),
@@ -313,4 +318,5 @@ def _moved(sums: Sums, dx: float, dy: float) -> Sums:
     rows, columns = np.triu_indices(4)
     upper = {(int(r), int(c)): float(N[r, c]) for r, c in zip(rows, columns, strict=True)}
     order = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3))
+
     return tuple(upper[key] for key in order)  # type: ignore[return-value]  # ten

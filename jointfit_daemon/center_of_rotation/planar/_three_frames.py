@@ -1,7 +1,7 @@
-r"""The center of rotation from three frames: the circle through three points, in closed form.
+"""Center of rotation from three frames: the circle through three points, in closed form.
 
-Law: three points are interpolated, not fitted: nothing is left to judge them by. So the answer is
-refused where the triangle is none, and its error is predicted from the triangle's sides.
+Three points leave no residual. The error is predicted from the sides of the triangle, and a
+degenerate triangle is refused.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ def three_frame_center(points: ArrayLike) -> Array:
     u, v, size = _sides(p)
     offset, flat = _offset(u, v)
     flat = (flat | np.isinf(size))[..., None]
+
     return np.where(flat, inf, p[..., 0, :] + size[..., None] * offset)
 
 
@@ -97,16 +98,20 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
     """
     p = np.asarray(points, dtype=np.float64)
     if not seen_places(p).all():
-        return _refusal(p, noise, "a marker is not seen in one of the frames: choose other frames")
+        return _refusal(
+            p, noise, "a marker is missing in one of the three frames: choose other frames"
+        )
     u, v, size = _sides(p)
     offset, flat = _offset(u, v)
     if flat or not np.isfinite(size):
         reason = "the three points are on a line or repeat: choose frames further apart"
         return _refusal(p, noise, reason)
+
     spokes = np.stack((-offset, u - offset, v - offset))
     covariance = _covariance(u, v, float(np.hypot(*offset)), noise)
     error = sqrt(float(np.trace(covariance)))
     radius = float(size * np.hypot(*offset))
+
     # beyond it the smallest turn of the center is lost in noise and the error has no mean square
     lost = f"noise of {1000 * noise:.1f} mm hides the arc: choose frames further apart"
     turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
@@ -127,7 +132,7 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
 
 
 def _covariance(u: Array, v: Array, radius: float, noise: float) -> Array:
-    r"""Return what noise along the spokes does to the center, m².
+    r"""Return the covariance of the center from noise along the spokes, m².
 
     .. math:: C = σ^2 r^2 A^{-1} \begin{pmatrix} 2 & 1 \\ 1 & 2 \end{pmatrix} A^{-T},
               \qquad A = (u\; v)^T
@@ -197,4 +202,5 @@ def chain_centers(
         x = in_segment_plane(parent.first, parent.second, child.first)
         chosen = list(frames or (0, (len(x) - 1) // 2, len(x) - 1))
         found.append(three_frame_estimate(x[chosen], noise))
+
     return found

@@ -6,7 +6,7 @@ from jointfit_daemon.center_of_rotation.spatial._geometric_solver import (
     judge_sphere,
     solve_sphere,
 )
-from jointfit_daemon.center_of_rotation.spatial._observability import Limits
+from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import (
     relative,
     spatial_noise,
@@ -25,8 +25,8 @@ from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered
 
 __all__ = [
     "NOISE_FACTOR",
-    "Limits",
     "RunningSphere",
+    "SphereLimits",
     "SphereOptions",
     "centered",
     "fit_axis",

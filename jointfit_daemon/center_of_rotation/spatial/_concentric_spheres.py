@@ -1,14 +1,15 @@
 r"""One center for the spheres (in a plane: circles) of several markers, from their sums.
 
-Law: the algebraic residual of marker j about its mean, F = |x|² - 2 a·x - mean|x|², is 2 R_j times
+The algebraic residual of marker j about its mean, F = |x|² - 2 a·x - mean|x|², is 2 R_j times
 the radial one, so that
 
 .. math:: \min_a \sum_j \frac{n_j}{R_j^2 s_j} \left( \mathrm{var} F_j - \eta\, E_j(a) \right)
           = 0 \text{ at the smallest } \eta
 
-weighs all markers as a geometric fit does, and E_j, what unit noise adds to var F_j, takes the bias
-of short arcs out: for one marker in a plane the center is that of the hyper fit (Al-Sharadqah and
-Chernov 2009; Kanatani and Rangarajan 2011; for spheres, Halvorsen 2003 solved instead of iterated).
+weighs all markers as a geometric fit does, and E_j, the contribution of unit noise to var F_j,
+removes the bias of short arcs: for one marker in a plane the center is that of the hyper fit
+(Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011; for spheres, Halvorsen 2003 solved
+instead of iterated).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _REACH_M = 1e3
 
 
 @dataclass(frozen=True, slots=True)
-class Paths:
+class MarkerPaths:
     """Central moments of k markers' paths in r directions."""
 
     n: Array
@@ -45,15 +46,17 @@ class Paths:
     Z: Array
     """Variance of |x|², m⁴, shape (k,)."""
     S: Array
-    """What unit noise adds to C: shape (k, r, r); the identity for isotropic noise."""
+    """Contribution of unit noise to C, shape (k, r, r); the identity for isotropic noise."""
 
-    def seen_along(self, basis: Array) -> Paths:
+    def seen_along(self, basis: Array) -> MarkerPaths:
         """Return the paths projected onto directions, the columns of `basis`, shape (r, s)."""
         B = basis
-        return Paths(self.n, self.mean @ B, B.T @ self.C @ B, self.c @ B, self.Z, B.T @ self.S @ B)
+        return MarkerPaths(
+            self.n, self.mean @ B, B.T @ self.C @ B, self.c @ B, self.Z, B.T @ self.S @ B
+        )
 
 
-def paths_of(sums: SphereSums, shape: Array | None = None) -> Paths:
+def paths_of(sums: SphereSums, shape: Array | None = None) -> MarkerPaths:
     """Return the central moments of `sums`, which must be about each marker's mean.
 
     Parameters
@@ -67,12 +70,13 @@ def paths_of(sums: SphereSums, shape: Array | None = None) -> Paths:
     own = np.einsum("jajb->jab", sums.M) / np.maximum(sums.weights, 1e-300)[:, None, None]
     Z = np.maximum(own[:, 0, 0] - own[:, 0, -1] ** 2, 0.0)
     S = np.tile(np.eye(d), (k, 1, 1)) if shape is None else np.asarray(shape, dtype=np.float64)
-    return Paths(sums.counts, sums.origin, own[:, 1:-1, 1:-1], own[:, 0, 1:-1], Z, S)
+
+    return MarkerPaths(sums.counts, sums.origin, own[:, 1:-1, 1:-1], own[:, 0, 1:-1], Z, S)
 
 
 @dataclass(frozen=True, slots=True)
-class Spheres:
-    """A center and what each marker's sphere about it looks like."""
+class ConcentricSpheres:
+    """Common center with noise and radius of each marker."""
 
     center: Array
     """m, shape (r,)."""
@@ -86,14 +90,15 @@ class Spheres:
     """Mean-square change of direction summed over frames and markers, noise taken out, each
     weighted by the common noise over its own: shape (r, r)."""
     floor: Array
-    """What noise alone would add to it, shape (r, r)."""
+    """Contribution of the noise alone, shape (r, r)."""
 
 
-def common_center(paths: Paths) -> Spheres | None:
+def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
     """Fit one center, each marker weighted by its own noise; None if the paths do not bend."""
     k = len(paths.n)
     relative = np.ones(k)
     found = _smallest_root(paths, relative)
+
     for _ in range(_REWEIGHED if k > 1 else 0):
         if found is None:
             return None
@@ -103,17 +108,19 @@ def common_center(paths: Paths) -> Spheres | None:
         if done:
             break
         found = _smallest_root(paths, relative)
+
     if found is None:
         return None
     m, eta, _, R2 = found
     total = float(paths.n.sum())
     noise2 = max(eta, _NOTHING_M2) * total / max(total - k - len(m), 1.0)
     w = paths.n / (R2 * relative)
+
     # of n frames, the path about its own mean holds 1 - 1/n of the noise
     left = (1.0 - 1.0 / np.maximum(paths.n, 1.0)) * noise2 * relative
     floor = np.einsum("j,jab->ab", w * left, paths.S)
     information = np.einsum("j,jab->ab", w, paths.C) - floor
-    return Spheres(m, noise2, relative, R2, information, floor)
+    return ConcentricSpheres(m, noise2, relative, R2, information, floor)
 
 
 def _shrunk(ratio: Array, n: Array) -> Array:
@@ -126,7 +133,7 @@ def _shrunk(ratio: Array, n: Array) -> Array:
     return np.asarray(np.maximum(1.0 + trust * (ratio - 1.0), 0.05))
 
 
-def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, Array] | None:
+def _smallest_root(paths: MarkerPaths, relative: Array) -> tuple[Array, float, Array, Array] | None:
     """Return center, eta, each marker's radial variance and its squared radius.
 
     Newton on G(η) det B(η), which has no other root below and reaches it from zero without passing
@@ -139,6 +146,7 @@ def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, 
     trSC, z0 = np.einsum("jab,jba->j", S, paths.C), np.einsum("jaa->j", paths.C)
     eta, R2 = 0.0, np.ones(len(h))
     m, V, added = g, np.zeros(len(h)), np.ones(len(h))
+
     for _ in range(_STEPS):
         w = paths.n / (R2 * relative)
         D = paths.C - eta * S
@@ -147,6 +155,7 @@ def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, 
             inverse = np.linalg.inv(B)
         except np.linalg.LinAlgError:
             return None
+
         m = inverse @ (w @ (np.einsum("jab,jb->ja", D, h) + paths.c / 2.0))
         a = m - h
         q = np.einsum("ja,ja->j", a, a)
@@ -162,6 +171,7 @@ def _smallest_root(paths: Paths, relative: Array) -> tuple[Array, float, Array, 
         eta += step
         if abs(step) <= 1e-13 * eta + 1e-30:
             break
+
     return (
         np.asarray(m + g),
         max(eta, 0.0),

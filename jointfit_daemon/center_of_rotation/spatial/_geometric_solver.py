@@ -1,7 +1,6 @@
-r"""The geometric fit of spheres about one center, robust against markers that jump.
+"""Robust geometric fit of concentric spheres.
 
-Law: directions that the movement does not show are left where the fit began; how far the answer may
-be believed is for the verdict, not for the fit.
+Unobservable directions keep the start value. Acceptance is decided by `judge_sphere`.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of, lag_one_correlation
 from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
-from jointfit_daemon.center_of_rotation.spatial._observability import MIN_CONDITIONING, Limits
+from jointfit_daemon.center_of_rotation.spatial._observability import MIN_CONDITIONING, SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import STRAIGHT, objection
 
 if TYPE_CHECKING:
@@ -33,25 +32,26 @@ _LONGEST_STEP_M = 0.2
 
 @dataclass(frozen=True, slots=True)
 class SphereOptions:
-    """How a geometric fit of spheres goes about it."""
+    """Settings of a geometric sphere fit."""
 
     huber: float = HUBER
     """Residuals above so many scales lose weight; inf: plain least squares."""
     smallest_scale: float = _ROUNDED
-    """m; on skin a tenth of a millimeter, so that good moments do not rule."""
+    """Smallest residual scale, m; 0.1 mm with soft-tissue artefact, so that a few good
+    frames do not dominate."""
     start: Array | None = None
-    """Where to begin, and to stay along unseen directions, m, shape (3,)."""
+    """Start, and position along unseen directions, m, shape (3,)."""
     hold: float = 0.0
-    """Noise, m, that may not pull the first guess from `start`."""
+    """Noise, m, that must not move the initial estimate away from `start`."""
     min_direction: float = 0.0
     """RMS turning, rad, below which a direction is not seen whatever the noise."""
     keep_one: bool = False
-    """Fit the best direction even where it does not pass for seen."""
+    """Fit the best direction even if it is not observable."""
 
 
 @dataclass(frozen=True, slots=True)
 class SphereFit:
-    """A geometric fit with what is needed to judge it."""
+    """Geometric fit with the statistics for its acceptance."""
 
     center: Array
     """m, shape (3,)."""
@@ -101,6 +101,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
     start = np.asarray(start, dtype=np.float64)
     m = _begin(v, w, start, options)
     basis: Array = np.eye(3)
+
     for _ in range(_PASSES):
         e, _ = radial_residuals(v, m, w)
         scale = max(1.4826 * float(np.median(np.abs(e[seen]))), options.smallest_scale)
@@ -115,6 +116,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
         if not np.trace(H) > 0.0:  # nothing moved at all
             basis = np.zeros((3, 0))
             break
+
         g = np.einsum("tj,tja,tj->a", w, Jb, e)
         # far from the answer the radii are wrong and full steps overshoot
         step = basis @ np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(len(H)), -g)
@@ -122,6 +124,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
         m = start + basis @ (basis.T @ (m + step - start))
         if np.linalg.norm(step) < 1e-9:
             break
+
     return _at(points, m, w, basis)
 
 
@@ -145,6 +148,7 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
     square = square - (w * square).sum(axis=0) / total
     A = 2.0 * np.einsum("tj,tja,tjb->ab", w / total, d, d)
     b = np.einsum("tj,tja,tj->a", w / total, d, square)
+
     # a millionth of the path keeps a plane from being singular
     least = max(options.hold**2, 1e-6 * float(np.trace(A)) / len(total))
     return np.asarray(start + np.linalg.solve(A + 2.0 * len(total) * least * np.eye(3), b))
@@ -164,7 +168,7 @@ def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
 def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
     """Return an orthonormal basis (3, r) of the directions the movement shows.
 
-    Noise turns a marker's direction across its own line of sight only, so the floor of each
+    Noise turns a marker's direction across its own line of sight only, so the threshold of each
     direction b is scaled by the mean of 1 - (b·u)².
     """
     _, J = radial_residuals(v, m, w)
@@ -175,20 +179,22 @@ def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions
     along = np.einsum("tj,tja,tjb->ab", w / u2, d, d) / total
     across = np.maximum(1.0 - np.einsum("ai,ab,bi->i", axes, along, axes), 0.0)
     noise = scale**2 * float((w / u2).sum() / total)
-    if options.keep_one:  # skin: a fixed multiple of its motion
+    if options.keep_one:  # soft-tissue artefact: a fixed multiple of its motion
         keep = spread >= max(options.min_direction**2, NOISE_FACTOR * noise) * across
         keep[-1] = True
         return np.asarray(axes[:, keep])
+
     left = spread - noise * across
     chance = np.array([7.0, 0.0, 0.0]) * noise * np.sqrt(2.0 / total) * across
     sharp = MIN_CONDITIONING**2 * noise / total
     third = np.array([options.min_direction**2, 0.0, 0.0])
     keep = left > np.maximum(np.maximum(third, chance), sharp)
+
     return np.asarray(axes[:, keep])
 
 
 def judge_sphere(
-    fit: SphereFit, method: str, frames: int, limits: Limits, options: SphereOptions
+    fit: SphereFit, method: str, frames: int, limits: SphereLimits, options: SphereOptions
 ) -> CenterEstimate:
     r"""Return a fit with its covariance, or the reason not to use it.
 
@@ -222,6 +228,7 @@ def judge_sphere(
     radius = float(np.median(fit.radii))
     conditioning = radius / float(np.sqrt(np.linalg.norm(shown, 2)))
     unseen = fit.unseen
+
     # obliquely seen markers turn less: the one that turned most knows the arc
     inside = np.linalg.norm(fit.resultant @ fit.basis, axis=1)
     off = np.linalg.norm(fit.resultant @ unseen.T, axis=1) if len(unseen) else 0.0 * inside

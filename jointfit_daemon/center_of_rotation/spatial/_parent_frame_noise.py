@@ -1,6 +1,6 @@
-r"""What the noise of the parent's own markers does to a point seen from the parent.
+r"""Effect of the parent's marker noise on a point in the parent's coordinates.
 
-Law: the parent's frame is itself a fit to noisy markers; a point a lever arm away is moved by the
+The parent's frame is itself a fit to noisy markers; a point a lever arm away is moved by the
 fit's turn. Close parent markers and long levers amplify noise, and all markers of the child share
 it. In a plane with two parent markers see `planar_reduction.parent_noise`.
 """
@@ -48,6 +48,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     middle = parent.mean(axis=0)
     d = parent - middle
     G = np.trace(d.T @ d) * np.eye(3) - d.T @ d
+
     # on a line, turning about it moves no marker
     if len(parent) < 3 or float(np.linalg.eigvalsh(G)[0]) < 1e-9 * float(np.trace(G)):
         raise ValueError("a frame needs three markers that are not on a line: move one aside")
@@ -134,4 +135,5 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     total = seen.sum(axis=0)
     along = (seen * radial).sum(axis=0) / np.maximum(total, 1.0)
     along = np.where(total > 0.0, along, np.trace(S) / len(center))
+
     return np.asarray(S / np.maximum(along, 1e-300)[:, None, None])

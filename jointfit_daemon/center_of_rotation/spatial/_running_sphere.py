@@ -1,7 +1,6 @@
-"""The center that several markers turn about, one frame at a time, at constant cost.
+"""Center of rotation of several markers, updated frame by frame at constant cost.
 
-Law: a frame costs the same whether it is the first or the millionth; the answer equals that of all
-frames at once with the same weights.
+Invariant: the result equals the batch fit of all frames with the same weights.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation.spatial._observability import Limits
+from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import (
     center_and_spheres,
     center_of,
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
-    from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import Spheres
+    from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import ConcentricSpheres
 
 
 OUTLIER = 3.0
@@ -39,21 +38,21 @@ OFF = 8.0
 """Standard deviations, and at least `OFF_M`, from which a marker is not where it belongs."""
 OFF_M = 0.01
 STAYED_OFF = 25
-"""Frames in a row that a marker must be off for it to begin anew where it is."""
+"""Consecutive frames off its sphere after which a marker is restarted at its new position."""
 _FAR_M = 2.0
 """Fourth powers lose their digits farther from the fixed point."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Expected:
-    """Where the last estimate expects the markers."""
+class _ExpectedMarkers:
+    """Marker positions expected from the last estimate."""
 
     f: Array
     """Radial residual of a marker is f·φ, m, shape (k, e); zero where nothing is known."""
     noise: Array
     """m, shape (k,); inf where nothing is known."""
     mean: Array
-    """Of each marker's path, from its fixed point, m, shape (k, d)."""
+    """Mean of each marker's path, from its fixed point, m, shape (k, d)."""
     unsure: Array
     """Covariance of the center over each squared radius, shape (k, d, d)."""
 
@@ -66,17 +65,17 @@ class RunningSphere:
     markers : int
         How many markers a frame has, k.
     forgetting : float
-        What is left of a frame's weight one frame later, in (0, 1]; 1 keeps all.
+        Remaining share of a frame's weight one frame later, in (0, 1]; 1 keeps all.
     dimension : int
         3, or 2 for points in a plane.
     near : ndarray, shape (dimension,), optional
         Where to stay along directions the movement does not show, m.
     robust : bool
-        Weigh down markers that leave the sphere found so far, as skin and swapped names do, and
-        begin anew with one that stays away. Works from the last `estimate`.
-    limits : Limits, optional
-        When to refuse. If None, residuals that last are not counted as going with posture: live,
-        skin is added by who asks, see ``skin`` (give ``Limits()`` to have it counted).
+        Reduce the weight of markers that leave their sphere (soft tissue, exchanged labels), and
+        restart a marker that stays away. Uses the last `estimate`.
+    limits : SphereLimits, optional
+        Acceptance limits. If None, persistent residuals are not counted as soft-tissue
+        artefact: live, the caller adds its variance (give ``SphereLimits()`` to have it counted).
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, see ``parent_noise``.
 
@@ -94,7 +93,7 @@ class RunningSphere:
         dimension: int = 3,
         near: Array | None = None,
         robust: bool = True,
-        limits: Limits | None = None,
+        limits: SphereLimits | None = None,
         shape: Array | None = None,
     ) -> None:
         if markers < 1 or not 0.0 < forgetting <= 1.0 or dimension not in {2, 3}:
@@ -102,9 +101,10 @@ class RunningSphere:
                 f"markers {markers}, forgetting {forgetting}, dimension {dimension}: at least one "
                 "marker, forgetting above 0 and at most 1, in a plane or in space"
             )
+
         e = dimension + 2
         self._near, self._robust, self._shape = near, robust, shape
-        self._limits = limits or Limits(posture=False)
+        self._limits = limits or SphereLimits(posture=False)
         self._forgetting = forgetting
         self._origin = np.full((markers, dimension), np.nan)
         self._M = np.zeros((markers * e, markers * e))
@@ -115,7 +115,7 @@ class RunningSphere:
         self._past = deque((np.zeros((markers, e)) for _ in range(LAGS[-1])), maxlen=LAGS[-1])
         self._frames = 0
         self._placed = False
-        self._expected: _Expected | None = None
+        self._expected: _ExpectedMarkers | None = None
         self._off = np.zeros(markers, dtype=np.int64)
         self._restarted: set[int] = set()
 
@@ -143,6 +143,7 @@ class RunningSphere:
             self._M *= self._forgetting
             self._L *= self._forgetting
             self._squares *= self._forgetting**2
+
         self._M += flat[:, None] * flat
         for g, lag in enumerate(LAGS):
             self._L[g] += phi[:, :, None] * self._past[-lag][:, None, :]
@@ -151,7 +152,7 @@ class RunningSphere:
         self._frames += 1 if w is None else int(w.any())
 
     def sums(self) -> SphereSums:
-        """Return what all frames so far come to."""
+        """Return the sums over all frames."""
         k, e = self._phi.shape
         origin = np.where(np.isfinite(self._origin), self._origin, 0.0)
         M = self._M.reshape(k, e, k, e).copy()
@@ -169,11 +170,12 @@ class RunningSphere:
         if self._robust:
             known = spheres is not None and found.refused is None
             self._expected = _expected(sums, found, spheres) if known and spheres else None
+
         flags = tuple(f"marker_moved:{j}" for j in sorted(self._restarted))
         return replace(found, flags=found.flags + flags) if flags else found
 
     def _place(self, points: Array) -> None:
-        """Give every marker seen for the first time a fixed point: where it is."""
+        """Set the fixed point of every marker at its first visible position."""
         first = np.isnan(self._origin[:, 0]) & np.isfinite(points).all(axis=1)
         self._origin[first] = points[first]
         self._placed = bool(np.isfinite(self._origin).all())
@@ -187,11 +189,13 @@ class RunningSphere:
                 return None
             w = np.where(near, 1.0 if given is None else given, 0.0)
             return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
+
         residual = np.abs(np.einsum("ja,ja->j", expected.f, phi))
         fine = residual <= OUTLIER * expected.noise
         if given is None and (fine & near).all():
             self._off[:] = 0
             return None
+
         w = np.where(near, 1.0 if given is None else given, 0.0)
         if fine.all():
             return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
@@ -202,10 +206,11 @@ class RunningSphere:
         residual = np.where(near, residual, 0.0)
         w = w * np.minimum(1.0, OUTLIER * scale / np.maximum(residual, 1e-300))
         off = near & (residual > np.maximum(OFF * scale, OFF_M))
+
         return self._restart(w, off | (np.isfinite(phi[:, 0]) & ~near))
 
     def _restart(self, w: Array, off: NDArray[np.bool_]) -> Array:
-        """Begin anew with markers that stayed off: on skin or by a new name they are others now."""
+        """Restart markers that stayed off: they have slipped or been relabelled."""
         self._off = np.where(off, self._off + 1, np.where(w > 0.0, 0, self._off))
         k, e = self._phi.shape
         for j in np.flatnonzero(self._off >= STAYED_OFF):
@@ -223,11 +228,15 @@ class RunningSphere:
             if self._expected is not None:
                 self._expected.f[j] = 0.0
                 self._expected.noise[j] = np.inf
+
             w = np.where(np.arange(k) == j, 0.0, w)
+
         return w
 
 
-def _expected(sums: SphereSums, found: CenterEstimate, spheres: Spheres) -> _Expected:
+def _expected(
+    sums: SphereSums, found: CenterEstimate, spheres: ConcentricSpheres
+) -> _ExpectedMarkers:
     k, d = sums.origin.shape
     used = np.isfinite(found.radii)
     at = centered(sums)
@@ -243,7 +252,8 @@ def _expected(sums: SphereSums, found: CenterEstimate, spheres: Spheres) -> _Exp
     noise = np.full(k, np.inf)
     noise[used] = np.sqrt(spheres.noise2 * spheres.relative)
     f = np.where(used[:, None], f / (2.0 * radii)[:, None], 0.0)
-    return _Expected(f, noise, mean, found.covariance / (radii**2)[:, None, None])
+
+    return _ExpectedMarkers(f, noise, mean, found.covariance / (radii**2)[:, None, None])
 
 
 def fit_running(
@@ -251,10 +261,10 @@ def fit_running(
     weights: Array | None = None,
     *,
     near: Array | None = None,
-    limits: Limits | None = None,
+    limits: SphereLimits | None = None,
     shape: Array | None = None,
 ) -> CenterEstimate:
-    """Return what `RunningSphere` says of all frames at once, plainly weighted.
+    """Return the estimate of `RunningSphere` for all frames at once.
 
     Parameters
     ----------
@@ -265,5 +275,5 @@ def fit_running(
     near, limits, shape
         As for `RunningSphere`.
     """
-    limits = limits or Limits(posture=False)
+    limits = limits or SphereLimits(posture=False)
     return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)

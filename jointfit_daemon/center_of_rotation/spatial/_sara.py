@@ -1,7 +1,7 @@
-"""The axis of a hinge from two moving bodies (SARA).
+"""Axis of a hinge from the poses of two bodies (SARA).
 
-Law: an axis is what the movement shows; a point on it is a choice, told by infinite variance along
-the axis. A movement about two axes is no hinge's, and is refused.
+The point on the axis is arbitrary; its variance along the axis is infinite. A movement about two
+axes is refused.
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ def fit_axis(
             f"{found.ratio:.2f}, a hinge has less than {HINGE_RATIO}): use score or sphere, or "
             "move about one axis only",
         )
+
     estimate = two_sided_estimate(found, child, parent, "sara", near)
     axis = estimate.axis
     if axis is None or toward is None or float(axis @ toward) >= 0.0:

@@ -1,8 +1,7 @@
-r"""A center from two moving bodies that are treated alike, and the axis of a hinge (SCoRE, SARA).
+"""Center of rotation from the poses of two bodies (SCoRE), or the axis of a hinge.
 
-Law: the point c₁ of the parent and c₂ of the child that are carried to the same place in every
-frame; both poses are needed, at least three markers each, and both may be noisy. The singular
-values of N = [R₁, -R₂] say whether there is a point or only an axis.
+The method finds the point of the parent and the point of the child that coincide in every frame.
+Both poses may be noisy. The singular values of N = [R₁, -R₂] distinguish a point from an axis.
 """
 
 from __future__ import annotations
@@ -15,7 +14,11 @@ import numpy as np
 
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of
 from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
-from jointfit_daemon.center_of_rotation.spatial._observability import Limits, of_posture, within95
+from jointfit_daemon.center_of_rotation.spatial._observability import (
+    SphereLimits,
+    posture_share,
+    within95,
+)
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import objection
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import LAGS
 from jointfit_daemon.kinematics import rotation
@@ -32,7 +35,7 @@ MIN_FRAMES = 15
 MIN_TURN_RAD = 0.02
 """RMS turning about the second axis of the movement below which nothing was turned."""
 LEVER_M = 0.24
-"""Stands for the radius in T, since poses do not say where markers are: a center has to be known to
+"""Replaces the radius in T, m, since poses carry no marker positions: the center must be known to
 40 mm."""
 HUBER = 1.5
 _PASSES = 10
@@ -40,8 +43,8 @@ _LEAST_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class TwoSided:
-    """What both bodies say of the point or axis they share."""
+class TwoSidedSolution:
+    """Common point or axis of two bodies."""
 
     parent_point: Array
     """m, in the parent, shape (3,); along an axis the point nearest both origins."""
@@ -58,11 +61,12 @@ class TwoSided:
     turn: float
     """σ₅ per frame: RMS turning about the second axis of the movement, rad."""
     gaps: Array
-    """What is left between the two sides, m, shape (n, 3)."""
+    """Distance vectors between the two sides, m, shape (n, 3)."""
     covariance: Array
-    """Of parent and child point for white noise, m², shape (6, 6), zero along the axis."""
-    skin: Array
-    """What goes with posture adds to it, m², shape (6, 6)."""
+    """Covariance of parent and child point for white noise, m², shape (6, 6), zero along the
+    axis."""
+    soft_tissue: Array
+    """Additional covariance of the soft-tissue artefact, m², shape (6, 6)."""
     persistence: float
     """Correlation of the gaps from one frame to the next, 0 to 0.99."""
     frames: int
@@ -70,8 +74,8 @@ class TwoSided:
 
 def solve_two_sided(
     parent: BodyPoses, child: BodyPoses, *, hinge: bool | None = None, robust: bool = True
-) -> TwoSided | None:
-    r"""Solve for the point that both bodies carry to the same place.
+) -> TwoSidedSolution | None:
+    r"""Solve for the point that coincides in both bodies.
 
     .. math:: \min \sum_t \rho\left(|R_1 c_1 + t_1 - R_2 c_2 - t_2|\right)
 
@@ -86,7 +90,7 @@ def solve_two_sided(
 
     Returns
     -------
-    TwoSided or None
+    TwoSidedSolution or None
         None with fewer than `MIN_FRAMES` frames.
     """
     good = np.isfinite(parent.q).all(1) & np.isfinite(child.q).all(1)
@@ -98,6 +102,7 @@ def solve_two_sided(
     N = np.concatenate((R1, -R2), axis=2)
     rhs = child.t[good] - parent.t[good]
     w = np.ones(n)
+
     for _ in range(_PASSES if robust else 0):
         size = np.linalg.norm(_solve(N, rhs, w, hinge)[1], axis=1)
         # the median length of three normal components is 1.538 of each
@@ -106,11 +111,13 @@ def solve_two_sided(
         if np.allclose(again, w, rtol=0.0, atol=1e-6):
             break
         w = again
+
     c, gaps, s, Vt, rank = _solve(N, rhs, w, hinge)
     noise2 = max(float((w[:, None] * gaps**2).sum()) / max(3.0 * n - rank, 1.0), _LEAST_M**2)
     inverse = (Vt[:rank].T / np.maximum(s[:rank], 1e-12) ** 2) @ Vt[:rank]
-    skin2 = noise2 * float(w.sum()) * of_posture(_correlation(gaps, LAGS[1]), n)
-    return TwoSided(
+    soft_tissue2 = noise2 * float(w.sum()) * posture_share(_correlation(gaps, LAGS[1]), n)
+
+    return TwoSidedSolution(
         parent_point=c[:3],
         child_point=c[3:],
         parent_axis=Vt[5, :3] / np.linalg.norm(Vt[5, :3]),
@@ -120,7 +127,7 @@ def solve_two_sided(
         turn=float(s[4]) / sqrt(float(w.sum())),
         gaps=gaps,
         covariance=noise2 * inverse,
-        skin=skin2 * inverse,
+        soft_tissue=soft_tissue2 * inverse,
         persistence=_persistence(gaps),
         frames=n,
     )
@@ -176,11 +183,11 @@ def fit_score(
     return two_sided_estimate(found, child, parent, "score", near)
 
 
-FEW = f"fewer than {MIN_FRAMES} frames show both bodies: keep three markers of each in view"
+FEW = f"fewer than {MIN_FRAMES} frames show both bodies: keep three markers of each body visible"
 
 
 def two_sided_estimate(
-    found: TwoSided, child: BodyPoses, parent: BodyPoses, method: str, near: Array | None
+    found: TwoSidedSolution, child: BodyPoses, parent: BodyPoses, method: str, near: Array | None
 ) -> CenterEstimate:
     """Write a two-sided solution as an estimate; a hinge if it was solved as one."""
     if found.turn < MIN_TURN_RAD:
@@ -188,12 +195,14 @@ def two_sided_estimate(
             method,
             3,
             found.frames,
-            "the child did not turn against the parent: move the joint, at least 30° each way",
+            "the child did not rotate against the parent: move the joint, at least 30° each way",
         )
+
     a = found.parent_axis
     rho = found.persistence
-    # noise that lasts leaves fewer frames; what goes with posture, one
-    total = found.covariance * (1.0 + rho) / (1.0 - rho) + found.skin
+
+    # persistent noise reduces the effective frames; soft-tissue artefact leaves one
+    total = found.covariance * (1.0 + rho) / (1.0 - rho) + found.soft_tissue
     center, C = found.parent_point, total[:3, :3]
     hinge = found.hinge
     unseen = a[None] if hinge else np.zeros((0, 3))
@@ -201,6 +210,7 @@ def two_sided_estimate(
         P = np.eye(3) - np.outer(a, a)
         along = 0.0 if near is None else float(a @ (near - center))
         center, C = center + along * a, P @ C @ P
+
     noise = sqrt(float((found.gaps**2).mean()))
     arc = _arc(parent, child)
     conditioning = LEVER_M / sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 1e-18))
@@ -220,7 +230,7 @@ def two_sided_estimate(
         axis=a if hinge else None,
         flags=("hinge",) if hinge else (),
         within95=within95(2 if hinge else 3, 3.0 * found.frames * (1 - rho) / (1 + rho) - 6.0),
-        refused=objection(arc, LEVER_M, conditioning, Limits()),
+        refused=objection(arc, LEVER_M, conditioning, SphereLimits()),
     )
 
 

@@ -1,7 +1,7 @@
-"""The answer that sums of spheres give: center, covariance, refusal with its remedy.
+"""Center estimates from sums over sphere paths: covariance, hinge axis and acceptance.
 
-Law: a hinge shows two directions and its axis, and that is a good answer; a line or a rest shows
-nothing, and that is said. Where to stay along an unseen direction is the caller's knowledge.
+A hinge shows two directions of the center and its axis. A straight path or a marker at rest is
+refused with a remedy. Along an unseen direction the caller chooses the position.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
 from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import paths_of
 from jointfit_daemon.center_of_rotation.spatial._observability import (
     MIN_CONDITIONING,
-    Limits,
-    moved,
+    SphereLimits,
+    moving_directions,
     observe,
 )
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import Paths, Spheres
-    from jointfit_daemon.center_of_rotation.spatial._observability import Seen
+    from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import (
+        ConcentricSpheres,
+        MarkerPaths,
+    )
+    from jointfit_daemon.center_of_rotation.spatial._observability import ObservedCenter
     from jointfit_daemon.center_of_rotation.spatial._sphere_sums import SphereSums
 
 
@@ -36,13 +39,13 @@ LOUD = 9.0
 """Variance of a marker over that of the others from which it is named."""
 PERSISTENT = 0.5
 """Correlation of residuals from frame to frame from which it is flagged."""
-STRAIGHT = "the markers' paths show no bend: move the joint further, at least 30° each way"
-FURTHER = ": move this joint further"
-SKIN = (
-    ", since markers leave their spheres as the posture goes, as on skin: move further and in more "
-    "directions, slowly, or put the markers where skin slides least; of a hinge sara shows the axis"
+STRAIGHT = "the marker paths have no curvature: move the joint by at least 30° in each direction"
+FURTHER = ": increase the range of motion of this joint"
+SOFT_TISSUE = (
+    ", because soft-tissue artefact moves the markers off their spheres: move slowly, further and "
+    "in more directions, or place the markers where the skin slides least; for a hinge use sara"
 )
-STILL = "the markers stood still in the parent: move the joint, at least 30° each way"
+STILL = "the markers did not move relative to the parent: move the joint, at least 30° each way"
 
 
 def center_of(
@@ -51,7 +54,7 @@ def center_of(
     method: str = "running_sphere",
     near: Array | None = None,
     shape: Array | None = None,
-    limits: Limits | None = None,
+    limits: SphereLimits | None = None,
 ) -> CenterEstimate:
     """Judge the center that sums over frames show.
 
@@ -62,12 +65,12 @@ def center_of(
     method : str
         Name to sign with.
     near : ndarray, shape (d,), optional
-        Where to stay along unseen directions, m; None: beside the markers' mean.
+        Position along unseen directions, m; None: at the markers' mean.
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, as
         ``parent_noise.relative`` gives it for a moving parent; None: isotropic.
-    limits : Limits, optional
-        When to refuse.
+    limits : SphereLimits, optional
+        Acceptance limits.
 
     Returns
     -------
@@ -84,18 +87,19 @@ def center_and_spheres(
     method: str = "running_sphere",
     near: Array | None = None,
     shape: Array | None = None,
-    limits: Limits | None = None,
-) -> tuple[CenterEstimate, Spheres | None]:
+    limits: SphereLimits | None = None,
+) -> tuple[CenterEstimate, ConcentricSpheres | None]:
     """Return `center_of` and the markers' spheres; None where they are about no such center."""
-    limits = limits or Limits()
+    limits = limits or SphereLimits()
     d = sums.origin.shape[1]
     usable = sums.counts >= MIN_FRAMES
     if not usable.any():
         reason = f"{sums.frames} usable frames, at least {MIN_FRAMES} are needed"
-        return refusal(method, d, sums.frames, f"{reason}: keep the markers in view"), None
+        return refusal(method, d, sums.frames, f"{reason}: keep the markers visible"), None
+
     sums = centered(sums.only(usable))
     paths = paths_of(sums, None if shape is None else shape[usable])
-    basis = moved(paths)
+    basis = moving_directions(paths)
     if basis.shape[1] == 0:
         return refusal(method, d, sums.frames, STILL), None
     seen = observe(sums, paths, basis, limits)
@@ -105,17 +109,22 @@ def center_and_spheres(
     radii = np.full(len(usable), np.nan)
     radii[usable] = found.radii
     whole = seen.shown.shape[0] == seen.shown.shape[1]
+
     return replace(found, method=method, radii=radii), seen.found if whole else None
 
 
 def _answer(
-    sums: SphereSums, paths: Paths, seen: Seen, near: Array | None, limits: Limits
+    sums: SphereSums,
+    paths: MarkerPaths,
+    seen: ObservedCenter,
+    near: Array | None,
+    limits: SphereLimits,
 ) -> CenterEstimate:
     basis, found = seen.basis @ seen.shown, seen.found
     middle = np.average(paths.mean, axis=0, weights=paths.n)
     unseen = np.asarray(np.linalg.svd(basis)[0][:, basis.shape[1] :].T)
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
-    center, spread = drawn_in(seen, middle @ seen.basis)
+    center, spread = shrink_center(seen, middle @ seen.basis)
     fitted = seen.basis @ center
     hidden = unseen @ seen.basis @ seen.basis.T  # in the fit, but not in the answer
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
@@ -126,6 +135,7 @@ def _answer(
     conditioning = radius / float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 1e-300)))
     relative, rho = found.relative, seen.left.persistence
     residual2 = np.maximum(np.diagonal(seen.left.together), 0.0)
+
     return CenterEstimate(
         method="",
         center=basis @ (basis.T @ fitted) + unseen.T @ (unseen @ stay),
@@ -142,12 +152,12 @@ def _answer(
         axis=unseen[0] if len(unseen) == 1 and len(basis) == 3 else None,
         flags=_flags(seen, len(unseen)),
         within95=seen.within95,
-        refused=objection(arc, radius, conditioning, limits, skin=seen.left.posture > 0.0),
+        refused=objection(arc, radius, conditioning, limits, soft_tissue=seen.left.posture > 0.0),
     )
 
 
-def _round(seen: Seen) -> tuple[Array, float]:
-    """Return the radii, m, and the arc, rad, about what is shown of the center."""
+def _round(seen: ObservedCenter) -> tuple[Array, float]:
+    """Return the radii, m, and the arc, rad, about the observable part of the center."""
     away = seen.found.center - seen.paths.mean
     inside = away @ seen.shown
     aside2 = np.maximum((away**2).sum(axis=1) - (inside**2).sum(axis=1), 0.0)
@@ -155,8 +165,8 @@ def _round(seen: Seen) -> tuple[Array, float]:
     return radii, arc_of(float((np.linalg.norm(inside, axis=1) / radii).min()))
 
 
-def drawn_in(seen: Seen, middle: Array) -> tuple[Array, Array]:
-    r"""Return the center drawn in by what its uncertainty biases it outward, and its covariance.
+def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:
+    r"""Return the center shrunk by the outward bias of its uncertainty, and its covariance.
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
@@ -169,7 +179,7 @@ def drawn_in(seen: Seen, middle: Array) -> tuple[Array, Array]:
     return middle + S @ (seen.found.center - middle), S @ seen.spread @ S.T
 
 
-def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
+def _flags(seen: ObservedCenter, unseen: int) -> tuple[str, ...]:
     flags = ["hinge"] if unseen else []
     if seen.left.persistence > PERSISTENT:
         flags.append("residuals_persist")
@@ -180,13 +190,19 @@ def _flags(seen: Seen, unseen: int) -> tuple[str, ...]:
 
 
 def objection(
-    arc: float, radius: float, conditioning: float, limits: Limits, *, skin: bool = False
+    arc: float,
+    radius: float,
+    conditioning: float,
+    limits: SphereLimits,
+    *,
+    soft_tissue: bool = False,
 ) -> str | None:
-    """Say why a center is not to be used and what to do; None if it may."""
+    """Return the cause and the remedy if a center must not be used; None if it may."""
     if arc < limits.min_arc:
-        return f"the joint turned {degrees(arc):.0f}° only: move through at least 30°"
+        return f"the joint turned {degrees(arc):.0f}°: move it through at least 30°"
     if not limits.reach[0] <= radius <= limits.reach[1]:
         return f"the markers would be {radius:.2f} m from the center: check marker names"
     if conditioning < MIN_CONDITIONING:
-        return f"uncertain to {1000 * radius / conditioning:.0f} mm{SKIN if skin else FURTHER}"
+        remedy = SOFT_TISSUE if soft_tissue else FURTHER
+        return f"uncertain to {1000 * radius / conditioning:.0f} mm{remedy}"
     return None

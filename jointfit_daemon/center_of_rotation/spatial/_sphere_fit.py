@@ -1,7 +1,7 @@
-r"""Centers of spheres in space from all frames at once.
+"""Sphere fits of all frames at once.
 
-Law: points in, one `CenterEstimate` out, judged as a stream of the same frames is. The linear fits
-are kept for comparison; the one to use is `fit_sphere`, robust against what leaves its sphere.
+`fit_sphere` is robust and is the recommended method. The linear fits serve comparisons.
+Invariant: acceptance equals that of a `RunningSphere` fed with the same frames.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jointfit_daemon.center_of_rotation.spatial._geometric_solver import (
     radial_residuals,
     solve_sphere,
 )
-from jointfit_daemon.center_of_rotation.spatial._observability import Limits
+from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import relative
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import MIN_FRAMES, center_of
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered, sum_up
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residuals above so many standard deviations lose weight in the verdict: beyond, noise hardly
-goes, so that it is not made smaller than it is."""
+"""Residuals above so many standard deviations lose weight in the estimate. Noise rarely
+exceeds it, so that its variance is not underestimated."""
 STILL_M = 1e-6
 _HALVORSEN_STEPS = 20
 
@@ -65,16 +65,19 @@ def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
 
 
 FLAT = (
-    "the markers moved about one axis or not at all, which shows this method no center: move in "
-    "other directions, too, or use sphere, which finds a hinge"
+    "the markers moved about one axis or not at all, so this method finds no center: move in "
+    "more directions, or use sphere, which also finds a hinge"
 )
 
 
 def _linear(points: Array, method: str, steps: int, min_direction: float) -> CenterEstimate:
-    judged = center_of(sum_up(points), method=method, limits=Limits(min_direction=min_direction))
+    judged = center_of(
+        sum_up(points), method=method, limits=SphereLimits(min_direction=min_direction)
+    )
     if len(judged.unseen) > 0:
         why = FLAT if judged.refused is None else judged.refused
         return refusal(method, 3, judged.frames, why)
+
     used = np.isfinite(judged.radii)
     points = points[:, used]
     seen = np.asarray(np.isfinite(points).all(axis=-1))
@@ -82,10 +85,12 @@ def _linear(points: Array, method: str, steps: int, min_direction: float) -> Cen
     A = paths.C.sum(axis=0)
     b = np.einsum("jab,jb->a", paths.C, paths.mean) + paths.c.sum(axis=0) / 2.0
     m = np.linalg.solve(A, b)
+
     for _ in range(steps):
         e, _ = radial_residuals(points, m, seen.astype(np.float64))
         noise2 = float((e[seen] ** 2).sum()) / max(int(seen.sum()) - len(paths.n) - 3, 1)
         m = np.linalg.solve(A, b - noise2 * (paths.mean - m).sum(axis=0))
+
     flags = judged.flags if steps else (*judged.flags, "biased_on_short_arcs")
     return replace(judged, center=m, flags=flags)
 
@@ -93,7 +98,7 @@ def _linear(points: Array, method: str, steps: int, min_direction: float) -> Cen
 def fit_sphere(
     points: Array,
     options: SphereOptions | None = None,
-    limits: Limits | None = None,
+    limits: SphereLimits | None = None,
     parent: Array | None = None,
 ) -> CenterEstimate:
     r"""Fit the point that each marker keeps its own distance from.
@@ -101,7 +106,7 @@ def fit_sphere(
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    finds what leaves its sphere; the center and its error are those of the other frames' sums.
+    finds outliers; the center and its error are those of the other frames' sums.
 
     Parameters
     ----------
@@ -109,11 +114,11 @@ def fit_sphere(
         Markers of the child in the parent's coordinates, m; NaN where not seen.
     options : SphereOptions, optional
         Start, robustness.
-    limits : Limits, optional
-        When to refuse.
+    limits : SphereLimits, optional
+        Acceptance limits.
     parent : ndarray, shape (m, 3), optional
         The parent's own markers in its coordinates, m: their noise, which all markers of the child
-        share, is told from theirs.
+        share, is separated from their own.
 
     Returns
     -------
@@ -145,4 +150,5 @@ def _weights(points: Array, options: SphereOptions) -> Array | None:
     scale = max(1.4826 * float(np.median(e[fit.seen])), options.smallest_scale)
     weights = np.ones(seen.shape)
     weights[:, enough] = np.minimum(1.0, OUTLIER * scale / np.maximum(e, 1e-12))
+
     return weights

@@ -1,13 +1,14 @@
-r"""What a fit of spheres needs to know of any number of frames: sums of fixed size.
+r"""Sums of fixed size over any number of frames, sufficient for a fit of spheres.
 
-Law: for every marker φ = (|p|², p, 1), p its place from a fixed point near it. All estimates of
+For every marker, φ = (|p|², p, 1), p its place from a fixed point near it. All estimates of
 spheres about one center are functions of
 
 .. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
           L_{gj} = \sum_t \sqrt{w_{tj} w_{t-g,j}}\, φ_{tj} φ_{t-g,j}^T, \quad g \in \{1, 4\}
 
-M holds the residuals' variances and what markers have in common (noise of the parent's frame), L
-how long they persist. Forgetting multiplies both. A marker that is not seen adds nothing.
+M holds the variances of the residuals and their covariance between markers (noise of the parent's
+frame), L their correlation in time. Forgetting multiplies both. A marker that is not visible adds
+nothing.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     flat = phi.reshape(n, k * e)
     M = (flat.T @ flat).reshape(k, e, k, e)
     L = np.stack([np.einsum("tja,tjb->jab", phi[g:], phi[:-g]) for g in LAGS])
+
     return SphereSums(origin, M, L, (w * w).sum(axis=0), int(np.count_nonzero(seen.any(axis=1))))
 
 

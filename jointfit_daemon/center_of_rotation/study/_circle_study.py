@@ -1,16 +1,17 @@
-r"""The numerical experiment on circle fits: maps of the error over arc, noise and radius.
+r"""Monte Carlo study of the circle fits: maps of the error over arc, noise and radius.
 
-Law: everything random comes from one seeded generator; all runs of a cell are computed at once.
+Invariant: one seeded generator supplies all random numbers. All runs of a cell are computed
+at once.
 
 A marker at distance r from the center stands at the angles 0, α and 2α; each coordinate carries
 independent noise of standard deviation σ. Two of (r, σ, α) vary over a map, the third is fixed. On
-every cell stand the RMS errors of the methods over many runs, the error predicted for three frames
+every cell are the RMS errors of the methods over many runs, the error predicted for three frames
 
 .. math:: F = \sigma \sqrt{\frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}}
 
 and, for many frames spread evenly over the same arc 0 … 2α, the Cramér-Rao bound. Source: Akbarifar
-et al., section 2-2-3, figure 2 and table 1, whose setup is only partly printed: `StudySetup` says
-how it is read here.
+et al., section 2-2-3, figure 2 and table 1, whose setup is only partly printed; `StudySetup`
+documents the interpretation.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.9
 
 @dataclass(frozen=True, slots=True)
 class StudySetup:
-    """What is varied, what is fixed, how often; SI. Defaults reproduce the source's figure 2."""
+    """Parameters of the study, SI. Defaults reproduce figure 2 of the source."""
 
     radii: Array = field(default_factory=lambda: np.linspace(0.1, 0.6, 11))
     noises: Array = field(default_factory=lambda: 0.0005 * np.arange(11.0))
@@ -84,7 +85,7 @@ class PairMaps:
     """RMS error, m, shape (len(rows), len(columns)), by method: ``predicted``, ``three frames``,
     ``grid``, ``shifted grid`` for three frames; ``bound``, ``hyper``, ``oriented`` for all."""
     refused: Array
-    """Share of runs in which the hyper fit says of itself that it is not usable (T < 6)."""
+    """Share of runs in which the Hyper fit is refused (T < 6)."""
 
 
 def correlation(a: Array, b: Array, clip: float | None = None) -> float:
@@ -95,14 +96,16 @@ def correlation(a: Array, b: Array, clip: float | None = None) -> float:
     return float(x @ y) / scale if scale > 0.0 else 0.0
 
 
-def run_study(setup: StudySetup, told: Callable[[float], None] | None = None) -> list[PairMaps]:
+def run_study(
+    setup: StudySetup, on_progress: Callable[[float], None] | None = None
+) -> list[PairMaps]:
     """Compute all maps.
 
     Parameters
     ----------
     setup : StudySetup
-    told : callable, optional
-        Is told the share done, 0 to 1, after every row of cells.
+    on_progress : callable, optional
+        Called with the share done, 0 to 1, after every row of cells.
 
     Returns
     -------
@@ -119,17 +122,20 @@ def run_study(setup: StudySetup, told: Callable[[float], None] | None = None) ->
     rng = np.random.default_rng(setup.seed)
     total, done = sum(len(rows) for _, rows, _, _ in pairs), 0
     found: list[PairMaps] = []
+
     for name, rows, columns, cells in pairs:
         lines = []
         for row in rows:
             radius, noise, step = np.broadcast_arrays(*cells(float(row)))
             lines.append(_line(setup, rng, radius, noise, step))
             done += 1
-            if told is not None:
-                told(done / total)
+            if on_progress is not None:
+                on_progress(done / total)
+
         maps = {key: np.array([line[key] for line in lines]) for key in lines[0]}
         refused = maps.pop("refused")
         found.append(PairMaps(name, rows, columns, maps, refused))
+
     return found
 
 
@@ -143,9 +149,11 @@ def _line(
         "predicted": equal_step_error(step, noise),
         "three frames": _rms(three_frame_center(three)),
     }
+
     for key, offset in (("grid", 0.0), ("shifted grid", 0.5 * setup.node)):
         nodes = Grid((offset, offset), setup.box, setup.node)
         line[key] = _rms(grid_center(few, nodes))
+
     return line | _all_frames(setup, rng, radius, noise, step)
 
 
@@ -162,6 +170,7 @@ def _all_frames(
     least = [
         uniform_arc_rms(float(a), setup.frames, float(s)) for a, s in zip(arc, noise, strict=True)
     ]
+
     return {
         "bound": np.array(least),
         "hyper": _rms(np.where(accepted[..., None], circles.center, np.nan)),

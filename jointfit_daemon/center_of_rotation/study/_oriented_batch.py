@@ -1,7 +1,7 @@
-r"""The orientation-aided center for many runs at once, as the numerical experiment needs it.
+"""The orientation-aided fit for many runs at once, for the Monte Carlo study.
 
-Law: the cost function, the start and the guard are those of ``oriented``; only the arithmetic is
-arranged for thousands of short movements, all with the same number of frames and turning evenly.
+Cost function, start and guard are those of `planar.oriented_estimate`. The arithmetic is arranged
+for thousands of short movements with equally many frames and evenly growing angles.
 """
 
 from __future__ import annotations
@@ -68,10 +68,12 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     )
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
+
     for _ in range(2):  # the angular noise is frozen at a radius: twice settles it
         radius = np.maximum(found[:, 2], 0.01)
         weights = _weights(theta, noise / radius, interval)
         found, H = _descend(_Runs(z, theta, noise, weights, weights.diagonal(), radius), found)
+
     return np.asarray(_guarded(found[:, :2], H, circles).reshape(*shape, 2))
 
 
@@ -105,14 +107,14 @@ def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
 
 
 class _Runs(NamedTuple):
-    """What stays the same while the runs descend."""
+    """Data of the runs that stay constant during the descent."""
 
     z: Complex
     theta: Array
     noise: Array
     weights: _Weights
     diagonal: Array
-    """Of M, shape (runs, n)."""
+    """Diagonal of M, shape (runs, n)."""
     rho0: Array
     """The radius at which M is frozen, shape (runs,)."""
 
@@ -128,6 +130,7 @@ def _descend(runs: _Runs, start: Array) -> tuple[Array, Array]:
     at, mu = start.copy(), np.full(len(start), 1e-3)
     cost, g, H = _cost(runs, at)
     moving = np.arange(len(start))
+
     for _ in range(_STEPS):
         damped = H[moving] * (1.0 + mu[moving, None, None] * np.eye(4))
         tried = at[moving] - np.linalg.solve(damped, g[moving, :, None])[..., 0]
@@ -142,6 +145,7 @@ def _descend(runs: _Runs, start: Array) -> tuple[Array, Array]:
         moving = moving[fell | ((mu[moving] < _STUCK) & ~better)]
         if moving.size == 0:
             break
+
     return at, H
 
 
@@ -164,11 +168,12 @@ def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
     pull = np.where(q > least, variance * diagonal / q**4, 0.0)
     g[:, 0] -= (pull * d.real).sum(axis=-1)
     g[:, 1] -= (pull * d.imag).sum(axis=-1)
+
     return cost, g, H
 
 
 def _guarded(center: Array, H: Array, circles: Circles) -> Array:
-    """Hold aided centers near what the path alone says: ``oriented.guarded`` of many runs."""
+    """Limit the distance of aided centers from the circle fits, as `guarded` does for one run."""
     C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
     held = circles.valid & (circles.noise > _LEAST_NOISE_M)
     of_circle = np.where(held[:, None, None], circles.covariance, np.eye(2))
@@ -179,4 +184,5 @@ def _guarded(center: Array, H: Array, circles: Circles) -> Array:
     s = np.sqrt((np.einsum("rai,ra->ri", axes, delta) ** 2 / apart).sum(axis=-1))
     reach = 0.7 * (1.0 + 0.5 * (GATE / np.maximum(circles.conditioning, 1e-3)) ** 2)
     kept = np.minimum(1.0, reach / np.maximum(s, 1e-12))
+
     return np.asarray(np.where(held[:, None], center - (1.0 - kept)[:, None] * delta, center))

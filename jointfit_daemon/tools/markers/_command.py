@@ -101,7 +101,7 @@ def markers(
 
     Exits with 1 if the trials do not fit the model.
     """
-    from jointfit_daemon.calibration.marker_refinement import RefinementSettings, Unrefinable
+    from jointfit_daemon.calibration.marker_refinement import RefinementError, RefinementSettings
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
     _check(method=method, up=up, out=out or [], plot=plot)
@@ -117,7 +117,7 @@ def markers(
         chain, remarks, found = _refined(
             ModelRequest(model, *names, up or None), (trials, validate or []), settings
         )
-    except Unrefinable as refused:
+    except RefinementError as refused:
         typer.echo(f"jointfit markers: refused: {refused}", err=True)
         raise typer.Exit(EXIT_FAILED) from None
     _print(chain, remarks, found, as_json=json)

@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.marker_refinement import (
-        Fit,
         MarkerOutcome,
         Refinement,
+        TrackingStatistics,
         TrialOutcome,
     )
     from jointfit_daemon.kinematics.chains import ChainModel
@@ -166,7 +166,7 @@ def _trial_json(t: TrialOutcome) -> dict[str, Any]:
     }
 
 
-def _fit_json(fit: Fit) -> dict[str, Any]:
+def _fit_json(fit: TrackingStatistics) -> dict[str, Any]:
     return {"rms_m": _nullable(fit.rms), "variance_m2": _nullable(fit.variance)}
 
 

@@ -1,4 +1,4 @@
-"""The published coordinate search, on errors whose minimum is known."""
+"""Published coordinate search on errors with a known minimum."""
 
 from __future__ import annotations
 

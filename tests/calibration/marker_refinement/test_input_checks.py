@@ -1,4 +1,4 @@
-"""What may not pass into a refinement in silence."""
+"""Faults of model and trials that a refinement must report."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 
 from jointfit_daemon.calibration.marker_refinement import (
     MotionTrial,
+    RefinementError,
     RefinementSettings,
-    Unrefinable,
     refine_markers,
 )
 from jointfit_daemon.calibration.marker_refinement._gauge import gauge_of
@@ -56,7 +56,7 @@ def changed(**markers: slice) -> MotionTrial:
 
 
 def refused(given: MotionTrial, model: ChainModel | None = None) -> str:
-    with pytest.raises(Unrefinable) as why:
+    with pytest.raises(RefinementError) as why:
         refine_markers(model or two_segments(), [given])
     return str(why.value)
 
@@ -96,20 +96,20 @@ def test_labels_exchanged_between_segments_are_refused() -> None:
     assert "labels" in refused(exchanged("P1", "T3", slice(None)))
 
 
-def test_labels_exchanged_for_a_while_are_left_out_and_told() -> None:
+def test_temporarily_exchanged_labels_are_removed_and_reported() -> None:
     found = refined(exchanged("T0", "T2", slice(10, 18)))
     assert any("T0 and T2 look exchanged in 8 frames" in note for note in found.notes)
     moved = np.abs(found.model.positions - refined(trial()).model.positions).max()
     assert moved < 0.001
 
 
-def test_a_marker_missing_in_a_whole_trial_is_told_and_learned_from_the_other() -> None:
+def test_marker_missing_in_one_trial_is_reported_and_fitted_from_the_other() -> None:
     found = refined(changed(T1=slice(None)), replace(trial(), name="squat"))
     assert any(note == "walk: T1 missing throughout" for note in found.notes)
     assert not any(found.markers[5].held)
 
 
-def test_a_marker_no_trial_has_is_kept_and_told() -> None:
+def test_marker_missing_in_all_trials_is_kept_and_reported() -> None:
     found = refined(changed(T1=slice(None)))
     assert any("T1" in note and "kept" in note for note in found.notes)
     np.testing.assert_array_equal(found.model.positions[5], THIGH[1])
@@ -117,7 +117,7 @@ def test_a_marker_no_trial_has_is_kept_and_told() -> None:
     assert np.isnan(found.markers[5].rms_after)
 
 
-def test_the_only_marker_of_a_segment_is_kept_and_told() -> None:
+def test_only_marker_of_a_segment_is_kept_and_reported() -> None:
     found = refined(changed(T1=slice(None), T2=slice(None), T3=slice(None)))
     assert any(note.startswith("T0: the only marker on thigh") for note in found.notes)
     np.testing.assert_array_equal(found.model.positions[4], THIGH[0])
@@ -134,10 +134,10 @@ def test_names_that_are_not_the_models_are_refused() -> None:
     assert "are the names the model's?" in refused(nothing)
 
 
-def test_all_that_is_wrong_is_told_at_once() -> None:
+def test_all_input_faults_are_reported_together() -> None:
     small = replace(trial("small"), targets=0.001 * trial().targets)
     empty = replace(trial("empty"), targets=np.full_like(trial().targets, np.nan))
-    with pytest.raises(Unrefinable) as why:
+    with pytest.raises(RefinementError) as why:
         refine_markers(two_segments(), [small, trial()], None, [empty])
     assert "small" in str(why.value)
     assert "empty" in str(why.value)
@@ -149,12 +149,12 @@ def test_a_crowd_of_wrong_labels_is_refused_by_the_error_it_leaves() -> None:
     assert refused(given)
 
 
-def test_trials_of_different_rates_count_by_frames_and_it_is_told() -> None:
+def test_trials_of_different_rates_are_weighted_by_frames_with_a_note() -> None:
     found = refined(trial(), trial("slow", 50.0))
     assert any("50, 100 Hz" in note for note in found.notes)
 
 
-def test_what_tracking_cannot_see_is_counted_and_named() -> None:
+def test_gauge_freedom_is_counted_and_named() -> None:
     found = refined(trial())
     assert found.gauge.free == 6  # both segments may turn about the hip with all their markers
     assert set(found.gauge.involved) <= set(two_segments().marker_names)

@@ -1,4 +1,4 @@
-"""Markers and poses solved together: against a chain whose truth is known."""
+"""Simultaneous refinement of markers and poses on a chain with known ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jointfit_daemon.calibration.marker_refinement import (
     RefinementSettings,
     refine_markers,
 )
-from jointfit_daemon.calibration.marker_refinement._objective import Problem
+from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
 from jointfit_daemon.calibration.marker_refinement._simultaneous import errors, place, solve_jointly
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
@@ -86,7 +86,7 @@ def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
     """An oracle that eliminates nothing: scipy on poses and markers together."""
     model, y = misplaced(limb()), seen(0.003)[::10]
     weights, free = np.ones(y.shape[:2]), ~model.locked
-    problem = Problem(model, y, weights, free, 0.1, None)
+    problem = RefinementProblem(model, y, weights, free, 0.1, None)
     start = place(problem, model.positions, solve_frames(model, y).state)
 
     def residuals(z: np.ndarray) -> np.ndarray:
@@ -106,7 +106,7 @@ def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
 
 @pytest.mark.parametrize("method", ["joint", "block"])
 @pytest.mark.parametrize("huber", [None, 0.004])
-def test_what_is_minimized_never_rises(method: RefinementMethod, huber: float | None) -> None:
+def test_cost_never_rises(method: RefinementMethod, huber: float | None) -> None:
     settings = RefinementSettings(method, huber_m=huber)
     trial = MotionTrial("walk", seen(0.004), 100.0)
     costs = refine_markers(misplaced(limb(), 0.015), [trial], settings).costs
@@ -122,7 +122,7 @@ def test_locked_coordinates_stay_to_the_last_digit() -> None:
     assert (found.model.positions[~kept] != model.positions[~kept]).all()
 
 
-def test_a_marker_gone_astray_moves_others_less_with_hubers_loss() -> None:
+def test_huber_loss_reduces_the_effect_of_an_outlier_marker() -> None:
     y = seen(0.001)
     y[:20, 8] += 0.08  # thigh3 slips for a third of the trial
     off = {}

@@ -1,4 +1,4 @@
-"""Circles: closed form against eigenproblem, live against batch, error told against error made."""
+"""Circle fits: closed form, streaming and batch, predicted and actual error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scipy.stats import f, norm
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of_spread
 from jointfit_daemon.center_of_rotation.planar import (
     GATE,
-    Limits,
+    CircleLimits,
     RunningCircle,
     circle_estimate,
     ellipse_scale,
@@ -72,7 +72,7 @@ def by_eigenvalues(p: Any, method: Any) -> Any:
 
 @pytest.mark.parametrize("method", METHODS[1:])
 @pytest.mark.parametrize("arc", [30.0, 90.0, 340.0])
-def test_the_closed_form_is_the_eigenproblems_answer(method: Any, arc: float) -> None:
+def test_closed_form_circles_equal_the_eigenproblem_solution(method: Any, arc: float) -> None:
     p = swing(arc=arc)
     expected = by_eigenvalues(p, method)
     assert np.abs(fit_circle(p, method=method)[:2] - expected).max() < 1e-9
@@ -88,7 +88,7 @@ def test_kasa_is_the_linear_solution() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_points_without_noise_give_the_circle_itself(method: Any) -> None:
+def test_noise_free_points_give_the_exact_circle(method: Any) -> None:
     p = swing(noise=0.0)
     x, y, radius = fit_circle(p, method=method)
     assert (x, y, radius) == pytest.approx((0.2, -0.4, 0.3), abs=1e-9)
@@ -96,7 +96,7 @@ def test_points_without_noise_give_the_circle_itself(method: Any) -> None:
 
 @given(st.floats(0.95, 1.0), st.integers(0, 9), st.sampled_from(METHODS), st.floats(-3.0, 3.0))
 @settings(max_examples=25, deadline=None)
-def test_live_equals_batch_whatever_is_forgotten_and_not_seen(
+def test_running_circle_equals_batch_fit_with_forgetting_and_gaps(
     forgetting: float, seed: int, method: Any, far: float
 ) -> None:
     p = swing(n=300, seed=seed, center=(far, -far))
@@ -110,7 +110,7 @@ def test_live_equals_batch_whatever_is_forgotten_and_not_seen(
 
 
 @pytest.mark.parametrize("window", [50, 200])
-def test_a_window_holds_the_last_frames_and_nothing_else(window: int) -> None:
+def test_windowed_running_circle_equals_fit_of_last_frames(window: int) -> None:
     p = np.concatenate((swing(n=1500) + 4.0, swing(n=1500, seed=1)))
     p[2990] = nan
     live = fed(p, window=window).estimate()
@@ -130,7 +130,7 @@ def test_many_circles_at_once_are_the_same_circles() -> None:
         assert found.conditioning[k] == pytest.approx(one.conditioning, rel=1e-6)
 
 
-def test_both_ways_to_moments_agree() -> None:
+def test_moments_of_one_equals_moments_of() -> None:
     p, w = swing(), np.random.default_rng(1).random(400)
     assert np.array(moments_of(p, w)) == pytest.approx(np.array(moments_of_one(p, w)), rel=1e-9)
 
@@ -140,7 +140,7 @@ def test_forgetting_follows_a_center_that_moves() -> None:
     assert fed(p, forgetting=0.98).estimate().center == pytest.approx([0.25, -0.4], abs=0.01)
 
 
-def test_a_marker_that_jumps_is_weighed_down() -> None:
+def test_robust_running_circle_reduces_weight_of_a_jump() -> None:
     p = swing(n=600)
     p[100::20] += (0.05, -0.08)
     robust, plain = fed(p, robust=True).estimate(), fed(p).estimate()
@@ -152,7 +152,7 @@ def test_a_marker_that_jumps_is_weighed_down() -> None:
 
 @given(st.lists(st.tuples(anything, anything), max_size=40), st.sampled_from(METHODS))
 @settings(deadline=None)
-def test_any_points_give_a_finite_center_or_a_reason(points: Any, method: Any) -> None:
+def test_circle_estimate_of_any_points_is_finite_or_refused(points: Any, method: Any) -> None:
     with np.errstate(all="ignore"):
         for found in (
             fed(np.reshape(points, (-1, 2)), method=method).estimate(),
@@ -168,7 +168,7 @@ def test_any_points_give_a_finite_center_or_a_reason(points: Any, method: Any) -
 @pytest.mark.parametrize(
     ("points", "cause"),
     [
-        (np.full((50, 2), nan), "never seen"),
+        (np.full((50, 2), nan), "missing in every frame"),
         (np.ones((50, 2)), "no motion"),
         (np.linspace(0, 1, 50)[:, None] * (1.0, 2.0), "line"),
         (swing(n=3), "3 usable frames"),
@@ -185,7 +185,7 @@ def test_a_refusal_names_cause_and_remedy(points: Any, cause: Any) -> None:
         assert ":" in found.refused
 
 
-def test_what_is_not_known_is_infinite() -> None:
+def test_refused_circle_has_infinite_error() -> None:
     found = fed(np.ones((50, 2))).estimate()
     assert found.sd == found.bound == inf
     assert fed(np.ones((50, 2))).circle() is None
@@ -193,7 +193,7 @@ def test_what_is_not_known_is_infinite() -> None:
         fit_circle(np.ones((5, 2)))
 
 
-def test_a_coordinate_beyond_ten_kilometers_is_no_measurement() -> None:
+def test_coordinates_beyond_ten_kilometers_are_missing() -> None:
     p = swing()
     p[7], p[9] = (1e300, 0.0), (0.0, -inf)
     live, batch = fed(p, robust=True).estimate(), circle_estimate(p)
@@ -201,7 +201,7 @@ def test_a_coordinate_beyond_ten_kilometers_is_no_measurement() -> None:
     assert live.refused is batch.refused is None
 
 
-def test_settings_that_contradict_each_other_are_a_wrong_call() -> None:
+def test_running_circle_rejects_contradictory_settings() -> None:
     for wrong in ({"forgetting": 0.0}, {"window": 3}, {"window": 9, "forgetting": 0.9}):
         with pytest.raises(ValueError, match=r"needed|needs"):
             RunningCircle(**wrong)
@@ -226,14 +226,14 @@ def test_correlated_circles_of_unseen_points_are_not_valid() -> None:
     assert not found.valid.any()
 
 
-def test_a_long_gap_costs_no_memory() -> None:
+def test_running_circle_memory_is_bounded_in_a_gap() -> None:
     running = fed(swing(n=30), window=20)
     for _ in range(500):
         running.feed(nan, 0.0)
     assert len(running._kept) <= 21
 
 
-def test_correlated_residuals_widen_the_claim() -> None:
+def test_correlated_residuals_increase_the_covariance() -> None:
     rng = np.random.default_rng(0)
     wander = np.zeros((400, 2))
     for k in range(1, 400):
@@ -248,7 +248,7 @@ def test_correlated_residuals_widen_the_claim() -> None:
 
 
 @given(st.floats(0.01, 6.2))
-def test_an_arc_is_read_from_its_spread(arc: float) -> None:
+def test_arc_of_spread_recovers_the_arc(arc: float) -> None:
     spread = 1.0 - (np.sin(arc / 2) / (arc / 2)) ** 2
     assert arc_of_spread(spread) == pytest.approx(arc, abs=1e-4)
 
@@ -294,7 +294,7 @@ def test_few_frames_widen_the_ellipse_as_fisher_says(n: int) -> None:
     assert isfinite(ellipse_scale(3.01, 10.0)) or exp(600) > 0
 
 
-def test_the_predicted_error_is_what_happens_at_20_degrees() -> None:
+def test_predicted_error_equals_actual_error_at_20_degrees() -> None:
     rng = np.random.default_rng(3)
     t = np.linspace(-0.5, 0.5, 100) * np.deg2rad(22.0)
     p = 0.3 * np.stack((np.cos(t), np.sin(t)), -1) + rng.normal(0, 0.002, (4000, 100, 2))
@@ -305,8 +305,8 @@ def test_the_predicted_error_is_what_happens_at_20_degrees() -> None:
     assert found.noise.mean() == pytest.approx(0.002, rel=0.01)
 
 
-def test_limits_are_the_callers() -> None:
+def test_circle_limits_of_the_caller_apply() -> None:
     p = swing(arc=24.0)
-    strict, lax = Limits(sd=0.001), Limits(sd=1.0)
+    strict, lax = CircleLimits(sd=0.001), CircleLimits(sd=1.0)
     assert circle_estimate(p, limits=strict).refused is not None
     assert circle_estimate(p, limits=lax).refused is None

@@ -1,4 +1,4 @@
-"""Measured angles help and cannot ruin; least distance bears outliers and joins markers."""
+"""Orientation-aided and geometric circle fits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.center_of_rotation.planar import (
     AngleNoise,
-    Limits,
+    CircleLimits,
     circle_estimate,
     combine,
     fit_circles,
@@ -21,7 +21,7 @@ from jointfit_daemon.center_of_rotation.planar import (
 )
 from jointfit_daemon.center_of_rotation.planar._oriented_fit import guarded
 
-WIDE = Limits(0.0, (0.0, inf), 0.0, inf)
+WIDE = CircleLimits(0.0, (0.0, inf), 0.0, inf)
 values = st.one_of(st.floats(-1.0, 1.0), st.just(nan), st.just(0.0))
 
 
@@ -60,7 +60,7 @@ def test_angles_of_another_limb_do_little_harm() -> None:
 
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 @settings(max_examples=40, deadline=None)
-def test_an_answer_never_leaves_the_circle_by_more_than_its_guard_allows(x: Any, y: Any) -> None:
+def test_guard_limits_distance_from_the_circle_fit(x: Any, y: Any) -> None:
     circle = fit_circles(arc(90.0)[0])
     held, covariance, _ = guarded(np.array([x, y]), circle.covariance * 0.1, circle)
     away = held - circle.center
@@ -76,7 +76,7 @@ def test_more_frames_than_needed_are_averaged() -> None:
     assert np.linalg.norm(found.center) < 0.005
 
 
-def test_a_place_that_is_known_pulls() -> None:
+def test_known_position_improves_oriented_fit() -> None:
     p, t = arc(20.0, seed=3)
     near = (np.zeros(2), 0.005)
     found = oriented_estimate(p, t, 0.02, near=near, limits=WIDE)
@@ -85,7 +85,7 @@ def test_a_place_that_is_known_pulls() -> None:
     assert found.sd < far.sd
 
 
-def test_what_the_angles_may_be_wrong_by_is_the_callers() -> None:
+def test_angle_noise_of_the_caller_sets_the_uncertainty() -> None:
     p, t = arc(30.0, seed=1)
     t = t + 0.05 * np.random.default_rng(0).normal(size=100)
     sure = oriented_estimate(p, t, 0.02, noise=AngleNoise(0.001, 1.0, 0.06, 0.001), limits=WIDE)
@@ -120,7 +120,7 @@ def test_angles_without_a_movement_are_refused(points: Any, angles: Any, cause: 
     ],
     ids=["a line", "along x", "two places in turn", "two places by turns", "tiny"],
 )
-def test_paths_without_a_second_dimension_warn_of_nothing_and_are_judged(points: Any) -> None:
+def test_degenerate_paths_give_no_warning_and_a_finite_estimate(points: Any) -> None:
     found = oriented_estimate(points, np.linspace(0.0, 1.0, len(points)), 0.01)
     assert np.isfinite(found.center).all()
     assert np.isfinite(found.covariance).all()
@@ -142,7 +142,7 @@ def test_paths_without_a_second_dimension_warn_of_nothing_and_are_judged(points:
     ]
 )
 @settings(deadline=None, max_examples=60)
-def test_any_input_gives_a_finite_center_or_a_reason(rows: Any) -> None:
+def test_oriented_and_geometric_estimates_of_any_input_are_finite_or_refused(rows: Any) -> None:
     data = np.reshape(rows, (-1, 3))
     aided = oriented_estimate(data[:, :2], data[:, 2], 0.01)
     for found in (aided, geometric_estimate(data[:, :2])):
@@ -165,7 +165,7 @@ def test_circle_estimates_of_any_points_have_no_negative_variance(rows: Any) -> 
     assert bool(many.valid) == bool(np.isfinite(many.covariance).all())
 
 
-def test_least_distance_is_hyper_on_clean_points_and_bears_outliers() -> None:
+def test_geometric_fit_equals_hyper_on_clean_points_and_resists_outliers() -> None:
     p, _ = arc(90.0)
     plain = circle_estimate(p)
     found = geometric_estimate(p, robust=False)
@@ -193,6 +193,6 @@ def test_markers_round_the_joint_share_their_center() -> None:
     assert np.sqrt(np.trace(C)) == pytest.approx(together.sd, rel=0.3)
 
 
-def test_nothing_cannot_be_combined() -> None:
+def test_combine_rejects_estimates_without_information() -> None:
     with pytest.raises(ValueError, match="nothing"):
         combine([circle_estimate(np.ones((9, 2)))])

@@ -1,4 +1,4 @@
-"""Three frames: the closed form is interpolation, its error is told by angles, sides or bound."""
+"""Three-frame centers, their predicted errors, grid search and bounds."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_three_points_of_a_circle_give_its_center(
 @example([1e308, 0.0, -1e308, 0.0, 0.0, 1.0])
 @example([1.0, 1.0, 1.0, 1.0 + 2**-52, 1.0 + 2**-52, 1.0])  # a center that rounds to a point
 @example([0.0, 0.0, 1.0, 0.0, 2.0, 5e-9])  # nearly a line
-def test_any_three_points_give_a_center_or_a_reason_never_silent_nan(values: Any) -> None:
+def test_three_frame_estimate_of_any_points_is_finite_or_refused(values: Any) -> None:
     with np.errstate(all="ignore"):
         found = three_frame_estimate(np.reshape(values, (3, 2)), 0.001)
     assert np.isfinite(found.center).all()
@@ -91,7 +91,7 @@ def test_points_on_a_line_are_infinitely_far_and_refused(points: Any) -> None:
     assert found.sd == inf
 
 
-def test_an_arc_that_noise_hides_is_refused() -> None:
+def test_three_frame_estimate_refuses_an_arc_hidden_by_noise() -> None:
     found = three_frame_estimate(on_circle(np.deg2rad([0, 5, 10])), 0.001)
     assert found.refused is not None
     assert "noise" in found.refused
@@ -125,7 +125,7 @@ def test_no_turn_and_half_turns_show_nothing() -> None:
     assert triangle_error([[0, 0], [1, 1], [2, 2]], 0.001) == inf
 
 
-def test_noise_that_differs_between_axes_is_told_per_axis() -> None:
+def test_component_errors_of_anisotropic_noise() -> None:
     rng = np.random.default_rng(0)
     t = np.array([0.0, 1.2, 2.0])
     noisy = on_circle(t) + rng.normal(size=(100_000, 3, 2)) * (0.001, 0.0003)
@@ -221,7 +221,7 @@ def test_known_angles_leave_the_mean_to_be_found() -> None:
 
 
 @pytest.mark.parametrize("angles", [[], [0.3], [0.3, 0.3, 0.3], [0.0, np.pi]])
-def test_what_shows_no_center_has_an_infinite_bound(angles: Any) -> None:
+def test_bound_is_infinite_without_information(angles: Any) -> None:
     assert circle_rms_bound(angles, 0.001) == inf
     assert np.isinf(np.diag(circle_bound(angles, 0.001))).all()
     assert oriented_rms_bound(angles[:1], 0.001) == inf

@@ -1,4 +1,4 @@
-"""The streaming sphere: equal to all frames at once, honest, hard to mislead."""
+"""Streaming sphere fit: equal to the batch fit, calibrated, and robust."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bench.subjects.simulated_joints import CHILD, ball_turns, carried, fan, hinge_turns
 from jointfit_daemon.center_of_rotation.planar import fit_circles
-from jointfit_daemon.center_of_rotation.spatial import Limits, RunningSphere, fit_running
+from jointfit_daemon.center_of_rotation.spatial import RunningSphere, SphereLimits, fit_running
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -81,7 +81,7 @@ def test_a_hinge_shows_its_axis_and_infinite_variance_along_it() -> None:
     assert np.allclose(found.covariance @ found.axis, 0.0, atol=1e-12)
 
 
-def test_the_error_told_falls_and_is_told_beside_its_bound() -> None:
+def test_predicted_error_falls_and_exceeds_the_bound() -> None:
     points = ball(np.random.default_rng(4), n=1600)
     stream, told = RunningSphere(4), []
     for number, frame in enumerate(points, 1):
@@ -137,15 +137,15 @@ def test_noise_of_one_marker_costs_only_that_marker() -> None:
 @pytest.mark.parametrize(
     ("points", "words"),
     [
-        (np.full((100, 2, 3), np.nan), "keep the markers in view"),
+        (np.full((100, 2, 3), np.nan), "keep the markers visible"),
         (np.ones((100, 2, 3)), "move the joint"),
-        (np.linspace(0, 0.2, 100)[:, None, None] * np.ones((1, 2, 3)), "show no bend"),
-        (ball(np.random.default_rng(8), rom=2.0), "further|only"),
+        (np.linspace(0, 0.2, 100)[:, None, None] * np.ones((1, 2, 3)), "no curvature"),
+        (ball(np.random.default_rng(8), rom=2.0), "range of motion|further|no curvature"),
         (ball(np.random.default_rng(8), n=9), "usable frames"),
     ],
     ids=["occluded", "still", "collinear", "too little", "too few"],
 )
-def test_what_shows_no_center_is_refused_with_a_remedy(points: Array, words: str) -> None:
+def test_running_sphere_refusal_names_cause_and_remedy(points: Array, words: str) -> None:
     found = fed(points).estimate()
     assert found.refused is not None
     assert any(word in found.refused for word in words.split("|"))
@@ -189,23 +189,23 @@ def test_never_nan_without_a_refusal(seed: int, kind: str, noise: float, hidden:
             assert not np.isnan([found.sd, found.noise, found.bound, found.arc]).any()
 
 
-def test_skin_that_turns_the_markers_does_not_make_a_hinge_a_ball() -> None:
+def test_soft_tissue_artefact_does_not_make_a_hinge_a_ball_joint() -> None:
     rng = np.random.default_rng(9)
     points = hinge(rng, 70.0, noise=2e-3)
     s = np.linspace(0, 4 * np.pi, len(points))
     points[:, :, 0] += 0.004 * np.sin(s)[:, None] * np.array([1.0, -0.5, 0.7, 0.2])
-    found = fit_running(points, limits=Limits(min_direction=np.radians(3.0)))
+    found = fit_running(points, limits=SphereLimits(min_direction=np.radians(3.0)))
     assert found.axis is not None
     assert abs(found.axis[0]) > 0.99
 
 
 @pytest.mark.parametrize(("markers", "forgetting"), [(0, 1.0), (2, 0.0), (2, 1.1)])
-def test_a_wrong_call_is_a_bug(markers: int, forgetting: float) -> None:
+def test_running_sphere_rejects_invalid_arguments(markers: int, forgetting: float) -> None:
     with pytest.raises(ValueError, match="at least one"):
         RunningSphere(markers, forgetting=forgetting)
 
 
-def test_a_marker_not_seen_has_no_radius_and_harms_nobody() -> None:
+def test_hidden_marker_has_no_radius_and_does_not_change_the_center() -> None:
     points = ball(np.random.default_rng(11))
     points[:, 3] = np.nan
     found = fit_running(points)

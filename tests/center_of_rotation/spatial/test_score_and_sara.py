@@ -1,4 +1,4 @@
-"""SCoRE, SARA, fused markers and the parent's noise: right, honest, and refusing by name."""
+"""SCoRE, SARA, fused estimates and the noise of the parent's frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bench.subjects.simulated_joints import (
 )
 from jointfit_daemon.center_of_rotation import BodyPoses, fuse_centers
 from jointfit_daemon.center_of_rotation._result import refusal
-from jointfit_daemon.center_of_rotation.planar import Limits, circle_estimate
+from jointfit_daemon.center_of_rotation.planar import CircleLimits, circle_estimate
 from jointfit_daemon.center_of_rotation.planar._plane import parent_noise
 from jointfit_daemon.center_of_rotation.spatial import (
     fit_axis,
@@ -31,10 +31,10 @@ from jointfit_daemon.center_of_rotation.spatial import (
 )
 from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import planar_noise
 
-ANYHOW = Limits(gate=0.0, arc=0.0, sd=inf)
+ANYHOW = CircleLimits(gate=0.0, arc=0.0, sd=inf)
 
 
-def test_score_is_exact_without_noise_and_honest_with_it() -> None:
+def test_score_is_exact_without_noise_and_calibrated_with_noise() -> None:
     rng = np.random.default_rng(1)
     exact = watched(rng, ball_turns(rng, 45), noise=0.0)
     assert np.linalg.norm(fit_score(exact.parent, exact.child).center) < 1e-9
@@ -79,14 +79,14 @@ def test_motion_about_two_axes_is_no_hinge() -> None:
     assert "score" in found.refused
 
 
-def test_bodies_hidden_or_still_are_refused_with_a_remedy() -> None:
+def test_score_and_sara_refuse_hidden_and_resting_bodies() -> None:
     rng = np.random.default_rng(5)
     seen = watched(rng, ball_turns(rng, 60))
     hidden = BodyPoses(np.full((200, 4), np.nan), np.full((200, 3), np.nan))
     still = watched(rng, np.tile(np.eye(3), (200, 1, 1)), noise=1e-4)
     for method in (fit_score, fit_axis):
         for parent, child, word in (
-            (seen.parent, hidden, "in view"),
+            (seen.parent, hidden, "visible"),
             (still.parent, still.child, "move the joint"),
         ):
             found = method(parent, child)

@@ -1,4 +1,4 @@
-"""Every spatial row of the joint center table keeps its goal, on the code that prints it."""
+"""Spatial joint-center experiments meet their targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.experiment
 
 
 @pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if not e.long], ids=lambda e: e.id)
-def test_every_spatial_figure_keeps_its_goal(experiment: Experiment) -> None:
+def test_spatial_experiment_meets_its_targets(experiment: Experiment) -> None:
     figures = experiment.run(DATA)
     assert figures
     assert [figure for figure in figures if not figure.kept] == []

@@ -1,4 +1,4 @@
-"""What is no movement is refused; what goes with posture is not taken for knowledge."""
+"""Sphere fits of segments at rest and with soft-tissue artefact."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from scipy.stats import f as fisher
 
 from bench.subjects.simulated_joints import CHILD, PARENT, ball_turns, hinge_turns, watched
 from jointfit_daemon.center_of_rotation import Movement, estimate_center
-from jointfit_daemon.center_of_rotation.spatial import Limits, fit_running, fit_sphere, turn_noise
-from jointfit_daemon.center_of_rotation.spatial._observability import of_posture, within95
+from jointfit_daemon.center_of_rotation.spatial import (
+    SphereLimits,
+    fit_running,
+    fit_sphere,
+    turn_noise,
+)
+from jointfit_daemon.center_of_rotation.spatial._observability import posture_share, within95
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import rigid_fit
 
@@ -68,11 +73,11 @@ def on_skin(seed: int, cycles: int = 4) -> Array:
     return np.asarray(points + rng.normal(0, 5e-4, points.shape))
 
 
-def test_a_direction_that_only_skin_shows_is_unseen() -> None:
+def test_direction_shown_only_by_soft_tissue_artefact_is_unseen() -> None:
     misled = 0
     for seed in range(12):
         points = on_skin(seed)
-        trusting = fit_sphere(points, limits=Limits(posture=False))
+        trusting = fit_sphere(points, limits=SphereLimits(posture=False))
         misled += bool(trusting.sd < inf and np.linalg.norm(trusting.center) > 3.0 * trusting.sd)
         found = fit_sphere(points)
         assert found.refused is not None or found.sd == inf
@@ -80,7 +85,7 @@ def test_a_direction_that_only_skin_shows_is_unseen() -> None:
     assert misled >= 6, "the case has lost its point: it misleads nobody"
 
 
-def test_the_error_told_on_skin_is_about_the_error_made() -> None:
+def test_predicted_error_with_soft_tissue_artefact_matches_actual_error() -> None:
     squares = []
     for seed in range(24):
         found = fit_sphere(on_skin(seed))
@@ -94,7 +99,7 @@ def test_the_error_told_on_skin_is_about_the_error_made() -> None:
     assert 0.2 < np.mean(squares) < 2.0
 
 
-def test_a_refusal_for_skin_does_not_ask_for_a_longer_arc_alone() -> None:
+def test_refusal_for_soft_tissue_artefact_names_more_than_a_longer_arc() -> None:
     told = [found.refused for seed in range(24) if (found := fit_sphere(on_skin(seed))).refused]
     assert any("where skin slides least" in why for why in told)
     clean = watched(np.random.default_rng(1), ball_turns(np.random.default_rng(1), 9.0))
@@ -102,12 +107,12 @@ def test_a_refusal_for_skin_does_not_ask_for_a_longer_arc_alone() -> None:
     assert why is None or "skin" not in why
 
 
-def test_cycles_repeated_do_not_make_skin_known_better() -> None:
+def test_repeated_cycles_do_not_reduce_soft_tissue_error() -> None:
     few, many = (fit_sphere(on_skin(3, cycles)) for cycles in (4, 40))
     assert np.trace(many.covariance) == pytest.approx(np.trace(few.covariance), rel=0.2)
 
 
-def test_noise_that_fades_does_not_pass_for_skin() -> None:
+def test_fading_noise_is_not_counted_as_soft_tissue_artefact() -> None:
     rng = np.random.default_rng(2)
     for rho in (0.0, 0.5):
         for _ in range(10):
@@ -116,8 +121,8 @@ def test_noise_that_fades_does_not_pass_for_skin() -> None:
             for t in range(1, len(e)):
                 e[t] = rho * e[t - 1] + np.sqrt(1 - rho**2) * e[t]
             assert "residuals_repeat" not in fit_sphere(seen.points + e).flags
-    assert of_posture(0.06, 1e6) == 0.0
-    assert of_posture(0.9, 100.0) == 0.9
+    assert posture_share(0.06, 1e6) == 0.0
+    assert posture_share(0.9, 100.0) == 0.9
 
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
@@ -127,7 +132,7 @@ def test_the_published_ellipse_has_the_quantile_of_its_freedom(rank: int, freedo
     assert within95(rank, freedom) == pytest.approx(exact, rel=0.02)
 
 
-def test_every_spatial_answer_says_how_large_its_ellipse_is() -> None:
+def test_spatial_estimates_have_an_ellipse_size() -> None:
     rng = np.random.default_rng(4)
     for turns in (ball_turns(rng, 45), hinge_turns(45.0, axis=0)):
         seen = watched(rng, turns)
@@ -138,7 +143,7 @@ def test_every_spatial_answer_says_how_large_its_ellipse_is() -> None:
             assert found.within95 > within95(3 - len(found.unseen), inf)
 
 
-def test_a_stream_leaves_skin_to_who_asks_unless_told() -> None:
+def test_running_sphere_excludes_soft_tissue_artefact_by_default() -> None:
     points = on_skin(5)
     assert "residuals_repeat" not in fit_running(points).flags
-    assert "residuals_repeat" in fit_running(points, limits=Limits()).flags
+    assert "residuals_repeat" in fit_running(points, limits=SphereLimits()).flags

@@ -1,4 +1,4 @@
-"""The numerical experiment: what it must reproduce, and what nobody can argue with."""
+"""Monte Carlo study of the circle fits."""
 
 from __future__ import annotations
 
