@@ -55,25 +55,6 @@ def circle_rms_bound(angles: ArrayLike, noise: float, *, known_radius: bool = Fa
     return float(np.sqrt(np.trace(circle_bound(angles, noise, known_radius=known_radius))))
 
 
-def oriented_rms_bound(angles: ArrayLike, noise: float) -> float:
-    r"""Return the least RMS error when the child's angle is known exactly in every frame, m.
-
-    .. math:: E^2 = 2\sigma^2 / \left(n (1 - |\overline{e^{i\theta}}|^2)\right)
-
-    Parameters
-    ----------
-    angles : array_like, shape (n,)
-        rad.
-    noise : float
-        Standard deviation of each coordinate, m.
-    """
-    t = np.asarray(angles, dtype=np.float64)
-    # 1 - |mean|² about the mean angle: no digits are lost on short arcs
-    z = np.exp(1j * t) - np.exp(1j * t).mean() if t.size else t
-    spread = float((np.abs(z) ** 2).sum())
-    return float(noise * np.sqrt(2.0 / spread)) if spread > 0.0 else float("inf")
-
-
 def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool = False) -> float:
     r"""Return `circle_rms_bound` for many points spread evenly over an arc, in closed form, m.
 

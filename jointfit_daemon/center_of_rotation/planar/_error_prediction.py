@@ -47,39 +47,6 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
     return _ratio(np.asarray(noise) * np.sqrt(square), np.abs(Q))
 
 
-def component_errors(angles: ArrayLike, noise_x: float, noise_y: float) -> tuple[Array, Array]:
-    r"""Predict the RMS errors of x and y apart, for noise that differs between the axes.
-
-    .. math::
-        E[\hat x^2] = \left\{ \sigma_x^2 \sum \cos^2\theta_i (\sin\theta_j - \sin\theta_k)^2
-            + \sigma_y^2 \sum \sin^2\theta_i (\sin\theta_j - \sin\theta_k)^2 \right\} / Q^2
-
-    and with cosines in the brackets for y; i, j, k cyclic. Source: equations 11 to 13, corrected:
-    the denominator of 11 has (x1 - x3), the second-order group of 13 the opposite sign.
-
-    Parameters
-    ----------
-    angles : array_like, shape (..., 3)
-        Of the marker about the center, rad.
-    noise_x, noise_y : float
-        Standard deviations of the coordinates, m.
-
-    Returns
-    -------
-    x, y : ndarray, shape (...)
-        RMS errors, m; inf where two angles coincide.
-    """
-    t = np.asarray(angles, dtype=np.float64)
-    s, c = np.sin(t), np.cos(t)
-    Q = (np.roll(s, -1, axis=-1) * c - np.roll(c, -1, axis=-1) * s).sum(axis=-1)
-    spoke = (noise_x * c) ** 2 + (noise_y * s) ** 2
-    across = np.roll(s, -1, axis=-1) - np.roll(s, -2, axis=-1)
-    along = np.roll(c, -1, axis=-1) - np.roll(c, -2, axis=-1)
-    errors = [np.sqrt((spoke * g**2).sum(axis=-1)) for g in (across, along)]
-
-    return _ratio(errors[0], np.abs(Q)), _ratio(errors[1], np.abs(Q))
-
-
 def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     r"""Predict the RMS error of a three-frame center for equal steps between the frames.
 
@@ -137,34 +104,6 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
     error = np.asarray(noise) * np.sqrt(sides.prod(axis=-1) * sides.sum(axis=-1))
 
     return _ratio(error, 8.0 * area**2)
-
-
-def needed_step(noise: float, target: float) -> float:
-    """Return the least equal step, rad, at which a three-frame center is expected to be on target.
-
-    Parameters
-    ----------
-    noise : float
-        Standard deviation of each coordinate, m.
-    target : float
-        RMS error wanted, m.
-
-    Returns
-    -------
-    float
-        rad, up to 2π/3 where three frames are best; inf if even that is not enough.
-    """
-    low, high = 0.0, 2.0 * np.pi / 3.0
-    if float(equal_step_error(high, noise)) > target:
-        return float("inf")
-    while high - low > 1e-12:
-        middle = (low + high) / 2
-        if float(equal_step_error(middle, noise)) > target:
-            low = middle
-        else:
-            high = middle
-
-    return high
 
 
 def _ratio(above: Array, below: Array) -> Array:

@@ -45,24 +45,6 @@ def in_segment_plane(first: ArrayLike, second: ArrayLike, marker: ArrayLike) -> 
     return np.stack((x, y), axis=-1)
 
 
-def project(points: ArrayLike, axis: ArrayLike) -> Array:
-    """Project points in the parent's coordinates on the plane across a joint's axis.
-
-    Parameters
-    ----------
-    points : array_like, shape (..., 3)
-        m.
-    axis : array_like, shape (3,)
-        The joint's axis; x gives the plane (y, z).
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        m, along the two columns of ``plane_of(axis)``.
-    """
-    return np.asarray(np.asarray(points, dtype=np.float64) @ plane_of(axis))
-
-
 def plane_of(axis: ArrayLike) -> Array:
     """Return two unit directions across an axis, right-handed with it, shape (3, 2).
 
@@ -85,51 +67,3 @@ def plane_of(axis: ArrayLike) -> Array:
     first /= np.linalg.norm(first)
 
     return np.column_stack((first, np.cross(n, first)))
-
-
-def parent_noise(lever: ArrayLike, apart: float, noise: float) -> Array:
-    r"""Return the covariance of a marker in coordinates that two noisy markers fix.
-
-    .. math:: \Sigma_x = \sigma^2 \left[ \tfrac32 I + \tfrac{2}{b^2}
-              \lambda_\perp \lambda_\perp^T \right], \qquad \lambda_\perp = (-\lambda_y, \lambda_x)
-
-    Two close parent markers are useless: their noise is turned by the lever arm.
-
-    Parameters
-    ----------
-    lever : array_like, shape (..., 2)
-        The marker from the middle of the parent's two, m.
-    apart : float
-        Distance of the parent's markers, b, m.
-    noise : float
-        Standard deviation of every coordinate of every marker, m.
-
-    Returns
-    -------
-    ndarray, shape (..., 2, 2)
-        m²; its component along the radius is the noise that a circle fit will find.
-    """
-    v = np.asarray(lever, dtype=np.float64)
-    across = np.stack((-v[..., 1], v[..., 0]), axis=-1)
-    outer = across[..., :, None] * across[..., None, :]
-    return np.asarray(noise**2 * (1.5 * np.eye(2) + 2.0 / apart**2 * outer))
-
-
-def radial_noise(points: ArrayLike, center: ArrayLike, apart: float, noise: float) -> float:
-    """Return the noise along the radius that a circle sees, parent's noise included, m.
-
-    Parameters
-    ----------
-    points : array_like, shape (n, 2)
-        Marker in the parent's coordinates, m.
-    center : array_like, shape (2,)
-        m.
-    apart, noise : float
-        As in `parent_noise`, m.
-    """
-    x = np.asarray(points, dtype=np.float64)
-    spoke = x - np.asarray(center, dtype=np.float64)
-    spoke = spoke / np.linalg.norm(spoke, axis=-1, keepdims=True)
-    S = parent_noise(x, apart, noise)
-
-    return float(np.sqrt(np.einsum("ni,nij,nj->n", spoke, S, spoke).mean()))

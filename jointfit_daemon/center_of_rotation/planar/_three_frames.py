@@ -195,7 +195,7 @@ def chain_centers(
     -------
     list of CenterEstimate
         One a joint, each in its parent's coordinates. The error counts the child's marker only;
-        the parent's own noise is added by ``parent_noise``.
+        the parent's own noise is added by ``planar_noise``.
     """
     found = []
     for parent, child in pairwise(segments):

@@ -77,7 +77,7 @@ class RunningSphere:
         Acceptance limits. If None, persistent residuals are not counted as soft-tissue
         artefact: live, the caller adds its variance (give ``SphereLimits()`` to have it counted).
     shape : ndarray, shape (k, d, d), optional
-        Covariance of each marker's noise relative to the common variance, see ``parent_noise``.
+        Covariance of each marker's noise relative to the common variance, see ``relative``.
 
     Raises
     ------

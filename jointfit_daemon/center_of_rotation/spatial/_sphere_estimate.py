@@ -68,7 +68,7 @@ def center_of(
         Position along unseen directions, m; None: at the markers' mean.
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, as
-        ``parent_noise.relative`` gives it for a moving parent; None: isotropic.
+        ``relative`` gives it for a moving parent; None: isotropic.
     limits : SphereLimits, optional
         Acceptance limits.
 

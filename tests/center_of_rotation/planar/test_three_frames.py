@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from jointfit_daemon.center_of_rotation import circle_rms_bound
 from jointfit_daemon.center_of_rotation._bounds import (
     circle_bound,
-    oriented_rms_bound,
     uniform_arc_rms,
 )
 from jointfit_daemon.center_of_rotation.planar import (
@@ -26,18 +25,12 @@ from jointfit_daemon.center_of_rotation.planar import (
     three_frame_estimate,
     triangle_error,
 )
-from jointfit_daemon.center_of_rotation.planar._error_prediction import (
-    component_errors,
-    needed_step,
-)
 from jointfit_daemon.center_of_rotation.planar._grid_search import grid_cost
 from jointfit_daemon.center_of_rotation.planar._plane import (
     in_segment_plane,
-    parent_noise,
-    project,
-    radial_noise,
 )
 from jointfit_daemon.center_of_rotation.planar._three_frames import SegmentMarkers, chain_centers
+from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import planar_noise
 
 numbers = st.floats(-10.0, 10.0)
 anything = st.floats(allow_nan=True, allow_infinity=True)
@@ -98,13 +91,11 @@ def test_three_frame_estimate_refuses_an_arc_hidden_by_noise() -> None:
     assert three_frame_estimate(on_circle(np.deg2rad([0, 60, 120])), 0.001).refused is None
 
 
-def test_the_three_forms_of_the_predicted_error_are_one() -> None:
+def test_both_forms_of_the_predicted_error_equal_the_bound() -> None:
     t = np.array([0.2, 0.9, 1.7])
     expected = circle_rms_bound(t, 0.001)
     assert arbitrary_error(t, 0.001) == pytest.approx(expected, rel=1e-12)
     assert triangle_error(on_circle(t), 0.001) == pytest.approx(expected, rel=1e-12)
-    x, y = component_errors(t, 0.001, 0.001)
-    assert np.hypot(x, y) == pytest.approx(expected, rel=1e-12)
     assert (arbitrary_error(t, 1.0)) ** 2 == pytest.approx(22.1, abs=0.05)
 
 
@@ -123,21 +114,6 @@ def test_no_turn_and_half_turns_show_nothing() -> None:
     assert equal_step_error(np.pi, 0.001) == inf
     assert arbitrary_error([0.0, 0.0, 1.0], 0.001) == inf
     assert triangle_error([[0, 0], [1, 1], [2, 2]], 0.001) == inf
-
-
-def test_component_errors_of_anisotropic_noise() -> None:
-    rng = np.random.default_rng(0)
-    t = np.array([0.0, 1.2, 2.0])
-    noisy = on_circle(t) + rng.normal(size=(100_000, 3, 2)) * (0.001, 0.0003)
-    rms = np.sqrt((three_frame_center(noisy) ** 2).mean(axis=0))
-    assert rms == pytest.approx(np.ravel(component_errors(t, 0.001, 0.0003)), rel=0.02)
-
-
-def test_the_needed_step_reaches_the_target() -> None:
-    step = needed_step(0.001, 0.006)
-    assert np.rad2deg(step) == pytest.approx(38, abs=1)
-    assert float(equal_step_error(step, 0.001)) == pytest.approx(0.006)
-    assert needed_step(0.01, 0.01) == inf
 
 
 def test_a_chain_is_found_joint_by_joint_in_its_parents_coordinates() -> None:
@@ -173,7 +149,7 @@ def test_a_plane_is_across_its_axis_and_right_handed(axis: Any) -> None:
     first, second = plane_of(axis).T
     n = np.array(axis) / np.linalg.norm(axis)
     assert np.cross(first, second) == pytest.approx(n, abs=1e-12)
-    assert np.abs(project(np.array(axis), axis)).max() < 1e-12
+    assert np.abs(np.array(axis) @ plane_of(axis)).max() < 1e-12
     assert plane_of((1, 0, 0)) == pytest.approx(np.eye(3)[:, 1:])
 
 
@@ -181,10 +157,8 @@ def test_the_parents_noise_is_turned_by_the_lever() -> None:
     rng = np.random.default_rng(1)
     n, noise, apart, at = 100_000, 0.001, 0.2, np.array([0.05, 0.3])
     p, q, m = (v + rng.normal(0, noise, (n, 2)) for v in ((-apart / 2, 0), (apart / 2, 0), at))
-    expected = parent_noise(at, apart, noise)
+    expected = planar_noise(at, np.array([[-apart / 2, 0.0], [apart / 2, 0.0]]), noise)
     assert np.cov(in_segment_plane(p, q, m).T) == pytest.approx(expected, rel=0.05, abs=2e-8)
-    sideways = radial_noise(at[None], (0.25, 0.3), apart, noise)
-    assert sideways == pytest.approx(np.sqrt(expected[0, 0]))
 
 
 def test_a_grid_finds_the_node_an_arc_is_round_about() -> None:
@@ -213,18 +187,10 @@ def test_bounds_of_even_arcs_are_the_known_ones(arc: float, free: Any, known: An
     assert uniform_arc_rms(1e-3, 100, 1.0) == pytest.approx(26.8 / 10 / 1e-6, rel=2e-3)
 
 
-def test_known_angles_leave_the_mean_to_be_found() -> None:
-    t = np.linspace(-0.5, 0.5, 101) * np.deg2rad(30)
-    z = np.exp(1j * t)
-    expected = np.sqrt(2 / (101 * (1 - abs(z.mean()) ** 2)))
-    assert oriented_rms_bound(t, 1.0) == pytest.approx(expected, rel=1e-6)
-
-
 @pytest.mark.parametrize("angles", [[], [0.3], [0.3, 0.3, 0.3], [0.0, np.pi]])
 def test_bound_is_infinite_without_information(angles: Any) -> None:
     assert circle_rms_bound(angles, 0.001) == inf
     assert np.isinf(np.diag(circle_bound(angles, 0.001))).all()
-    assert oriented_rms_bound(angles[:1], 0.001) == inf
     assert uniform_arc_rms(0.0, 10, 0.001) == inf
     assert uniform_arc_rms(1e-100, 10, 0.001) == inf
     assert uniform_arc_rms(1e-9, 10, 0.001, known_radius=True) == inf

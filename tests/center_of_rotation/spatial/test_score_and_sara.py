@@ -21,7 +21,6 @@ from bench.subjects.simulated_joints import (
 from jointfit_daemon.center_of_rotation import BodyPoses, fuse_centers
 from jointfit_daemon.center_of_rotation._result import refusal
 from jointfit_daemon.center_of_rotation.planar import CircleLimits, circle_estimate
-from jointfit_daemon.center_of_rotation.planar._plane import parent_noise
 from jointfit_daemon.center_of_rotation.spatial import (
     fit_axis,
     fit_running,
@@ -138,7 +137,9 @@ def test_a_shared_unseen_direction_stays_unseen() -> None:
 def test_planar_noise_of_two_markers_is_the_published_form() -> None:
     parent = np.array([[0.1, 0.0], [-0.1, 0.0]])
     lever = np.array([0.05, -0.3])
-    assert np.allclose(planar_noise(lever, parent, 2e-3), parent_noise(lever, 0.2, 2e-3))
+    across = np.array([0.3, 0.05])
+    expected = 2e-3**2 * (1.5 * np.eye(2) + 2.0 / 0.2**2 * np.outer(across, across))
+    assert np.allclose(planar_noise(lever, parent, 2e-3), expected)
 
 
 def test_planar_noise_agrees_with_simulation() -> None:
