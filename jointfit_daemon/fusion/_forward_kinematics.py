@@ -58,6 +58,7 @@ def joint_positions(
             position = None
             out.append((None, None))
             continue
+
         length = stored.length
         dx, dy, dz = rotate_z_one(segment.q, -length)
         position = (position[0] + dx, position[1] + dy, position[2] + dz)

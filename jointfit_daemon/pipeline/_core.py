@@ -114,6 +114,7 @@ class Core:
         """Return the core's part of ``bridge/health`` as JSON values."""
         if self._grid is None:
             return {"devices": {}, "frames": {}, "calibration": {}, "learning": {}}
+
         counts = {"mocap": self._mocap.counts()} | self._grid.counts()
         lags = {} if self._lags is None else self._lags.health()
         return core_health(self._sources, counts, self._session, self._fuser, now_ns) | {
@@ -183,6 +184,7 @@ class Core:
         no_north = drifting(rig.sources)
         self._fuser = LimbFuser(rig.chain, calibration, self._sensor_monitor, no_north)
         usable = calibration if calibration and calibration.fits(rig.chain) else None
+
         self._lags = LagMonitor(rig.chain, usable, self._lags, known_lags(rig))
         self._session.lags = self._lags
         self._mocap.set_calibration(rig.chain, usable)
@@ -234,6 +236,7 @@ class Core:
         if state is None:
             return []
         outputs = self._process(event.source, state, state.feed(event.chunk))
+
         # After a stall of the process, samples of other sources are still in the kernel. Deadlines
         # therefore apply at a Tick only, which comes after everything readable was read.
         outputs += self._advance(complete_only=True)
@@ -250,10 +253,12 @@ class Core:
             if not isinstance(item, StampedMeasurement):
                 outputs += self._report(source, state, item)
                 continue
+
             if state.open and not state.online:  # not by the rest of a closed decoder
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, "device", source, "streaming"))
+
             measurement, stamp = item
             if isinstance(measurement, ImuSample):
                 outputs += self._add_sample(source, measurement, stamp)
@@ -273,6 +278,8 @@ class Core:
     def _add_sample(self, source: str, sample: ImuSample, stamp: Stamp) -> list[Output]:
         t_ns, _, synced, epoch, _ = stamp
         q = sample.q_world_sensor
+
+        # The aligner gets instants of the optical system: stamps minus the lag in use.
         self._aligner.push(
             source,
             t_ns - self._lag_ns.get(source, 0),
@@ -316,6 +323,7 @@ class Core:
         self._seq += 1
         self._empty += not frame.orientations
         mocap = self._mocap.is_fresh(self._now_ns)
+
         state = self._fuser.fuse(
             frame.t_ns,
             frame.completed_ns,
@@ -337,6 +345,7 @@ class Core:
             outputs = self._session.request(event)
             self._apply_calibration_change(before)
             return outputs
+
         message = f"unknown request {event.command!r}; known: calibrate"
         error = {"key": "command", "message": message}
         return [Reply(event.command, event.transaction, "error", {}, error)]

@@ -31,6 +31,7 @@ def core_health(
     """
     devices = {}
     for name, state in sources.items():
+        # Mocap frames are counted by the decoder and the router, samples by the frame grid.
         samples = counts[name]
         if state.source.kind == "mocap":
             samples = _mocap_counts(state, samples)
@@ -39,6 +40,7 @@ def core_health(
             devices[name]["orientation_filter"] = orientation_filter
         if state.source.kind == "imu":
             devices[name]["sensor"] = fuser.sensor_monitor.state(name)
+
     return {
         "devices": devices,
         "calibration": {"phase": session.phase, "version": session.version},

@@ -56,6 +56,7 @@ class NoticeLimiter:
         """Add one event; return the notices that are due."""
         if isinstance(item, Corrupt):
             return self._collect(now_ns, (source, "corrupt"), item.discarded, item.reason)
+
         if item.kind == "gap":
             lost = item.data.get("lost", 1)
             return self._collect(
@@ -74,6 +75,7 @@ class NoticeLimiter:
         for key, condition in self._conditions.items():
             if now_ns - condition.reported_ns < QUIET_NS:
                 continue
+
             if condition.count:
                 condition.lasting = key[1] not in _JUMPS
                 notices.append(_notice(now_ns, key, condition))
@@ -93,6 +95,7 @@ class NoticeLimiter:
         condition.count += 1
         condition.amount += amount
         condition.text, condition.data = text, data
+
         if now_ns - condition.reported_ns < QUIET_NS:
             return []
         condition.lasting = False

@@ -1,4 +1,4 @@
-"""Feeds the real core with bytes of simulated arrival: two Xbus and two XCDI sensors, cameras."""
+"""Bytes with simulated arrival times for the core: two Xbus and two XCDI sensors, mocap."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def orientation(name: str, number: int) -> tuple[float, float, float, float]:
 
 
 def counter(number: int) -> int:
-    """Return what a device calls its sample `number`."""
+    """Return the device's counter or ticks of sample `number`."""
     return number % 65536
 
 
@@ -103,7 +103,7 @@ def camera_bytes(number: int) -> bytes:
 
 
 def camera_hello(t_ns: int) -> list[Event]:
-    """Return what a server says first."""
+    """Return the first packet of a mocap server."""
     info = ServerInfo("Motive", (2, 1, 0, 0), (3, 0, 0, 0), 10_000_000)
     bodies = tuple(
         BodyDescription(name, number, -1, _NOWHERE, (), (), ())

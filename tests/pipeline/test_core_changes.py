@@ -121,7 +121,7 @@ def test_counts_of_a_device_start_at_0_after_removal_and_return() -> None:
 
 
 def shaped(worn: dict[str, str], *, mocap: bool = False) -> dict[str, Any]:
-    """Return a rig of some of the four sensors, each worn on a segment of its own choice."""
+    """Return a rig with some of the four sensors on arbitrary segments."""
     rig = table()
     segments = list(dict.fromkeys(worn.values()))
     rig["chain"] = {"joints": [f"J{i}" for i in range(len(segments) + 1)], "segments": segments}
@@ -134,14 +134,14 @@ def shaped(worn: dict[str, str], *, mocap: bool = False) -> dict[str, Any]:
 
 
 def still(names: Iterable[str], first: int, end: int) -> list[Event]:
-    """Return what sensors send that do not turn: one orientation under running numbers."""
+    """Return samples of sensors at rest: one orientation with increasing counters."""
     turning = core_feed.orientation
     with patch.object(core_feed, "orientation", lambda name, _: turning(name, 0)):
         return samples(names, first, end)
 
 
 def calibrated_by_standing(rig_table: dict[str, Any]) -> tuple[Bench, Calibration]:
-    """Stand still before a core without cameras; return it and what the worker made of it."""
+    """Stand still without mocap; return the core and the result of the worker."""
     rig, bench = parse_rig(rig_table), Bench()
     names = [source.id for source in rig.sources]
     bench.feed([Configured(BEGIN_NS, rig, None), *(SourceOpened(BEGIN_NS, n) for n in names)])

@@ -65,7 +65,7 @@ class Sent:
     arrival_ns: int = 0
     copies: int = 1
     timed: bool = True
-    """Whether a CAN device tells its time at all."""
+    """Whether a CAN device sends its time."""
 
     def chunks(self) -> list[ChunkArrived]:
         ticks, q = self.device_ns // TICK_NS % WRAP, orientation(self.name, self.number)
@@ -95,7 +95,7 @@ class Sent:
 
 
 class WatchedCore(Core):
-    """The core, with somebody who looks at the frames: uncalibrated states name no sensor."""
+    """The core with access to its frames: uncalibrated states name no sensor."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -109,7 +109,7 @@ class WatchedCore(Core):
 
 @dataclass
 class Lived:
-    """What came of a run."""
+    """Result of a run."""
 
     states: list[LimbState]
     frames: list[AlignedFrame]
@@ -127,7 +127,7 @@ class Lived:
         ]
 
     def sync_with(self, name: str, begin_ns: int, end_ns: int) -> set[str]:
-        """Return what the frames with that sensor called themselves."""
+        """Return the sync states of the frames with that sensor."""
         return {
             sync for sync, frame in self.between(begin_ns, end_ns) if name in frame.orientations
         }
@@ -189,7 +189,7 @@ def assert_healed(run: Lived, after_ns: int = RECOVERY_NS) -> None:
 
 
 def told(run: Lived, name: str) -> list[str]:
-    """Return what was said of a clock after the fault."""
+    """Return the notices about a clock after the fault."""
     return [n.text for n in run.notices if n.kind == "clock" and n.id == name]
 
 

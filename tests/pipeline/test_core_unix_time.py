@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 S = 1_000_000_000
 BITSTREAM = (4, 1)
 UNIX_NS = 1_795_250_000 * S - BEGIN_NS
-"""What UNIX time is ahead of the host's clock, and the grandmaster's UTC always is."""
+"""Offset of UNIX time, and of the grandmaster's UTC, from the host clock."""
 TAI_NS = 37 * S
 HOUR_NS = 3_600 * S
 
 
 class WatchedCore(Core):
-    """Notes every stamp of a camera frame and what health says of the clock then."""
+    """Records every stamp of a mocap frame, with the clock's health at that time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class Rig:
         self.bench.feed([Configured(BEGIN_NS, rig, None)])
 
     def start(self, offset_ns: int = UNIX_NS) -> None:
-        """Open everything; the shell tells what UNIX time is."""
+        """Open all sources and set the UNIX offset."""
         info = ServerInfo("Motive", (3, 1, 0, 0), (*BITSTREAM, 0, 0), 10_000_000)
         words = (encode_natnet(info, BITSTREAM), encode_natnet(ModelDefinition(()), BITSTREAM))
         opened: list[Event] = [UnixOffset(BEGIN_NS, offset_ns)]
@@ -107,7 +107,7 @@ class Rig:
         self.bench.feed([UnixOffset(BEGIN_NS + self.number * PERIOD_NS, offset_ns)])
 
     def state(self) -> str:
-        """Return what health says of the cameras' clock."""
+        """Return the health of the mocap clock."""
         return str(self.bench.devices()["mocap"]["clock"])
 
     def errors_ms(self, since: int) -> list[float]:
@@ -119,7 +119,7 @@ class Rig:
         ]
 
     def notices(self) -> list[Notice]:
-        """Return what was told of clocks."""
+        """Return the notices about clocks."""
         notices = [n for n in self.bench.out if isinstance(n, Notice) and n.level == "warning"]
         return [n for n in notices if "rigid body" not in n.text]
 
@@ -157,11 +157,9 @@ def test_wrong_unix_time_moves_no_stamp_and_is_used_again_when_corrected(
     rig.stream(6)
     assert rig.state() == "passive"
     rig.set_unix_time(UNIX_NS)
-    rig.stream(16)  # what passive time did not know is slewed away
+    rig.stream(16)  # the error of passive time is slewed away
     assert rig.state() == "direct"
-    assert (
-        max(map(abs, rig.errors_ms(30))) < 4.1
-    )  # 6 ms of delay, 10 assumed where only arrivals tell
+    assert max(map(abs, rig.errors_ms(30))) < 4.1  # 6 ms of delay, 10 assumed from arrivals alone
     assert rig.errors_ms(rig.number - 10) == [0.0] * 10
     stamps = [t_ns for _, t_ns, _, _ in rig.core.frames]
     assert all(b > a for a, b in itertools.pairwise(stamps))

@@ -61,6 +61,7 @@ def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
     """
     names = {name for pair in pairs for name in (pair.link.a, pair.link.b)}
     corrections = {}
+
     for name in names:
         x = y = z = 0.0
         for pair in pairs:

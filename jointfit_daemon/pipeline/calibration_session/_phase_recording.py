@@ -65,6 +65,7 @@ class PhaseRecording:
         self._look: MovementLook | None = None
         self._start_ns = self._progress_ns = start_ns
         self._recorder = TrialRecorder()
+
         sensors = [sensor for group in chain.sensors for sensor in group]
         self._gate = StillnessGate(sensors) if phase == CalibrationPhase.STATIC else None
         self._latest: dict[str, Quaternion] = {}
@@ -105,6 +106,7 @@ class PhaseRecording:
         silent = [name for name, t in self._last_ns.items() if now_ns - t > SILENT_NS]
         done, text = self._share(elapsed_s), "keep turning the plate about several axes"
         data: dict[str, object] = {}
+
         if self._guide is not None:
             done, text, data = self._guided_progress(self._guide, elapsed_s, silent)
         if silent:
@@ -125,6 +127,7 @@ class PhaseRecording:
             "parts": look.parts,
             "missing": list(look.missing),
         }
+
         if not look.ready or silent:
             return self._share(elapsed_s), first_of(look.missing) or "keep moving", data
         left_s = self._min_s - elapsed_s

@@ -152,6 +152,7 @@ class CalibrationSession:
         if recording is None or not recording.progress_due(now_ns):
             return []
         done, text, data = recording.progress(now_ns)
+
         outputs: list[Output] = [
             CalibrationProgress(now_ns, recording.phase, round(done, 3), text, data)
         ]
@@ -251,6 +252,7 @@ class CalibrationSession:
             )
         if wanted in ("align", "functional") and not self._mocap:
             return "phase", f"{wanted!r} needs a mocap system: add [mocap] to rig.toml"
+
         reason = self._missing_markers(wanted)
         if reason is None and wanted == "functional":
             reason = self._missing_pose()
@@ -270,6 +272,7 @@ class CalibrationSession:
                 "'align' needs the plate that carries the sensors: name its rigid body in rig.toml "
                 '([mocap] plate = "Plate") or its markers (markers.plate = [...])'
             )
+
         named = {*settings.markers, *settings.rigid_bodies}
         bare = [segment for segment in self._chain.segments if segment not in named]
         if wanted == "functional" and bare:
@@ -293,6 +296,7 @@ class CalibrationSession:
         guide, settings = None, self._settings
         if phase == CalibrationPhase.FUNCTIONAL:
             guide = MovementGuide(self._chain, settings, self._static)
+
         wanted_s = min(wanted_s, MAX_PHASE_S)
         min_s = settings.functional_min_s
         self._recording = PhaseRecording(

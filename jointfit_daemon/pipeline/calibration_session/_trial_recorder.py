@@ -53,6 +53,7 @@ class TrialRecorder:
             sensor: _sensor_track([row for row in track if low <= row[0] <= high])
             for sensor, track in self._samples.items()
         }
+
         frames = [row for row in self._frames if low <= row[0] <= high]
         return CalibrationTrial(sensors, _optical_track(frames) if frames else None)
 

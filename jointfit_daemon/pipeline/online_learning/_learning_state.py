@@ -92,6 +92,7 @@ class LearningMonitor:
             state = "waiting"
         elif self._obstacle is not None:
             state = "stopped"
+
         stopped = state == "stopped" and since_ns is not None
         return {
             "state": state,

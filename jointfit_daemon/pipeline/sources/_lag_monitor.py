@@ -151,6 +151,7 @@ class LagMonitor:
         if lag is None or not self._clusters or self._next_ns is None:
             return
         samples = lag.samples
+
         if lag.epoch not in (None, epoch):
             samples.clear()
             lag.tracker.widen(RESTART_SD_NS)
@@ -202,6 +203,7 @@ class LagMonitor:
                 work = self._estimate(sensor, end_ns)
                 self._window = _Window(sensor, end_ns - WINDOW_NS // 2, work)
             return []
+
         try:
             next(window.work)
         except StopIteration as done:
@@ -226,6 +228,7 @@ class LagMonitor:
             self._tracks[segment] = end_ns, track
         t_ref, q_ref = self._tracks[segment][1]
 
+        # Samples of the sensor, with a margin for the lag.
         low, high = start_ns - MARGIN_NS, end_ns + MARGIN_NS
         samples = [row for row in self.sensors[sensor].samples if low <= row[0] <= high]
         if len(samples) < _MIN_FRAMES:
@@ -262,6 +265,7 @@ class LagMonitor:
         known = self._known.get(name)
         if known is None:
             return []
+
         difference = tracked.lag_ns - known.lag_ns
         sigma = float(np.hypot(tracked.sigma_ns, known.sigma_ns))
         before = lag.contradicted
@@ -301,6 +305,7 @@ class LagMonitor:
         if known is not None:
             used, source = known.lag_ns, "configured"
         quality = self._quality.get(sensor, {})
+
         return {
             "lag_ms": _rounded_ms(used),
             "lag_sigma_ms": _rounded_ms(

@@ -86,6 +86,7 @@ class SourceState:
         mean_ns, sd_ns = latency_prior(source)
         period_ns = round(_NS / source.rate_hz)
         clock = DeviceClock(period_ns, latency_ns=mean_ns, latency_sd_ns=sd_ns)
+
         state = cls(source=source, clock=clock)
         if lines is not None:
             state.lines = lines
@@ -103,6 +104,7 @@ class SourceState:
             self.clock.feed_restart()
         elif self.counts.opened and self.counts.received:
             self.clock.feed_reopened()
+
         driver = self.source.driver_class(self.source.settings)
         self._decoder = driver.decoder()
         self.open = True

@@ -50,6 +50,7 @@ class SyncLines:
         silent = edge.t_ns - line.last_ns > SYNC_STALE_NS
         if line.reference is None or (silent and number not in self._mocap_lines):
             line.reference, line.edges = source, SyncLine()
+
         if line.reference == source:
             self._add_reference_edge(number, source, clock, edge)
             return

@@ -26,7 +26,7 @@ UNIT = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass
 class Spoken:
-    """A decoder that says what the test put before it: the chunk's bytes are its place there."""
+    """A decoder that returns prepared items: the chunk's bytes are their index."""
 
     items: list[list[Decoded]] = field(default_factory=list)
     tick_clock: TickClock | None = OWN
