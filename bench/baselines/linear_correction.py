@@ -25,7 +25,7 @@ from jointfit_daemon.kinematics.rotation_scalar import (
     log_one,
     multiply_one,
 )
-from jointfit_daemon.limb_model import Prediction, SegmentModel, fuse, fuse_one, widened
+from jointfit_daemon.limb_model import Prediction, SegmentModel, fuse, fuse_one, widen_sd
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -113,7 +113,7 @@ class LinearCorrection(SegmentModel):
 
     def _sd(self, h: float) -> float:
         grown = (h / self.mean_leverage + 3.0) / self.ratio_offset
-        return widened(self.residual_sd * sqrt(grown), self.movements)
+        return widen_sd(self.residual_sd * sqrt(grown), self.movements)
 
     @override
     def to_dict(self) -> dict[str, Any]:

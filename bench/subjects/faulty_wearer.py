@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.subjects.simulated_wearer import NS, bench_rig, phases
-from jointfit_daemon.calibration import CalibrationRefused
+from jointfit_daemon.calibration import CalibrationError
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.kinematics import rotation
 from jointfit_simulators.body import SENSORS, Rotation, Step, Wearer, from_wxyz, to_wxyz
@@ -63,7 +63,7 @@ def calibrated(seed: int) -> Calibration | None:
         return fit_calibration(
             trials.static, trials.functional, alignment, rig.calibration, rig.chain
         )
-    except CalibrationRefused:
+    except CalibrationError:
         return None
 
 

@@ -1,21 +1,21 @@
-"""Learning how sensors sit, where joints turn, and how redundant sensors combine. Pure."""
+"""Calibration of a limb: trials, settings, and fits of alignments, joints and models."""
 
-from jointfit_daemon.calibration._errors import CalibrationRefused
+from jointfit_daemon.calibration._errors import CalibrationError
 from jointfit_daemon.calibration._trial import (
     PLATE,
     CalibrationSettings,
     CalibrationTrial,
-    Fresh,
+    OnlineFrames,
     OpticalTrack,
     SensorTrack,
 )
 
 __all__ = [
     "PLATE",
-    "CalibrationRefused",
+    "CalibrationError",
     "CalibrationSettings",
     "CalibrationTrial",
-    "Fresh",
+    "OnlineFrames",
     "OpticalTrack",
     "SensorTrack",
 ]

@@ -1,7 +1,4 @@
-"""What a calibration says when it will not answer.
-
-Law: every sentence names the thing, what was found and the remedy.
-"""
+"""Errors of a calibration, with the reason and the remedy for the operator."""
 
 from __future__ import annotations
 
@@ -13,13 +10,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 
-class CalibrationRefused(Exception):  # noqa: N818 - named for what happened, as CONVENTIONS.md asks
-    """The data cannot give what was asked for; every reason found, each with its remedy.
+class CalibrationError(Exception):
+    """The data do not suffice for the calibration.
 
     Parameters
     ----------
     *reasons : str
-        One sentence each: the thing, what was found, what to do.
+        One sentence for each problem: the object, the finding, the remedy.
     """
 
     def __init__(self, *reasons: str) -> None:
@@ -28,7 +25,7 @@ class CalibrationRefused(Exception):  # noqa: N818 - named for what happened, as
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return the sentence for a name the stream does not have, with the nearest spelling."""
+    """Return the message for a name that the stream does not have, with the nearest spelling."""
     choices: Sequence[str] = sorted(known)
     listed = f"it has: {', '.join(choices) or 'none'}"
     hint = " ".join(filter(None, (did_you_mean(name, choices), listed)))

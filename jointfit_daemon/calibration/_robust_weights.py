@@ -1,4 +1,4 @@
-"""Scale and Huber weights from residual magnitudes. Law: no estimator here, only what all share."""
+"""Robust statistics of residuals: scale, Huber weights and effective sample count."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HUBER_K = 1.5
-"""Residuals beyond this many robust scales count less than fully."""
+"""Residuals above this number of robust scales have reduced weight."""
 
 MAX_PASSES = 30
+"""Largest number of reweighting iterations."""
 SETTLED = 1e-7
-"""Iterated weights that change by less than this have settled."""
+"""Largest change of a weight at which the iteration has converged."""
 
 _MEDIAN_TO_SD = 1.4826
 
@@ -30,12 +31,11 @@ def huber_weights(magnitudes: NDArray[np.float64], scale: float) -> NDArray[np.f
 
 
 def effective_count(residuals: NDArray[np.float64]) -> float:
-    r"""Return how many independent looks a series of residuals is worth.
+    r"""Return the number of independent samples in a series of residuals.
 
     .. math:: n_{eff} = n \frac{1 - \rho_1}{1 + \rho_1}
 
-    with the lag-one autocorrelation of the series about its mean, taken over all columns; never
-    more than n.
+    with the lag-one autocorrelation of the series about its mean over all columns; at most n.
 
     Parameters
     ----------

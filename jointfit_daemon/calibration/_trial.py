@@ -1,6 +1,6 @@
-"""What a calibration is fitted to: recorded tracks on one clock, and what was asked for.
+"""Inputs of a calibration: recorded trials on one clock, and the settings.
 
-Law: plain data. All instants are host CLOCK_MONOTONIC nanoseconds, already through the clocks.
+All time stamps are host CLOCK_MONOTONIC nanoseconds, already mapped by the device clocks.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class SensorTrack:
 
 @dataclass(frozen=True, slots=True)
 class OpticalTrack:
-    """What the optical system saw; NaN where it did not."""
+    """Measurements of the optical system; NaN where occluded."""
 
     t_ns: NDArray[np.int64]
     """Instants of exposure, shape (m,), strictly increasing."""
@@ -56,7 +56,7 @@ class OpticalTrack:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTrial:
-    """One phase of a calibration as it was recorded."""
+    """The recording of one phase of a calibration."""
 
     sensors: Mapping[str, SensorTrack]
     optical: OpticalTrack | None
@@ -64,42 +64,44 @@ class CalibrationTrial:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSettings:
-    """What rig.toml says about calibration, in SI."""
+    """Settings of the calibration in rig.toml, in SI units."""
 
     method: Method = "anchored"
     static_s: float = 5.0
     align_s: float = 30.0
     functional_s: float = 60.0
-    """The movement ends by then at the latest."""
+    """Longest duration of the functional phase, s."""
     functional_min_s: float = 45.0
-    """And not before, however good the joint centers are: the regression wants its share."""
+    """Shortest duration of the functional phase, s: the regression needs this much movement even if
+    the joint centers converge earlier."""
     center_target_m: float = 0.003
-    """Noise part of every joint center's predicted error at which the movement is enough, m."""
+    """Noise part of the predicted error of every joint center at which the movement suffices, m."""
     markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Markers of each segment or neighbouring body part (pelvis, foot)."""
+    """Markers of each segment or adjacent body part (pelvis, foot)."""
     rigid_bodies: Mapping[str, str] = field(default_factory=dict)
-    """Rigid body of each segment, where markers are not given."""
+    """Rigid body of each segment without markers."""
     plate: str | None = None
-    """Rigid body of the plate that carries the sensors in the align phase."""
+    """Rigid body of the calibration plate that carries the sensors in the align phase."""
     holdout_share: float = 0.4
-    """Last share of the functional trial, contiguous, that judges the fit."""
+    """Last, contiguous share of the functional trial that is held out for evaluation."""
     refine_markers: bool = True
-    """Whether the movement refines where markers sit on their body parts."""
+    """Whether marker positions on the body parts are refined from the movement."""
     learn_online: bool = True
-    """Whether the models go on learning while cameras see the limb."""
+    """Whether the models are refitted while the cameras see the limb."""
 
 
 PLATE = "plate"
-"""Key of `markers` in rig.toml for a plate that is a set of markers."""
+"""Key of `markers` in rig.toml for a calibration plate that is a set of markers."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fresh:
-    """New frames, all sensors and markers whole, in order of time."""
+class OnlineFrames:
+    """New complete frames of sensors and markers, in order of time."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment as each sensor says it through its bias, shape (n, 4)."""
+    """q_optical_segment of each sensor through its mount, shape (n, 4)."""
     markers: Mapping[str, Array]
-    """Of each segment's cluster, optical world, m, shape (n, k, 3); absent for rigid bodies."""
+    """Markers of the cluster of each segment, optical world, m, shape (n, k, 3); absent for rigid
+    bodies."""
     bodies: Mapping[str, Array]
-    """q_world_body of each segment followed by a rigid body, shape (n, 4)."""
+    """q_world_body of each segment with a rigid body, shape (n, 4)."""

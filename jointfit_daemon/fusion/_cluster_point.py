@@ -22,7 +22,7 @@ from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.limb_model import MarkerCluster
     from jointfit_daemon.model import MocapFrame, MocapLayout, Vector
 
 
@@ -44,7 +44,7 @@ class ClusterPoint:
 
     Parameters
     ----------
-    cluster : Cluster
+    cluster : MarkerCluster
         Markers of the body part, or its rigid body.
     point : ndarray, shape (3,)
         The point in the static world, m.
@@ -52,7 +52,7 @@ class ClusterPoint:
         Layout of the frames.
     """
 
-    def __init__(self, cluster: Cluster, point: Array, layout: MocapLayout) -> None:
+    def __init__(self, cluster: MarkerCluster, point: Array, layout: MocapLayout) -> None:
         self._cluster = cluster
         self._offset: Array = point - cluster.origin
         self._subsets: dict[bytes, _MarkerSubset | None] = {}
@@ -112,7 +112,7 @@ class ClusterPoint:
         return _MarkerSubset(rows, centered, self._offset - mean, float((centered**2).sum()))
 
 
-def _columns(cluster: Cluster, layout: MocapLayout) -> list[int] | None:
+def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
     """Return the columns of a cluster, or None if the stream lacks one of its names."""
     if cluster.body is not None:
         return [layout.bodies.index(cluster.body)] if cluster.body in layout.bodies else None

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.fusion._cluster_point import ClusterPoint
-from jointfit_daemon.limb_model import live_cluster
+from jointfit_daemon.limb_model import restore_cluster
 
 if TYPE_CHECKING:
-    from jointfit_daemon.limb_model import Calibration, Cluster
+    from jointfit_daemon.limb_model import Calibration, MarkerCluster
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Vector
 
 
@@ -27,7 +27,7 @@ class OpticalOrigin:
 
     def __init__(self, chain: Chain, calibration: Calibration | None) -> None:
         self._center: Vector | None = None
-        self._clusters: list[Cluster] = []
+        self._clusters: list[MarkerCluster] = []
         self._layout: MocapLayout | None = None
         self._points: list[ClusterPoint] = []
         if calibration is None:
@@ -35,7 +35,7 @@ class OpticalOrigin:
         found = calibration.joint.get(chain.joints[0])
         self._center = None if found is None else found.center
         self._clusters = [
-            live_cluster(part, calibration.clusters[part])
+            restore_cluster(part, calibration.clusters[part])
             for part in (chain.proximal, chain.segments[0])
             if part is not None and part in calibration.clusters
         ]

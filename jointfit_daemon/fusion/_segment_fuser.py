@@ -13,7 +13,7 @@ from math import radians, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.rotation_scalar import difference_one, normalize_one, perturb_one
-from jointfit_daemon.limb_model import UNREFERENCED_SD, Prediction, alive_key
+from jointfit_daemon.limb_model import UNREFERENCED_SD, Prediction, model_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -166,7 +166,7 @@ class SegmentFuser:
     def _choose(self, alive: Names, near: Names) -> tuple[SegmentModel | None, Names]:
         """Return the model for a set of sensors, and the neighbor sensors that it uses."""
         for others in (near, near[:1], ()):
-            model = self._models.get(alive_key(alive, "+".join(others) or None))
+            model = self._models.get(model_key(alive, "+".join(others) or None))
             if model is not None:
                 return model, others
         return None, ()

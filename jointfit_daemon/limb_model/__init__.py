@@ -1,30 +1,33 @@
-"""The calibrated limb: models that are evaluated in every frame, and the record that holds them."""
+"""The calibrated limb: the record of a calibration and the models that are evaluated every frame.
+
+The models are fitted in `jointfit_daemon.calibration` and evaluated in `jointfit_daemon.fusion`.
+"""
 
 from jointfit_daemon.limb_model._aligned_model import AlignedModel
 from jointfit_daemon.limb_model._calibration import (
     Calibration,
+    CalibrationSchemaError,
     JointCalibration,
     Method,
     SegmentCalibration,
     SensorCalibration,
-    UnknownSchema,
-    alive_key,
+    model_key,
 )
 from jointfit_daemon.limb_model._chain_conventions import body_parts, flexion_sign, neighbor
-from jointfit_daemon.limb_model._kernel_expert import Expert, as_rows
+from jointfit_daemon.limb_model._kernel_expert import KernelExpert, as_rows
 from jointfit_daemon.limb_model._kernel_features import TILTS, bumps, smooth_terms, widths_of
 from jointfit_daemon.limb_model._kernel_model import KernelModel, mix_corrections, model_inputs
 from jointfit_daemon.limb_model._kernel_trend import LEVEL_AXES, trend
-from jointfit_daemon.limb_model._leverage_variance import FARTHEST, WITHIN, Spread
+from jointfit_daemon.limb_model._leverage_variance import FARTHEST, WITHIN, LeverageVariance
 from jointfit_daemon.limb_model._marker_cluster import (
-    Cluster,
+    MarkerCluster,
     StoredCluster,
-    live_cluster,
-    stored_cluster,
+    cluster_record,
+    restore_cluster,
     vector,
 )
 from jointfit_daemon.limb_model._mean_model import MeanModel
-from jointfit_daemon.limb_model._patent_model import PatentModel, Reading
+from jointfit_daemon.limb_model._patent_model import PatentModel, PatentReading
 from jointfit_daemon.limb_model._rigid_fit import (
     MAX_FIT_RMS_M,
     MIN_MARKERS,
@@ -37,11 +40,11 @@ from jointfit_daemon.limb_model._segment_model import (
     UNREFERENCED_SD,
     Prediction,
     SegmentModel,
-    widened,
+    widen_sd,
 )
 from jointfit_daemon.limb_model._sensor_link import (
     LEAST_LEVEL,
-    Kind,
+    LinkKind,
     SensorLink,
     axis_heading_one,
     level_axis,
@@ -61,47 +64,47 @@ __all__ = [
     "WITHIN",
     "AlignedModel",
     "Calibration",
-    "Cluster",
-    "Expert",
+    "CalibrationSchemaError",
     "JointCalibration",
+    "KernelExpert",
     "KernelModel",
-    "Kind",
+    "LeverageVariance",
+    "LinkKind",
+    "MarkerCluster",
     "MeanModel",
     "Method",
     "PatentModel",
+    "PatentReading",
     "Prediction",
-    "Reading",
     "SegmentCalibration",
     "SegmentModel",
     "SensorCalibration",
     "SensorLink",
-    "Spread",
     "StoredCluster",
-    "UnknownSchema",
-    "alive_key",
     "as_rows",
     "axis_heading_one",
     "body_parts",
     "bumps",
+    "cluster_record",
     "equal_weights",
     "flexion_sign",
     "fuse",
     "fuse_one",
     "is_line",
     "level_axis",
-    "live_cluster",
     "mix_corrections",
     "model_inputs",
+    "model_key",
     "neighbor",
     "posture_one",
+    "restore_cluster",
     "rigid_fit",
     "smooth_terms",
     "steady_fit",
-    "stored_cluster",
     "trend",
     "up_one",
     "vector",
     "visible",
-    "widened",
+    "widen_sd",
     "widths_of",
 ]

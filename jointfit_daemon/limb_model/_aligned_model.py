@@ -1,10 +1,10 @@
-r"""The mean of sensors whose worlds and mounts were first fitted to the reference: a baseline.
+r"""Weighted mean of sensors whose worlds and mounts were aligned with the reference: a baseline.
 
 .. math:: \hat q = \operatorname{mean}_\omega \left( q_{W,m} \otimes q_m \otimes q_{B,m} \right)
 
-Law: learns constants only, a turn about the vertical and a mount of each sensor, and its weight;
-nothing of posture. On skin the turn absorbs what moves with flexion, so it holds for the heading it
-was trained at.
+The model has constants only: for each sensor a rotation of its world about the vertical, a mount
+and a weight. It has no posture-dependent term. The fitted heading absorbs soft-tissue artefact that
+correlates with flexion, so the model is valid only at the heading of the training movement.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion, multiply_one
-from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel, widened
+from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel, widen_sd
 from jointfit_daemon.limb_model._weighted_mean import fuse, fuse_one
 
 if TYPE_CHECKING:
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AlignedModel(SegmentModel):
-    """Weighted mean of sensors that are turned by constants on both sides."""
+    """Weighted mean of sensors with a constant rotation on either side."""
 
     kind: ClassVar[str] = "aligned"
 
     worlds: tuple[Quaternion, ...]
-    """q_optical_world of each sensor beyond its calibration: turns about the vertical."""
+    """q_optical_world of each sensor beyond its calibration: rotations about the vertical."""
     mounts: tuple[Quaternion, ...]
     """q_segment_bone of each sensor beyond its static mount."""
     weights: tuple[float, ...]
-    """One a sensor, sum 1."""
+    """Weight of each sensor; the sum is 1."""
     residual_sd: float
     movements: int
-    """Kinds of movement in training."""
+    """Number of distinct movements in the training data."""
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
@@ -63,7 +63,7 @@ class AlignedModel(SegmentModel):
             multiply_one(multiply_one(world, q), mount)
             for world, q, mount in zip(self.worlds, sensors, self.mounts, strict=True)
         ]
-        sd = widened(self.residual_sd, self.movements)
+        sd = widen_sd(self.residual_sd, self.movements)
         return Prediction(fuse_one(turned, self.weights), sd, False)
 
     @override

@@ -1,7 +1,7 @@
-"""What a calibration is once it is done: everything live fusion needs, and how good it was.
+"""The record of a calibration: all parameters that fusion evaluates, and quality figures.
 
-Law: frozen plain data with an exact JSON form. `from_dict(to_dict(c)) == c`, to the last bit, also
-through text; NaN and infinity never occur. No clock and no version of its own: both are handed in.
+Invariants: ``Calibration.from_dict(c.to_dict()) == c`` to the last bit, also through JSON text. The
+record never contains NaN or infinity. Time of creation and software version are passed in.
 """
 
 from __future__ import annotations
@@ -24,59 +24,59 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
 SCHEMA = 1
-"""Version of the JSON form; a reader refuses what it does not know."""
+"""Version of the JSON form; other versions are rejected."""
 
 
-class UnknownSchema(ValueError):  # noqa: N818 - named for what happened
-    """The JSON is no calibration, or one of another version of this program."""
+class CalibrationSchemaError(ValueError):
+    """The JSON value is not a calibration, is incomplete, or has another schema version."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorCalibration:
-    """One sensor on its segment."""
+    """Calibration of one sensor on its segment."""
 
     q_optical_world: Quaternion
-    """From the sensor's own world to the optical one (or to the static world, without cameras)."""
+    """From the world of the sensor to the optical world (to the static world without cameras)."""
     q_sensor_segment: Quaternion
-    """Bias: how the segment lies in the sensor, from the static pose."""
+    """Sensor-to-segment alignment from the static pose."""
     lag_ns: int = 0
-    """Sensor stamp minus optical stamp of the same event."""
+    """Sensor time stamp minus optical time stamp of the same event."""
     spread: float = 0.0
-    """Robust scatter in the static pose, rad."""
+    """Robust standard deviation of the orientation during the static pose, rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentCalibration:
-    """One segment and the models that give its orientation from whatever sensors are alive."""
+    """Calibration of one segment, with one model for each set of available sensors."""
 
     q_static: Quaternion
     """q_optical_segment in the static pose."""
     length: float | None
-    """Between its joint centers, m; None if unknown."""
+    """Distance between its joint centers, m; None if unknown."""
     length_sd: float | None
     models: Mapping[str, SegmentModel] = field(default_factory=dict)
-    """By `alive_key`: one for every set of sensors that was trained."""
+    """Models by `model_key`: one for each trained set of sensors."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointCalibration:
-    """One joint center."""
+    """Calibration of one joint center."""
 
     center: Vector | None
-    """In the optical world of the static pose, m."""
+    """Position in the optical world during the static pose, m."""
     sd: float | None
-    """Root of the mean variance per axis, m."""
+    """Root mean variance per axis, m."""
     source: str
     """``fit`` | ``length`` | ``unknown``."""
     residual_rms: float | None = None
-    """Of the markers' distances from it, m."""
+    """RMS residual of the distances between the markers and the center, m."""
     gap_rms: float | None = None
-    """How far apart its two body parts carry it, m."""
+    """RMS distance between the centers carried by the two adjacent body parts, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibration of one limb on one wearer."""
+    """Calibration of one limb of one subject."""
 
     method: Method
     joints: tuple[str, ...]
@@ -87,28 +87,28 @@ class Calibration:
     joint: Mapping[str, JointCalibration]
     clusters: Mapping[str, StoredCluster] = field(default_factory=dict)
     flags: tuple[str, ...] = ()
-    """What every LimbState must say: ``headings_from_static``, ``facing_unknown``, …"""
+    """Flags repeated in every LimbState: ``headings_from_static``, ``facing_unknown``, …"""
     notes: tuple[str, ...] = ()
-    """Sentences for people: what was not found and what to do."""
+    """Sentences for the operator: missing quantities and remedies."""
     quality: Mapping[str, Any] = field(default_factory=dict)
     digest: str = ""
-    """SHA-256 of the trials' arrays."""
+    """SHA-256 of the arrays of the trials."""
     software: str = ""
     created_utc: str = ""
     links: tuple[SensorLink, ...] = ()
-    """What is expected between sensors; empty where no movement was seen."""
+    """Expected relations between sensors; empty without a recorded movement."""
     correlations: Mapping[str, float] = field(default_factory=dict)
-    """How far the errors of both segments of an inner joint are alike, see `joint_correlation`."""
+    """Error correlation of the two segments at each inner joint, see `joint_error_correlations`."""
     memory: str = ""
-    """Frames it was taught with, see `memory`; empty in calibrations of earlier versions."""
+    """Training frames, encoded by `pack_training`; the basis of online learning."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
-        """Lag of every sensor."""
+        """Lag of every sensor, ns."""
         return {name: sensor.lag_ns for name, sensor in self.sensor.items()}
 
     def fits(self, chain: Chain) -> bool:
-        """Tell whether this is a calibration of that chain: same segments, joints and sensors."""
+        """Return whether segments, joints and sensors equal those of a chain."""
         mine = (self.joints, self.segments, self.chain_sensors)
         return mine == (chain.joints, chain.segments, chain.sensors)
 
@@ -141,21 +141,25 @@ class Calibration:
 
         Raises
         ------
-        UnknownSchema
-            Not a calibration, incomplete, or of another schema version.
+        CalibrationSchemaError
+            The value is not a calibration, is incomplete, or has another schema version.
         """
         if data.get("schema") != SCHEMA:
-            raise UnknownSchema(f"schema {data.get('schema')!r}, this program reads {SCHEMA}")
+            raise CalibrationSchemaError(
+                f"schema {data.get('schema')!r}, this program reads {SCHEMA}"
+            )
         if type(data["schema"]) is not int:
-            raise UnknownSchema(f"schema {data['schema']!r}, expected a whole number")
+            raise CalibrationSchemaError(f"schema {data['schema']!r}, expected a whole number")
         try:
             return _from_dict(data)
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-            raise UnknownSchema(f"not a calibration: {type(error).__name__}: {error}") from error
+            raise CalibrationSchemaError(
+                f"not a calibration: {type(error).__name__}: {error}"
+            ) from error
 
 
-def alive_key(sensors: Sequence[str], other: str | None) -> str:
-    """Return the name of an alive set: sensors of the segment, then the one of its neighbour."""
+def model_key(sensors: Sequence[str], other: str | None) -> str:
+    """Return the key of a model: available sensors of the segment, then sensors of its neighbor."""
     return f"{'+'.join(sensors)}|{other or ''}"
 
 
@@ -214,12 +218,14 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         software=data["software"],
         created_utc=data["created_utc"],
         links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
-        correlations={name: _alike(rho) for name, rho in data.get("correlations", {}).items()},
+        correlations={
+            name: _correlation(rho) for name, rho in data.get("correlations", {}).items()
+        },
         memory=str(data.get("memory", "")),
     )
 
 
-def _alike(value: Any) -> float:
+def _correlation(value: Any) -> float:
     if not -1.0 < (rho := float(value)) < 1.0:
         raise ValueError(f"correlation {rho}")
     return rho

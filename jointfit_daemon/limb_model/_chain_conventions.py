@@ -1,4 +1,4 @@
-"""Conventions of a chain: body parts beside a joint, neighbouring segments, sign of flexion."""
+"""Conventions of a chain: body parts beside joints, neighboring segments, signs of flexion."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ if TYPE_CHECKING:
 
 
 FLEXES_FORWARD = ("hip", "ankle", "elbow", "shoulder", "wrist")
-"""Joints whose flexion is positive about x (the distal part goes forward); others are knees."""
+"""Joints with positive flexion about x (distal end forward); knees and other names are negative."""
 
 
 def body_parts(chain: Chain) -> list[str | None]:
-    """Return the parts on either side of the joints: joint i lies between parts i and i + 1."""
+    """Return the body parts beside the joints: joint i lies between parts i and i + 1."""
     return [chain.proximal, *chain.segments, chain.distal]
 
 
 def flexion_sign(joint: str) -> float:
-    """Return +1 where flexion brings the distal part forward, -1 for knees and unknown names."""
+    """Return +1 if flexion moves the distal segment forward, -1 for knees and unknown names."""
     return 1.0 if any(word in joint.casefold() for word in FLEXES_FORWARD) else -1.0
 
 
 def neighbor(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the segment that segment i looks at: the next, the last looks back."""
+    """Return the sensors of the next segment, or of the previous one for the last segment."""
     count = len(chain.segments)
     if count == 1:
         return ()

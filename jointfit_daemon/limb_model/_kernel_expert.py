@@ -1,9 +1,9 @@
-r"""One correction by kernel ridge: width and penalties by held-out groups.
+r"""One soft-tissue correction by kernel ridge regression.
 
 .. math:: c(u) = \mathrm{clip}(C^T [s(u), a_{z_1}(u / \ell) \dots a_{z_m}(u / \ell)])
 
-with smooth terms s and anchored bumps a of `kernel_features`. Law: an expert only says what it has
-learned and how far outside its training a frame lies; what is made of it is the model's affair.
+with the smooth terms s and the anchored bumps a of `kernel_features`. An expert returns its
+correction and the leverage of the frame; `KernelModel` combines two experts.
 """
 
 from __future__ import annotations
@@ -23,37 +23,39 @@ if TYPE_CHECKING:
     Rows = tuple[tuple[float, ...], ...]
 
 LARGEST = 0.4
-"""No component of a correction exceeds this, rad."""
+"""Limit of each component of a correction, rad."""
 
 
 @dataclass(frozen=True, slots=True)
-class Expert:
+class KernelExpert:
     """A fitted correction of one segment."""
 
     width: float
-    """Chosen among ``WIDTHS``, rad."""
+    """Kernel width, rad; one of ``WIDTHS``."""
     tilted: bool
-    """It looks at the tilt of the segment, too."""
+    """Whether the tilt of the segment is among the regressors."""
     coefficients: Rows
     """C^T: three rows, rad per unit of each smooth term and bump."""
     centers: Rows
-    """Of the bumps, in widths."""
+    """Centers of the bumps, in kernel widths."""
     leverage: Rows
-    """Square: ``s @ leverage @ s`` of smooth terms s: how far a frame lies outside training."""
+    """Square matrix H: ``s @ H @ s`` is the leverage of a frame with smooth terms s."""
     hull_leverage: float
-    """0.995 quantile of the leverage over training."""
+    """0.995 quantile of the leverage over the training frames."""
     carried: tuple[float, ...]
-    """Sum of shares by axis: how much of what was learned carries over to unseen frames."""
+    """Sum of the stacking shares of each axis: the share that generalizes to unseen frames."""
 
     def correct(self, u: Array, sensors: int) -> tuple[Array, Array]:
-        """Return the correction, rad, shape (n, 3), and leverage over its quantile, shape (n,).
+        """Return the correction, rad, shape (n, 3), and the leverage ratio, shape (n,).
+
+        The leverage ratio is the leverage of a frame over its 0.995 quantile in training.
 
         Parameters
         ----------
         u : ndarray, shape (n, 3 m + 3)
             Relative rotations of m sensors, then tilts.
         sensors : int
-            m.
+            Number of sensors m.
         """
         seen = u if self.tilted else u[:, : 3 * sensors]
         smooth = smooth_terms(seen)
@@ -77,9 +79,9 @@ class Expert:
         }
 
     @staticmethod
-    def read(data: Mapping[str, Any]) -> Expert:
+    def read(data: Mapping[str, Any]) -> KernelExpert:
         """Return the expert of its JSON form."""
-        return Expert(
+        return KernelExpert(
             width=data["width"],
             tilted=data["tilted"],
             coefficients=as_rows(data["coefficients"]),
@@ -91,4 +93,5 @@ class Expert:
 
 
 def as_rows(rows: Iterable[Iterable[float]]) -> Rows:
+    """Return nested numbers as a tuple of tuples."""
     return tuple(tuple(row) for row in rows)

@@ -1,14 +1,14 @@
-r"""What the anchored model looks at: joint rotation, disagreement of sensors, tilt, bumps of them.
+"""Regressors of the kernel model: joint rotation, sensor disagreement, tilt, and Gaussian bumps.
 
-Law: relative rotations are blind to any constant turn of the world, tilts to any turn about the
-vertical, so both are to the heading of a person. Every feature vanishes where sensors agree, the
-joint is straight and the segment upright, as people stand, more or less, in the static pose, where
-nothing is to be corrected: a correction needs no intercept.
+Relative rotations are invariant to any constant rotation of the world, tilts to a rotation about
+the vertical. Both are therefore invariant to the heading of the subject. All regressors vanish if
+the sensors agree, the joint is straight and the segment is upright. This holds approximately in the
+static pose, where the correction must be zero, so the regression has no intercept.
 
 .. math:: a_z(x) = e^{-|x - z|^2 / 2} - e^{-|x|^2 / 2} - e^{-|z|^2 / 2} + 1
 
-is the Gaussian kernel between x and a center z, less what would not vanish at x = 0: the kernel of
-all functions f(x) - f(0) where f has the Gaussian kernel.
+is the Gaussian kernel between x and a center z, minus the terms that do not vanish at x = 0. It is
+the kernel of all functions f(x) - f(0) for which f has the Gaussian kernel.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 PAIR_SHARE = 0.4
-"""The same of the disagreement of sensors, over that of joints: skin moves less than joints."""
+"""Kernel width of sensor disagreement over that of joint rotation: soft tissue moves less than
+joints."""
 TILTS = 3
+"""Number of tilt components."""
 
 
 def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:
@@ -56,7 +58,7 @@ def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) ->
 def relative_rotations_one(
     sensors: Sequence[Quaternion], mean: Quaternion, q_other: Quaternion
 ) -> list[float]:
-    """Return the same of one frame."""
+    """Return the relative rotations of one frame, see `relative_rotations`."""
     found = [*difference_one(mean, q_other)]
     for q in sensors[1:]:
         found += difference_one(sensors[0], q)
@@ -64,9 +66,9 @@ def relative_rotations_one(
 
 
 def tilts(q: Array) -> Array:
-    r"""Return :math:`[v_1, v_2, 1 - v_3]` of the vertical v seen from the segment, shape (n, 3).
+    """Return :math:`[v_1, v_2, 1 - v_3]` for the vertical v in segment axes, shape (n, 3).
 
-    Its tilt stands for the joint above, and for what gravity does to flesh.
+    The tilt is a proxy for the proximal joint angle and for the effect of gravity on soft tissue.
     """
     w, x, y, z = q.T
     found: Array = np.stack(
@@ -76,7 +78,7 @@ def tilts(q: Array) -> Array:
 
 
 def tilts_one(q: Quaternion) -> list[float]:
-    """Return the same of one frame."""
+    """Return the tilts of one frame, see `tilts`."""
     w, x, y, z = q
     return [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 2.0 * (x * x + y * y)]
 
@@ -84,8 +86,9 @@ def tilts_one(q: Quaternion) -> list[float]:
 def smooth_terms(u: Array) -> Array:
     r"""Return :math:`[1 - \cos f, \sin f, 1 - \cos 2f, \sin 2f, f k_2, f k_3, u]`, f = k_1.
 
-    f turns about x, the axis about which limbs flex: what skin does over a whole bend is a smooth
-    periodic function of it. Shape (n, 6 + columns of u); u may have tilts beside its rotations.
+    f is the rotation about x, the flexion axis. The soft-tissue artefact is assumed to be a smooth
+    periodic function of flexion. Shape (n, 6 + columns of u); u may contain tilts after its
+    rotations.
     """
     f = u[:, :1]
     bends = [1.0 - np.cos(f), np.sin(f), 1.0 - np.cos(2.0 * f), np.sin(2.0 * f)]
@@ -93,14 +96,14 @@ def smooth_terms(u: Array) -> Array:
 
 
 def smooth_terms_one(u: Sequence[float]) -> list[float]:
-    """Return the same of one frame."""
+    """Return the smooth terms of one frame, see `smooth_terms`."""
     f = u[0]
     s, c = sin(f), cos(f)
     return [1.0 - c, s, 2.0 * s * s, 2.0 * s * c, f * u[1], f * u[2], *u]
 
 
 def widths_of(width: float, sensors: int, *, tilted: bool) -> Array:
-    """Return what each rotation, and tilt, is measured by, rad; shape (3 m,) or (3 m + 3,)."""
+    """Return the kernel width of each rotation and tilt, rad, shape (3 m,) or (3 m + 3,)."""
     joint, pairs = [width] * 3, [PAIR_SHARE * width] * (3 * sensors - 3)
     return np.array(joint + pairs + [width] * (TILTS if tilted else 0))
 

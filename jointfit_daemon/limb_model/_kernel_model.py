@@ -1,19 +1,21 @@
-r"""The recommended model: a soft-tissue correction that turns with the subject.
+r"""The recommended model: mean of the sensors with a posture-dependent soft-tissue correction.
 
 .. math:: \hat q = \bar q \otimes \exp\bigl(\tfrac12 [\eta_a c_a + (1 - \eta_a) T_a]
           + \tfrac12 [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
 
-with the mean :math:`\bar q` of the segment's sensors and two experts of `kernel_expert` on
-:math:`\rho = \log(\bar q^* \otimes q_{ref})`: a, who looks at relative rotations alone and carries
-over to other movements, and b, who looks at the tilt of the segment, too, and knows the trained
-movements better. Inside training they count alike. Outside, their corrections fade (eta) into the
-trend T of `kernel_trend`, which carries over best, that of b at once, that of a farther off. About
-the long axis there is no trend: there b gives way to a, and a to the mean.
+:math:`\bar q` is the mean of the sensors of the segment. The corrections :math:`c_a` and
+:math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
+uses relative rotations only and generalizes to other movements. Expert b also uses the tilt of the
+segment and has smaller errors on the trained movements. Inside the training range both have equal
+weight. Outside, their corrections fade (:math:`\eta`) into the linear trend T of `kernel_trend`,
+which extrapolates best: expert b fades at once, expert a at a larger distance. The trend has no
+component about the long axis. There b fades into a, and a into the mean.
 
-Law: upright and straight, where sensors agree, no leverage is left and nothing is corrected,
-wherever training was; a heading changes nothing. What the model is worth is measured on frames that
-its fit has not seen, axis by axis, and grows with the distance from training that either expert
-sees.
+Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
+agree. A rotation of the world about the vertical does not change the correction.
+
+The claimed standard deviations come from held-out frames, for each axis, and increase with the
+larger leverage ratio of the two experts.
 """
 
 from __future__ import annotations
@@ -27,16 +29,16 @@ from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import perturb_one
-from jointfit_daemon.limb_model._kernel_expert import Expert
+from jointfit_daemon.limb_model._kernel_expert import KernelExpert
 from jointfit_daemon.limb_model._kernel_features import (
     relative_rotations,
     relative_rotations_one,
     tilts,
     tilts_one,
 )
-from jointfit_daemon.limb_model._kernel_tables import Tables
+from jointfit_daemon.limb_model._kernel_tables import KernelTables
 from jointfit_daemon.limb_model._kernel_trend import trend
-from jointfit_daemon.limb_model._leverage_variance import Spread
+from jointfit_daemon.limb_model._leverage_variance import LeverageVariance
 from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel
 from jointfit_daemon.limb_model._weighted_mean import equal_weights, fuse, fuse_one
 
@@ -49,40 +51,43 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 HULL = 3.0
-"""The correction of a fades where its leverage exceeds this many times its quantile over training:
-root of the ratio. That of b fades from the quantile itself, with the ratio."""
+"""Leverage ratio above which the correction of expert a fades, by the root of the ratio.
+
+The correction of expert b fades from ratio 1, in proportion to the ratio."""
 OUTSIDE = 3.0
-"""A frame is called extrapolating where the leverage of either exceeds this many times its own."""
+"""Leverage ratio of either expert above which a frame counts as extrapolation."""
 SHARE = 0.5
-"""Of b. Held-out frames decide too little between two that are nearly alike: a plain mean it is."""
+"""Weight of expert b. Held-out frames hardly distinguish two similar experts, so weights are
+equal."""
 
 
 @dataclass(frozen=True)
 class KernelModel(SegmentModel):
-    """Mean of the sensors and its correction by relative rotations and tilt."""
+    """Mean of the sensors, corrected by relative rotations and tilt."""
 
     kind: ClassVar[str] = "kernel"
 
     sensors: int
-    plain: Expert
-    """a."""
-    tilted: Expert
-    """b."""
+    plain: KernelExpert
+    """Expert a."""
+    tilted: KernelExpert
+    """Expert b."""
     trend: tuple[tuple[float, ...], tuple[float, ...]]
-    """T about x and y: coefficients over [1, relative rotations, tilts]."""
-    spread: Spread
+    """T about x and y: coefficients of [1, relative rotations, tilts]."""
+    spread: LeverageVariance
     residual_sd: float
     mean_sd: float
-    """Of the uncorrected mean on the training frames, rad per axis: when the neighbour is lost."""
-    _tables: Tables = field(init=False, repr=False, compare=False)
+    """Standard deviation of the uncorrected mean in training, rad per axis; applies without
+    neighbor."""
+    _tables: KernelTables = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Keep the tables as arrays beside: the frame loop multiplies by them."""
-        object.__setattr__(self, "_tables", Tables.of(self.plain, self.tilted, self.trend))
+        """Derive the arrays that are multiplied in every frame."""
+        object.__setattr__(self, "_tables", KernelTables.of(self.plain, self.tilted, self.trend))
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
-        """Return the corrected mean, shape (n, 4); the plain mean without a neighbour."""
+        """Return the corrected mean, shape (n, 4), or the plain mean without a neighbor."""
         inputs = [np.asarray(q, dtype=np.float64) for q in sensors]
         mean = fuse(inputs, equal_weights(len(inputs)))
         if q_other is None:
@@ -97,21 +102,26 @@ class KernelModel(SegmentModel):
     def predict_one(
         self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
     ) -> Prediction:
-        """Return the corrected mean of one frame, its standard deviations by its leverage."""
+        """Return the corrected mean of one frame and its standard deviations from the leverage."""
         mean = fuse_one(sensors, equal_weights(len(sensors)))
         if q_other is None:
             return Prediction(mean, self.mean_sd, False)
         u = relative_rotations_one(sensors, mean, q_other)
         a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, tilts_one(mean))
+
+        # Weights of the experts: a by the root of its leverage ratio, b by the ratio itself.
         p = 1.0 - SHARE if ratio <= HULL else (1.0 - SHARE) * sqrt(HULL / ratio)
         s = SHARE / b_ratio if b_ratio > 1.0 else SHARE
         (ax, ay, az), (bx, by, bz) = a, b
         rest, along = 1.0 - p - s, p / (1.0 - SHARE)
+
+        # About z there is no trend: b fades into a, and a into the mean.
         c = (
             p * ax + s * bx + rest * tx,
             p * ay + s * by + rest * ty,
             along * (1.0 - s) * az + s * bz,
         )
+
         far = max(ratio, b_ratio)
         sds = self.spread.at(far)
         x, y, z = sds
@@ -138,22 +148,23 @@ class KernelModel(SegmentModel):
         """Return the model of its JSON form."""
         return cls(
             sensors=data["sensors"],
-            plain=Expert.read(data["plain"]),
-            tilted=Expert.read(data["tilted"]),
+            plain=KernelExpert.read(data["plain"]),
+            tilted=KernelExpert.read(data["tilted"]),
             trend=_rows_xy(data["trend"]),
-            spread=Spread.read(data["spread"]),
+            spread=LeverageVariance.read(data["spread"]),
             residual_sd=data["residual_sd"],
             mean_sd=data["mean_sd"],
         )
 
 
 def model_inputs(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:
+    """Return relative rotations and tilts of all frames, rad, shape (n, 3 m + 3)."""
     u = relative_rotations(sensors, mean, q_other)
     return np.concatenate([u, tilts(mean)], axis=1)
 
 
 def mix_corrections(line: Array, a: Array, a_ratio: Array, b: Array, b_ratio: Array) -> Array:
-    """Return the correction by both experts and the trend together, rad, shape (n, 3)."""
+    """Return the combined correction of both experts and the trend, rad, shape (n, 3)."""
     inside_a = 1.0 / np.sqrt(np.maximum(a_ratio / HULL, 1.0))[:, None]
     inside_b = 1.0 / np.maximum(b_ratio, 1.0)[:, None]
     plain = inside_a * a + (1.0 - inside_a) * line

@@ -1,9 +1,8 @@
-r"""How wrong a correction is, axis by axis, from frames that its fit has not seen.
+r"""Variance of a correction as a function of the distance from the training range.
 
 .. math:: \sigma_j^2(r) = a_j + b_j \max(0, \min(r, 30) - \tfrac12)
 
-with r the leverage of a frame over the training's 0.995 quantile: how far the pose lies outside
-what training has shown.
+for each axis j, with r the leverage of a frame over its 0.995 quantile in training.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ if TYPE_CHECKING:
 
 
 FARTHEST = 30.0
-"""Leverage ratios beyond tell nothing more."""
+"""Leverage ratio above which the variance no longer increases."""
 WITHIN = 0.5
-"""Leverage ratios up to this are the heart of the training: there errors do not grow."""
+"""Leverage ratio below which the variance is constant: the center of the training range."""
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """Variances of the three axes by distance from training."""
+class LeverageVariance:
+    """Variances of the three axes as a function of the leverage ratio."""
 
     inside: tuple[float, float, float]
-    """a, rad^2."""
+    """a, rad²."""
     outside: tuple[float, float, float]
-    """b, rad^2."""
+    """b, rad²."""
 
     def at(self, ratio: float) -> tuple[float, float, float]:
         """Return the standard deviations about x, y and z of the segment, rad."""
@@ -42,9 +41,9 @@ class Spread:
         return {"inside": list(self.inside), "outside": list(self.outside)}
 
     @staticmethod
-    def read(data: Mapping[str, Any]) -> Spread:
-        """Return what `to_dict` described."""
-        return Spread(_three(data["inside"]), _three(data["outside"]))
+    def read(data: Mapping[str, Any]) -> LeverageVariance:
+        """Return the variances of a JSON form."""
+        return LeverageVariance(_three(data["inside"]), _three(data["outside"]))
 
 
 def _three(values: Sequence[float]) -> tuple[float, float, float]:

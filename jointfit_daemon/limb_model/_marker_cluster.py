@@ -1,4 +1,4 @@
-"""Marker clusters of body parts as they were in the static pose."""
+"""Marker clusters of body parts as they were in the static pose, as arrays and as stored data."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Cluster:
-    """One body part as it stood in the static pose."""
+class MarkerCluster:
+    """Markers of one body part in the static pose."""
 
     name: str
     markers: tuple[str, ...]
-    """Names in the stream; empty where a rigid body stands for the part."""
+    """Marker names in the stream; empty for a rigid body."""
     body: str | None
     """Name of the rigid body in the stream, or None."""
     template: Array
-    """Marker positions minus `origin`, static world, m, shape (k, 3). A rigid body has four
-    virtual points 0.1 m around its origin, so that every later step is the same for both."""
+    """Marker positions minus `origin`, static world, m, shape (k, 3). A rigid body has four virtual
+    points 0.1 m around its origin, so that markers and rigid bodies are processed alike."""
     origin: Array
-    """Centroid of the markers (or origin of the body), static world, m, shape (3,)."""
+    """Centroid of the markers or origin of the rigid body, static world, m, shape (3,)."""
     q_body: Array
     """q_static-world_body of the rigid body; the identity for markers."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredCluster:
-    """Markers of one body part as they stood in the static pose; see `markers.Cluster`."""
+    """A `MarkerCluster` as plain data in a calibration."""
 
     markers: tuple[str, ...]
     body: str | None
@@ -49,12 +49,12 @@ class StoredCluster:
 
 
 def vector(values: Iterable[Any]) -> Vector:
-    """Return three numbers as a plain tuple of floats."""
+    """Return three numbers as a tuple of floats."""
     x, y, z = (float(value) for value in values)
     return (x, y, z)
 
 
-def stored_cluster(cluster: Cluster) -> StoredCluster:
+def cluster_record(cluster: MarkerCluster) -> StoredCluster:
     """Return a cluster as plain data."""
     return StoredCluster(
         cluster.markers,
@@ -65,9 +65,9 @@ def stored_cluster(cluster: Cluster) -> StoredCluster:
     )
 
 
-def live_cluster(name: str, stored: StoredCluster) -> Cluster:
-    """Return a cluster from plain data."""
-    return Cluster(
+def restore_cluster(name: str, stored: StoredCluster) -> MarkerCluster:
+    """Return the cluster of a calibration as arrays."""
+    return MarkerCluster(
         name,
         stored.markers,
         stored.body,

@@ -1,4 +1,4 @@
-"""The model that trusts its sensors: their weighted mean, uncorrected. Law: needs no neighbour."""
+"""Weighted mean of the sensors without a correction. It needs no neighboring segment."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeanModel(SegmentModel):
-    """Weighted mean of the sensors."""
+    """Weighted mean of the sensors of a segment."""
 
     kind: ClassVar[str] = "mean"
 
     weights: tuple[float, ...]
-    """One a sensor, sum 1."""
+    """Weight of each sensor; the sum is 1."""
     residual_sd: float
 
     @override

@@ -1,10 +1,10 @@
-r"""The patent's multiple linear regression of quaternion components, in both of its readings.
+r"""Multiple linear regression of quaternion components, in two readings of the patent.
 
 .. math:: \hat Y_k = \sum_m a_{k m} X_{m,k} + c_k, \qquad k = w, x, y, z
 
-Law: kept as a named baseline. ``patent12`` fits every component alone (12 parameters for two
-sensors), ``patent6`` shares the sensors' coefficients between components (6). Neither turns with
-the subject: the intercept ties the fit to the heading it was trained at.
+This is a baseline. ``patent12`` fits every component separately (12 parameters for two sensors),
+``patent6`` uses the same sensor coefficients for all components (6 parameters). Neither is
+equivariant to the heading: the intercept fixes the fit to the heading of the training movement.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
-from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel, widened
+from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel, widen_sd
 from jointfit_daemon.limb_model._weighted_mean import equal_weights, fuse, fuse_one
 
 if TYPE_CHECKING:
@@ -29,26 +29,26 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
 
-Reading = Literal["patent12", "patent6"]
+PatentReading = Literal["patent12", "patent6"]
 
 SHORTEST = 0.5
-"""A regression output shorter than this is no rotation; the mean of the sensors stands in."""
+"""Norm of the regression output below which the mean of the sensors replaces it."""
 
 
 @dataclass(frozen=True)
 class PatentModel(SegmentModel):
-    """Linear regression on quaternion components, normalised."""
+    """Linear regression of quaternion components, normalized."""
 
     kind: ClassVar[str] = "patent"
 
-    reading: Reading
+    reading: PatentReading
     coefficients: tuple[tuple[float, ...], ...]
-    """Four rows w, x, y, z; one column a sensor and the intercept last."""
+    """Four rows w, x, y, z; one column for each sensor, the intercept last."""
     q_sign: Quaternion
-    """The first reference of training: signs are such that products with it are not negative."""
+    """First reference of the training data; inputs get the sign with a non-negative product."""
     residual_sd: float
     movements: int
-    """Kinds of movement in training."""
+    """Number of distinct movements in the training data."""
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
@@ -65,13 +65,14 @@ class PatentModel(SegmentModel):
     def predict_one(
         self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
     ) -> Prediction:
-        """Return the regression of one frame; the mean, flagged, where it gave no rotation."""
-        sd = widened(self.residual_sd, self.movements)
+        """Return the regression of one frame, or the flagged mean if the output is too short."""
+        sd = widen_sd(self.residual_sd, self.movements)
         inputs = [_same_side(q, self.q_sign) for q in sensors]
         said = [
             row[-1] + sum([a * q[k] for a, q in zip(row, inputs, strict=False)])
             for k, row in enumerate(self.coefficients)
         ]
+
         length = sqrt(sum([c * c for c in said]))
         if length < SHORTEST:
             return Prediction(fuse_one(inputs, equal_weights(len(inputs))), sd, True)

@@ -1,8 +1,8 @@
-"""What every model of a segment can do, and what every fit is given.
+"""Interface of the models that estimate the orientation of one segment from its sensors.
 
-Law: a model is frozen plain data with an exact JSON form. It is trained for one set of sensors in
-one order; a segment keeps one model for each set that may be alive. Sensors come in bone-aligned:
-``q_world_segment`` as each says it, through its static mount.
+A model is frozen plain data with an exact JSON form. It is trained for one ordered set of sensors.
+A segment has one model for each set of sensors that can be available. The inputs are bone-aligned
+orientations ``q_world_segment``, one for each sensor, computed with its static mount.
 """
 
 from __future__ import annotations
@@ -28,33 +28,34 @@ if TYPE_CHECKING:
 
 
 FEW_MOVEMENTS = 3
+"""Number of training movements from which the claimed standard deviation is not increased."""
 FEW_MOVEMENTS_FACTOR = 2.5
-"""Fewer kinds of movement in training than that: errors elsewhere are this much larger (measured:
-2.2 to 2.7 times on a movement that was not trained)."""
+"""Factor on the standard deviation with fewer training movements. Measured: errors on an untrained
+movement were 2.2 to 2.7 times larger."""
 
 
 class Prediction(NamedTuple):
-    """One segment in one frame."""
+    """Estimate of one segment in one frame."""
 
     q: Quaternion
     """q_world_segment."""
     sd: float
-    """Standard deviation of the orientation, rad (root of the mean variance per axis)."""
+    """Standard deviation of the orientation, rad (root mean variance per axis)."""
     extrapolating: bool
-    """The pose lies outside what training has shown; treat with care."""
+    """The pose is outside the training range."""
     axis_sd: Vector | None = None
-    """Standard deviations about x, y and z of the segment, rad, where they are known apart."""
+    """Standard deviations about x, y and z of the segment, rad; None if not known separately."""
 
 
 class SegmentModel(ABC):
-    """Orientation of one segment from a fixed set of its sensors."""
+    """Model of the orientation of one segment for a fixed set of its sensors."""
 
     kind: ClassVar[str] = ""
     """Name of the model in its JSON form."""
     _kinds: ClassVar[dict[str, type[SegmentModel]]] = {}
 
     residual_sd: float
-    """RMS per axis, rad, of what the model leaves over on frames it was not fitted to."""
+    """RMS residual per axis on frames outside the fit, rad."""
 
     @override
     def __init_subclass__(cls) -> None:
@@ -63,25 +64,25 @@ class SegmentModel(ABC):
 
     @abstractmethod
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
-        """Return q_world_segment frame by frame, shape (n, 4); NaN where an input is.
+        """Return q_world_segment of every frame, shape (n, 4); NaN if an input is NaN.
 
         Parameters
         ----------
         sensors : sequence of array_like, shape (n, 4)
-            One array a sensor, in the order of training.
+            One array for each sensor, in the order of training.
         q_other : array_like, shape (n, 4), optional
-            The sensor of the neighbouring segment named in training.
+            Orientation of the neighboring segment.
         """
 
     @abstractmethod
     def predict_one(
         self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
     ) -> Prediction:
-        """Return the same for one frame of plain tuples."""
+        """Return the estimate of one frame from plain tuples."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form: exact, also through text."""
+        """Return the JSON form, exact also through text."""
 
     @classmethod
     @abstractmethod
@@ -90,14 +91,14 @@ class SegmentModel(ABC):
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> SegmentModel:
-        """Return the model that ``to_dict`` described.
+        """Return the model of a JSON form of any kind.
 
         Raises
         ------
         ValueError
             The kind is unknown.
         KeyError
-            Something is missing.
+            A key is missing.
         """
         kind = data["kind"]
         if kind not in SegmentModel._kinds:
@@ -105,10 +106,11 @@ class SegmentModel(ABC):
         return SegmentModel._kinds[kind].read(data)
 
 
-def widened(sd: float, movements: int) -> float:
-    """Return `sd` as it must be claimed when few kinds of movement were trained."""
+def widen_sd(sd: float, movements: int) -> float:
+    """Return `sd`, increased if few distinct movements were trained."""
     return sd if movements >= FEW_MOVEMENTS else sd * FEW_MOVEMENTS_FACTOR
 
 
 UNREFERENCED_SD = radians(10.0)
-"""Given to a segment that no camera ever judged: skin sensors on thigh and shank move that much."""
+"""Standard deviation of a segment without optical reference, rad: the order of the soft-tissue
+artefact on thigh and shank."""

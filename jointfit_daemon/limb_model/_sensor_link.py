@@ -1,14 +1,12 @@
-r"""How the sensors of a limb lie to each other, posture by posture, as calibration saw it.
+r"""Expected relation between two sensors of a limb as a function of posture.
 
-Law: what is learnt holds for skin, not for mounts or headings. Postures are told by gravity alone,
-so no heading, and no drift of one, gets into them; all is counted from the static pose, so it
-outlives sensors that are put on anew.
+Posture is described by gravity alone, so headings and heading drift have no influence. All
+quantities are relative to the static pose, so links stay valid after sensors are re-donned.
 
-Two kinds of links are learnt. A pair is two sensors of one segment; what is predicted is their
-rotation :math:`d = \log(q_a^* q_b)`. A joint is two sensors of neighboring segments; what is
-predicted is the angle about the vertical between their flexion axes, which on a hinge is small and
-repeats with posture. Either is linear in ten polynomials of the two segments' tilts (ridge), and
-what it leaves over on blocks that were not fitted, contiguous in time, is its spread.
+There are two kinds of links. A pair consists of two sensors of one segment; its quantity is the
+rotation :math:`d = \log(q_a^* q_b)`. A joint consists of two sensors of neighboring segments; its
+quantity is the angle about the vertical between their flexion axes, which on a hinge is small and
+depends on posture. Both are linear in ten polynomials of the tilts of the two segments.
 """
 
 from __future__ import annotations
@@ -23,40 +21,43 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Quaternion, Vector
 
-Kind = Literal["pair", "joint"]
+LinkKind = Literal["pair", "joint"]
 
 LEAST_LEVEL = 0.5
-"""Squared horizontal part of a flexion axis below which its heading is not read."""
+"""Smallest squared horizontal part of a flexion axis for which its heading is defined."""
 STRAY = 0.15
-"""By how much of its range a tilt may leave what was seen before the link is less sure."""
+"""Share of its range by which a tilt may exceed the training range without loss of certainty."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorLink:
-    """Two sensors and what is expected between them."""
+    """Expected relation between two sensors."""
 
     a: str
     b: str
-    kind: Kind
+    kind: LinkKind
     near: tuple[str, ...]
-    """Sensors whose tilt, with that of `a`, tells the posture: the first one alive."""
+    """Sensors whose tilt, with that of `a`, describes the posture; the first available one is
+    used."""
     weights: tuple[tuple[float, ...], ...]
-    """By component of what is predicted (3 of a pair, 1 of a joint), ten each."""
+    """Ten weights for each predicted component (3 for a pair, 1 for a joint)."""
     low: tuple[float, ...]
+    """Smallest value of each polynomial in training."""
     high: tuple[float, ...]
-    """Range of the polynomials in training."""
+    """Largest value of each polynomial in training."""
     spread: float
-    """What the prediction leaves over on frames left out: RMS per component, rad."""
+    """RMS residual per component on held-out frames, rad."""
     total: float
-    """RMS per component of what is predicted itself: what is left over without a posture, rad."""
+    """RMS per component of the predicted quantity itself, rad: the residual without a known
+    posture."""
 
     def expected(self, up_a: Vector, up_near: Vector | None) -> tuple[tuple[float, ...], float]:
-        """Return what is expected in a posture, and the standard deviation per component, rad.
+        """Return the expected components in a posture and their standard deviation, rad.
 
         Parameters
         ----------
         up_a, up_near : Vector
-            The vertical in the frames of the two segments; None: not known.
+            Vertical in the frames of the two segments; None if unknown.
         """
         if up_near is None:
             return (0.0,) * len(self.weights), self.total + self.spread
@@ -67,7 +68,7 @@ class SensorLink:
         return said, self.spread + min(1.0, 2.0 * stray) * self.total
 
     def _kept(self, posture: tuple[float, ...]) -> tuple[tuple[float, ...], float]:
-        """Return a posture kept within what was seen, and how far it strays from there."""
+        """Return a posture limited to the training range, and its largest excess."""
         kept, stray = [], 0.0
         for value, low, high in zip(posture, self.low, self.high, strict=True):
             kept.append(low if value < low else min(value, high))
@@ -90,7 +91,7 @@ class SensorLink:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> SensorLink:
-        """Return the link that ``to_dict`` described."""
+        """Return the link of a JSON form."""
         return SensorLink(
             a=data["a"],
             b=data["b"],
@@ -108,13 +109,13 @@ class SensorLink:
 
 
 def up_one(q: Quaternion) -> Vector:
-    """Return the vertical in the frame of a segment, q_world_segment."""
+    """Return the vertical in segment axes from q_world_segment."""
     w, x, y, z = q
     return (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
 
 
 def posture_one(u: Vector, v: Vector) -> tuple[float, ...]:
-    """Return ten polynomials of two tilts, all 0 when both segments stand upright."""
+    """Return ten polynomials of two tilts, all 0 if both segments are upright."""
     ux, uy, uz = u
     vx, vy, vz = v
     return (
@@ -124,9 +125,9 @@ def posture_one(u: Vector, v: Vector) -> tuple[float, ...]:
 
 
 def axis_heading_one(a: Quaternion, b: Quaternion) -> float | None:
-    """Return the heading of b's flexion axis (its x) seen from that of a, rad.
+    """Return the heading of the flexion axis (x) of b relative to that of a, rad.
 
-    None where either axis is too steep to have one.
+    None if either axis is too steep for a heading.
     """
     ax, ay = level_axis(a)
     bx, by = level_axis(b)
@@ -136,6 +137,7 @@ def axis_heading_one(a: Quaternion, b: Quaternion) -> float | None:
 
 
 def level_axis(q: Quaternion) -> tuple[float, float]:
+    """Return the horizontal components of the flexion axis (x) of a segment."""
     w, x, y, z = q
     return 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
 

@@ -1,7 +1,7 @@
-"""Several orientations of one segment as one: weights from training, and the weighted mean.
+"""Weighted mean of several orientations of one segment.
 
-Law: the mean is the eigenvector mean, blind to signs and equivariant under any turn of the world.
-By itself it helps little where sensors ride the same tissue; it is what the corrections start from.
+The mean is the eigenvector mean of Markley et al. 2007. It does not depend on quaternion signs and
+is equivariant to any rotation of the world.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 
 def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
-    """Return the weighted mean orientation frame by frame, shape (n, 4).
+    """Return the weighted mean orientation of every frame, shape (n, 4).
 
     Parameters
     ----------
     sensors : sequence of ndarray, shape (n, 4)
-        One array a sensor.
+        One array for each sensor.
     weights : sequence of float
-        One a sensor, positive.
+        Positive weight of each sensor.
     """
     if len(sensors) == 1:
         return rotation.normalize(sensors[0])
@@ -46,6 +46,8 @@ def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
         stacked = np.stack([q[finite] for q in sensors], axis=1)
         mean[finite] = rotation.average(stacked, np.broadcast_to(weights, stacked.shape[:2]))
         return mean
+
+    # Two sensors: the closed form of `fuse_one`, for all frames.
     first, second = sensors
     w1, w2 = weights
     d = np.sum(first * second, axis=1)
@@ -58,20 +60,21 @@ def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
 
 
 def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quaternion:
-    r"""Return the weighted mean of one frame; two sensors in closed form.
+    r"""Return the weighted mean of one frame; closed form for two sensors.
 
     .. math:: q = \sqrt{\tfrac{\omega_1(\omega_1 - \omega_2 + z)}{z(\omega_1 + \omega_2 + z)}} q_1
               + \mathrm{sign}(d) \sqrt{\tfrac{\omega_2(\omega_2 - \omega_1 + z)}
               {z(\omega_1 + \omega_2 + z)}} q_2,
               \quad z = \sqrt{(\omega_1 - \omega_2)^2 + 4 \omega_1 \omega_2 d^2}
 
-    with d the product of the two quaternions; the eigenvector of Markley et al. 2007, eq. 19.
-    More sensors take the eigenvector itself.
+    with d the scalar product of the two quaternions (Markley et al. 2007, eq. 19). For more sensors
+    the eigenvector is computed.
     """
     if len(sensors) == 1:
         return normalize_one(sensors[0])
     if len(sensors) > 2:
         return as_quaternion(rotation.average(np.array(sensors), np.array(weights)).tolist())
+
     (pw, px, py, pz), (qw, qx, qy, qz) = sensors
     w1, w2 = weights
     d = pw * qw + px * qx + py * qy + pz * qz
@@ -79,6 +82,7 @@ def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quatern
         if d < 0.0:
             return normalize_one((pw - qw, px - qx, py - qy, pz - qz))
         return normalize_one((pw + qw, px + qx, py + qy, pz + qz))
+
     z = max(sqrt((w1 - w2) ** 2 + 4.0 * w1 * w2 * d * d), 1e-300)
     share = z * (w1 + w2 + z)
     a = sqrt(w1 * max(w1 - w2 + z, 0.0) / share)
@@ -88,4 +92,5 @@ def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quatern
 
 @cache
 def equal_weights(count: int) -> tuple[float, ...]:
+    """Return equal weights with sum 1."""
     return (1.0 / count,) * count

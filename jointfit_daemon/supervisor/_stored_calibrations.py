@@ -6,7 +6,7 @@ import dataclasses
 import datetime
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.calibration.record import CalibrationStore, CalibrationUnreadable
+from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
 from jointfit_daemon.supervisor.state_directory import state_directory
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def stored(rig: Rig) -> Found:
     """Return the newest calibration that belongs to the rig's limb; never raises for a bad file."""
     try:
         latest = store_of(rig).latest()
-    except (CalibrationUnreadable, OSError) as error:
+    except (CalibrationFileError, OSError) as error:
         return Found(None, None, (f"no stored calibration can be read: {error}",))
     if latest is None:
         return Found(None, None, ())

@@ -87,7 +87,7 @@ def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
     """
     for code, module, name in (
         (EXIT_MISUSE, "jointfit_daemon.config", "ConfigError"),
-        (EXIT_MISUSE, "jointfit_daemon.calibration._errors", "CalibrationRefused"),
+        (EXIT_MISUSE, "jointfit_daemon.calibration._errors", "CalibrationError"),
         (EXIT_MISUSE, "jointfit_daemon.files.mocap._c3d", "MissingPackageError"),
         (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlottingUnavailableError"),
         (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriverError"),

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from jointfit_daemon.calibration import Fresh
+from jointfit_daemon.calibration import OnlineFrames
 from jointfit_daemon.calibration.soft_tissue import LimbTraining, fit_models, pack
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
@@ -61,13 +61,13 @@ def _owners(chain: Chain) -> dict[str, str]:
     }
 
 
-def fresh(training: LimbTraining) -> Fresh:
+def fresh(training: LimbTraining) -> OnlineFrames:
     """Return what sensors and cameras say of a movement: each segment's markers at a place."""
     markers = {
         name: rotation.rotate(q[:, None], np.array(TEMPLATE)) + np.array([0.1, 0.2, 1.0])
         for name, q in training.reference.items()
     }
-    return Fresh(training.sensors, markers, {})
+    return OnlineFrames(training.sensors, markers, {})
 
 
 @cache

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.fusion._cluster_point import ClusterPoint
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import MAX_FIT_RMS_M, Cluster, rigid_fit
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MarkerCluster, rigid_fit
 from jointfit_daemon.model import MocapFrame, MocapLayout
 
 NAMES = ("a", "b", "c", "d", "e")
@@ -18,10 +18,10 @@ LAYOUT = MocapLayout(("x", *reversed(NAMES)), ("other", "Pelvis"))
 POINT = np.array([0.3, -0.1, 0.9])
 
 
-def cluster(template: np.ndarray, body: str | None = None) -> Cluster:
+def cluster(template: np.ndarray, body: str | None = None) -> MarkerCluster:
     origin = np.array([0.2, 0.1, 1.0])
     q = rotation.exp(np.array([0.3, 0.2, -0.4]))
-    return Cluster("pelvis", () if body else NAMES, body, template, origin, q)
+    return MarkerCluster("pelvis", () if body else NAMES, body, template, origin, q)
 
 
 def seen(positions: np.ndarray) -> MocapFrame:

@@ -16,7 +16,7 @@ from jointfit_daemon.fusion._forward_kinematics import (
     joint_positions,
 )
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser, mean_one
-from jointfit_daemon.limb_model import MeanModel, SegmentCalibration, alive_key
+from jointfit_daemon.limb_model import MeanModel, SegmentCalibration, model_key
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
@@ -88,7 +88,7 @@ def test_left_limb_mirrors_the_right_and_gimbal_lock_is_flagged() -> None:
 
 
 def test_exchange_of_all_sensors_fades_over_250_ms() -> None:
-    models = {alive_key((s,), None): MeanModel((1.0,), 0.05) for s in ("A", "B")}
+    models = {model_key((s,), None): MeanModel((1.0,), 0.05) for s in ("A", "B")}
     fuser = SegmentFuser("thigh", ("A", "B"), SegmentCalibration(REST, None, None, models))
     assert fuser.fuse(0, {"A": REST}, ()).q == REST
     for after_ms, degrees in ((10, 0.0), (135, 5.0), (210, 8.0), (260, 10.0), (900, 10.0)):

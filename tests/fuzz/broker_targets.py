@@ -18,7 +18,7 @@ import orjson
 from jointfit_daemon.calibration import CalibrationTrial, SensorTrack
 from jointfit_daemon.calibration.phases import fit_static
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
-from jointfit_daemon.calibration.record import CalibrationStore, CalibrationUnreadable
+from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
 from jointfit_daemon.config import MqttSettings, load_rig, parse_rig
 from jointfit_daemon.config._fault_messages import ConfigError
 from jointfit_daemon.model import Chunk
@@ -240,12 +240,12 @@ def seeds_event_log() -> list[bytes]:
 TARGETS = (
     Target("mqtt-request", run_request, seeds_request, share=3),
     Target("rig-toml", run_rig, seeds_rig, (ConfigError,), share=0.1),
-    Target("calibration-file", run_calibration, seeds_calibration, (CalibrationUnreadable,), 0.4),
+    Target("calibration-file", run_calibration, seeds_calibration, (CalibrationFileError,), 0.4),
     Target(
         "calibration-content",
         run_calibration_content,
         lambda: [bytes(8)],
-        (CalibrationUnreadable,),
+        (CalibrationFileError,),
         0.4,
         32,
     ),

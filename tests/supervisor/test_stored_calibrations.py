@@ -55,7 +55,7 @@ def test_a_damaged_store_is_told_and_survived(rig: Rig, tmp_path: Path) -> None:
     found = _stored_calibrations.stored(rig)
     assert found.calibration is None
     assert "cannot be used" in found.complaints[0]
-    assert "set aside as 0001.json.bad" in found.complaints[0]
+    assert "renamed to 0001.json.bad" in found.complaints[0]
 
 
 async def test_a_worker_dies_with_its_parent(tmp_path: Path) -> None:

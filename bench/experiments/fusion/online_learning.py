@@ -18,9 +18,9 @@ from bench.framework.experiment import Experiment, Figure
 from bench.subjects.faulty_wearer import Worn, play
 from bench.subjects.simulated_wearer import NS, bench_rig
 from jointfit_daemon.calibration import (
-    CalibrationRefused,
+    CalibrationError,
     CalibrationTrial,
-    Fresh,
+    OnlineFrames,
     OpticalTrack,
     SensorTrack,
 )
@@ -28,7 +28,7 @@ from jointfit_daemon.calibration.phases import (
     fit_calibration,
     fit_plate_alignment,
     fit_static,
-    learn,
+    refit_models,
     with_new_static,
 )
 from jointfit_daemon.calibration.registration import sensor_at
@@ -133,11 +133,11 @@ def calibrated(seed: int) -> Calibration | None:
         return fit_calibration(
             one.trial(26.0, 33.0), one.trial(33.0, LEARN_S), alignment, settings, rig.chain
         )
-    except CalibrationRefused:
+    except CalibrationError:
         return None
 
 
-def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -> Fresh:
+def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -> OnlineFrames:
     """Return what the daemon keeps of a while in view of the cameras."""
     trial = one.trial(begin_s, end_s)
     optical = trial.optical
@@ -156,7 +156,7 @@ def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -
         turned = rotation.multiply(np.array(item.q_optical_world), raw)
         sensors[name] = rotation.multiply(turned, np.array(item.q_sensor_segment))
         whole &= np.isfinite(sensors[name]).all(axis=1)
-    return Fresh(
+    return OnlineFrames(
         {name: q[whole] for name, q in sensors.items()},
         {name: x[whole] for name, x in markers.items()},
         {},
@@ -169,7 +169,7 @@ def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
     for k in range(ROUNDS):
         begin_s = LEARN_S + k * ROUND_S
         new = fresh(person(seed), calibration, begin_s, begin_s + ROUND_S)
-        result = learn(calibration, new, bench_rig().chain)
+        result = refit_models(calibration, new, bench_rig().chain)
         if "calibration" in result:
             calibration, taken = Calibration.from_dict(result["calibration"]), taken + 1
     return calibration, taken
@@ -230,17 +230,17 @@ def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
 # --- cameras that are wrong -------------------------------------------------------------------
 
 
-def _swapped(new: Fresh) -> Fresh:
+def _swapped(new: OnlineFrames) -> OnlineFrames:
     return replace(new, markers={"thigh": new.markers["shank"], "shank": new.markers["thigh"]})
 
 
-def _two_names(new: Fresh) -> Fresh:
+def _two_names(new: OnlineFrames) -> OnlineFrames:
     x = new.markers["thigh"].copy()
     x[:, [0, 1]] = x[:, [1, 0]]
     return replace(new, markers={**new.markers, "thigh": x})
 
 
-def _moved(new: Fresh) -> Fresh:
+def _moved(new: OnlineFrames) -> OnlineFrames:
     """Turn the whole cluster on the thigh by 12°: it fits as well as ever."""
     x = new.markers["thigh"]
     middle = x.mean(axis=1, keepdims=True)
@@ -254,11 +254,11 @@ def _moved(new: Fresh) -> Fresh:
     )
 
 
-def _late(new: Fresh) -> Fresh:
+def _late(new: OnlineFrames) -> OnlineFrames:
     return replace(new, markers={name: np.roll(x, 4, axis=0) for name, x in new.markers.items()})
 
 
-SPOILERS: dict[str, Callable[[Fresh], Fresh]] = {
+SPOILERS: dict[str, Callable[[OnlineFrames], OnlineFrames]] = {
     "thigh and shank swapped": _swapped,
     "two markers of a segment swapped": _two_names,
     "a cluster turned on its segment by 12 deg": _moved,
@@ -277,8 +277,10 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
         person.cache_clear()
         for name, spoil in SPOILERS.items():
             try:
-                taken[name] += "calibration" in learn(calibration, spoil(new), bench_rig().chain)
-            except CalibrationRefused:
+                taken[name] += "calibration" in refit_models(
+                    calibration, spoil(new), bench_rig().chain
+                )
+            except CalibrationError:
                 continue
     return [Figure(f"taken: {name}", float(n), 0.0, unit="") for name, n in taken.items()]
 
@@ -300,7 +302,7 @@ def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
         rig = bench_rig()
         try:
             pose = fit_static(again.trial(STAND_S + 2.0, JUDGE_S), rig.calibration, rig.chain)
-        except CalibrationRefused:
+        except CalibrationError:
             rows["as worn"].pop()
             continue
         new = with_new_static(calibration, pose)

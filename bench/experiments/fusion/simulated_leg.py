@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Figure
 from bench.subjects.simulated_wearer import bench_rig, phases
-from jointfit_daemon.calibration import CalibrationRefused, CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration import CalibrationError, CalibrationTrial, SensorTrack
 from jointfit_daemon.calibration.phases import (
     StaticPose,
     fit_calibration,
@@ -183,7 +183,7 @@ def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
     )
     try:
         return fit_static(asked, rig.calibration, rig.chain)
-    except CalibrationRefused as refusal:
+    except CalibrationError as refusal:
         print(f"SIM: {refusal}", file=sys.stderr)
         return None
 

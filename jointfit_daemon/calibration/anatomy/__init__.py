@@ -3,7 +3,7 @@
 from jointfit_daemon.calibration.anatomy._joint_center import (
     MIN_DIRECTION_RAD,
     UNSEEN_SD_M,
-    CenterOfRotation,
+    JointCenterFit,
 )
 from jointfit_daemon.calibration.anatomy._marker_clusters import (
     ClusterTrack,
@@ -17,28 +17,28 @@ from jointfit_daemon.calibration.anatomy._marker_clusters import (
 from jointfit_daemon.calibration.anatomy._segment_frames import (
     SKIN_SD_M,
     Anatomy,
-    JointFound,
+    JointCenter,
     find_anatomy,
     on_skin,
-    settle_unseen,
+    place_unobserved,
 )
-from jointfit_daemon.calibration.anatomy._standing_prior import stand_straight
+from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
 
 __all__ = [
     "MIN_DIRECTION_RAD",
     "SKIN_SD_M",
     "UNSEEN_SD_M",
     "Anatomy",
-    "CenterOfRotation",
     "ClusterTrack",
-    "JointFound",
+    "JointCenter",
+    "JointCenterFit",
+    "apply_standing_prior",
     "columns",
     "find_anatomy",
     "marked_parts",
     "moving_template",
     "on_skin",
-    "settle_unseen",
-    "stand_straight",
+    "place_unobserved",
     "static_cluster",
     "track_cluster",
     "track_clusters",

@@ -1,7 +1,7 @@
-"""Centers of rotation from the markers of one body part seen by its neighbour.
+"""Joint centers from the markers of one body part relative to its neighbor.
 
-Law: points in, one center with its covariance out; which directions the movement showed and which
-it did not is part of the answer. A hinge shows its axis and nothing along it.
+A fit has one center with a covariance, and the directions that the movement did not excite: a hinge
+does not determine the position of the center along its axis.
 """
 
 from __future__ import annotations
@@ -28,73 +28,80 @@ if TYPE_CHECKING:
 
 
 MIN_FRAMES = 50
+"""Smallest number of frames with visible markers."""
 MAX_FRAMES = 2000
+"""Frames used at most; longer recordings are decimated."""
 MIN_DIRECTION_RAD = radians(3.0)
-"""RMS change of the markers' directions below which a direction of the center is not observed."""
+"""RMS change of marker directions below which a direction of the center is unobserved, rad."""
 UNSEEN_SD_M = 0.03
-"""Standard deviation given to the center along a direction that the movement did not show."""
+"""Standard deviation of the center along an unobserved direction, m."""
 MAX_SD_M = 0.04
 """Standard deviation, in a direction that was observed, above which a center is refused."""
 LIMITS = SphereLimits(min_arc=radians(10.0), reach=(0.02, 1.0))
 ON_SKIN = SphereOptions(
     smallest_scale=1e-4, hold=0.003, min_direction=MIN_DIRECTION_RAD, keep_one=True
 )
+"""Options of the sphere fit for skin markers."""
 _STEEP = 0.5  # smallest horizontal part of an unobserved direction to slide along
 
 
 @dataclass(frozen=True, slots=True)
-class CenterOfRotation:
-    """A point at rest in one body part and in its neighbour, as far as the movement shows it."""
+class JointCenterFit:
+    """The point that is fixed in a body part and in its neighbor, with its uncertainty."""
 
     center: Array
-    """m, shape (3,), in the coordinates of the points given."""
+    """m, shape (3,), in the coordinates of the points."""
     covariance: Array
-    """m², shape (3, 3); already widened for residuals that persist from frame to frame."""
+    """m², shape (3, 3), increased for residuals that are correlated in time."""
     residual_rms: float
-    """RMS of the markers' distances to the center about their means, m."""
+    """RMS deviation of the marker distances from their means, m."""
     frames: int
     arc: float
-    """Angle that the markers went through about the center, rad (4 times the RMS direction)."""
+    """Range of the marker directions about the center, rad (4 times the RMS)."""
     unseen: Array
-    """Unit directions in which nothing was observed, shape (0..2, 3)."""
+    """Unobserved unit directions, shape (0..2, 3)."""
     leverage: Array
-    """Covariance of the center for every m² of radial skin motion that goes with posture, shape
-    (3, 3): such motion repeats, so no number of frames averages it away."""
+    """Covariance of the center per m² of radial soft-tissue artefact, shape (3, 3). The artefact
+    repeats with posture, so more frames do not reduce it."""
     refused: str | None = None
-    """Why the center must not be used; None if it may."""
+    """Reason for the rejection of the center; None if it is accepted."""
 
 
-def fit_center(points: Array, start: Array) -> CenterOfRotation:
-    r"""Fit the point that each marker keeps its own distance from.
+def fit_center(points: Array, start: Array) -> JointCenterFit:
+    r"""Fit the point at a constant distance from each marker.
 
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    The geometric fit of `center.sphere`, set for skin: directions in which the markers turned less
-    than `MIN_DIRECTION_RAD` are left at `start`, where skin would rule, with `UNSEEN_SD_M`.
+    This is the geometric sphere fit with options for skin markers: directions in which the markers
+    rotated by less than `MIN_DIRECTION_RAD` would be dominated by the soft-tissue artefact. They
+    are left at `start` with the standard deviation `UNSEEN_SD_M`.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
-        Markers of the child in the parent's coordinates, m; NaN where not seen.
+        Markers of the distal part in coordinates of the proximal part, m; NaN if not visible.
     start : ndarray, shape (3,)
-        Where to begin and where to stay in unobserved directions, m.
+        Initial center, and its value in unobserved directions, m.
 
     Returns
     -------
-    CenterOfRotation
-        With `refused` set where there are too few frames, no arc, or an absurd radius.
+    JointCenterFit
+        With `refused` set if there are too few frames, no arc, or an implausible radius.
     """
     points = _thin(points)
     seen = visible(points)
     frames = int(np.count_nonzero(seen.any(axis=1)))
     if frames < MIN_FRAMES:
         return _refused(start, frames, f"{frames} usable frames, at least {MIN_FRAMES} are needed")
+
     options = replace(ON_SKIN, start=np.asarray(start, dtype=np.float64))
     fit = solve_sphere(points, options)
     found = judge_sphere(fit, "sphere", frames, LIMITS, options)
+
+    # Covariance of the center per variance of the radial residuals.
     lever = fit.basis @ np.linalg.pinv(fit.information / max(float(fit.weights.sum()), 1e-12))
-    return CenterOfRotation(
+    return JointCenterFit(
         fit.center,
         found.covariance + UNSEEN_SD_M**2 * fit.unseen.T @ fit.unseen,
         found.residual,
@@ -121,25 +128,25 @@ def _objection(found: CenterEstimate, shown: Array) -> str | None:
     return None
 
 
-def _refused(start: Array, frames: int, reason: str) -> CenterOfRotation:
+def _refused(start: Array, frames: int, reason: str) -> JointCenterFit:
     wide = np.eye(3)
     none = np.zeros((0, 3))
     at = np.asarray(start, float)
-    return CenterOfRotation(at, wide, np.inf, frames, 0.0, none, np.zeros((3, 3)), reason)
+    return JointCenterFit(at, wide, np.inf, frames, 0.0, none, np.zeros((3, 3)), reason)
 
 
-def slide_under(found: CenterOfRotation, above: Array | None) -> CenterOfRotation:
-    """Move a center along its unobserved directions to come straight over or under a point.
+def align_vertically(found: JointCenterFit, above: Array | None) -> JointCenterFit:
+    """Move a center along its unobserved directions above or below a point.
 
-    A hinge does not show where along its axis the joint is. Nearly vertical directions stay as they
-    are: nothing above or below says how high a joint is.
+    A hinge does not determine the position along its axis. Nearly vertical directions are
+    unchanged: the horizontal position of a neighbor does not determine a height.
 
     Parameters
     ----------
-    found : CenterOfRotation
-        In coordinates whose z is vertical.
+    found : JointCenterFit
+        In coordinates with vertical z.
     above : ndarray, shape (2,), or None
-        Horizontal place to come to, m; None: the center stays where its fit left it.
+        Horizontal target position, m; None leaves the center unchanged.
     """
     if len(found.unseen) == 0 or above is None:
         return found
@@ -153,17 +160,17 @@ def _pinv(A: Array) -> Array:
     return np.asarray(Vt.T @ (inverse[:, None] * U.T))
 
 
-def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> CenterOfRotation:
+def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> JointCenterFit:
     """Fit the center between two body parts, in static-world coordinates, m (shape (3,)).
 
-    The child's markers are taken to the parent's static-world coordinates first (C1), where the
-    center stands still.
+    The markers of the distal part are first transformed to static-world coordinates of the proximal
+    part, in which the center is fixed.
     """
     return fit_center(parent.to_static(child.points), start)
 
 
-def carried_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:
-    """Return how far apart the two body parts carry one center, RMS, m: a figure of quality."""
+def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:
+    """Return the RMS distance between the centers carried by the two body parts, m."""
     gap = np.linalg.norm(parent.carry(center) - child.carry(center), axis=-1)
     gap = gap[np.isfinite(gap)]
     return float(np.sqrt((gap**2).mean())) if gap.size else float("inf")

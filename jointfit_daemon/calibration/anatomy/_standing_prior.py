@@ -1,8 +1,8 @@
-"""Joint centers of a limb that was told to stand straight: the movement and the pose together.
+"""Prior that a subject stands upright in the static pose, combined with joint centers.
 
-Law: linear and Gaussian. A center found through skin over a short arc is uncertain by centimeters
-across the limb (the ankle above all), while a wearer who was told to stand straight does so within
-degrees. Neither is thrown away: each counts by its own variance.
+A center from skin markers over a short arc has an uncertainty of centimeters across the limb, the
+ankle most of all. A subject who was asked to stand upright does so within a few degrees. Both are
+combined by their covariances; the model is linear and Gaussian.
 """
 
 from __future__ import annotations
@@ -20,36 +20,37 @@ if TYPE_CHECKING:
 
 
 STANDING_SD_RAD = radians(2.0)
-"""How far from plumb a segment is when its wearer stands straight, per axis: an operator looks."""
+"""Standard deviation of the tilt of a segment in the static pose, rad per axis, with an operator
+present."""
 
 
-def stand_straight(
+def apply_standing_prior(
     centers: Sequence[Array | None],
     covariances: Sequence[Array | None],
     sd: float = STANDING_SD_RAD,
 ) -> list[tuple[Array, Array] | None]:
-    r"""Pull neighbouring joint centers towards one plumb line, as far as they are uncertain.
+    r"""Combine joint centers with the prior that neighbors are vertically above each other.
 
-    For every two neighbours, a distance L apart, the horizontal part of their difference is
-    measured to be zero with standard deviation L sd,
+    The horizontal part of the difference of two neighbors at distance L is measured as zero with
+    standard deviation L sd,
 
     .. math:: 0 = S (c_i - c_{i+1}) + e, \qquad e \sim N(0, (L\,sd)^2 I_2),
 
-    and one Kalman update of all centers at once gives the mean and the covariance.
+    and one Kalman update of all centers gives the mean and the covariance.
 
     Parameters
     ----------
     centers : sequence of (ndarray, shape (3,)) or None
-        Joint centers in the static world (z up), m, from proximal to distal; None: unknown.
+        Joint centers in the static world (z up), m, from proximal to distal; None if unknown.
     covariances : sequence of (ndarray, shape (3, 3)) or None
-        m², skin motion included.
+        m², including the soft-tissue artefact.
     sd : float
-        Standard deviation of a segment's tilt in the static pose, rad.
+        Standard deviation of the tilt of a segment in the static pose, rad.
 
     Returns
     -------
     list of (center, covariance) or None
-        In the order given; a center without known neighbours is returned as it was.
+        In the given order; a center without known neighbors is unchanged.
     """
     known = [i for i, center in enumerate(centers) if center is not None]
     at = {joint: 3 * k for k, joint in enumerate(known)}
@@ -57,9 +58,11 @@ def stand_straight(
     P = np.zeros((len(x), len(x)))
     for i in known:
         P[at[i] : at[i] + 3, at[i] : at[i] + 3] = covariances[i]
+
     for i, j in pairwise(range(len(centers))):
         if i in at and j in at:
             x, P = _plumb(x, P, at[i], at[j], sd)
+
     out: list[tuple[Array, Array] | None] = [None] * len(centers)
     for i in known:
         part = slice(at[i], at[i] + 3)
@@ -72,6 +75,8 @@ def _plumb(x: Array, P: Array, i: int, j: int, sd: float) -> tuple[Array, Array]
     H = np.zeros((2, len(x)))
     H[:, i : i + 2] = np.eye(2)
     H[:, j : j + 2] = -np.eye(2)
+
+    # Kalman update with the measurement 0 = H x.
     S = H @ P @ H.T + (length * sd) ** 2 * np.eye(2)
     K = np.linalg.solve(S, H @ P).T
     Q = P - K @ H @ P

@@ -2,8 +2,8 @@
 
 from jointfit_daemon.calibration.guidance._movement_guide import (
     MovementGuide,
-    MovementLook,
-    first_of,
+    MovementStatus,
+    most_urgent,
 )
 
-__all__ = ["MovementGuide", "MovementLook", "first_of"]
+__all__ = ["MovementGuide", "MovementStatus", "most_urgent"]

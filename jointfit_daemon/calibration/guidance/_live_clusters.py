@@ -1,7 +1,7 @@
-"""Where the body parts are, one camera frame at a time: all of them in one small rigid fit.
+"""Poses of all body parts, one camera frame at a time, in one small batched rigid fit.
 
-Law: a frame costs the same whether it is the first or the millionth. A part whose markers do not
-fit the static pose is not seen in that frame, and what was wrong is counted under its name.
+Every frame costs the same. A part whose markers do not fit the static pose has no pose in that
+frame, and the most deviating marker is counted.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.limb_model import MarkerCluster
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
 Mask = NDArray[np.bool_]
 
 _PATTERNS = 4096
-"""Ways of being hidden that are remembered; a bound, not a need."""
+"""Largest number of visibility patterns in the cache."""
 
 
-class PartFigures(NamedTuple):
-    """How well one body part was seen so far."""
+class ClusterVisibility(NamedTuple):
+    """Visibility of one body part."""
 
     seen: float
-    """Share of the frames in which it had a pose."""
+    """Share of the frames with a pose."""
     misfits: float
-    """Share of the frames in which its markers were seen, but not where they belong."""
+    """Share of the frames in which visible markers did not fit the static pose."""
     suspect: str | None
-    """The marker that was out of place most often in those."""
+    """Marker that deviated most often in those frames."""
     absent: tuple[str, ...]
-    """Markers (or the body) that no frame so far has had by that name."""
+    """Markers (or the rigid body) that the stream does not name."""
 
 
-class LiveParts:
-    """Poses of body parts against the static pose, frame by frame.
+class LiveClusters:
+    """Poses of body parts relative to the static pose, frame by frame.
 
     Parameters
     ----------
-    clusters : mapping of str to Cluster
-        The body parts as they stood, by name. A rigid body counts with its four virtual points.
+    clusters : mapping of str to MarkerCluster
+        Body parts in the static pose, by name. A rigid body has four virtual points.
     """
 
-    def __init__(self, clusters: Mapping[str, Cluster]) -> None:
+    def __init__(self, clusters: Mapping[str, MarkerCluster]) -> None:
         self.names = tuple(clusters)
         self._clusters = tuple(clusters.values())
         sizes = [len(cluster.template) for cluster in self._clusters]
@@ -73,46 +73,51 @@ class LiveParts:
         self._missing = ~self._wanted
         self._body_columns: dict[int, int] = {}
         self.points = np.full((*shape, 3), np.nan)
-        """Markers as seen in the last frame, optical world, m, shape (parts, k, 3); NaN where not,
-        and where a part's markers do not fit it."""
+        """Markers in the last frame, optical world, m, shape (parts, k, 3); NaN if not visible, or
+        if the markers of the part do not fit it."""
         self.R = np.tile(np.eye(3), (shape[0], 1, 1))
-        """R_now_static of the last frame, shape (parts, 3, 3); true only where `placed`."""
+        """R_now_static of the last frame, shape (parts, 3, 3); valid only where `placed`."""
         self.p = np.zeros((shape[0], 3))
-        """Where each origin was, m, shape (parts, 3)."""
+        """Position of each origin, m, shape (parts, 3)."""
         self.placed = np.zeros(shape[0], dtype=np.bool_)
-        """Which parts have a pose in the last frame, shape (parts,)."""
+        """Parts with a pose in the last frame, shape (parts,)."""
 
     def feed(self, frame: MocapFrame) -> None:
-        r"""Place every body part in one frame.
+        r"""Fit the pose of every body part in one frame.
 
         .. math:: \min_{R,t} \sum_k |R a_k + t - y_k|^2
 
-        over the markers seen (Kabsch 1976), all parts at once.
+        over the visible markers (Kabsch 1976), for all parts at once.
         """
         if frame.layout is not self._layout and frame.layout != self._layout:
             self._read(frame.layout)
         self._frames += 1
+
+        # Marker positions in the order of the templates.
         y = np.full_like(self.points, np.nan)
         if len(frame.markers):
             y = frame.markers[self._columns]
         y[self._missing] = np.nan
         for i in self._bodies:
             y[i, : self.sizes[i]] = self._virtual(i, frame)
+
         seen: Mask = np.asarray(np.isfinite(y).all(axis=2))
         ok = self._enough(seen)
         self.points = y
         gap = self._fit(np.where(seen[..., None], y, 0.0), np.asarray(seen, dtype=np.float64))
+
+        # Parts with a large residual have no pose; the most deviating marker is counted.
         count = np.maximum(seen.sum(axis=1), 1)
         wrong = ok & (gap.sum(axis=1) / count > MAX_FIT_RMS_M**2)
         self.placed = ok & ~wrong
         self._good += self.placed
         for i in np.flatnonzero(wrong).tolist():
             self._bad[i] += 1
-            self._blamed[i, _out_of_place(self._template[i], y[i], seen[i])] += 1
+            self._blamed[i, _most_deviating(self._template[i], y[i], seen[i])] += 1
             y[i] = np.nan
 
     def _read(self, layout: MocapLayout) -> None:
-        """Find the columns of a new layout; what it lacks is not seen."""
+        """Find the columns of a new layout; missing names are not visible."""
         self._layout = layout
         markers = {name: i for i, name in enumerate(layout.markers)}
         bodies = {name: i for i, name in enumerate(layout.bodies)}
@@ -128,7 +133,7 @@ class LiveParts:
                     self._known[i, k] = True
 
     def _virtual(self, i: int, frame: MocapFrame) -> Array:
-        """Return where the virtual points of a rigid body are; NaN while it is not seen."""
+        """Return the virtual points of a rigid body; NaN while it is not visible."""
         column = self._body_columns.get(i)
         if column is None:
             return np.full((self.sizes[i], 3), np.nan)
@@ -141,7 +146,7 @@ class LiveParts:
         return np.asarray(self._clusters[i].template @ R.T + frame.body_positions[column])
 
     def _enough(self, seen: Mask) -> Mask:
-        """Tell which parts show three markers or more that are not on a line."""
+        """Return the parts with at least three visible markers that are not on a line."""
         key = seen.tobytes()
         known = self._usable.get(key)
         if known is None:
@@ -158,7 +163,7 @@ class LiveParts:
         return known
 
     def _fit(self, y: Array, w: Array) -> Array:
-        """Fit all parts; return the squared gap of every marker, m², shape (parts, k)."""
+        """Fit all parts; return the squared residual of every marker, m², shape (parts, k)."""
         total = np.maximum(w.sum(axis=1), 1.0)[:, None, None]
         weight = w[:, None, :]
         a_mean, y_mean = weight @ self._template / total, weight @ y / total
@@ -172,26 +177,26 @@ class LiveParts:
         self.R, self.p = R, t[:, 0]
         return np.asarray((gap * gap).sum(axis=2) * w)
 
-    def figures(self) -> dict[str, PartFigures]:
-        """Return how well each body part was seen so far."""
+    def visibility(self) -> dict[str, ClusterVisibility]:
+        """Return the visibility of each body part since the start."""
         frames = max(self._frames, 1)
-        told = {}
+        found = {}
         for i, (name, cluster) in enumerate(zip(self.names, self._clusters, strict=True)):
             labels = cluster.markers or (cluster.body or name,) * self.sizes[i]
             worst = labels[int(self._blamed[i, : self.sizes[i]].argmax())]
             unknown = ~self._known[i] & (self._frames > 0)
             absent = tuple(dict.fromkeys(label for k, label in enumerate(labels) if unknown[k]))
-            told[name] = PartFigures(
+            found[name] = ClusterVisibility(
                 float(self._good[i]) / frames,
                 float(self._bad[i]) / frames,
                 worst if self._bad[i] else None,
                 absent,
             )
-        return told
+        return found
 
 
-def _out_of_place(template: Array, y: Array, seen: Mask) -> int:
-    """Return the marker whose distances to the others changed most: a rigid fit would share it."""
+def _most_deviating(template: Array, y: Array, seen: Mask) -> int:
+    """Return the marker whose distances to the others changed most."""
     known = np.where(seen[:, None], y, 0.0)
     now, then = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, template))
     return int((np.abs(now - then) * np.outer(seen, seen)).sum(axis=1).argmax())

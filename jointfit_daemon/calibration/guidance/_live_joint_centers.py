@@ -1,15 +1,15 @@
-r"""Joint centers while the wearer still moves: frame by frame, with the error to be expected.
+r"""Joint centers during the movement, frame by frame, with their expected errors.
 
-Law: two errors, never one for the other. *Noise* is what more frames average away: the covariance
-of the fit, widened for residuals that persist from frame to frame. *Skin* moves with posture, so no
-number of frames averages it away: only a larger arc makes it small, through the leverage
+Two errors are reported separately. *Noise* decreases with the number of frames: it is the
+covariance of the fit, increased for residuals that are correlated in time. The *soft-tissue
+artefact* depends on posture, so more frames do not reduce it. It decreases with a larger arc,
+through the leverage
 
 .. math:: \mathrm{Cov}_{skin} = \sigma_r^2 \Big[ \frac{1}{\sum_j n_j} \sum_j n_j
           \frac{\mathrm{Cov}(v_j)}{R_j^2} \Big]^{-1} + \sigma_s^2 I
 
-with :math:`v_j` marker j in the parent's coordinates at distance :math:`R_j` from the center. The
-constants and the rest of the arithmetic are those of the fit that follows, so that the prediction
-is the one the fit will make.
+with :math:`v_j` marker j in coordinates of the proximal part at distance :math:`R_j` from the
+center. Constants and arithmetic are those of the final fit, so that the prediction matches it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from jointfit_daemon.calibration.anatomy import (
     MIN_DIRECTION_RAD,
     SKIN_SD_M,
     UNSEEN_SD_M,
-    CenterOfRotation,
+    JointCenterFit,
+    apply_standing_prior,
     on_skin,
-    settle_unseen,
-    stand_straight,
+    place_unobserved,
 )
-from jointfit_daemon.calibration.guidance._live_clusters import LiveParts
+from jointfit_daemon.calibration.guidance._live_clusters import LiveClusters
 from jointfit_daemon.center_of_rotation.spatial import RunningSphere, centered
 from jointfit_daemon.limb_model import body_parts
 
@@ -38,56 +38,58 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.center_of_rotation import CenterEstimate
-    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.limb_model import MarkerCluster
     from jointfit_daemon.model import Chain, MocapFrame
 
 
 _ROUNDED_M2 = 1e-12
+"""Lower bound of squared radii, m², against division by zero."""
 _ALONG = 0.7
-"""Cosine from which a direction counts for one that the estimator has not seen."""
+"""Cosine above which a direction counts as unobserved by the estimator."""
 
 
 @dataclass(frozen=True, slots=True)
-class LiveCenter:
-    """One joint center as far as it is known by now. Nothing in it is NaN."""
+class LiveJointCenter:
+    """Current estimate of one joint center; never contains NaN."""
 
     joint: str
     center: Array | None
-    """Static world, m, shape (3,); None while there is none."""
+    """Static world, m, shape (3,); None without an estimate."""
     noise: float
-    """Standard deviation by noise, m: root of the mean variance of the directions observed; inf
-    while there are none."""
+    """Standard deviation due to noise, m: root mean variance of the observed directions; inf
+    without any."""
     noise_across: float
-    """The same without the direction known least: all that a hinge can show."""
+    """The same without the least certain direction: all that a hinge determines."""
     total: float
-    """Standard deviation per axis with skin motion and what the static pose says of unseen
-    directions, m: the figure that a calibration stores."""
+    """Standard deviation per axis, m, including soft-tissue artefact and the prior of the static
+    pose in unobserved directions: the value stored in a calibration."""
     arc: float
-    """Angle the markers went through about the center, rad."""
+    """Range of the marker directions about the center, rad."""
     conditioning: float
-    """Radius over the standard deviation along the direction known least: below 6 it is none."""
+    """Radius over the standard deviation in the least certain direction; below 6 there is no
+    center."""
     frames: int
-    """Frames that showed both body parts."""
+    """Number of frames with both body parts."""
     unseen: int
-    """Directions that the movement has not shown, 0 to 3."""
+    """Number of unobserved directions, 0 to 3."""
     refused: str | None
-    """Why there is no center yet, as the estimator has it."""
+    """Reason of the estimator for the lack of a center."""
 
 
-class LiveCenters:
-    """Centers of all joints whose two body parts carry markers, one camera frame at a time.
+class LiveJointCenters:
+    """Centers of all joints with markers on both body parts, one camera frame at a time.
 
     Parameters
     ----------
     chain : Chain
-        Joints, segments and the body parts beside them.
-    clusters : mapping of str to Cluster
-        The body parts as they stood in the static pose; parts without markers are absent.
+        Joints, segments and adjacent body parts.
+    clusters : mapping of str to MarkerCluster
+        Body parts in the static pose; parts without markers are absent.
     """
 
-    def __init__(self, chain: Chain, clusters: Mapping[str, Cluster]) -> None:
+    def __init__(self, chain: Chain, clusters: Mapping[str, MarkerCluster]) -> None:
         self._chain = chain
-        self.parts = LiveParts(clusters)
+        self.parts = LiveClusters(clusters)
         place = {name: i for i, name in enumerate(self.parts.names)}
         ends = body_parts(chain)
         pairs = [
@@ -100,18 +102,19 @@ class LiveCenters:
         self._children = np.array([below for _, _, below in pairs], dtype=np.intp)
         self._home = self.parts.origins[self._parents][:, None]
         self._sizes = [self.parts.sizes[i] for i in self._children]
+
         starts = (self.parts.origins[self._parents] + self.parts.origins[self._children]) / 2
         self._spheres = [
             RunningSphere(size, near=start) for size, start in zip(self._sizes, starts, strict=True)
         ]
         self._frames = np.zeros(len(pairs), dtype=np.int64)
-        self._told: dict[str, tuple[LiveCenter, CenterOfRotation | None]] = {
+        self._latest: dict[str, tuple[LiveJointCenter, JointCenterFit | None]] = {
             joint: (_unknown(joint, 0, 0.0, 3, "no frame yet"), None) for joint in self.joints
         }
         self._turn = -1
 
     def feed(self, frame: MocapFrame) -> None:
-        """Take one frame: every marker of a joint's lower part as its upper part sees it."""
+        """Process one frame: markers of the distal parts relative to the proximal ones."""
         parts = self.parts
         parts.feed(frame)
         if not self.joints:
@@ -126,38 +129,44 @@ class LiveCenters:
             if some[k]:
                 sphere.feed(v[k, : self._sizes[k]])
 
-    def look(self) -> dict[str, LiveCenter]:
-        """Return every center as known by now; for a few times a second, not for every frame.
+    def estimate_centers(self) -> dict[str, LiveJointCenter]:
+        """Return the current estimates; call a few times per second, not in every frame.
 
-        Estimating costs a thousand times what a frame does, so each look takes up one joint anew,
-        in turn.
+        An estimate costs a thousand times a frame, so each call updates one joint in turn.
         """
         if self.joints:
             k = self._turn = (self._turn + 1) % len(self.joints)
-            with np.errstate(all="ignore"):  # of markers that stand still little is left but zeros
+            with np.errstate(all="ignore"):  # markers at rest leave zeros
                 found = self._spheres[k].estimate()
-            self._told[self.joints[k]] = self._judged(k, found)
-        fits = {joint: fit for joint, (_, fit) in self._told.items() if fit is not None}
-        settled = settle_unseen(self._chain, fits)
+            self._latest[self.joints[k]] = self._observed_estimate(k, found)
+
+        # Unobserved directions and the standing prior need all joints together.
+        fits = {joint: fit for joint, (_, fit) in self._latest.items() if fit is not None}
+        settled = place_unobserved(self._chain, fits)
+
         order = self._chain.joints
-        straight = stand_straight(
+        straight = apply_standing_prior(
             [settled[j].center if j in settled else None for j in order],
             [on_skin(settled[j]) if j in settled else None for j in order],
         )
         placed = dict(zip(order, straight, strict=True))
-        return {joint: _placed(one, placed[joint]) for joint, (one, _) in self._told.items()}
+        return {joint: _placed(one, placed[joint]) for joint, (one, _) in self._latest.items()}
 
-    def _judged(self, k: int, fit: CenterEstimate) -> tuple[LiveCenter, CenterOfRotation | None]:
-        """Return what a fit shows on skin, where a direction that hardly turned shows nothing."""
+    def _observed_estimate(
+        self, k: int, fit: CenterEstimate
+    ) -> tuple[LiveJointCenter, JointCenterFit | None]:
+        """Return an estimate without directions in which the markers hardly rotated."""
         joint, frames = self.joints[k], int(self._frames[k])
         center = np.asarray(fit.center, dtype=np.float64)
         shown, axes, clear = np.zeros((3, 3)), np.eye(3), np.zeros(3, dtype=np.bool_)
         if len(fit.unseen) < 2 and np.isfinite(center).all():
-            shown = self._shown(k, center)
+            shown = self._direction_spread(k, center)
             spread, axes = np.linalg.eigh(shown)
             clear = np.asarray(spread >= MIN_DIRECTION_RAD**2)
             for axis in fit.unseen:
                 clear &= np.abs(axes.T @ axis) < _ALONG
+
+        # Restrict covariance and leverage to the observed directions.
         basis, unseen = axes[:, clear], 3 - int(clear.sum())
         if unseen > 1:
             reason = fit.refused or "the joint has hardly turned"
@@ -167,17 +176,18 @@ class LiveCenters:
         rest = axes[:, ~clear].T
         covariance = basis @ own @ basis.T + UNSEEN_SD_M**2 * rest.T @ rest
         variances = np.maximum(np.linalg.eigvalsh(own), 0.0)
-        one = LiveCenter(
+
+        one = LiveJointCenter(
             joint, center, sqrt(float(variances.mean())), sqrt(float(variances[:2].mean())), inf,
             _finite(fit.arc), _finite(fit.conditioning), frames, unseen, fit.refused,
         )  # fmt: skip
-        found = CenterOfRotation(
+        found = JointCenterFit(
             center, covariance, _finite(fit.residual), frames, one.arc, rest, lever, fit.refused
         )
         return one, found
 
-    def _shown(self, k: int, center: Array) -> Array:
-        """Return the mean square change of the markers' directions, rad², shape (3, 3)."""
+    def _direction_spread(self, k: int, center: Array) -> Array:
+        """Return the mean square change of the marker directions, rad², shape (3, 3)."""
         sums = centered(self._spheres[k].sums())
         n = sums.weights
         spread = (
@@ -192,12 +202,12 @@ def _finite(value: float) -> float:
     return float(value) if np.isfinite(value) else 0.0
 
 
-def _unknown(joint: str, frames: int, arc: float, unseen: int, reason: str) -> LiveCenter:
-    return LiveCenter(joint, None, inf, inf, inf, arc, 0.0, frames, unseen, reason)
+def _unknown(joint: str, frames: int, arc: float, unseen: int, reason: str) -> LiveJointCenter:
+    return LiveJointCenter(joint, None, inf, inf, inf, arc, 0.0, frames, unseen, reason)
 
 
-def _placed(one: LiveCenter, pair: tuple[Array, Array] | None) -> LiveCenter:
-    """Return a center with what the others and the static pose say of it."""
+def _placed(one: LiveJointCenter, pair: tuple[Array, Array] | None) -> LiveJointCenter:
+    """Return an estimate with the position and covariance from all joints together."""
     if pair is None:
         return one
     total = sqrt(max(float(np.trace(pair[1])), 0.0) / 3.0 + SKIN_SD_M**2)

@@ -1,6 +1,6 @@
-"""How much a functional movement has shown to the inertial sensors, while it goes on.
+"""Arc and flexion count of each joint from the inertial sensors during a functional movement.
 
-Law: a guide for the wearer, cheap enough to run a few times a second; the fit judges for itself.
+This is guidance for the subject, computed a few times per second; the fit checks its data itself.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion
 
 SKIN_NOISE_M = 0.005
-"""Soft-tissue motion of a skin marker, m RMS: what limits a functional joint centre."""
+"""RMS soft-tissue artefact of a skin marker, m: the limit of a functional joint center."""
 
 CORRELATION_S = 0.5
-"""Skin motion keeps its value about this long, so a second is worth two samples."""
+"""Correlation time of the soft-tissue artefact, s: one second has two independent samples."""
 
-BENT_RAD, STRAIGHT_RAD = math.radians(30.0), math.radians(15.0)
-"""A joint bent when it turned further than the first from where it was in the static pose, and came
-back when it is nearer than the second: what one step or one squat does to a knee."""
+BENT_RAD = math.radians(30.0)
+"""Rotation from the static pose below which a joint is extended again, rad."""
+STRAIGHT_RAD = math.radians(15.0)
+"""Rotation from the static pose below which a joint is extended again, rad."""
 
 
-class _Reach:
-    """How far one orientation went about its first value, and how often."""
+class _RotationRange:
+    """Range of one orientation relative to its first value, and the number of flexions."""
 
     def __init__(self, first: np.ndarray) -> None:
         self._first = first
@@ -54,23 +55,22 @@ class _Reach:
 
 @dataclass(slots=True)
 class MovementProgress:
-    """Arc and bends of each inner joint, by the sensors on either side of it.
+    """Arc and flexion count of each inner joint, from the sensors on either side of it.
 
-    Where no marker shows the joint center, the arc also predicts its error: the Cramér-Rao bound of
-    a circle of unknown radius seen over an arc φ, ``26.8 σ / (√n φ²)`` capped at the full-circle
-    value (bounds of a uniform arc), with n the number of independent looks at the skin, not of
-    frames.
+    For joints without markers, the arc predicts the error of the center by the Cramér-Rao bound of
+    a circle of unknown radius over an arc φ, ``26.8 σ / (√n φ²)``, at least the full-circle value.
+    n is the number of independent samples of the soft-tissue artefact, not of frames.
     """
 
     chain: Chain
     standing: Mapping[str, Quaternion] = field(default_factory=dict)
-    """Orientation of each sensor in the static pose, from which bends are counted; of one that is
-    not in it, the first that is looked at."""
-    _seen: dict[tuple[str, str, str], _Reach] = field(default_factory=dict)
-    """By joint and the two sensors looked at: each pair has a mount, so a zero, of its own."""
+    """Orientation of each sensor in the static pose, the zero of flexion; for other sensors the
+    first orientation."""
+    _seen: dict[tuple[str, str, str], _RotationRange] = field(default_factory=dict)
+    """By joint and pair of sensors: each pair has its own mounts, and therefore its own zero."""
 
-    def look(self, latest: Mapping[str, Quaternion]) -> None:
-        """Take the newest orientation of each sensor that is alive."""
+    def update(self, latest: Mapping[str, Quaternion]) -> None:
+        """Process the newest orientation of each available sensor."""
         for joint, above, below in zip(
             self.chain.joints[1:-1], self.chain.sensors, self.chain.sensors[1:], strict=False
         ):
@@ -80,25 +80,25 @@ class MovementProgress:
                 reach = self._seen.get((joint, a, b))
                 if reach is None:
                     zero = self.standing if {a, b} <= self.standing.keys() else latest
-                    reach = self._seen[joint, a, b] = _Reach(_between(zero[a], zero[b]))
+                    reach = self._seen[joint, a, b] = _RotationRange(_between(zero[a], zero[b]))
                 reach.take(_between(latest[a], latest[b]))
 
     def arcs(self) -> dict[str, float]:
-        """Return the largest arc each inner joint went through so far, rad."""
+        """Return the largest arc of each inner joint so far, rad."""
         arcs: dict[str, float] = {}
         for (joint, _, _), reach in self._seen.items():
             arcs[joint] = max(arcs.get(joint, 0.0), reach.arc)
         return arcs
 
     def bends(self) -> dict[str, int]:
-        """Return how often each inner joint bent so far, whichever sensors saw it."""
+        """Return the number of flexions of each inner joint so far, over all pairs of sensors."""
         bends: dict[str, int] = {}
         for (joint, _, _), reach in self._seen.items():
             bends[joint] = bends.get(joint, 0) + reach.bends
         return bends
 
     def predicted_center_errors(self, elapsed_s: float) -> dict[str, float | None]:
-        """Return the expected RMS error of each inner joint centre, m; None while it is useless."""
+        """Return the expected RMS error of each inner joint center, m; None for a small arc."""
         looks = max(1.0, elapsed_s / CORRELATION_S)
         return {joint: _predicted(arc, looks) for joint, arc in self.arcs().items()}
 

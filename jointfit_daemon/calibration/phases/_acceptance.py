@@ -1,4 +1,4 @@
-"""Whether a new calibration may replace the one in force. Law: never silently, always a reason."""
+"""Comparison of a new calibration with the one in force; a rejection always has a reason."""
 
 from __future__ import annotations
 
@@ -12,45 +12,56 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 SLACK = 1.15
-"""Hold-out figures of two good trials differ by less than this factor."""
+"""Ratio of the hold-out errors of two equally good trials."""
 SLACK_RAD = np.deg2rad(0.3)
+"""Absolute difference of hold-out errors that is accepted, rad."""
 SLACK_M = 0.005
+"""Difference of joint-center gaps that is accepted, m."""
 
 
-class Verdict(NamedTuple):
-    """Whether the new one is at least as good, and why (or why not)."""
+class CalibrationComparison(NamedTuple):
+    """Whether the new calibration is at least as good, with the reason."""
 
     better: bool
     reason: str
 
 
-def better(new: Calibration, old: Calibration | None) -> Verdict:
-    """Judge a new calibration against the one in force.
+def compare_calibrations(new: Calibration, old: Calibration | None) -> CalibrationComparison:
+    """Compare a new calibration with the one in force.
 
-    Compared in this order, the first difference decides: the chain, whether cameras took part,
-    whether worlds were aligned, the hold-out error of each segment and of each inner joint's
-    flexion by the method in force (a factor of 1.15 and 0.3° are allowed), and how far apart the
-    body parts carry each joint center (5 mm are allowed).
+    The criteria are checked in this order, and the first difference decides: the chain, use of
+    cameras, alignment of the worlds, the hold-out error of each segment and of the flexion of each
+    inner joint (factor 1.15 plus 0.3°), and the gap between the centers carried by the two body
+    parts (5 mm).
     """
     if old is None:
-        return Verdict(True, "there was none")
+        return CalibrationComparison(True, "there was no calibration")
     if (new.joints, new.segments, new.chain_sensors) != (
         old.joints,
         old.segments,
         old.chain_sensors,
     ):
-        return Verdict(True, "the old one is of another chain or other sensors")
+        return CalibrationComparison(True, "the old one belongs to another chain or other sensors")
+
     had, has = "holdout" in old.quality, "holdout" in new.quality
     if had != has:
-        return Verdict(has, "only the new one saw cameras" if has else "the old one saw cameras")
+        return CalibrationComparison(
+            has, "only the new one used cameras" if has else "the old one used cameras"
+        )
+
     assumed = "headings_from_static"
     if (assumed in old.flags) != (assumed in new.flags):
         aligned = assumed in old.flags
-        return Verdict(
+        return CalibrationComparison(
             aligned, "its worlds are aligned" if aligned else "the old one's worlds were aligned"
         )
+
     worse = [*_worse_angles(new, old), *_worse_joints(new, old)] if has else []
-    return Verdict(False, "; ".join(worse)) if worse else Verdict(True, "no figure is worse")
+    return (
+        CalibrationComparison(False, "; ".join(worse))
+        if worse
+        else CalibrationComparison(True, "no figure is worse")
+    )
 
 
 def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
@@ -63,9 +74,9 @@ def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
             if was is None or now is None:
                 continue
             if now > SLACK * was + SLACK_RAD:
-                what = "orientation" if kind == "segments" else "flexion"
+                quantity = "orientation" if kind == "segments" else "flexion"
                 found.append(
-                    f"{name}: {what} error {np.rad2deg(now):.1f} deg, was {np.rad2deg(was):.1f}"
+                    f"{name}: {quantity} error {np.rad2deg(now):.1f} deg, was {np.rad2deg(was):.1f}"
                 )
     return found
 
@@ -83,7 +94,7 @@ def _worse_joints(new: Calibration, old: Calibration) -> list[str]:
             found.append(f"{name}: its center was fitted, now it is {now.source}")
         elif (now.gap_rms or 0.0) > (was.gap_rms or np.inf) + SLACK_M:
             found.append(
-                f"{name}: center moves by {1000 * (now.gap_rms or 0.0):.0f} mm, "
+                f"{name}: center gap {1000 * (now.gap_rms or 0.0):.0f} mm, "
                 f"was {1000 * (was.gap_rms or 0.0):.0f}"
             )
     return found

@@ -1,15 +1,16 @@
-r"""Where the markers of body parts are while moving: refined clusters from the functional phase.
+r"""Refinement of marker positions on body parts from the functional movement.
 
-Law: the static pose shows markers once, on skin that moves; a movement shows them thousands of
-times, and shows one that was knocked off since. Each part's markers are refined against the
-movement (`marker_refinement`, no joints between the parts: joint centers found through skin are a
-centimeter off and would bend the shapes). Tracking cannot see a turn of a whole part, so the
-refined shape :math:`p'` is laid back on the pose :math:`p`, robustly,
+The static pose shows markers in one state of the soft tissue; the movement shows them thousands of
+times, and reveals a displaced marker. The markers of each part are refined by `marker_refinement`
+without joints between the parts: joint centers from skin markers have errors of a centimeter and
+would distort the shapes. A rotation of a whole part is unobservable, so the refined shape
+:math:`p'` is fitted back to the pose :math:`p`,
 
 .. math:: \min_{R,t} \sum_k \rho(|R p'_k + t - p_k|)
 
-with Huber's :math:`\rho`, and a marker that moved alone does not turn its part. Learned from the
-first part of the trial, judged on the rest; a part whose error did not fall there stays as it was.
+with the Huber loss :math:`\rho`, so that a single displaced marker does not rotate its part. The
+refinement uses the first part of the trial and is evaluated on the rest. A part without a smaller
+error there is unchanged.
 """
 
 from __future__ import annotations
@@ -33,54 +34,57 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.anatomy import ClusterTrack
     from jointfit_daemon.calibration.marker_refinement import Refinement
-    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.limb_model import MarkerCluster
 
 FARTHEST_M = 0.03
-"""A marker that would move farther is another one, or is no longer on this part."""
+"""Largest plausible displacement of a marker, m; above it the label is wrong or the marker fell
+off."""
 ALONE_M = 0.004
-"""A marker farther from the others' place than this is taken to have moved alone."""
+"""Residual above which a marker was displaced individually, m."""
 _ROBUST = IkOptions(huber_m=ALONE_M, reweightings=12)
 
 
 @dataclass(frozen=True, slots=True)
 class RefinedClusters:
-    """Body parts as they are used from here on, and what refining them did."""
+    """Body parts after refinement, with quality figures."""
 
-    clusters: Mapping[str, Cluster]
+    clusters: Mapping[str, MarkerCluster]
     figures: Mapping[str, Any] | None
-    """``parts``: per part RMS before and after on the part of the trial that was not learned from,
-    and whether the refined one is used; ``moved_m`` per marker. None: nothing was refined."""
+    """``parts``: RMS residual of each part before and after on the held-out part of the trial, and
+    whether the refinement is used; ``moved_m`` of each marker. None if nothing was refined."""
     notes: tuple[str, ...] = field(default=())
 
 
 def refine_clusters(
-    clusters: Mapping[str, Cluster], tracks: Mapping[str, ClusterTrack], holdout_share: float
+    clusters: Mapping[str, MarkerCluster], tracks: Mapping[str, ClusterTrack], holdout_share: float
 ) -> RefinedClusters:
-    """Refine the markers of body parts on a movement.
+    """Refine the markers of body parts with a movement.
 
     Parameters
     ----------
     clusters
-        Parts as they stood in the static pose; rigid bodies stay as they are.
+        Body parts in the static pose; rigid bodies are unchanged.
     tracks
-        The same parts moving, markers as seen in ``points``.
+        The same parts in the movement, with markers in ``points``.
     holdout_share
-        Last share of the movement, contiguous, that judges.
+        Last, contiguous share of the movement for the evaluation.
 
     Returns
     -------
     RefinedClusters
-        The given ones, with a note that says why, where nothing could be refined.
+        The given clusters, with a note on the reason, if nothing could be refined.
     """
     marked = {name: c for name, c in clusters.items() if c.body is None and name in tracks}
     if not marked:
-        text = "markers not refined: the cameras send rigid bodies, not their single markers"
+        text = "markers not refined: the cameras send rigid bodies without single markers"
         return RefinedClusters(clusters, None, (text,))
+
     model = _model(marked)
     points = np.concatenate([tracks[name].points for name in marked], axis=1)
     t_ns = tracks[next(iter(marked))].t_ns
     moving = MotionTrial("functional", points, 1e9 / float(np.median(np.diff(t_ns))))
     learned, unseen = moving.split(holdout_share)
+
     try:
         found = refine_markers(model, [learned], validation=[unseen])
     except RefinementError as refusal:
@@ -88,8 +92,8 @@ def refine_clusters(
     return _judged(clusters, marked, model, found)
 
 
-def _model(marked: Mapping[str, Cluster]) -> ChainModel:
-    """Return the parts, each on its own, in the axes of the static world around its origin."""
+def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
+    """Return the unconnected parts, in axes of the static world about their origins."""
     return ChainModel(
         tuple(Segment(name) for name in marked),
         tuple(
@@ -102,12 +106,12 @@ def _model(marked: Mapping[str, Cluster]) -> ChainModel:
 
 
 def _judged(
-    clusters: Mapping[str, Cluster],
-    marked: Mapping[str, Cluster],
+    clusters: Mapping[str, MarkerCluster],
+    marked: Mapping[str, MarkerCluster],
     model: ChainModel,
     found: Refinement,
 ) -> RefinedClusters:
-    """Keep the parts that follow unseen movement better and are still themselves."""
+    """Select the parts with a smaller held-out error and plausible marker displacements."""
     judge = next(trial for trial in found.trials if not trial.trained)
     used, parts = dict(clusters), {}
     moved: dict[str, float] = {}
@@ -115,12 +119,13 @@ def _judged(
     for i, (name, cluster) in enumerate(marked.items()):
         mine = model.marker_segments == i
         before, after = _rms(judge.before.by_marker[mine]), _rms(judge.after.by_marker[mine])
-        other = laid_back(cluster, found.model.positions[mine])
+        other = fit_shape_to_pose(cluster, found.model.positions[mine])
         shift = other.template + other.origin - cluster.template - cluster.origin
         lengths = np.linalg.norm(shift, axis=1)
         far = int(lengths.argmax())
         better = bool(after < before and lengths[far] < FARTHEST_M)
         parts[name] = {"before_m": before, "after_m": after, "refined": better}
+
         if better:
             used[name] = other
             moved |= dict(zip(cluster.markers, lengths.tolist(), strict=True))
@@ -137,8 +142,8 @@ def _rms(by_marker: Array) -> float:
     return float(np.sqrt((seen**2).mean())) if seen.size else 0.0
 
 
-def laid_back(cluster: Cluster, shape: Array) -> Cluster:
-    """Return a part with another shape, m, shape (k, 3), in its place in the static pose."""
+def fit_shape_to_pose(cluster: MarkerCluster, shape: Array) -> MarkerCluster:
+    """Return a part with another shape, m, shape (k, 3), fitted to its place in the static pose."""
     model = _model({cluster.name: cluster}).with_markers(shape)
     placed = solve_frames(model, cluster.template[None], options=_ROBUST)
     points = shape @ placed.rotations[0, 0].T + placed.origins[0, 0] + cluster.origin

@@ -1,7 +1,7 @@
-"""The functional phase: from a static pose and a movement to a whole calibration.
+"""The functional phase: a complete calibration from a static pose and a movement.
 
-Law: pure; the optical system is the reference and is itself made of skin markers, so figures are
-distances from that reference, not from bones. Everything refused is refused at once, with remedies.
+The optical reference consists of skin markers. All quality figures are distances from this
+reference, not from bones. All reasons for a rejection are reported at once, with remedies.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration._errors import CalibrationRefused
+from jointfit_daemon.calibration._errors import CalibrationError
 from jointfit_daemon.calibration.anatomy import (
     SKIN_SD_M,
     Anatomy,
     ClusterTrack,
-    JointFound,
+    JointCenter,
     find_anatomy,
     track_clusters,
 )
-from jointfit_daemon.calibration.phases._acceptance import better
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.phases._static_pose import (
     StaticPose,
@@ -31,19 +30,19 @@ from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
     NO_LAG,
     SKIN,
-    ChosenLag,
+    SensorLag,
+    configured_lag,
     fit_sensor_alignment,
-    known_lag,
-    seen_lags,
     segment_lags,
     sensor_lags,
+    tracked_lags,
 )
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
-    error_correlations,
     evenly,
     fit_links,
     fit_models,
+    joint_error_correlations,
     judge,
     pack,
 )
@@ -54,7 +53,7 @@ from jointfit_daemon.limb_model import (
     JointCalibration,
     SegmentCalibration,
     SensorCalibration,
-    stored_cluster,
+    cluster_record,
     vector,
     visible,
 )
@@ -69,20 +68,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion
     from jointfit_daemon.timing.lag import LagEstimate
 
-__all__ = ["better", "fit_calibration"]
-
-
 MIN_SEEN = 0.5
+"""Smallest share of frames in which a body part is visible."""
 PLATE_SD_NS = 500_000.0
-"""Of a lag from the align phase that came without its standard deviation."""
+"""Standard deviation of a lag from the align phase without its own, ns."""
 STORED_SD_NS = 3e6
-"""Of a lag of the calibration in force: it may have been found on skin."""
+"""Standard deviation of a lag of the calibration in force, ns; it may have been estimated on
+skin."""
 MISALIGNED = np.deg2rad(25.0)
-"""A heading that differs by more is no matter of skin; below, skin may be all of it."""
+"""Heading difference that soft tissue does not explain, rad."""
 MEANING = (
     "RMS distance from the optical reference on the last part of the trial, after a fit to the"
     " first part; the stored models were then fitted to all of it"
 )
+"""Explanation of the hold-out figures, published with them."""
 
 
 def fit_calibration(
@@ -103,34 +102,41 @@ def fit_calibration(
     Parameters
     ----------
     static : StaticPose or CalibrationTrial
-        The static pose, or the trial to take it from.
+        The static pose, or its trial.
     functional : CalibrationTrial
-        The movement, with the optical system; sensor stamps not yet corrected for lag.
+        The movement with the optical system; sensor time stamps without lag correction.
     alignment : PlateAlignment or None
-        None: all sensor worlds are taken for the optical one, and ``headings_from_static`` says so.
+        None takes all sensor worlds as equal to the optical one, with flag
+        ``headings_from_static``.
     previous : Calibration, optional
-        Gives lags where this movement shows none.
+        Source of lags that this movement does not determine.
     lag_ns : mapping, optional
-        Lags known beforehand; the others are estimated.
+        Configured lags, ns; the others are estimated.
     tracked : mapping, optional
-        Lag and sigma, ns, that earlier movement showed: used where this one shows none.
+        Lag and standard deviation, ns, tracked at run time; used if this movement determines none.
 
     Raises
     ------
-    CalibrationRefused
-        No optical system or markers, too little seen or moved, sensors missing.
+    CalibrationError
+        No optical system or markers, too little visible or moved, or sensors missing.
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
+
+    # Reference: body parts, joint centers and segment axes.
     refined, tracks = _refined(_tracks(pose, functional, chain), pose, functional, settings)
     anatomy = find_anatomy(chain, tracks)
+
+    # Lags and mounts of the sensors.
     lags = _lags(chain, functional, tracks, lag_ns or {})
     used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}), lag_ns or {})
     used_ns = {name: item.lag_ns for name, item in used.items()}
     sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
-    training, raw, taught_notes = limb_training(chain, functional, tracks, anatomy, sensors)
+
+    # Segment models.
+    training, raw, training_notes = limb_training(chain, functional, tracks, anatomy, sensors)
     models = fit_models(chain, training, settings.method)
     headings = _heading_notes(chain, raw, training) if alignment is None else []
-    notes = (*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *taught_notes, *headings)
+    notes = (*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *training_notes, *headings)
     return Calibration(
         method=settings.method,
         joints=chain.joints,
@@ -139,7 +145,7 @@ def fit_calibration(
         sensor=sensors,
         segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
-        clusters={name: stored_cluster(cluster) for name, cluster in refined.clusters.items()},
+        clusters={name: cluster_record(cluster) for name, cluster in refined.clusters.items()},
         flags=(*anatomy.flags, *(["headings_from_static"] if alignment is None else [])),
         notes=notes,
         quality={
@@ -154,7 +160,7 @@ def fit_calibration(
         software=software,
         created_utc=created_utc,
         links=fit_links(chain, training.sensors, anatomy.q_static),
-        correlations=error_correlations(chain, training, settings.method),
+        correlations=joint_error_correlations(chain, training, settings.method),
         memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
     )
 
@@ -167,31 +173,34 @@ def _holdout(chain: Chain, training: LimbTraining, settings: CalibrationSettings
 def _tracks(
     pose: StaticPose, functional: CalibrationTrial, chain: Chain
 ) -> dict[str, ClusterTrack]:
-    """Follow all body parts; refuse what makes a reference impossible."""
+    """Return the poses of all body parts; reject trials without a usable reference."""
     if functional.optical is None or len(functional.optical.t_ns) < MIN_FRAMES:
-        raise CalibrationRefused("functional: needs the optical system; check that it streams")
+        raise CalibrationError("functional: no data of the optical system; check that it streams")
+
     reasons = [
         f"{segment}: no markers in the static pose; name them under markers.{segment} "
         "and repeat the static pose in view of the cameras"
         for segment in chain.segments
         if segment not in pose.clusters
     ]
+
     tracks = track_clusters(functional.optical, pose.clusters)
     for segment in chain.segments:
         share = float(visible(tracks[segment].q).mean()) if segment in tracks else 1.0
         if share < MIN_SEEN:
             reasons.append(
-                f"{segment}: three markers were seen together in {100 * share:.0f} % of the trial; "
-                "at least 50 % are needed: add a marker or stay in view"
+                f"{segment}: at least three markers were visible in {100 * share:.0f} % of "
+                "the trial, 50 % are needed; add a marker or stay in view"
             )
     reasons += [
-        f"{sensor}: no data while moving; switch it on and repeat"
+        f"{sensor}: no data in the movement; switch it on and repeat"
         for group in chain.sensors
         for sensor in group
         if sensor not in functional.sensors
     ]
+
     if reasons:
-        raise CalibrationRefused(*reasons)
+        raise CalibrationError(*reasons)
     return tracks
 
 
@@ -201,7 +210,7 @@ def _refined(
     functional: CalibrationTrial,
     settings: CalibrationSettings,
 ) -> tuple[RefinedClusters, dict[str, ClusterTrack]]:
-    """Refine the markers if that is wanted, and follow the body parts by them."""
+    """Refine the markers, if configured, and return the poses of the refined body parts."""
     if not settings.refine_markers or functional.optical is None:
         return RefinedClusters(pose.clusters, None), tracks
     refined = refine_clusters(pose.clusters, tracks, settings.holdout_share)
@@ -228,12 +237,13 @@ def _chosen_lags(
     chain: Chain,
     moving: Mapping[str, LagEstimate],
     alignment: PlateAlignment | None,
-    earlier: Mapping[str, ChosenLag],
+    earlier: Mapping[str, SensorLag],
     known: Mapping[str, int],
-) -> dict[str, ChosenLag]:
-    """Return what is known, else the lag of this movement and the plate together, else earlier."""
+) -> dict[str, SensorLag]:
+    """Return configured lags, else lags from movement and plate combined, else earlier lags."""
     lags = dict(earlier)
     plate = {} if alignment is None else alignment.sensors
+
     prior = {
         name: (
             item.lag_ns,
@@ -242,22 +252,23 @@ def _chosen_lags(
         for name, item in plate.items()
         if item.lag_ns is not None
     }
+
     for group in chain.sensors:
         lags |= segment_lags(
             {name: moving[name] for name in group if name in moving},
             {name: prior[name] for name in group if name in prior},
         )
-    return lags | {name: known_lag(lag) for name, lag in known.items()}
+    return lags | {name: configured_lag(lag) for name, lag in known.items()}
 
 
 def _earlier(
     previous: Calibration | None, tracked: Mapping[str, tuple[float, float]]
-) -> dict[str, ChosenLag]:
-    """Return what was known before: as stored, or as seen since where that is surer."""
+) -> dict[str, SensorLag]:
+    """Return earlier lags: the stored ones, or the tracked ones if more certain."""
     stored = {} if previous is None else previous.lag_ns
-    seen = seen_lags(tracked)
+    seen = tracked_lags(tracked)
     kept = {
-        name: ChosenLag(lag, STORED_SD_NS, "stored")
+        name: SensorLag(lag, STORED_SD_NS, "stored")
         for name, lag in stored.items()
         if name not in seen or (seen[name].sigma_ns or 0.0) >= STORED_SD_NS
     }
@@ -290,7 +301,7 @@ def _sensors(
 
 
 def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTraining) -> list[str]:
-    """Say which worlds seem turned. No alignment: skin motion is part of the figure."""
+    """Return sensors whose world seems rotated; the angle includes soft-tissue artefact."""
     notes = []
     for segment, group in zip(chain.segments, chain.sensors, strict=True):
         for s in group:
@@ -298,8 +309,8 @@ def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTrainin
             turn = float(rotation.heading_of(found.q_world))
             if abs(turn) > MISALIGNED:
                 notes.append(
-                    f"{s}: its world seems turned by about {np.rad2deg(turn):.0f} deg against the "
-                    "optical one; run the align phase"
+                    f"{s}: its world seems rotated by about {np.rad2deg(turn):.0f} deg relative to "
+                    "the optical world; run the align phase"
                 )
     return notes
 
@@ -309,7 +320,7 @@ def _segment(name: str, anatomy: Anatomy, models: Mapping[str, SegmentModel]) ->
     return SegmentCalibration(q_static, *anatomy.lengths[name], models)
 
 
-def _joint(found: JointFound | None) -> JointCalibration:
+def _joint(found: JointCenter | None) -> JointCalibration:
     if found is None:
         return JointCalibration(None, None, "unknown")
     sd = float(np.sqrt(np.trace(found.covariance) / 3.0 + SKIN_SD_M**2))
@@ -317,8 +328,8 @@ def _joint(found: JointFound | None) -> JointCalibration:
     return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
 
 
-def _lag_figures(moving: LagEstimate | None, used: ChosenLag) -> dict[str, Any]:
-    """Return the lag in use, and beside it what this movement alone said."""
+def _lag_figures(moving: LagEstimate | None, used: SensorLag) -> dict[str, Any]:
+    """Return the lag in use and the lag of this movement alone."""
     figures: dict[str, Any] = {"source": used.source}
     if used.source != "none":
         figures["lag_ns"] = used.lag_ns
@@ -327,8 +338,12 @@ def _lag_figures(moving: LagEstimate | None, used: ChosenLag) -> dict[str, Any]:
     if moving is not None and moving.refused is not None:
         return figures | {"refused": moving.refused}
     if moving is not None:
-        said = {"lag_ns": round(moving.lag_ns), "sigma_ns": round(moving.sigma_ns), "r2": moving.r2}
-        figures["movement"] = said
+        measured = {
+            "lag_ns": round(moving.lag_ns),
+            "sigma_ns": round(moving.sigma_ns),
+            "r2": moving.r2,
+        }
+        figures["movement"] = measured
     return figures
 
 
@@ -336,7 +351,7 @@ def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:
     return {
         "joints": {
             name: {
-                "source": "unknown" if found is None else found.told,
+                "source": "unknown" if found is None else found.source_text,
                 "sd_m": _joint(found).sd,
                 "residual_rms_m": _joint(found).residual_rms,
                 "gap_rms_m": None if found is None else found.gap_rms,

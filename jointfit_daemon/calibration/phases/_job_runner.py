@@ -1,6 +1,6 @@
-"""The fits that run in the worker process: recorded trials in, JSON-able results out.
+"""The fits of the worker process: typed jobs in, JSON-able results out.
 
-Law: pure and picklable; a refusal is a result (`refused`), anything raised is a bug.
+A rejected calibration is a result with ``refused``; any other exception is a bug.
 """
 
 from __future__ import annotations
@@ -8,9 +8,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon import __version__
-from jointfit_daemon.calibration._errors import CalibrationRefused
-from jointfit_daemon.calibration.phases._functional import better, fit_calibration
-from jointfit_daemon.calibration.phases._online import learn
+from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration.phases._acceptance import compare_calibrations
+from jointfit_daemon.calibration.phases._functional import fit_calibration
+from jointfit_daemon.calibration.phases._online import refit_models
 from jointfit_daemon.calibration.phases._plate_alignment import (
     AlignedSensor,
     PlateAlignment,
@@ -21,7 +22,7 @@ from jointfit_daemon.calibration.phases._static_pose import (
     fit_static_only,
     with_new_static,
 )
-from jointfit_daemon.calibration.registration import redonning_problems
+from jointfit_daemon.calibration.registration import redonning_notes
 from jointfit_daemon.limb_model import Calibration
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
     """
     try:
         return _JOBS[kind](payload)
-    except CalibrationRefused as refusal:
+    except CalibrationError as refusal:
         return {"refused": str(refusal)}
 
 
@@ -87,7 +88,7 @@ def _align(payload: Mapping[str, Any]) -> dict[str, Any]:
     heard = payload["trial"].sensors
     missing = [s for group in payload["chain"].sensors for s in group if s not in heard]
     if missing:  # later phases would have to refuse what this one let pass
-        raise CalibrationRefused(
+        raise CalibrationError(
             *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
         )
     found = fit_plate_alignment(payload["trial"], payload["settings"], lag_ns=payload.get("lag_ns"))
@@ -106,7 +107,7 @@ def _static(payload: Mapping[str, Any]) -> dict[str, Any]:
             for one in (previous, calibration)
         )
         groups = dict(zip(chain.segments, chain.sensors, strict=True))
-        result["notes"] = list(redonning_problems(before, after, groups))
+        result["notes"] = list(redonning_notes(before, after, groups))
     elif not markers:  # no cameras: a static pose is all there will ever be
         calibration = fit_static_only(pose, _alignment(payload), chain, software=__version__)
     else:
@@ -129,7 +130,7 @@ def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
     result: dict[str, Any] = {"quality": dict(found.quality), "calibration": found.to_dict()}
     previous = _previous(payload)
     if previous is not None:
-        wins, why = better(found, previous)
+        wins, why = compare_calibrations(found, previous)
         if not wins:
             result["worse"] = why
     return result
@@ -138,8 +139,8 @@ def _functional(payload: Mapping[str, Any]) -> dict[str, Any]:
 def _online(payload: Mapping[str, Any]) -> dict[str, Any]:
     previous = _previous(payload)
     if previous is None:
-        raise CalibrationRefused("no calibration of this limb to go on from")
-    return learn(previous, payload["fresh"], payload["chain"], software=__version__)
+        raise CalibrationError("no calibration of this limb to go on from")
+    return refit_models(previous, payload["fresh"], payload["chain"], software=__version__)
 
 
 _JOBS = {"align": _align, "static": _static, "functional": _functional, "online": _online}

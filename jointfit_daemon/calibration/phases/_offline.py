@@ -1,8 +1,8 @@
-"""Fits and judgements on whole trials with a reference, as files hold them; no clocks, no markers.
+"""Fits and evaluation of recorded trials with a reference, without device clocks and markers.
 
-Law: pure. Sensors and reference are in one world and on one time axis already. What is judged was
-never fitted to: a whole trial is left out, or, of a single one, its last part. The calibration that
-comes out is the one the daemon uses, with lengths and joint centers unknown.
+Sensors and reference are in one world and on one time axis. The evaluation always uses held-out
+data: a whole trial, or the last part of a single trial. The resulting calibration has the form of
+the daemon, with unknown lengths and joint centers.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration._errors import CalibrationRefused
-from jointfit_daemon.calibration.registration import RobustMean, static_bias
+from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration.registration import RobustMean, static_mount
 from jointfit_daemon.calibration.soft_tissue import (
     FEWEST_FRAMES,
     METHODS,
     LimbTraining,
-    all_alive,
-    error_correlations,
     fit_links,
     fit_models,
+    joint_error_correlations,
+    predict_all_sensors,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import functional_axis, joint_rotation, swing_twist
@@ -45,22 +45,22 @@ if TYPE_CHECKING:
 
 
 COMPARED: tuple[Method, ...] = tuple(method for method in METHODS if method != "single")
-"""Beside each sensor alone, of which ``single`` would be one again."""
+"""Evaluated methods; ``single`` is omitted, because each sensor is evaluated alone."""
 MAX_TRAINING_FRAMES = 2000
-"""Of one trial; of a longer one every n-th frame is taken."""
+"""Largest number of training frames of one trial; longer trials are decimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class OfflineTrial:
-    """One movement."""
+    """One recorded movement."""
 
     name: str
     t_s: Array
     """Shape (n,), s."""
     sensors: Mapping[str, Array]
-    """q_world_sensor by id, shape (n, 4); NaN where missing."""
+    """q_world_sensor of each sensor, shape (n, 4); NaN if missing."""
     reference: Mapping[str, Array]
-    """q_world_segment by segment, the same world, shape (n, 4); NaN where unseen."""
+    """q_world_segment of each segment, same world, shape (n, 4); NaN if not visible."""
 
     def part(self, chosen: slice) -> OfflineTrial:
         """Return a contiguous part, or every n-th frame."""
@@ -73,46 +73,47 @@ class OfflineTrial:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """One method on one trial that it was not fitted to."""
+class MethodScore:
+    """Errors of one method on one held-out trial."""
 
     trial: str
     method: str
-    """A method of `METHODS`, or ``single S1+S3``: the first sensor of each segment alone."""
+    """A method of `METHODS`, or ``single S1+S3``: one sensor of each segment alone."""
     frames: int
-    """That judged: all sensors and the reference were there."""
+    """Number of complete frames."""
     segments: Mapping[str, float]
     """RMS angle to the reference, rad."""
     joints: Mapping[str, float]
     """RMS error of flexion about the functional axis of the training movement, rad."""
     flexion: Mapping[str, Array]
-    """That flexion over time, rad, shape (n,)."""
+    """Estimated flexion over time, rad, shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
-    """All methods on all trials left out."""
+class MethodEvaluation:
+    """Errors of all methods on all held-out trials."""
 
-    rows: tuple[Judged, ...]
+    rows: tuple[MethodScore, ...]
     reference: Mapping[str, Mapping[str, Array]]
-    """Flexion by the reference, rad: by trial, then joint."""
+    """Flexion of the reference, rad, by trial and joint."""
     t_s: Mapping[str, Array]
-    """Instants of all that was judged, by trial, s."""
+    """Instants of the evaluated frames by trial, s."""
     held_out: str
-    """What was left out, in words."""
+    """Description of the held-out data."""
 
 
 def mounts_of(chain: Chain, trials: Sequence[OfflineTrial]) -> dict[str, RobustMean]:
-    """Return ``q_sensor_segment`` of every sensor as the reference of whole trials says it.
+    """Return ``q_sensor_segment`` of every sensor from the reference of whole trials.
 
-    On a still trial this is the static calibration. On movements it is the mean over what skin
-    and muscle do, and learns from the reference: good for research, not for another day.
+    For a static trial this is the static calibration. For movements it is the mean over the
+    soft-tissue artefact and depends on the reference: suitable for research, not for another
+    session.
     """
     found = {}
     for i, segment in enumerate(chain.segments):
         reference = np.concatenate([trial.reference[segment] for trial in trials])
         for sensor in chain.sensors[i]:
-            found[sensor] = static_bias(
+            found[sensor] = static_mount(
                 np.concatenate([trial.sensors[sensor] for trial in trials]), reference
             )
     return found
@@ -128,20 +129,20 @@ def fit_offline(
     software: str = "",
     created_utc: str = "",
 ) -> Calibration:
-    """Fit every model that live fusion may need to all trials.
+    """Fit the models of every set of sensors to all trials.
 
     Parameters
     ----------
     mounts : mapping
-        ``q_sensor_segment`` per sensor, shape (4,).
+        ``q_sensor_segment`` of each sensor, shape (4,).
 
     Raises
     ------
-    CalibrationRefused
+    CalibrationError
         Fewer than 30 complete frames of a segment.
     """
     training = _training(chain, trials, mounts)
-    _refuse_few(chain, training, "what is fitted to")
+    _refuse_few(chain, training, "the training data")
     models = fit_models(chain, training, method)
     return Calibration(
         method=method,
@@ -167,7 +168,7 @@ def fit_offline(
         software=software,
         created_utc=created_utc,
         links=fit_links(chain, training.sensors, dict.fromkeys(chain.segments, rotation.IDENTITY)),
-        correlations=error_correlations(chain, training, method),
+        correlations=joint_error_correlations(chain, training, method),
     )
 
 
@@ -178,36 +179,37 @@ def evaluate(
     *,
     methods: Sequence[Method] = COMPARED,
     holdout: float = 0.4,
-) -> Judgement:
-    """Judge every method where it was not fitted: leave one trial out, or the end of the only one.
+) -> MethodEvaluation:
+    """Evaluate every method on each trial held out, or on the end of a single trial.
 
     Parameters
     ----------
     mounts : mapping, optional
-        ``q_sensor_segment`` per sensor; None: from the reference of the training part.
+        ``q_sensor_segment`` of each sensor; by default from the reference of the training part.
     holdout : float
-        Share of a single trial that judges.
+        Held-out share of a single trial.
 
     Raises
     ------
-    CalibrationRefused
-        Fewer than 30 complete frames of a segment, of those that are fitted to or that judge.
+    CalibrationError
+        Fewer than 30 complete frames of a segment in the training or held-out data.
     """
     if len(trials) == 1:
         cut = round(len(trials[0].t_s) * (1.0 - holdout))
         folds = [([trials[0].part(slice(None, cut))], trials[0].part(slice(cut, None)))]
-        said = f"the last {100 * holdout:.0f} % of the trial, fitted to the rest"
+        held_out = f"the last {100 * holdout:.0f} % of the trial, with a fit to the rest"
     else:
         folds = [([t for t in trials if t is not left], left) for left in trials]
-        said = "one trial after the other, fitted to the others"
-    rows: list[Judged] = []
+        held_out = "one trial after the other, with a fit to the others"
+
+    rows: list[MethodScore] = []
     reference, t_s = {}, {}
     for training, test in folds:
-        judge = _Judge.of(chain, training, test, mounts)
+        judge = _Fold.of(chain, training, test, mounts)
         rows += judge.singles()
         rows += [judge.method(method) for method in reversed(methods)]
         reference[test.name], t_s[test.name] = judge.truth, test.t_s
-    return Judgement(tuple(rows), reference, t_s, said)
+    return MethodEvaluation(tuple(rows), reference, t_s, held_out)
 
 
 def _training(
@@ -225,32 +227,33 @@ def _training(
     )
 
 
-def _refuse_few(chain: Chain, frames: LimbTraining, what: str) -> None:
-    """Refuse what no fit or judgement can be made of, segment by segment."""
+def _refuse_few(chain: Chain, frames: LimbTraining, data: str) -> None:
+    """Raise an error if a segment has too few complete frames."""
     for i, segment in enumerate(chain.segments):
         needed = [frames.sensors[s] for s in (*chain.sensors[i], *neighbor(chain, i))]
         known = [visible(q) for q in (*needed, frames.reference[segment])]
         count = int(np.count_nonzero(np.all(known, axis=0)))
         if count < FEWEST_FRAMES:
             seen = int(np.count_nonzero(known[-1]))
-            raise CalibrationRefused(
-                f"{segment}: {count} complete frames in {what}, at least {FEWEST_FRAMES} are "
-                f"needed (its reference alone is there in {seen}): take a trial whose sensors and "
-                "reference are there together, or another --holdout"
+            raise CalibrationError(
+                f"{segment}: {count} complete frames in {data}, at least {FEWEST_FRAMES} are "
+                f"needed (its reference alone has {seen}); use a trial with simultaneous data of "
+                "sensors and reference, or another --holdout"
             )
 
 
 @dataclass(frozen=True, slots=True)
-class _Judge:
-    """What was fitted to, what judges, and the flexion axes of the former."""
+class _Fold:
+    """Training data, held-out data and flexion axes of one fold."""
 
     chain: Chain
     training: LimbTraining
     test: OfflineTrial
     aligned: LimbTraining
-    """The test, bone-aligned."""
+    """The held-out trial, bone-aligned."""
     axes: Mapping[str, Array]
-    """Flexion of each inner joint is positive about it: `functional_axis`, and a knee's turned."""
+    """Axis of positive flexion of each inner joint, from `functional_axis` of the training
+    movement."""
     truth: Mapping[str, Array]
 
     @staticmethod
@@ -259,28 +262,30 @@ class _Judge:
         training: Sequence[OfflineTrial],
         test: OfflineTrial,
         mounts: Mapping[str, Array] | None,
-    ) -> _Judge:
+    ) -> _Fold:
         if mounts is None:
             mounts = {name: mean.q for name, mean in mounts_of(chain, training).items()}
         known = _training(chain, training, mounts)
-        _refuse_few(chain, known, f"what is fitted to, to judge {test.name},")
+        _refuse_few(chain, known, f"the training data for {test.name}")
+
         axes, truth = {}, {}
         for joint, above, below in _inner(chain):
             q = joint_rotation(known.reference[above], known.reference[below])
             axis = functional_axis(q[np.isfinite(q).all(axis=1)])
             axes[joint] = flexion_sign(joint) * axis
             truth[joint] = _flexion(test.reference[above], test.reference[below], axes[joint])
+
         sensors = {name: rotation.multiply(test.sensors[name], m) for name, m in mounts.items()}
         aligned = LimbTraining(sensors, test.reference)
-        _refuse_few(chain, aligned, f"the part of {test.name} that judges")
-        return _Judge(chain, known, test, aligned, axes, truth)
+        _refuse_few(chain, aligned, f"the held-out part of {test.name}")
+        return _Fold(chain, known, test, aligned, axes, truth)
 
-    def method(self, method: Method) -> Judged:
-        """Judge one method with all sensors alive, as the daemon would use it."""
+    def method(self, method: Method) -> MethodScore:
+        """Evaluate one method with all sensors available, like the daemon."""
         return self._judged(
             method,
             {
-                segment: all_alive(self.chain, i, method, self.training, self.aligned)
+                segment: predict_all_sensors(self.chain, i, method, self.training, self.aligned)
                 for i, segment in enumerate(self.chain.segments)
             },
         )
@@ -292,28 +297,30 @@ class _Judge:
         ]
         return int(np.count_nonzero(np.all(known, axis=0)))
 
-    def singles(self) -> list[Judged]:
-        """Judge the first sensor of each segment alone, then the second; who has no more, again."""
+    def singles(self) -> list[MethodScore]:
+        """Evaluate the first sensor of each segment alone, then the second, and so on."""
         chain = self.chain
         found = []
         for k in range(max(map(len, chain.sensors))):
             names = [group[min(k, len(group) - 1)] for group in chain.sensors]
-            said = dict(zip(chain.segments, (self.aligned.sensors[n] for n in names), strict=True))
-            found.append(self._judged(f"single {'+'.join(names)}", said))
+            estimates = dict(
+                zip(chain.segments, (self.aligned.sensors[n] for n in names), strict=True)
+            )
+            found.append(self._judged(f"single {'+'.join(names)}", estimates))
         return found
 
-    def _judged(self, method: str, said: Mapping[str, Array]) -> Judged:
+    def _judged(self, method: str, estimates: Mapping[str, Array]) -> MethodScore:
         chain, reference = self.chain, self.test.reference
         flexion = {
-            joint: _flexion(said[above], said[below], self.axes[joint])
+            joint: _flexion(estimates[above], estimates[below], self.axes[joint])
             for joint, above, below in _inner(chain)
         }
         off = {j: flexion[j] - self.truth[j] for j in flexion}
-        return Judged(
+        return MethodScore(
             self.test.name,
             method,
             self.frames,
-            {s: _rms(rotation.angle_between(said[s], reference[s])) for s in chain.segments},
+            {s: _rms(rotation.angle_between(estimates[s], reference[s])) for s in chain.segments},
             {j: _rms(np.arctan2(np.sin(angle), np.cos(angle))) for j, angle in off.items()},
             flexion,
         )

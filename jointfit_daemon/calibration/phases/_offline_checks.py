@@ -1,6 +1,6 @@
-"""What is odd about trials of files before anything is fitted to them, in words.
+"""Checks of recorded trials before a fit: joints without movement, misaligned or identical sensors.
 
-Law: pure. Only clear cases, each with the thing and the remedy; what skin can do is not odd.
+Only clear cases are reported, each with the object and the remedy; soft-tissue artefact is not.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.phases._training_set import twins
+from jointfit_daemon.calibration.phases._training_set import identical_sensors
 from jointfit_daemon.calibration.registration import fit_sensor_alignment, robust_mean
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import joint_rotation
@@ -23,40 +23,42 @@ if TYPE_CHECKING:
 
 
 MISALIGNED = np.deg2rad(25.0)
-"""A heading that differs by more is no matter of skin."""
+"""Heading difference that soft tissue does not explain, rad."""
 HEADING_SEPARABLE = 0.98
-"""Above this ratio of singular values heading and mount cannot be told apart."""
+"""Ratio of singular values above which heading and mount are indistinguishable."""
 FAR = np.deg2rad(45.0)
-"""Median distance of a sensor on its mount from the reference that no skin explains."""
+"""Median angle between a mounted sensor and its reference that soft tissue does not explain,
+rad."""
 LEAST_TURN = np.deg2rad(5.0)
-"""A joint that turns by less in 95 % of the frames teaches nothing."""
+"""0.95 quantile of the rotation of a joint below which the trials do not constrain its model,
+rad."""
 
 
-def unmoved(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
-    """Return which joint (of a lone segment: which segment) does not move; None: all do."""
+def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
+    """Return a message on a joint (or single segment) that does not move; None if all move."""
     for name, q in _movements(chain, trials):
         known = q[np.isfinite(q).all(axis=1)]
         turned = rotation.angle_between(robust_mean(known).q, known)
         most = float(np.quantile(turned, 0.95))
         if most < LEAST_TURN:
             return (
-                f"{name} turns by {np.rad2deg(most):.1f} deg only in all trials: there is nothing "
-                "to learn from and nothing to judge; take trials that move it (squats, walking), "
-                "or fit with --method mean"
+                f"{name} rotates by only {np.rad2deg(most):.1f} deg in all trials, too little "
+                "for a fit or an evaluation; use trials that move it (squats, walking), or fit "
+                "with --method mean"
             )
     return None
 
 
-def doubts(
+def trial_warnings(
     chain: Chain, trials: Sequence[OfflineTrial], mounts: Mapping[str, Array] | None
 ) -> list[str]:
-    """Return what people should look at before they believe figures of these trials."""
+    """Return warnings that affect the credibility of results from these trials."""
     worn = [name for group in chain.sensors for name in group]
     sensors = {name: np.concatenate([t.sensors[name] for t in trials]) for name in worn}
     return [
         *([] if mounts is None else _far_sensors(chain, trials, mounts)),
         *_turned_worlds(chain, trials),
-        *twins(chain, sensors),
+        *identical_sensors(chain, sensors),
     ]
 
 
@@ -81,27 +83,27 @@ def _far_sensors(
                 continue
             yield (
                 f"{trial.name}: {sensor} is {np.rad2deg(apart):.0f}° from the reference of "
-                f"{segment}: are its quaternions scalar first (w, x, y, z), is --up right, and is "
-                "its mount of this wearing?"
+                f"{segment}; check that quaternions are scalar first (w, x, y, z), --up, and that "
+                "the mount is of this session"
             )
 
 
 def _turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str]:
-    """Tell of worlds turned about the vertical, where the movement parts heading from mount."""
+    """Yield warnings on worlds rotated about the vertical, if the angle is observable."""
     for _, sensor, q, reference in _streams(chain, trials):
         alignment = fit_sensor_alignment("heading", q, reference)
         angle = float(rotation.heading_of(alignment.q_world))
         if alignment.kappa <= HEADING_SEPARABLE and abs(angle) > MISALIGNED:
             yield (
-                f"{sensor}: its world seems turned by {np.rad2deg(angle):.0f}° about the vertical "
-                "against the reference's: bring both into one world first, or check --up"
+                f"{sensor}: its world seems rotated by {np.rad2deg(angle):.0f}° about the vertical "
+                "relative to that of the reference; transform both to one world, or check --up"
             )
 
 
 def _streams(
     chain: Chain, trials: Sequence[OfflineTrial]
 ) -> Iterator[tuple[str, str, Array, Array]]:
-    """Give segment, sensor, its orientations and the reference's, of all trials."""
+    """Yield segment, sensor, its orientations and those of the reference, over all trials."""
     for i, segment in enumerate(chain.segments):
         reference = np.concatenate([trial.reference[segment] for trial in trials])
         for sensor in chain.sensors[i]:

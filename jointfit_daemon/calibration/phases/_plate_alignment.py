@@ -1,7 +1,7 @@
-"""The align phase: all sensors on one plate that the cameras see, turned by hand.
+"""The align phase: all sensors on one plate with markers, rotated by hand.
 
-Law: each sensor's world gets its rotation to the optical world from here or from nowhere; skin
-motion never decides it. What the movement did not show is refused with the reason.
+The rotation of each sensor world to the optical world comes from this phase only, never from
+skin-mounted sensors. Parameters that the movement did not excite are rejected with the reason.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration._errors import CalibrationRefused, unknown_name
+from jointfit_daemon.calibration._errors import CalibrationError, unknown_name
 from jointfit_daemon.calibration._trial import PLATE
 from jointfit_daemon.calibration.anatomy import columns, moving_template
 from jointfit_daemon.calibration.registration import (
@@ -38,33 +38,35 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 MIN_FRAMES = 200
+"""Smallest number of frames with plate and sensor."""
 MAX_RMS = np.deg2rad(6.0)
-"""A worse fit has a loose sensor, a swapped marker or a sensor that is not on the plate."""
+"""Largest residual, rad; above it a sensor is loose or not on the plate, or markers are swapped."""
 MAX_FRAMES = 3000
+"""Frames used at most; longer recordings are decimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlignedSensor:
-    """One sensor's world in the optical one."""
+    """World of one sensor relative to the optical world."""
 
     q_optical_world: Quaternion
     kind: str
-    """``full`` | ``heading`` (both verticals taken for true)."""
+    """``full`` | ``heading`` (both verticals assumed correct)."""
     kappa: float
-    """1: world and mount could not be told apart."""
+    """1 if world and mount are indistinguishable."""
     error: float
     """Standard error of the weakest direction, rad."""
     rms: float
     """RMS angle between plate and model, rad."""
     lag_ns: int | None = None
-    """Sensor stamp minus optical stamp of the same event; None where the turning showed none."""
+    """Sensor minus optical time stamp of the same event; None if not observable."""
     lag_sigma_ns: float | None = None
-    """Standard deviation; None where it was given without one."""
+    """Standard deviation of the lag, ns; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlateAlignment:
-    """Every sensor's world in the optical one."""
+    """Worlds of all sensors relative to the optical world."""
 
     sensors: Mapping[str, AlignedSensor]
     notes: tuple[str, ...] = field(default=())
@@ -74,18 +76,18 @@ class PlateAlignment:
 
         Raises
         ------
-        CalibrationRefused
+        CalibrationError
             The sensor was not on the plate.
         """
         if sensor not in self.sensors:
-            raise CalibrationRefused(
-                f"{sensor}: not in the align phase; repeat it with all sensors on the plate"
+            raise CalibrationError(
+                f"{sensor}: missing in the align phase; repeat it with all sensors on the plate"
             )
         return self.sensors[sensor].q_optical_world
 
     @property
     def quality(self) -> dict[str, Any]:
-        """Figures of every sensor, angles in rad."""
+        """Quality figures of every sensor, angles in rad."""
         return {
             name: {
                 "kind": item.kind,
@@ -134,31 +136,32 @@ def fit_plate_alignment(
     *,
     lag_ns: Mapping[str, int] | None = None,
 ) -> PlateAlignment:
-    """Align every sensor of the trial with the optical world.
+    """Align the world of every sensor in the trial with the optical world.
 
     Parameters
     ----------
     trial : CalibrationTrial
-        The plate being turned; every sensor in it is taken to be on the plate.
+        Movement of the plate; every sensor in it is assumed to be on the plate.
     settings : CalibrationSettings
         `plate` names the rigid body, or ``markers["plate"]`` the markers.
     lag_ns : mapping, optional
-        Sensor stamp minus optical stamp of the same event, where known; the others are estimated,
-        and taken for 0 where that is refused.
+        Known lags (sensor minus optical time stamp), ns. The others are estimated, or 0 if the
+        estimate is rejected.
 
     Raises
     ------
-    CalibrationRefused
-        No plate, hardly seen, or a sensor whose movement or fit does not suffice; all at once.
+    CalibrationError
+        The plate is missing or hardly visible, or movement or fit of a sensor do not suffice; all
+        reasons at once.
     """
     if trial.optical is None or not trial.sensors:
-        raise CalibrationRefused(
-            "align: needs the optical system and at least one sensor streaming"
-        )
+        raise CalibrationError("align: needs data of the optical system and of at least one sensor")
+
     t_ns, q_plate = plate_track(trial.optical, settings)
     unknown = {n: track for n, track in trial.sensors.items() if n not in (lag_ns or {})}
     turning = sensor_lags(t_ns, q_plate, unknown)
     lags = {**usable_ns(turning), **(lag_ns or {})}
+
     reasons: list[str] = []
     found: dict[str, AlignedSensor] = {}
     for name, track in trial.sensors.items():
@@ -166,12 +169,13 @@ def fit_plate_alignment(
             aligned = _align_one(name, track, (t_ns, q_plate), lags.get(name))
             sigma = turning[name].sigma_ns if name in turning and name in lags else None
             found[name] = replace(aligned, lag_sigma_ns=sigma)
-        except CalibrationRefused as refusal:
+        except CalibrationError as refusal:
             reasons += refusal.reasons
     if reasons:
-        raise CalibrationRefused(*reasons)
+        raise CalibrationError(*reasons)
+
     notes = [
-        f"{name}: heading only; turn the plate about more axes to align the vertical, too"
+        f"{name}: only the heading was aligned; rotate the plate about more axes"
         for name, item in found.items()
         if item.kind == "heading"
     ]
@@ -181,29 +185,30 @@ def fit_plate_alignment(
 def plate_track(
     optical: OpticalTrack, settings: CalibrationSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return stamps and q_optical_plate, at most `MAX_FRAMES` of them with NaN where unseen.
+    """Return time stamps and q_optical_plate, with NaN if not visible.
 
     Raises
     ------
-    CalibrationRefused
+    CalibrationError
         rig.toml names no plate, or the stream does not have it or hardly shows it.
     """
     if settings.plate is not None:
         if settings.plate not in optical.bodies:
             name = unknown_name("rigid body", settings.plate, optical.bodies)
-            raise CalibrationRefused(f"plate: {name}")
+            raise CalibrationError(f"plate: {name}")
         column = optical.bodies.index(settings.plate)
         q = rotation.normalize(optical.body_orientations[:, column])
     elif PLATE in settings.markers:
         positions = optical.positions[:, columns(optical, PLATE, settings)]
         q = rigid_fit(moving_template(positions), positions)[0]
     else:
-        raise CalibrationRefused(
-            "align: no plate; name its rigid body (plate = …) or its markers (markers.plate = […])"
+        raise CalibrationError(
+            "align: no plate configured; name its rigid body (plate = …) or its markers"
+            " (markers.plate = […])"
         )
     if (seen := int(np.count_nonzero(visible(q)))) < MIN_FRAMES:
-        raise CalibrationRefused(
-            f"plate: seen in {seen} frames, at least {MIN_FRAMES} are needed; keep it in view"
+        raise CalibrationError(
+            f"plate: visible in {seen} frames, at least {MIN_FRAMES} are needed; hold it in view"
         )
     return optical.t_ns, q
 
@@ -218,18 +223,19 @@ def _align_one(
     q_sensor = sensor_at(track, t_ns, lag_ns or 0)
     both = np.flatnonzero(visible(q_sensor) & visible(q_plate))
     if both.size < MIN_FRAMES:
-        raise CalibrationRefused(
+        raise CalibrationError(
             f"{name}: {both.size} frames together with the plate, at least {MIN_FRAMES} are needed;"
             " check that the sensor streams and the plate is in view"
         )
+
     every = both[:: -(-both.size // MAX_FRAMES)]
     fit = fit_observable_alignment(q_sensor[every], q_plate[every])
     if fit.kind == "mount":
-        raise CalibrationRefused(f"{name}: {'; '.join(fit.refused)}")
+        raise CalibrationError(f"{name}: {'; '.join(fit.refused)}")
     if fit.residual_scale > MAX_RMS:
-        raise CalibrationRefused(
-            f"{name}: off the plate by {np.rad2deg(fit.residual_scale):.1f} deg; fix the sensor to"
-            " the plate and check that all its markers belong to it"
+        raise CalibrationError(
+            f"{name}: moves {np.rad2deg(fit.residual_scale):.1f} deg relative to the plate; fix the"
+            " sensor to the plate and check that all plate markers belong to it"
         )
     return AlignedSensor(
         as_quaternion(fit.q_world), fit.kind, fit.kappa, fit.weak_error, fit.residual_rms, lag_ns

@@ -1,7 +1,7 @@
-"""The static pose: how sensors and markers stood while the wearer stood still.
+"""The static calibration: orientations of sensors and markers in the static pose (N-pose).
 
-Law: a pose is judged as a whole; every reason to repeat it is said at once, each with its remedy.
-Without cameras the pose defines its own world, in which all segments are upright and face +y.
+A pose is accepted or rejected as a whole, with all reasons and remedies at once. Without cameras
+the pose defines its own world, in which all segments are upright and face +y.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration._errors import CalibrationRefused
+from jointfit_daemon.calibration._errors import CalibrationError
 from jointfit_daemon.calibration.anatomy import marked_parts, static_cluster
 from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
@@ -30,7 +30,7 @@ from jointfit_daemon.limb_model import (
     SegmentCalibration,
     SegmentModel,
     SensorCalibration,
-    alive_key,
+    model_key,
     rigid_fit,
 )
 
@@ -41,28 +41,28 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration._trial import CalibrationSettings, CalibrationTrial
     from jointfit_daemon.calibration.phases._plate_alignment import PlateAlignment
-    from jointfit_daemon.limb_model import Cluster, StoredCluster
+    from jointfit_daemon.limb_model import MarkerCluster, StoredCluster
     from jointfit_daemon.model import Chain, Quaternion
 
 MAX_TEMPLATE_RMS_M = 0.02
-"""Markers that fit their old places worse than this were moved since."""
+"""RMS residual of a cluster relative to the earlier pose above which markers were moved, m."""
 _NS = 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class StaticPose:
-    """Means over one stretch of standing still."""
+    """Mean orientations over one static pose."""
 
     sensors: Mapping[str, RobustMean]
-    """q_world_sensor per sensor, in its own world."""
+    """q_world_sensor of each sensor, in its own world."""
     still_s: float
-    clusters: Mapping[str, Cluster] = field(default_factory=dict)
-    """Body parts the cameras saw; empty without cameras."""
+    clusters: Mapping[str, MarkerCluster] = field(default_factory=dict)
+    """Body parts that are visible to cameras; empty without cameras."""
     digest: str = ""
 
     @property
     def quality(self) -> dict[str, Any]:
-        """Figures for people: seconds, spread of every sensor in rad, parts seen."""
+        """Duration, scatter of every sensor in rad, and visible body parts."""
         return {
             "still_s": self.still_s,
             "spread_rad": {name: mean.spread for name, mean in self.sensors.items()},
@@ -71,38 +71,42 @@ class StaticPose:
 
 
 def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Chain) -> StaticPose:
-    """Take the static pose from a trial in which the wearer stood still throughout.
+    """Return the static pose of a trial.
 
     Raises
     ------
-    CalibrationRefused
-        A sensor is silent or spreads by more than 1°, the pose is too short, markers are unknown,
+    CalibrationError
+        A sensor has no data or scatters too much, the pose is too short, markers are unknown,
         hidden or on a line; all reasons at once.
     """
     wanted = [sensor for group in chain.sensors for sensor in group]
     reasons = [
-        f"{sensor}: no data while standing still; switch it on, or take it out of rig.toml"
+        f"{sensor}: no data in the static pose; switch it on, or remove it from rig.toml"
         for sensor in wanted
         if sensor not in trial.sensors or len(trial.sensors[sensor].t_ns) < 2
     ]
-    heard = [s for s in wanted if s in trial.sensors and len(trial.sensors[s].t_ns) >= 2]
-    means = {s: robust_mean(trial.sensors[s].q_world_sensor) for s in heard}
-    spans = [_span_s(trial.sensors[s].t_ns) for s in heard]
+    present = [s for s in wanted if s in trial.sensors and len(trial.sensors[s].t_ns) >= 2]
+
+    means = {s: robust_mean(trial.sensors[s].q_world_sensor) for s in present}
+    spans = [_span_s(trial.sensors[s].t_ns) for s in present]
     still_s = min(spans, default=0.0)
-    # A rig may ask for a shorter pose than the usual three seconds. A tenth less is enough: the
-    # samples of a pose span less than the pose, by their period and the way they come.
+    # rig.toml may configure a pose shorter than three seconds. A tenth less is accepted, because
+    # the samples span less than the pose.
     limits = StaticLimits(still_s=0.9 * min(StaticLimits().still_s, settings.static_s))
-    if heard:
+
+    if present:
         reasons += static_problems(means, still_s, limits)
-    clusters: dict[str, Cluster] = {}
+
+    clusters: dict[str, MarkerCluster] = {}
     if trial.optical is not None and len(trial.optical.t_ns) > 0:
         for name in marked_parts(settings, chain):
             try:
                 clusters[name] = static_cluster(trial.optical, name, settings)
-            except CalibrationRefused as refusal:
+            except CalibrationError as refusal:
                 reasons += refusal.reasons
+
     if reasons:
-        raise CalibrationRefused(*reasons)
+        raise CalibrationError(*reasons)
     return StaticPose(means, still_s, clusters, trials_digest(trial))
 
 
@@ -113,7 +117,7 @@ def _span_s(t_ns: NDArray[np.int64]) -> float:
 def sensor_calibration(
     mean: RobustMean, q_optical_world: Quaternion, q_static: Quaternion, lag_ns: int = 0
 ) -> SensorCalibration:
-    """Return a sensor's bias, (q_optical_world q_world_sensor)* q_optical_segment, static pose."""
+    """Return a sensor with its mount (q_optical_world q_world_sensor)* q_optical_segment."""
     q_optical_sensor = rotation.multiply(q_optical_world, mean.q)
     bias = rotation.multiply(rotation.conjugate(q_optical_sensor), q_static)
     return SensorCalibration(q_optical_world, as_quaternion(bias), lag_ns, mean.spread)
@@ -129,9 +133,9 @@ def fit_static_only(
 ) -> Calibration:
     """Calibrate without cameras: all segments upright in the pose, plain mean of the sensors.
 
-    Without an alignment every sensor's world is taken for the static world (the patent's reading:
-    one common world); with arbitrary headings only the inclination is right then, and
-    ``headings_from_static`` says so.
+    Without an alignment, every sensor world is taken as the static world (one common world, as in
+    the patent). With arbitrary headings only the inclination is then correct, and the flag is
+    ``headings_from_static``.
     """
     upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
     flags = ["facing_unknown"] if alignment is not None else ["headings_from_static"]
@@ -158,7 +162,7 @@ def fit_static_only(
         },
         joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
         flags=tuple(flags),
-        notes=("no cameras: angles count from the static pose, the deviation given is a guess",),
+        notes=("no cameras: angles are relative to the static pose; standard deviation assumed",),
         quality={"static": pose.quality, "functional": None},
         digest=pose.digest,
         software=software,
@@ -170,7 +174,7 @@ def _plain_means(sensors: tuple[str, ...]) -> dict[str, SegmentModel]:
     """Return equal-weight means of all sensors and of each alone."""
     sets = {sensors, *((sensor,) for sensor in sensors)}
     return {
-        alive_key(alive, None): MeanModel((1.0 / len(alive),) * len(alive), UNREFERENCED_SD)
+        model_key(alive, None): MeanModel((1.0 / len(alive),) * len(alive), UNREFERENCED_SD)
         for alive in sorted(sets)
     }
 
@@ -178,25 +182,28 @@ def _plain_means(sensors: tuple[str, ...]) -> dict[str, SegmentModel]:
 def with_new_static(
     calibration: Calibration, pose: StaticPose, alignment: PlateAlignment | None = None
 ) -> Calibration:
-    """Return the calibration after sensors were put on anew: only the biases change.
+    """Return the calibration after sensors were re-donned: only the mounts change.
 
-    Where cameras see a segment's markers in their old places on the body, they say how it stands
-    now; else it is taken to stand as in the old pose, facing the same way (`same_pose_assumed`).
+    If cameras see the markers of a segment at their earlier places on the body, they determine its
+    current orientation. Otherwise it is assumed to stand as in the earlier pose, with the same
+    heading (flag ``same_pose_assumed``).
 
     Parameters
     ----------
     alignment : PlateAlignment, optional
-        Newer than the calibration: gives the worlds, and the lags it has found.
+        Newer than the calibration: source of the worlds and of its estimated lags.
 
     Raises
     ------
-    CalibrationRefused
+    CalibrationError
         The pose or the alignment lacks a calibrated sensor, or markers were moved.
     """
     if missing := [name for name in calibration.sensor if name not in pose.sensors]:
-        raise CalibrationRefused(
-            *(f"{name}: not in the new static pose; switch it on" for name in missing)
+        raise CalibrationError(
+            *(f"{name}: no data in the new static pose; switch it on" for name in missing)
         )
+
+    # Current orientation of every segment, as seen by cameras or as before.
     q_now: dict[str, Quaternion] = {}
     assumed = False
     for name, segment in calibration.segment.items():
@@ -204,6 +211,8 @@ def with_new_static(
         assumed |= turned is None and bool(calibration.clusters)
         q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
         q_now[name] = as_quaternion(q)
+
+    # Mounts from the new means; worlds and lags from a newer alignment.
     owner = {
         s: n
         for n, g in zip(calibration.segments, calibration.chain_sensors, strict=True)
@@ -216,6 +225,7 @@ def with_new_static(
             world, found_ns = alignment.world(name), alignment.sensors[name].lag_ns
             lag_ns = lag_ns if found_ns is None else found_ns
         sensors[name] = sensor_calibration(pose.sensors[name], world, q_now[owner[name]], lag_ns)
+
     flags = [flag for flag in calibration.flags if flag != "same_pose_assumed"]
     flags += ["same_pose_assumed"] if assumed else []
     quality = {**calibration.quality, "static": pose.quality}
@@ -224,17 +234,17 @@ def with_new_static(
     return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)
 
 
-def _turned(old: StoredCluster | None, new: Cluster | None) -> NDArray[np.float64] | None:
-    """Return how a body part stands now as seen from its old static pose; None if not seen."""
+def _turned(old: StoredCluster | None, new: MarkerCluster | None) -> NDArray[np.float64] | None:
+    """Return the rotation of a body part since its earlier pose; None if not visible."""
     if old is None or new is None or old.markers != new.markers or old.body != new.body:
         return None
     if old.body is not None:
         return rotation.multiply(new.q_body, rotation.conjugate(old.q_body))
     q, _, rms = rigid_fit(np.array(old.template), (new.template + new.origin)[None])
     if rms[0] > MAX_TEMPLATE_RMS_M:
-        raise CalibrationRefused(
-            f"markers of {new.name}: {1000 * rms[0]:.0f} mm from their old places on the body; "
-            "calibrate again with a functional trial"
+        raise CalibrationError(
+            f"markers of {new.name}: {1000 * rms[0]:.0f} mm RMS from their earlier places on the "
+            "body; repeat the functional calibration"
         )
     turned: NDArray[np.float64] = q[0]
     return turned

@@ -1,7 +1,6 @@
-"""What the models of a limb are fitted to: sensors and reference at common instants.
+"""Training frames of a limb: sensors and reference at common instants.
 
-Law: pure. Only frames in which everything is known; what lacks is named, with the remedy, and
-whether the fit goes on without it or is refused.
+Only complete frames are used. Missing data are reported with the remedy, as a note or as an error.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.calibration._errors import CalibrationRefused
+from jointfit_daemon.calibration._errors import CalibrationError
 from jointfit_daemon.calibration.registration import sensor_at
 from jointfit_daemon.calibration.soft_tissue import LimbTraining
 from jointfit_daemon.kinematics import rotation
@@ -28,23 +27,24 @@ if TYPE_CHECKING:
 
 
 MAX_FRAMES = 2000
-"""More frames than this of one movement repeat themselves; the fit takes every n-th."""
+"""Frames of one movement used at most; longer movements are decimated."""
 MIN_FRAMES = 300
+"""Smallest number of complete frames."""
 SILENT = 0.1
-"""Share of the movement for which a sensor may be silent and nobody need know."""
+"""Share of the movement without data of a sensor above which a note is published."""
 TWINS = np.deg2rad(0.01)
-"""Two real sensors never keep to each other so closely."""
+"""Largest rotation between two sensors, rad, that identifies them as one device."""
 
 
-class Taught(NamedTuple):
-    """What the movement gave."""
+class TrainingSet(NamedTuple):
+    """Training frames of a functional trial."""
 
     training: LimbTraining
-    """Through lag, worlds and mounts."""
+    """Frames with lag, world and mount applied."""
     raw: dict[str, Array]
     """q_world_sensor of every sensor at the same instants, shape (n, 4)."""
     notes: list[str]
-    """What people should know of it."""
+    """Sentences for the operator."""
 
 
 def limb_training(
@@ -53,43 +53,46 @@ def limb_training(
     tracks: Mapping[str, ClusterTrack],
     anatomy: Anatomy,
     sensors: Mapping[str, SensorCalibration],
-) -> Taught:
-    """Return what models are fitted to.
+) -> TrainingSet:
+    """Return the training frames of a functional trial.
 
     Raises
     ------
-    CalibrationRefused
-        Sensors and segments are known together in fewer than 300 frames.
+    CalibrationError
+        Sensors and segments have fewer than 300 common frames.
     """
     t_ns = next(iter(tracks.values())).t_ns
     raw = {s: sensor_at(functional.sensors[s], t_ns, item.lag_ns) for s, item in sensors.items()}
     reference = {
         name: rotation.multiply(tracks[name].q, anatomy.q_static[name]) for name in chain.segments
     }
+
     whole = np.all([visible(q) for q in (*raw.values(), *reference.values())], axis=0)
     rows = np.flatnonzero(whole)
     silent = _silent(raw)
     if rows.size < MIN_FRAMES:
-        raise CalibrationRefused(*silent, _too_few(rows.size, raw | reference))
+        raise CalibrationError(*silent, _too_few(rows.size, raw | reference))
     rows = rows[:: -(-rows.size // MAX_FRAMES)]
-    said = {
+
+    aligned = {
         s: rotation.multiply(
             rotation.multiply(item.q_optical_world, raw[s][rows]), item.q_sensor_segment
         )
         for s, item in sensors.items()
     }
-    training = LimbTraining(said, {name: q[rows] for name, q in reference.items()})
+
+    training = LimbTraining(aligned, {name: q[rows] for name, q in reference.items()})
     kept = {s: q[rows] for s, q in raw.items()}
-    return Taught(training, kept, [*silent, *twins(chain, kept)])
+    return TrainingSet(training, kept, [*silent, *identical_sensors(chain, kept)])
 
 
-def twins(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
-    """Return which sensors of a segment never move against each other: they are one.
+def identical_sensors(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
+    """Return notes on sensors of a segment without relative motion: they are one device.
 
     Parameters
     ----------
     sensors : mapping of str to ndarray, shape (n, 4)
-        Orientations of each, in any world, on any mount; NaN where missing.
+        Orientations of each sensor, in any world, on any mount; NaN if missing.
     """
     found = []
     for group in chain.sensors:
@@ -100,18 +103,18 @@ def twins(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
                 continue
             if float(np.max(rotation.angle_between(between[0], between))) < TWINS:
                 found.append(
-                    f"{a} and {b} say the same in every frame: one device or recording under two "
-                    "names? What a second sensor wins is not there"
+                    f"{a} and {b} are identical in every frame: check that they are not one "
+                    "device or recording under two names; a second sensor has no benefit then"
                 )
     return found
 
 
 def _silent(raw: Mapping[str, Array]) -> list[str]:
-    """Return which sensors were silent for a part of the movement, and how long."""
+    """Return notes on sensors without data in a part of the movement."""
     shares = {name: 1.0 - float(visible(q).mean()) for name, q in raw.items()}
     return [
-        f"{name}: no data in {100 * share:.0f} % of the movement, of which nothing was learned for "
-        "any sensor: see to its plug or battery, and repeat"
+        f"{name}: no data in {100 * share:.0f} % of the movement; this part was ignored for all "
+        "sensors: check its connector or battery, and repeat"
         for name, share in shares.items()
         if share > SILENT
     ]
@@ -120,6 +123,6 @@ def _silent(raw: Mapping[str, Array]) -> list[str]:
 def _too_few(count: int, known: Mapping[str, Array]) -> str:
     counts = {name: int(visible(q).sum()) for name, q in known.items()}
     return (
-        f"functional: all sensors and segments together in {count} frames, at least {MIN_FRAMES} "
-        f"are needed; seen of each: {counts}"
+        f"functional: {count} frames with all sensors and segments, at least {MIN_FRAMES} "
+        f"are needed; frames of each: {counts}"
     )

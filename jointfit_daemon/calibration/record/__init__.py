@@ -2,9 +2,9 @@
 
 from jointfit_daemon.calibration.record._store import (
     MOST_BYTES,
+    CalibrationFileError,
     CalibrationStore,
-    CalibrationUnreadable,
 )
 from jointfit_daemon.calibration.record._trial_digest import trials_digest
 
-__all__ = ["MOST_BYTES", "CalibrationStore", "CalibrationUnreadable", "trials_digest"]
+__all__ = ["MOST_BYTES", "CalibrationFileError", "CalibrationStore", "trials_digest"]

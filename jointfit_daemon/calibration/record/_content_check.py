@@ -1,7 +1,7 @@
-"""Whether a calibration that was read can be used: types, shapes, ranges and names, all of it.
+"""Check of the content of a stored calibration: types, shapes, ranges and names.
 
-Invariant: what passes makes no later code raise. Models are evaluated, since their shapes depend on
-each other in ways that only they know.
+Invariant: no later code raises an error for a calibration that passed. Models are evaluated,
+because the shapes of their arrays depend on each other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from jointfit_daemon.limb_model import Method, Reading
+from jointfit_daemon.limb_model import Method, PatentReading
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -21,26 +21,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration, SegmentCalibration, SegmentModel, SensorLink
 
 _UNIT = 1e-6
-"""By how much the norm of a quaternion may differ from 1; writing rounds to 1e-16."""
+"""Tolerance of the norm of a unit quaternion; rounding in text is 1e-16."""
 _LONGEST_M = 10.0
-"""No position or length of a body in a capture volume is larger than the volume."""
+"""Largest length of a segment, m."""
 _FARTHEST_M = 1000.0
+"""Largest coordinate, m."""
 _LONGEST_LAG_NS = 10**10
 _LARGEST_SD = 1e3
 _LARGEST = 1e12
-"""No coefficient of a model is larger."""
+"""Largest coefficient of a model."""
 _POLYNOMIALS = 10
 _COMPONENTS = {"pair": 3, "joint": 1}
 _HALF = sqrt(0.5)
 _PROBES = ((1.0, 0.0, 0.0, 0.0), (_HALF, _HALF, 0.0, 0.0), (0.5, -0.5, 0.5, 0.5))
-"""Orientations that every model must take."""
+"""Orientations for the evaluation of every model."""
 
 
 def content_faults(calibration: Calibration) -> list[str]:
-    """Return what is wrong with a calibration, one phrase each; empty if it can be used."""
+    """Return the faults of a calibration, one phrase each; empty if it can be used."""
     try:
         return list(_faults(calibration))
-    except Exception as error:  # noqa: BLE001 - a wrong type may raise anything; it is a fault
+    except Exception as error:  # noqa: BLE001 - a wrong type may raise any error
         return [f"{type(error).__name__}: {error}"]
 
 
@@ -51,12 +52,12 @@ def _faults(c: Calibration) -> Iterator[str]:
     if not all(isinstance(text, str) for text in texts):
         yield "flags, notes, digest, software, created_utc and memory must be text"
     if len(b64decode(c.memory, validate=True)) % 2:
-        yield "memory: cut short"
-    worn = [name for group in c.chain_sensors for name in group]
+        yield "memory: truncated"
+    sensors = [name for group in c.chain_sensors for name in group]
     yield from _names("joints", c.joints)
     yield from _names("segments", c.segments)
-    yield from _names("chain_sensors", worn)
-    yield from _same("sensor", c.sensor, worn)
+    yield from _names("chain_sensors", sensors)
+    yield from _same("sensor", c.sensor, sensors)
     yield from _same("segment", c.segment, c.segments)
     yield from _same("joint", c.joint, c.joints)
     yield from _sensors(c)
@@ -65,7 +66,7 @@ def _faults(c: Calibration) -> Iterator[str]:
     yield from _joints(c)
     yield from _clusters(c)
     for link in c.links:
-        yield from _link(link, worn)
+        yield from _link(link, sensors)
     yield from _quality(c.quality)
     for name, rho in c.correlations.items():
         if name not in c.joints or not _number(rho, -1.0, 1.0):
@@ -90,7 +91,7 @@ def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
     for key, model in segment.models.items():
         sensors, bar, other = key.partition("|")
         if not bar:
-            yield f"segment.{name}.models: {key!r} names no set of sensors"
+            yield f"segment.{name}.models: {key!r} is not a set of sensors"
         elif wrong := [*_wrong_types(model)]:
             yield f"segment.{name}.models[{key}]: wrong type of {', '.join(wrong)}"
         elif fault := _model(model, len(sensors.split("+")), has_other=bool(other)):
@@ -98,13 +99,13 @@ def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
 
 
 def _wrong_types(model: Any) -> Iterator[str]:
-    """Yield the fields of a model whose values are not of the annotated type.
+    """Yield the fields of a model whose values do not have the annotated type.
 
-    Evaluating a model does not reach all of them: some count only after a sensor was lost.
+    An evaluation does not use all fields: some apply only after the loss of a sensor.
     """
     for field in fields(model):
         value = getattr(model, field.name)
-        if field.name.startswith("_"):  # derived from the others
+        if field.name.startswith("_"):  # derived from other fields
             continue
         if is_dataclass(value):
             yield from (f"{field.name}.{name}" for name in _wrong_types(value))
@@ -117,8 +118,8 @@ def _is_of(value: object, annotation: str) -> bool:
         return isinstance(value, bool)
     if annotation == "int":
         return isinstance(value, int) and _number(value, 0, _LARGEST)
-    if annotation == "Reading":
-        return value in get_args(Reading)
+    if annotation == "PatentReading":
+        return value in get_args(PatentReading)
     if annotation == "float":
         return _number(value, -_LARGEST, _LARGEST)
     return isinstance(value, tuple) and all(_is_numeric(item) for item in value)
@@ -131,21 +132,21 @@ def _is_numeric(value: object) -> bool:
 
 
 def _model(model: SegmentModel, count: int, *, has_other: bool) -> str | None:
-    """Return why a model does not give orientations, or None."""
+    """Return the reason why a model does not return orientations, or None."""
     if (trained := getattr(model, "sensors", count)) != count:
-        return f"trained for {trained!r} sensors, not for {count}"
+        return f"trained for {trained!r} sensors, expected {count}"
     for i in range(len(_PROBES)):
         sensors = [_PROBES[(i + k) % len(_PROBES)] for k in range(count)]
         other = _PROBES[i - 1] if has_other else None
         found = model.predict_one(sensors, other)
         sds = (found.sd, *(found.axis_sd or ()))
         if not _is_unit(found.q) or not all(_number(sd, 0.0, _LARGEST_SD) for sd in sds):
-            return "gives no orientation with a standard deviation"
-    return None if _number(model.residual_sd, 0.0, _LARGEST_SD) else "residual_sd is no number"
+            return "returns no orientation with a standard deviation"
+    return None if _number(model.residual_sd, 0.0, _LARGEST_SD) else "residual_sd is not a number"
 
 
 def _quality(quality: Mapping[str, Any]) -> Iterator[str]:
-    """Check the figures that the program itself reads; the others are published as they are."""
+    """Check the figures that the program evaluates; the others are published unchanged."""
     for key, section in quality.items():
         if not (section is None or isinstance(section, dict)):
             yield f"quality.{key}: expected a table"
@@ -179,7 +180,7 @@ def _clusters(c: Calibration) -> Iterator[str]:
         yield from _names(f"{key}.markers", cluster.markers)
         if not (cluster.body is None or _is_text(cluster.body)):
             yield f"{key}.body: {cluster.body!r}"
-        # A rigid body is followed by its own orientation, whatever its template holds.
+        # The pose of a rigid body does not depend on its template.
         count = len(cluster.markers) if cluster.body is None else len(cluster.template)
         if count or cluster.template:
             yield from _finite(f"{key}.template", cluster.template, (count, 3))
@@ -187,10 +188,10 @@ def _clusters(c: Calibration) -> Iterator[str]:
         yield from _unit(f"{key}.q_body", cluster.q_body)
 
 
-def _link(link: SensorLink, worn: Sequence[str]) -> Iterator[str]:
+def _link(link: SensorLink, sensors: Sequence[str]) -> Iterator[str]:
     key = f"links {link.a}-{link.b}"
-    if not {link.a, link.b, *link.near} <= set(worn):
-        yield f"{key}: names a sensor that is not worn"
+    if not {link.a, link.b, *link.near} <= set(sensors):
+        yield f"{key}: contains an unknown sensor"
     if link.kind not in _COMPONENTS:
         yield f"{key}: kind {link.kind!r}"
         return
@@ -222,7 +223,7 @@ def _finite(key: str, values: Any, shape: tuple[int, ...]) -> Iterator[str]:
 
 def _unit(key: str, q: Sequence[float]) -> Iterator[str]:
     if not _is_unit(q):
-        yield f"{key}: {list(q)!r:.80} is no unit quaternion"
+        yield f"{key}: {list(q)!r:.80} is not a unit quaternion"
 
 
 def _is_unit(q: Sequence[float]) -> bool:

@@ -1,12 +1,13 @@
-"""Calibrations on disk: numbered versions, written whole or not at all, with a checksum.
+"""Versioned store of calibrations: atomic writes, checksums, and quarantine of damaged files.
 
-Invariant: a version, once written, is never changed; a reader sees a complete file or none. Text
-is written aside, flushed to the medium, then linked under its number, which fails if that number
-exists; the directory is flushed last. A stop at any moment leaves the previous version in force.
+Invariant: a stored version never changes, and a reader finds a complete file or none. The text is
+written to a temporary file, flushed to the medium and linked under its number; linking fails if the
+number exists. The directory is flushed last. After an interruption at any point the previous
+version is in force.
 
 A file is ``{"sha256": …, "calibration": {…}}``; the checksum is that of the calibration as JSON
-with sorted keys and without blanks. A file whose content cannot be used is renamed to ``….bad``,
-which keeps its number taken, and never deleted.
+with sorted keys and without whitespace. A file with unusable content is renamed to ``….bad``, so
+that its number stays reserved, and is never deleted.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from jointfit_daemon.files.text import (
     parse_json,
     read_bounded,
 )
-from jointfit_daemon.limb_model import Calibration, UnknownSchema
+from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,17 +41,17 @@ _TAKEN = re.compile(r"(\d{4,9})\.json(\.bad\d*)?")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
-class CalibrationUnreadable(Exception):  # noqa: N818 - named for what happened
+class CalibrationFileError(Exception):
     """A stored file is damaged or of another program; the message names the file and the remedy."""
 
 
-class _DamagedError(CalibrationUnreadable):
-    """Its content can never be used by this program."""
+class _DamagedFileError(CalibrationFileError):
+    """The content of the file cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
-    """A calibration as found."""
+class StoredCalibration:
+    """A calibration from the store."""
 
     calibration: Calibration
     version: int
@@ -59,19 +60,19 @@ class Stored:
 
 
 class CalibrationStore:
-    """The versions of one name under one directory: ``DIRECTORY/NAME/0001.json`` and on.
+    """The versions of one name in one directory: ``DIRECTORY/NAME/0001.json`` and so on.
 
     Parameters
     ----------
     directory : Path
-        Usually ``$STATE_DIRECTORY/calibrations``; made when first written to.
+        Usually ``$STATE_DIRECTORY/calibrations``; created by the first write.
     name : str
-        Of the wearer or session: letters, digits, ``. _ -``, starting with a letter or digit.
+        Name of the subject or session: letters, digits, ``. _ -``, starting with a letter or digit.
 
     Raises
     ------
     ValueError
-        The name would leave the directory or needs other characters.
+        The name has other characters.
     """
 
     def __init__(self, directory: Path, name: str) -> None:
@@ -90,16 +91,16 @@ class CalibrationStore:
         return sorted(int(match[1]) for match in found if match)
 
     def path(self, version: int) -> Path:
-        """Return where a version lies, whether it exists or not."""
+        """Return the path of a version, existing or not."""
         return self._directory / f"{version:04d}.json"
 
     def save(self, calibration: Calibration) -> int:
-        """Write a new version and return its number; durable when this returns.
+        """Write a new version to durable storage and return its number.
 
         Raises
         ------
         OSError
-            The medium is full, read-only or gone; nothing was changed then.
+            The medium is full, read-only or missing; nothing was changed.
         """
         self._directory.mkdir(parents=True, exist_ok=True)
         content = calibration.to_dict()
@@ -118,18 +119,18 @@ class CalibrationStore:
         return version
 
     def _link(self, aside: Path) -> int:
-        """Give the file the next free number. A hard link, unlike a rename, never replaces."""
+        """Link the file under the next free number; unlike a rename, this never replaces a file."""
         names = (_TAKEN.fullmatch(path.name) for path in self._directory.iterdir())
         version = max((int(match[1]) for match in names if match), default=0) + 1
         while True:
             try:
                 os.link(aside, self.path(version))
-            except FileExistsError:  # another process was first: its version stays
+            except FileExistsError:  # another process used this number
                 version += 1
             except OSError as error:
                 if error.errno not in _NO_LINKS:
                     raise
-                aside.rename(self.path(version))  # FAT and the like: atomic, one writer trusted
+                aside.rename(self.path(version))  # FAT has no links: atomic with one writer
                 return version
             else:
                 return version
@@ -146,49 +147,49 @@ class CalibrationStore:
 
         Raises
         ------
-        CalibrationUnreadable
+        CalibrationFileError
             No such version, or the file is damaged.
         """
         path = self.path(version)
         if not path.exists():
             known = ", ".join(map(str, self.versions())) or "none"
-            raise CalibrationUnreadable(f"{path}: no such version; stored: {known}")
+            raise CalibrationFileError(f"{path}: no such version; stored: {known}")
         try:
             data = read_bounded(path, MOST_BYTES)
         except MalformedFileError as error:
-            raise CalibrationUnreadable(str(error)) from error
+            raise CalibrationFileError(str(error)) from error
         try:
             return _calibration_of(data)
-        except (UnknownSchema, ValueError, RecursionError) as error:
-            raise _DamagedError(
+        except (CalibrationSchemaError, ValueError, RecursionError) as error:
+            raise _DamagedFileError(
                 f"{path}: cannot be used ({str(error) or type(error).__name__:.300}); "
                 "restore the file from a backup or calibrate again"
             ) from error
 
-    def latest(self) -> Stored | None:
-        """Return the newest usable version, with a note for every newer one that is not.
+    def latest(self) -> StoredCalibration | None:
+        """Return the newest usable version, with a note on every newer one that is unusable.
 
-        Files whose content cannot be used are renamed.
+        Files with unusable content are renamed.
 
         Raises
         ------
-        CalibrationUnreadable
-            There are versions and none can be read.
+        CalibrationFileError
+            There are versions, but none can be read.
         """
         notes: list[str] = []
         for version in reversed(self.versions()):
             try:
-                return Stored(self.load(version), version, tuple(notes))
-            except _DamagedError as error:
-                notes.append(f"{error}; {self._set_aside(version)}; the version before is used")
-            except CalibrationUnreadable as error:
-                notes.append(f"{error}; the version before is used")
+                return StoredCalibration(self.load(version), version, tuple(notes))
+            except _DamagedFileError as error:
+                notes.append(f"{error}; {self._set_aside(version)}; the previous version is used")
+            except CalibrationFileError as error:
+                notes.append(f"{error}; the previous version is used")
         if notes:
-            raise CalibrationUnreadable("; ".join(notes))
+            raise CalibrationFileError("; ".join(notes))
         return None
 
     def _set_aside(self, version: int) -> str:
-        """Rename a damaged version, so that it is reported once; return what was done."""
+        """Rename a damaged version, so that it is reported once; return the outcome."""
         path = self.path(version)
         for count in range(1, 100):
             aside = path.with_name(f"{path.name}.bad{count if count > 1 else ''}")
@@ -197,12 +198,12 @@ class CalibrationStore:
                     path.rename(aside)
                 except OSError as error:
                     return f"it cannot be renamed: {error.strerror}"
-                return f"set aside as {aside.name}"
-        return "it stays: too many files of this name are set aside"
+                return f"renamed to {aside.name}"
+        return "it was not renamed: too many damaged files of this name"
 
 
 def checksum(content: Mapping[str, object]) -> str:
-    """Return the SHA-256, in hex, of the JSON form of a calibration, whatever its layout."""
+    """Return the SHA-256, in hex, of the JSON form of a calibration, independent of its layout."""
     text = json.dumps(content, allow_nan=False, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -213,17 +214,17 @@ def _calibration_of(data: bytes) -> Calibration:
     Raises
     ------
     ValueError, RecursionError
-        It cannot be used; `UnknownSchema` among them.
+        The content cannot be used; includes `CalibrationSchemaError`.
     """
     table = parse_json(data.decode("utf-8-sig"))
     if not isinstance(table, dict):
-        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - of a file
+        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - file content
     content: object = table if "schema" in table else table.get("calibration")
     if not isinstance(content, dict):
-        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - as above
+        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - file content
     # A bare calibration was written before there were checksums.
     if content is not table and table.get("sha256") != checksum(content):
-        raise ValueError("the checksum differs: it was damaged, or edited by hand")
+        raise ValueError("the checksum differs: the file was damaged or edited")
     if fault := find_structure_fault(content):
         raise ValueError(fault)
     calibration = Calibration.from_dict(content)

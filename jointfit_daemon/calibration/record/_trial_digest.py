@@ -1,4 +1,4 @@
-"""One number for the data behind a calibration. Law: names, stamps and values, nothing else."""
+"""Digest of the trials of a calibration: names, time stamps and values."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 def trials_digest(*trials: CalibrationTrial | None) -> str:
     """Return the SHA-256, in hex, of the arrays of all trials and the names of their columns.
 
-    Little-endian bytes in a fixed order, so it is the same on every machine and for every order in
-    which sensors were recorded.
+    Bytes are little-endian in a fixed order, so the digest is the same on every machine and does
+    not depend on the order of the sensors in the recording.
     """
     sha = hashlib.sha256()
     for trial in trials:

@@ -3,11 +3,11 @@
 from jointfit_daemon.calibration.registration._lags import (
     NO_LAG,
     SKIN,
-    ChosenLag,
-    known_lag,
-    seen_lags,
+    SensorLag,
+    configured_lag,
     segment_lags,
     sensor_lags,
+    tracked_lags,
     usable_ns,
 )
 from jointfit_daemon.calibration.registration._resampling import orientations_at, sensor_at
@@ -18,9 +18,9 @@ from jointfit_daemon.calibration.registration._sensor_mount import (
 from jointfit_daemon.calibration.registration._static_mean import (
     RobustMean,
     StaticLimits,
-    redonning_problems,
+    redonning_notes,
     robust_mean,
-    static_bias,
+    static_mount,
     static_problems,
 )
 from jointfit_daemon.calibration.registration._stillness import StillnessMonitor, still_from_rates
@@ -28,22 +28,22 @@ from jointfit_daemon.calibration.registration._stillness import StillnessMonitor
 __all__ = [
     "NO_LAG",
     "SKIN",
-    "ChosenLag",
     "RobustMean",
+    "SensorLag",
     "StaticLimits",
     "StillnessMonitor",
+    "configured_lag",
     "fit_observable_alignment",
     "fit_sensor_alignment",
-    "known_lag",
     "orientations_at",
-    "redonning_problems",
+    "redonning_notes",
     "robust_mean",
-    "seen_lags",
     "segment_lags",
     "sensor_at",
     "sensor_lags",
-    "static_bias",
+    "static_mount",
     "static_problems",
     "still_from_rates",
+    "tracked_lags",
     "usable_ns",
 ]

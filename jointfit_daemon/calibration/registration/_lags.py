@@ -1,13 +1,15 @@
-r"""Lag of each sensor against the optical clock, from turning alone. Law: unsure means absent.
+r"""Lag of each sensor relative to the optical clock, estimated from rotation.
 
-On skin, sensor and markers ride on different flesh, and the wobble of either passes for a lag. The
-fit's own sigma does not know that, so what a movement says of a segment's sensors is taken as
+On skin, sensor and markers move with different soft tissue, and their relative motion biases the
+lag. The standard deviation of the fit does not contain this bias. The measured lags of the sensors
+of one segment are therefore modeled as
 
 .. math:: m_i = \tau_i + c + d_i + n_i ,
 
-with n of the fit's sigma, d of each sensor's own flesh, c of the markers' flesh, shared by all.
-What the align phase said of them, on a plate without flesh, is combined with it by precision. So a
-sensor known from the plate tells c, and through it the lag of a neighbor that was not on the plate.
+with the noise n of the fit, the artefact d of each sensor, and the artefact c of the markers,
+common to all sensors. The lags of the align phase, measured on a plate without soft tissue, are
+combined with them by precision. A sensor with a known lag thus determines c, and through c the lag
+of a neighbor that was not on the plate. Lags that are too uncertain are absent.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ PLATE = LagSettings(
     min_acceleration=radians(60),
     min_valid=0.5,
 )
-"""A rigid body turned by hand: noise and occlusion are all that may spoil it."""
+"""Limits of the lag estimate for a rigid plate: only noise and occlusion disturb it."""
 SKIN = LagSettings(
     max_sigma_ns=5e6,
     min_r2=0.7,
@@ -43,40 +45,40 @@ SKIN = LagSettings(
     min_weight=0.5,
     min_valid=0.5,
 )
-"""Sensors and markers on skin move apart, so R² stays lower; 5 ms at 3 rad/s is still below 1°."""
+"""Limits of the lag estimate on skin: R² is lower; 5 ms at 3 rad/s is still below 1°."""
 
-FLESH_SD_NS = 2e6
-"""Of a sensor's own flesh."""
-MARKERS_SD_NS = 3e6
-"""Of the flesh under a segment's markers, shared by its sensors."""
-RULED_OUT = 4.0
-"""Standard deviations between plate and movement from which on a clock or filter changed between
-the two, and the later one counts."""
+SENSOR_TISSUE_SD_NS = 2e6
+"""Standard deviation of the lag due to soft tissue under a sensor, ns."""
+MARKER_TISSUE_SD_NS = 3e6
+"""Standard deviation of the lag due to soft tissue under the markers of a segment, ns."""
+MAX_PRIOR_DEVIATION = 4.0
+"""Difference of the lags on plate and in movement, in standard deviations, above which a clock or
+filter changed in between; the later lag is used."""
 
 
-class ChosenLag(NamedTuple):
-    """The lag a calibration uses for one sensor."""
+class SensorLag(NamedTuple):
+    """The lag that a calibration uses for one sensor."""
 
     lag_ns: int
     sigma_ns: float | None
-    """None where whoever said it did not say how sure it is."""
+    """Standard deviation, ns; None if unknown."""
     source: str
     """``known``, ``plate``, ``movement``, ``plate and movement``, ``tracked``, ``stored`` or
     ``none``."""
 
 
-NO_LAG = ChosenLag(0, None, "none")
+NO_LAG = SensorLag(0, None, "none")
 
 
-def known_lag(lag_ns: int) -> ChosenLag:
-    """Return a lag that was told from outside."""
-    return ChosenLag(lag_ns, None, "known")
+def configured_lag(lag_ns: int) -> SensorLag:
+    """Return a configured lag."""
+    return SensorLag(lag_ns, None, "known")
 
 
 def segment_lags(
     moving: Mapping[str, LagEstimate], prior: Mapping[str, tuple[int, float]]
-) -> dict[str, ChosenLag]:
-    r"""Return the most probable lags of one segment's sensors.
+) -> dict[str, SensorLag]:
+    r"""Return the most probable lags of the sensors of one segment.
 
     .. math:: \hat\tau = (P + C^{-1})^{-1} (P p + C^{-1} m), \quad
               C = \mathrm{diag}(\sigma_i^2 + \sigma_d^2) + \sigma_c^2 1 1^T
@@ -84,35 +86,40 @@ def segment_lags(
     Parameters
     ----------
     moving : mapping
-        What the movement says; refused ones are left out.
+        Lags measured in the movement; rejected ones are ignored.
     prior : mapping
-        Lag and its standard deviation, ns, from the align phase, for any of them.
+        Lag and standard deviation, ns, of the align phase, for any of the sensors.
 
     Returns
     -------
     dict
-        Sensors of which neither says anything are absent; so are those whose movement alone says
-        less than its standard deviation: that is noise, and would set partners apart.
+        Sensors without either lag are absent. A lag from movement alone that is below its standard
+        deviation is noise and is absent, too.
     """
     names = [name for name, lag in moving.items() if lag.refused is None]
-    alone = {n: ChosenLag(lag, sd, "plate") for n, (lag, sd) in prior.items() if n not in names}
+    alone = {n: SensorLag(lag, sd, "plate") for n, (lag, sd) in prior.items() if n not in names}
     if not names:
         return alone
     found = np.array([moving[name].lag_ns for name in names])
     sigma = np.array([moving[name].sigma_ns for name in names])
+
+    # Prior lags that agree with the movement.
     trusted = {
         name: prior[name]
         for name, lag, own in zip(names, found, sigma, strict=True)
-        if name in prior and abs(lag - prior[name][0]) <= RULED_OUT * _apart_sd(own, prior[name][1])
+        if name in prior
+        and abs(lag - prior[name][0]) <= MAX_PRIOR_DEVIATION * _apart_sd(own, prior[name][1])
     }
+
+    # Precision-weighted combination, equation above.
     weight = np.array([trusted[n][1] ** -2.0 if n in trusted else 0.0 for n in names])
-    said = np.array([trusted[n][0] if n in trusted else 0.0 for n in names])
-    inverse = np.linalg.inv(np.diag(sigma**2 + FLESH_SD_NS**2) + MARKERS_SD_NS**2)
+    prior_ns = np.array([trusted[n][0] if n in trusted else 0.0 for n in names])
+    inverse = np.linalg.inv(np.diag(sigma**2 + SENSOR_TISSUE_SD_NS**2) + MARKER_TISSUE_SD_NS**2)
     covariance = np.linalg.inv(np.diag(weight) + inverse)
-    lags = covariance @ (weight * said + inverse @ found)
+    lags = covariance @ (weight * prior_ns + inverse @ found)
     sds = np.sqrt(np.diag(covariance))
     return alone | {
-        name: ChosenLag(
+        name: SensorLag(
             round(lag), float(sd), "plate and movement" if name in trusted else "movement"
         )
         for name, lag, sd in zip(names, lags.tolist(), sds.tolist(), strict=True)
@@ -120,16 +127,18 @@ def segment_lags(
     }
 
 
-def seen_lags(tracked: Mapping[str, tuple[float, float]]) -> dict[str, ChosenLag]:
-    """Return lags seen while running, where sensors and markers ride on flesh, too."""
+def tracked_lags(tracked: Mapping[str, tuple[float, float]]) -> dict[str, SensorLag]:
+    """Return lags tracked at run time, with the uncertainty of soft tissue added."""
     return {
-        name: ChosenLag(round(lag), hypot(sigma, FLESH_SD_NS, MARKERS_SD_NS), "tracked")
+        name: SensorLag(
+            round(lag), hypot(sigma, SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS), "tracked"
+        )
         for name, (lag, sigma) in tracked.items()
     }
 
 
 def _apart_sd(sigma_ns: float, prior_sd_ns: float) -> float:
-    return hypot(sigma_ns, prior_sd_ns, FLESH_SD_NS, MARKERS_SD_NS)
+    return hypot(sigma_ns, prior_sd_ns, SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS)
 
 
 def sensor_lags(
@@ -138,12 +147,12 @@ def sensor_lags(
     sensors: Mapping[str, SensorTrack],
     settings: LagSettings = PLATE,
 ) -> dict[str, LagEstimate]:
-    """Estimate the lag of every sensor against one optical body, `timing.lag.estimate_lag`.
+    """Estimate the lag of every sensor relative to one optical body.
 
     Parameters
     ----------
     t_ns, q : ndarray, shapes (m,), (m, 4)
-        The optical body; NaN where not seen.
+        The optical body; NaN if not visible.
     sensors : mapping
         Sensors fixed to that body.
     """
@@ -156,5 +165,5 @@ def sensor_lags(
 
 
 def usable_ns(lags: Mapping[str, LagEstimate]) -> dict[str, int]:
-    """Return the lags, ns, that may be used."""
+    """Return the accepted lags, ns."""
     return {name: round(lag.lag_ns) for name, lag in lags.items() if lag.refused is None}

@@ -1,4 +1,4 @@
-"""Orientation tracks at other instants. Law: never across a gap; NaN says that nothing is known."""
+"""Orientations interpolated to other instants. Gaps are not bridged: NaN means unknown."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 
 MAX_GAP_SAMPLES = 3.5
-"""Widest gap bridged, in median sample periods: three missing samples are not bridged."""
+"""Widest interpolated gap, in median sample periods: two missing samples are bridged, three are
+not."""
 
 
 def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64]) -> Array:
@@ -26,11 +27,11 @@ def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64])
     Parameters
     ----------
     t_ns : ndarray, shape (n,)
-        Strictly increasing.
+        Strictly increasing, ns.
     q : ndarray, shape (n, 4)
-        Unit; rows of NaN are left out as if never sampled.
+        Unit quaternions; rows with NaN are ignored.
     at_ns : ndarray, shape (m,)
-        Where to.
+        Target instants, ns.
 
     Returns
     -------
@@ -41,19 +42,21 @@ def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64])
     t, q = t_ns[good], q[good]
     if len(t) < 2:
         return np.full((len(at_ns), 4), np.nan)
+
     widest = MAX_GAP_SAMPLES * float(np.median(np.diff(t_ns)))
     i = np.clip(np.searchsorted(t, at_ns, side="right") - 1, 0, len(t) - 2)
     width = (t[i + 1] - t[i]).astype(np.float64)
     share = (at_ns - t[i]) / width
+
     out = rotation.interpolate(q[i], q[i + 1], share)
     out[(share < 0.0) | (share > 1.0) | ((width > widest) & (share > 0.0) & (share < 1.0))] = np.nan
     return out
 
 
 def sensor_at(track: SensorTrack, at_ns: NDArray[np.int64], lag_ns: int = 0) -> Array:
-    """Return a sensor's orientations at instants of the optical clock.
+    """Return the orientations of a sensor at instants of the optical clock.
 
-    `lag_ns` is the sensor's stamp minus the optical stamp of the same event, so the sensor is read
-    at ``at_ns + lag_ns``.
+    `lag_ns` is the sensor time stamp minus the optical time stamp of the same event, so the sensor
+    is evaluated at ``at_ns + lag_ns``.
     """
     return orientations_at(track.t_ns, track.q_world_sensor, at_ns + lag_ns)

@@ -1,11 +1,11 @@
-r"""How a sensor's world and housing sit against the optical world and the body it is on.
+r"""Sensor-to-segment and world-to-world alignment of one sensor.
 
 .. math:: q_{ref,i} = q_W \otimes q_{s,i} \otimes q_B
 
-Law: pure, linear algebra of 4x4 matrices; the solver says what the movement could not show and
-refuses to answer it. The full and the heading-only problem are for sensors on a rigid plate:
-skin-mounted sensors move with the tissue, the fit takes that for a turn of the world, and is tens
-of degrees wrong once the subject faces another way.
+The problem is solved by linear algebra of 4x4 matrices; parameters that the movement does not
+excite are detected and not estimated. The full and the heading-only problem apply to sensors on a
+rigid plate. Skin-mounted sensors move with soft tissue; the fit takes this motion for a rotation of
+the world and is wrong by tens of degrees at other headings of the subject.
 """
 
 from __future__ import annotations
@@ -30,96 +30,99 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
 
-Kind = Literal["full", "heading", "mount"]
+AlignmentKind = Literal["full", "heading", "mount"]
 
 _SAME = 1e-9  # singular values closer than this, relatively, are equal
 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentLimits:
-    """When a turn between the worlds is believed."""
+    """Limits for accepting a rotation between the worlds."""
 
     kappa_full: float = 0.95
     kappa_heading: float = 0.98
     weak_error: float = np.deg2rad(1.0)
-    """Largest standard error of the full problem's weakest direction, rad."""
+    """Largest standard error of the weakest direction of the full problem, rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorAlignment:
-    """What was found, how well, and what was refused."""
+    """Alignment of one sensor with its quality."""
 
-    kind: Kind
+    kind: AlignmentKind
     q_world: Array
     """q_optical_sensorworld, shape (4,); the identity for kind ``mount``."""
     q_mount: Array
     """q_sensor_body, shape (4,)."""
     kappa: float
-    """Second singular value over the first: 1 where world and mount cannot be told apart; 0 for
-    kind ``mount``, which has nothing to tell apart."""
+    """Second over first singular value: 1 if world and mount are indistinguishable, 0 for kind
+    ``mount``."""
     weak_error: float
     """Standard error of the weakest direction, rad; inf where it is unobservable."""
     residual_rms: float
     """RMS angle between model and reference, rad, all frames."""
     residual_scale: float
-    """Robust scale of the same angles, rad: outliers do not enter."""
+    """Robust scale of the residual angles, rad; insensitive to outliers."""
     effective_count: float
-    """Independent looks the frames are worth."""
+    """Number of independent frames."""
     refused: tuple[str, ...] = ()
-    """Why each richer kind was not accepted."""
+    """Reasons for rejecting each richer kind of alignment."""
 
 
 def fit_observable_alignment(
     q_world_sensor: ArrayLike, q_optical_body: ArrayLike, limits: AlignmentLimits | None = None
 ) -> SensorAlignment:
-    """Return the richest alignment the movement supports: full, else heading, else mount only.
+    """Return the richest alignment that the movement supports: full, else heading, else mount only.
 
     Parameters
     ----------
     q_world_sensor : array_like, shape (n, 4)
-        Sensor orientations in the sensor's own world.
+        Sensor orientations in the world of the sensor.
     q_optical_body : array_like, shape (n, 4)
-        The body the sensor is fixed to, at the same instants; rows with NaN in either are left out.
+        Orientations of the body that carries the sensor, at the same instants. Rows with NaN in
+        either are ignored.
 
     Raises
     ------
     ValueError
-        Fewer than four frames have both.
+        Fewer than four complete frames.
     """
     limits = limits or AlignmentLimits()
     refused: list[str] = []
     full = fit_sensor_alignment("full", q_world_sensor, q_optical_body)
     if full.kappa <= limits.kappa_full and full.weak_error <= limits.weak_error:
         return full
+
     refused.append(
         f"full world alignment: kappa {full.kappa:.3f} (at most {limits.kappa_full}), error of the "
-        f"weakest direction {np.rad2deg(full.weak_error):.2f} deg: turn about two or more axes"
+        f"weakest direction {np.rad2deg(full.weak_error):.2f} deg: rotate about two or more axes"
     )
+
     heading = fit_sensor_alignment("heading", q_world_sensor, q_optical_body)
     if heading.kappa <= limits.kappa_heading:
         return _with_refused(heading, refused)
     refused.append(
-        f"heading alignment: kappa {heading.kappa:.3f} (at most {limits.kappa_heading}): turn "
+        f"heading alignment: kappa {heading.kappa:.3f} (at most {limits.kappa_heading}): rotate "
         "about a horizontal axis, too"
     )
     return _with_refused(fit_sensor_alignment("mount", q_world_sensor, q_optical_body), refused)
 
 
 def fit_sensor_alignment(
-    kind: Kind, q_world_sensor: ArrayLike, q_optical_body: ArrayLike
+    kind: AlignmentKind, q_world_sensor: ArrayLike, q_optical_body: ArrayLike
 ) -> SensorAlignment:
-    r"""Fit one kind of alignment by robust least squares, without judging it.
+    r"""Fit one kind of alignment by robust least squares, without accepting or rejecting it.
 
-    With :math:`b = q_B` and :math:`v = q_W^*` the model reads :math:`L(q_s) b = \pm R(q_{ref}) v`;
-    the summed squared difference over unit b, v is smallest at the first singular vectors of
+    With :math:`b = q_B` and :math:`v = q_W^*` the model reads :math:`L(q_s) b = \pm R(q_{ref}) v`.
+    The sum of squared differences over unit b and v is smallest at the first singular vectors of
     :math:`M = \sum w_i s_i L(q_{s,i})^T R(q_{ref,i})`. Signs s and Huber weights w are iterated.
-    For ``heading`` only the columns w and z of M are kept; for ``mount`` q_W = 1 and q_B is a
+    For ``heading`` only the columns w and z of M are used. For ``mount`` q_W = 1 and q_B is a
     robust mean. Source: the quaternion form of AX = YB, Zhuang, Roth and Sudhakar 1994.
 
     Raises
     ------
     ValueError
-        Fewer than four frames have both orientations.
+        Fewer than four complete frames.
     """
     q_s = rotation.normalize(q_world_sensor)
     q_ref = rotation.normalize(q_optical_body)
@@ -127,9 +130,11 @@ def fit_sensor_alignment(
     if np.count_nonzero(both) < 4:
         raise ValueError("an alignment needs at least four frames with both orientations")
     q_s, q_ref = q_s[both], q_ref[both]
+
     if kind == "mount":
         q_mount = robust_mean(rotation.multiply(rotation.conjugate(q_s), q_ref)).q
         return _judged(kind, (q_s, q_ref), rotation.IDENTITY, q_mount, 0.0)
+
     T = np.swapaxes(rotation.left_matrix(q_s), -1, -2) @ rotation.right_matrix(q_ref)
     starts = _starts(q_s, q_ref, T)
     return min(
@@ -139,9 +144,9 @@ def fit_sensor_alignment(
 
 
 def _starts(q_s: Array, q_ref: Array, T: Array) -> tuple[Array, Array]:
-    """Return two guesses of the signs: both streams continuous, and blind to time.
+    """Return two initial guesses of the signs: from continuity in time, and independent of time.
 
-    Outliers break continuity; the second guess takes the signs that make the T_i most alike.
+    Outliers break continuity; the second guess maximizes the similarity of the T_i.
     """
     steady = np.where(np.sum(rotation.continuous(q_s) * q_s, axis=1) < 0.0, -1.0, 1.0)
     steady *= np.where(np.sum(rotation.continuous(q_ref) * q_ref, axis=1) < 0.0, -1.0, 1.0)
@@ -150,9 +155,12 @@ def _starts(q_s: Array, q_ref: Array, T: Array) -> tuple[Array, Array]:
     return steady, np.where(flat @ alike < 0.0, -1.0, 1.0)
 
 
-def _solve(kind: Kind, q_s: Array, q_ref: Array, T: Array, signs: Array) -> SensorAlignment:
+def _solve(
+    kind: AlignmentKind, q_s: Array, q_ref: Array, T: Array, signs: Array
+) -> SensorAlignment:
     weights = np.ones(len(T))
     q_world, b, kappa = _decompose(kind, T, signs)
+
     for _ in range(MAX_PASSES):
         angles = rotation.angle_between(_model(q_world, q_s, b), q_ref)
         before = weights * signs
@@ -164,7 +172,7 @@ def _solve(kind: Kind, q_s: Array, q_ref: Array, T: Array, signs: Array) -> Sens
     return _judged(kind, (q_s, q_ref), q_world, b, kappa)
 
 
-def _decompose(kind: Kind, T: Array, signed_weights: Array) -> tuple[Array, Array, float]:
+def _decompose(kind: AlignmentKind, T: Array, signed_weights: Array) -> tuple[Array, Array, float]:
     """Return q_W, q_B and kappa from the first singular vectors of the weighted sum of T_i."""
     U, S, Vt = np.linalg.svd(np.einsum("i,ijk->jk", signed_weights, T))
     v = np.zeros(4)
@@ -172,8 +180,8 @@ def _decompose(kind: Kind, T: Array, signed_weights: Array) -> tuple[Array, Arra
     return rotation.conjugate(v), U[:, 0], float(S[1] / S[0])
 
 
-def _columns(kind: Kind) -> list[int]:
-    """Return which components of v are free: a turn about the vertical has no x and no y."""
+def _columns(kind: AlignmentKind) -> list[int]:
+    """Return the free components of v: a rotation about the vertical has no x and y."""
     return [0, 3] if kind == "heading" else [0, 1, 2, 3]
 
 
@@ -182,14 +190,14 @@ def _model(q_world: Array, q_s: Array, q_mount: Array) -> Array:
 
 
 def _judged(
-    kind: Kind, streams: tuple[Array, Array], q_world: Array, q_mount: Array, kappa: float
+    kind: AlignmentKind, streams: tuple[Array, Array], q_world: Array, q_mount: Array, kappa: float
 ) -> SensorAlignment:
     q_s, q_ref = streams
     model = _model(q_world, q_s, q_mount)
     residuals = rotation.log(rotation.multiply(rotation.conjugate(model), q_ref))
     angles = np.linalg.norm(residuals, axis=1)
     rms, scale = float(np.sqrt(np.mean(angles**2))), robust_scale(angles)
-    # the weights hold outliers down, so they must not swell the claimed error either
+    # Outliers have small weights in the fit, so they have small weights in its error, too.
     weights = huber_weights(angles, scale)
     weighted_rms = float(np.sqrt(np.sum(weights**2 * angles**2) / np.sum(weights)))
     count = effective_count(residuals * weights[:, None])

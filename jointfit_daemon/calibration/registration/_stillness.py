@@ -1,7 +1,7 @@
-"""When a sensor is at rest: from raw rates or from orientations, recorded or as they come.
+"""Detection of rest from angular rates or orientations, recorded or live.
 
-Law: pure; time is what the samples say. Variances and relative rotations are used, so a constant
-gyro bias or an arbitrary heading does not matter.
+Time is the time of the samples. Only variances and relative rotations are used, so a constant gyro
+bias or an arbitrary heading has no influence.
 """
 
 from __future__ import annotations
@@ -27,27 +27,30 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class StillnessLimits:
-    """Thresholds. For a noisier sensor: three times what it shows on a table."""
+    """Thresholds of rest. For a noisier sensor use three times its values on a table."""
 
     window_s: float = 1.0
+    """Length of the window that must be at rest, s."""
     shortest_s: float = 1.5
-    """Shorter rests are not believed (recordings only; live, the session asks for longer)."""
+    """Shorter periods of rest are ignored, s (recordings only; the live session requires longer
+    ones)."""
     gyr: float = np.deg2rad(1.0)
     """Root of the summed variances of the three rates, rad/s."""
     acc: float = 0.15
     """Root of the summed variances of the three specific forces, m/s^2."""
     turn: float = np.deg2rad(1.0)
-    """Largest rotation from the start of a window to any later step of it, rad."""
+    """Largest rotation from the first step of a window to any later step, rad."""
     step_s: float = 0.05
+    """Averaging interval of the orientations, s."""
 
 
 def still_from_rates(
     gyr: ArrayLike, acc: ArrayLike, rate_hz: float, limits: StillnessLimits | None = None
 ) -> Mask:
-    """Return where a sensor was at rest, from raw data, over centred windows.
+    """Return the samples at rest, from raw data over centered windows.
 
-    A sample is a candidate while the root of the summed variances over the window is below the
-    limits of both kinds; runs of candidates shorter than ``shortest_s`` are dropped.
+    A sample is a candidate if the root of the summed variances over its window is below both
+    limits. Runs of candidates shorter than ``shortest_s`` are dropped.
 
     Parameters
     ----------
@@ -56,7 +59,7 @@ def still_from_rates(
     acc : array_like, shape (n, 3)
         Specific force, m/s^2.
     rate_hz : float
-        Samples per second.
+        Sampling rate, Hz.
 
     Returns
     -------
@@ -71,47 +74,52 @@ def still_from_rates(
 def still_from_orientation(
     q_world_sensor: ArrayLike, rate_hz: float, limits: StillnessLimits | None = None
 ) -> Mask:
-    """Return where a sensor was at rest, from orientations only.
+    """Return the samples at rest, from orientations only.
 
-    A window is still if the rotation from its first 0.05 s step to every later one is below the
-    limit; its centre is then a candidate, and runs shorter than ``shortest_s`` are dropped. A step
-    is the mean of its samples: white noise of a third of a degree is no movement.
+    A window is at rest if the rotation from its first 0.05 s step to every later one is below the
+    limit. The center of the window is then a candidate, and runs shorter than ``shortest_s`` are
+    dropped. A step is the mean of its samples, so that white noise of a third of a degree is no
+    movement.
 
     Parameters
     ----------
     q_world_sensor : array_like, shape (n, 4)
-        Evenly sampled; a window with NaN is not still.
+        Evenly sampled; a window with NaN is not at rest.
     rate_hz : float
-        Samples per second.
+        Sampling rate, Hz.
 
     Returns
     -------
     ndarray of bool, shape (n,)
-        Half a window at either end takes the verdict of the first or last whole window.
+        Half a window at either end has the value of the first or last complete window.
     """
     limits = limits or StillnessLimits()
     q = rotation.continuous(q_world_sensor)
     count = len(q)
+
     size, step = round(limits.window_s * rate_hz), max(1, round(limits.step_s * rate_hz))
     q = _step_means(q, step)
     starts = len(q) - size
     if starts <= 0:
         return np.zeros(count, dtype=bool)
+
+    # Rotation from the first step of every window to each of its later steps.
     calm = np.ones(starts, dtype=bool)
     for later in range(step, size + 1, step):
         turned = rotation.angle_between(q[:starts], q[later : later + starts])
         calm &= np.nan_to_num(turned, nan=np.inf) < limits.turn
+
     before = (size + step) // 2
     candidate = np.pad(calm, (before, count - starts - before), mode="edge")
     return _long_runs(candidate, round(limits.shortest_s * rate_hz))
 
 
 class StillnessMonitor:
-    """Tells of one sensor, as samples come, whether it has been at rest for a whole window.
+    """Detects from live samples whether one sensor was at rest for a complete window.
 
-    The causal form of ``still_from_orientation``: the window ends with the last whole step, so a
-    movement is told at most one step late. A pause in the data, or time running backwards, begins
-    a new window.
+    This is the causal form of `still_from_orientation`. The window ends with the last complete
+    step, so a movement is detected at most one step late. A pause in the data or time running
+    backwards starts a new window.
     """
 
     def __init__(self, limits: StillnessLimits | None = None) -> None:
@@ -126,7 +134,7 @@ class StillnessMonitor:
         self._calm = False
 
     def feed(self, t_ns: int, q: Quaternion) -> bool:
-        """Take one orientation at `t_ns`; return True while the last window was still."""
+        """Process one orientation at `t_ns`; return True while the last window was at rest."""
         pause = t_ns - self._last_ns
         self._last_ns = t_ns
         if self._sum is None or not 0 <= pause <= self._longest_pause_ns:
@@ -151,14 +159,14 @@ class StillnessMonitor:
         while len(steps) > 1 and t_ns - steps[1][0] >= self._window_ns:
             steps.popleft()
         began, start = steps[0]
-        # irregular stamps make the steps fall short of the window by less than one step
+        # With irregular time stamps the steps are up to one step shorter than the window.
         if t_ns - began < self._window_ns - self._step_ns:
             return False
         return all(angle_between_one(start, q) < self._turn for _, q in steps)
 
 
 def _step_means(q: NDArray[np.float64], step: int) -> NDArray[np.float64]:
-    """Return the normalised mean of every `step` successive rows; one row fewer per step more."""
+    """Return the normalized mean of every `step` successive rows; `step` - 1 rows fewer."""
     count = max(0, len(q) - step + 1)
     total = np.zeros((count, 4))
     for offset in range(step):
@@ -175,9 +183,10 @@ def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
 
 
 def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the means over windows of `size` rows about each row; the ends count on beyond.
+    """Return the means over windows of `size` rows about each row; end rows are repeated beyond.
 
-    Running sums, not scipy's filter: importing that would take half of the daemon's start.
+    Running sums instead of a scipy filter: importing scipy would double the start time of the
+    daemon.
     """
     before = size // 2
     padded = np.pad(values, ((before + 1, size - 1 - before), (0, 0)), mode="edge")
@@ -188,7 +197,7 @@ def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
 
 
 def _long_runs(mask: Mask, shortest: int) -> Mask:
-    """Keep only runs of at least `shortest` samples."""
+    """Return only runs of at least `shortest` samples."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0]))))
     kept = np.zeros_like(mask)
     for begin, end in zip(edges[::2], edges[1::2], strict=True):

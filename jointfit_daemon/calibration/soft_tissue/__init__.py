@@ -2,18 +2,18 @@
 
 from jointfit_daemon.calibration.soft_tissue._error_correlation import (
     error_correlation,
-    error_correlations,
+    joint_error_correlations,
 )
 from jointfit_daemon.calibration.soft_tissue._kernel_expert_fit import fit_expert
 from jointfit_daemon.calibration.soft_tissue._kernel_fit import BLOCKS
 from jointfit_daemon.calibration.soft_tissue._limb_fit import (
     METHODS,
     LimbTraining,
-    all_alive,
     fit_models,
     flexion,
     judge,
     mean_of,
+    predict_all_sensors,
 )
 from jointfit_daemon.calibration.soft_tissue._mean_fit import fusion_weights
 from jointfit_daemon.calibration.soft_tissue._robust_ridge import fit_ridge
@@ -28,9 +28,7 @@ __all__ = [
     "METHODS",
     "LimbTraining",
     "SegmentTraining",
-    "all_alive",
     "error_correlation",
-    "error_correlations",
     "evenly",
     "fit_expert",
     "fit_links",
@@ -40,8 +38,10 @@ __all__ = [
     "flexion",
     "fusion_weights",
     "joined",
+    "joint_error_correlations",
     "judge",
     "mean_of",
     "pack",
+    "predict_all_sensors",
     "unpack",
 ]

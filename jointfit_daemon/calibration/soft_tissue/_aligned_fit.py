@@ -8,7 +8,7 @@ from jointfit_daemon.calibration.registration import fit_sensor_alignment
 from jointfit_daemon.calibration.soft_tissue._mean_fit import fusion_weights
 from jointfit_daemon.calibration.soft_tissue._segment_training import (
     SegmentTraining,
-    cross_validated_sd,
+    held_out_sd,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 def fit_aligned(training: SegmentTraining) -> AlignedModel:
-    """Return the mean of aligned sensors, each weighted by what it errs then.
+    """Return the mean of aligned sensors, weighted by their residual errors.
 
-    Robot-world and hand-eye calibration with true verticals, see `fit_sensor_alignment`, sensor by
+    Robot-world and hand-eye calibration with known verticals (`fit_sensor_alignment`) for each
     sensor, then the eigenvector mean of Markley et al. 2007.
     """
 
@@ -31,7 +31,7 @@ def fit_aligned(training: SegmentTraining) -> AlignedModel:
         model = _aligned(part, 0.0)
         return lambda test: model.predict(test.sensors)
 
-    return _aligned(training, cross_validated_sd(training, fit))
+    return _aligned(training, held_out_sd(training, fit))
 
 
 def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:

@@ -1,13 +1,11 @@
-r"""How far two neighbouring segments err alike about the axis that limbs flex about.
+r"""Correlation of the errors of two neighboring segments about the flexion axis.
 
 .. math:: \rho = \frac{\sum_i e_{1i} e_{2i}}{\sqrt{\sum_i e_{1i}^2 \sum_i e_{2i}^2}}, \qquad
           \sigma_{flexion}^2 = \sigma_1^2 + \sigma_2^2 - 2 \rho\, \sigma_1 \sigma_2
 
-with e what is left over of each segment about its x on frames that its fit has not seen. Both
-models look at the same joint: where they are wrong, they are so together, mostly one against the
-other.
-
-Law: held-out frames only; where nothing is known the errors are taken to be independent.
+with e the residual of each segment about its x axis on held-out frames. Both models use the same
+joint rotation, so their errors are correlated, mostly negatively. Without data, errors are taken as
+independent.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.soft_tissue._kernel_fit import learn_kernel
+from jointfit_daemon.calibration.soft_tissue._kernel_fit import fit_kernel_with_residuals
 from jointfit_daemon.calibration.soft_tissue._limb_fit import mean_of
 from jointfit_daemon.calibration.soft_tissue._segment_training import FEWEST_FRAMES, SegmentTraining
 from jointfit_daemon.limb_model import neighbor
@@ -30,13 +28,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
 
 MOST = 0.9
-"""Neither errors that are quite the same nor quite opposite are believed."""
+"""Limit of the absolute correlation: perfectly correlated errors are implausible."""
 
 
-def error_correlations(chain: Chain, training: LimbTraining, method: Method) -> Mapping[str, float]:
+def joint_error_correlations(
+    chain: Chain, training: LimbTraining, method: Method
+) -> Mapping[str, float]:
     """Return rho of every inner joint; empty for methods other than ``anchored``.
 
-    Joints whose segments were not seen whole together in 30 frames are left out.
+    Joints whose two segments have fewer than 30 common complete frames are absent.
     """
     if method != "anchored":
         return {}
@@ -46,6 +46,7 @@ def error_correlations(chain: Chain, training: LimbTraining, method: Method) -> 
         whole = np.all([np.isfinite(q).all(axis=1) for q in (*columns[0], *columns[1])], axis=0)
         if np.count_nonzero(whole) < FEWEST_FRAMES:
             continue
+
         trials = None if training.trials is None else training.trials[whole]
         upper, lower = (
             SegmentTraining.of([q[whole] for q in sensors], near[whole], truth[whole], trials)
@@ -56,14 +57,14 @@ def error_correlations(chain: Chain, training: LimbTraining, method: Method) -> 
 
 
 def error_correlation(first: SegmentTraining, second: SegmentTraining) -> float:
-    """Return rho of two segments that were trained on the same frames, upper one first."""
-    a, b = (learn_kernel(training)[1][:, 0] for training in (first, second))
+    """Return rho of two segments trained on the same frames, proximal segment first."""
+    a, b = (fit_kernel_with_residuals(training)[1][:, 0] for training in (first, second))
     size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
     return 0.0 if size == 0.0 else min(max(float(np.sum(a * b)) / size, -MOST), MOST)
 
 
 def _columns(chain: Chain, training: LimbTraining, i: int) -> list[Array]:
-    """Return the sensors of segment i, its neighbour as they see it, and its reference."""
+    """Return the sensors of segment i, the mean of its neighbor, and its reference."""
     sensors = [training.sensors[name] for name in chain.sensors[i]]
     near = mean_of(training, neighbor(chain, i))
     return [*sensors, near, training.reference[chain.segments[i]]]

@@ -12,7 +12,7 @@ from jointfit_daemon.calibration.soft_tissue._leverage_variance_fit import (
     hull,
     ratios,
 )
-from jointfit_daemon.limb_model import Expert, as_rows, bumps, smooth_terms, widths_of
+from jointfit_daemon.limb_model import KernelExpert, as_rows, bumps, smooth_terms, widths_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,35 +29,38 @@ if TYPE_CHECKING:
 
 
 HULL_QUANTILE = 0.995
+"""Quantile of the training leverage that defines the training range."""
 
 
 class Fitted(NamedTuple):
-    """An expert, and what it had said of frames it had not seen."""
+    """A fitted expert with its predictions of held-out frames."""
 
-    expert: Expert
+    expert: KernelExpert
     unseen: tuple[Array, ...]
-    """By way of leaving out: its corrections of held-out frames, rad, shape (n, 3)."""
+    """Corrections of held-out frames for each grouping, rad, shape (n, 3)."""
     ratios: tuple[Array, ...]
-    """By way: how far each frame lay outside the others, shape (n,)."""
+    """Leverage ratio of each held-out frame for each grouping, shape (n,)."""
 
 
 def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) -> Fitted:
-    """Fit one expert; the width is the one of the smallest squared error on held-out groups.
+    """Fit one expert; its width has the smallest squared error on held-out groups.
 
-    Penalties are stacked once for every way of leaving out, and the fits by these shares averaged:
-    whole trials ask what carries over to another movement, blocks what does within one.
+    Penalties are stacked once for each grouping, and the resulting fits are averaged: whole trials
+    measure generalization to another movement, blocks in time generalization within one.
 
     Parameters
     ----------
     u : ndarray, shape (n, 3 m + 3)
         Relative rotations, then tilts.
     rho : ndarray, shape (n, 3)
-        What is to be corrected, rad.
+        Target corrections, rad.
     ways : sequence of sequence of ndarray of bool, shape (n,)
-        Ways of leaving out, each with its groups.
+        Groupings of the frames, each a sequence of held-out masks.
     """
     seen = u if tilted else u[:, : 3 * sensors]
     smooth = smooth_terms(seen)
+
+    # Width with the smallest held-out error.
     best = None
     for width in WIDTHS:
         x = seen / widths_of(width, sensors, tilted=tilted)
@@ -70,10 +73,12 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
     if best is None:
         raise ValueError("no width to choose")
     _, width, centers, basis, held = best
+
+    # Final fit to all frames with the stacked shares of every grouping.
     C = np.mean([fit(basis, rho, each.shares) for each in held], axis=0)
     leverage = hull(smooth)
     h = np.einsum("ij,jk,ik->i", smooth, leverage, smooth)
-    expert = Expert(
+    expert = KernelExpert(
         width=width,
         tilted=tilted,
         coefficients=as_rows(C.T.tolist()),
@@ -82,29 +87,31 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         hull_leverage=max(float(np.quantile(h, HULL_QUANTILE)), SMALLEST_LEVERAGE),
         carried=tuple(held[-1].shares.sum(axis=(1, 2)).tolist()),
     )
+
     unseen = tuple(rho - each.residuals for each in held)
     return Fitted(expert, unseen, tuple(ratios(smooth, groups) for groups in ways))
 
 
 WIDTHS = (0.35, 0.5, 0.8)
-"""Joint rotations and tilts this far apart have much to do with each other, rad: what a fit may
-choose among."""
+"""Candidate kernel widths, rad: the distance over which joint rotations and tilts are
+correlated."""
 
 MOST_CENTERS = 24
+"""Largest number of bump centers."""
 
 NEAREST_CENTERS = 0.01
-"""Centers nearer to each other than this (square root of it, in widths) say the same."""
+"""Squared distance between centers, in kernel widths, below which they are redundant."""
 
 
 def spread_centers(x: Array) -> Array:
-    """Return frames that lie far from each other and from zero, shape (m, width).
+    """Return frames far from each other and from zero, shape (m, width).
 
-    Farthest-point choice, at most 24: each is the frame farthest from all before it.
+    Farthest-point selection of at most 24 frames: each has the largest distance to all before it.
 
     Parameters
     ----------
     x : ndarray, shape (n, width)
-        Relative rotations, and tilts, in widths.
+        Relative rotations and tilts, in kernel widths.
     """
     distance = np.sum(x**2, axis=1)
     chosen: list[int] = []

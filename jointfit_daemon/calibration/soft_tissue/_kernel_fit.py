@@ -24,46 +24,54 @@ if TYPE_CHECKING:
 
 
 BLOCKS = 3
-"""Of a single trial: few and long ones, so that each holds movement the others do not."""
+"""Held-out blocks of a single trial: few and long, so that each contains movement absent
+elsewhere."""
 
 
 def fit_kernel(training: SegmentTraining) -> KernelModel:
-    """Return the model alone, see `learn_kernel`."""
-    return learn_kernel(training)[0]
+    """Return the kernel model of one segment."""
+    return fit_kernel_with_residuals(training)[0]
 
 
-def learn_kernel(training: SegmentTraining) -> tuple[KernelModel, Array]:
-    """Fit both experts; all that is chosen, and the claimed variance, come from held-out groups.
+def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, Array]:
+    """Fit both experts and the trend; widths, penalties and variances come from held-out groups.
 
-    Groups are blocks in time and, where several trials train, whole trials as well.
+    Groups are blocks in time and, with several trials, whole trials.
 
     Returns
     -------
     model : KernelModel
     residuals : ndarray, shape (w n, 3)
-        What is left over of every frame when its group is left out, rad in the axes of the segment;
-        one way of leaving out after the other.
+        Residual of every frame with its group held out, rad, segment axes; one grouping after the
+        other.
 
     Raises
     ------
     ValueError
-        There is no neighbouring segment to look at.
+        There is no neighboring segment.
     """
     if training.q_other is None:
-        raise ValueError("the anchored model needs a sensor of the neighbouring segment")
+        raise ValueError("the kernel model needs a sensor of the neighboring segment")
+
     count = len(training.sensors)
     mean = fuse(training.sensors, equal_weights(count))
     rho = rotation.log(rotation.multiply(rotation.conjugate(mean), training.q_reference))
     u = model_inputs(training.sensors, mean, training.q_other)
+
+    # Groupings: blocks in time and, with several trials, whole trials.
     ways = [list(training.folds(BLOCKS))]
     if training.movements > 1:
         ways.append([training.trials == label for label in np.unique(training.trials)])
+
     plain = fit_expert(u, rho, count, ways, tilted=False)
     tilted = fit_expert(u, rho, count, ways, tilted=True)
+
+    # Residuals of held-out frames and their distance from the training range.
     lines = [unseen_trend(u, rho, groups) for groups in ways]
     unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
     residuals = [rho - mix_corrections(*each) for each in unseen]
     distances = [np.maximum(a_ratio, b_ratio) for _, _, a_ratio, _, b_ratio in unseen]
+
     model = KernelModel(
         sensors=count,
         plain=plain.expert,

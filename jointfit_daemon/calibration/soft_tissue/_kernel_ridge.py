@@ -1,4 +1,4 @@
-r"""Ridge regression on smooth terms and bumps, several penalties stacked by held-out groups.
+r"""Ridge regression on smooth terms and bumps, with penalties stacked by held-out groups.
 
 .. math:: c_{jp} = \arg\min \sum_i w_{ij} (\rho_{ij} - c_{jp}^T g_i)^2
           + \lambda_p n (|c_{smooth}|^2 + r_p |c_{bumps}|^2), \qquad c_j = \sum_p a_{jp} c_{jp}
@@ -6,10 +6,9 @@ r"""Ridge regression on smooth terms and bumps, several penalties stacked by hel
 .. math:: a_j = \arg\min_{a \ge 0,\ \sum a \le 1} \sum_i
           \bigl(\rho_{ij} - \sum_p a_p\, \hat\rho_{ijp}\bigr)^2
 
-for every axis j, with predictions of frames whose group was left out (stacking: Breiman 1996).
-Law: nothing is centered, which would be an intercept by another name. Shares may sum to less than
-one: what does not carry over to frames that the fit has not seen is left to the mean of the
-sensors.
+for every axis j, with predictions of held-out frames (stacking: Breiman 1996). Regressors are not
+centered, because the regression must have no intercept. Shares may sum to less than 1: the part
+that does not generalize to held-out frames is not corrected.
 """
 
 from __future__ import annotations
@@ -31,45 +30,52 @@ if TYPE_CHECKING:
     Masks = Sequence[NDArray[np.bool_]]
 
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""Ridge penalties that are stacked."""
 RATIOS = (1.0, 0.1, 10.0)
 """Penalty of bumps over that of smooth terms."""
 PASSES = 3
+"""Reweighting iterations."""
 SMALLEST_SCALE = 1e-3
-"""A feature that hardly moved in training is not blown up, rad."""
+"""Added to the RMS of each regressor, rad, so that a nearly constant one is not amplified."""
 _JITTER = 1e-6
+"""Added to diagonals of kernel matrices, relative, for a stable Cholesky decomposition."""
 _HEAVY = 1e3
+"""Relative weight of the row that fixes the sum of the shares."""
 _SMALLEST_SHARE = 1e-3
+"""Shares below this are ignored in the final fit."""
 _BUMPS_COUNT_AS = 5.0
-"""All bumps together are scaled as if they were so many features."""
+"""All bumps together are scaled like this number of regressors."""
 
 
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """Features of training, scaled, and the way back to coefficients of raw features."""
+    """Scaled regressors of the training frames, and the transformation back to raw regressors."""
 
     g: Array
-    """Shape (n, p): smooth terms, then bumps made independent of each other."""
+    """Shape (n, p): smooth terms, then whitened bumps."""
     smooth: int
-    """How many of them are smooth terms."""
+    """Number of smooth terms."""
     back: Array
-    """Shape (p, p): coefficients of raw features are ``back @ c``."""
+    """Shape (p, p): coefficients of raw regressors are ``back @ c``."""
 
     @staticmethod
     def of(smooth: Array, raw_bumps: Array, at_centers: Array) -> Basis:
-        """Scale and whiten.
+        """Scale smooth terms and whiten bumps.
 
         Parameters
         ----------
         smooth : ndarray, shape (n, s)
         raw_bumps : ndarray, shape (n, m)
         at_centers : ndarray, shape (m, m)
-            Bumps at the centers themselves: the kernel matrix.
+            Bumps evaluated at the centers: the kernel matrix.
         """
         s, m = smooth.shape[1], raw_bumps.shape[1]
         back = np.zeros((s + m, s + m))
         scales = np.sqrt(np.mean(smooth**2, axis=0)) + SMALLEST_SCALE
         back[:s, :s] = np.diag(1.0 / scales)
         g = smooth / scales
+
+        # Whiten the bumps by the Cholesky root of the kernel matrix.
         if m:
             root = np.linalg.cholesky(at_centers + _JITTER * np.eye(m))
             white = np.linalg.solve(root, raw_bumps.T).T
@@ -79,40 +85,43 @@ class Basis:
         return Basis(g, s, back)
 
     def shape(self, ratio: float) -> Array:
-        """Return the penalty's shape, one number a feature."""
+        """Return the relative penalty of each regressor."""
         count = self.g.shape[1]
         return np.concatenate([np.ones(self.smooth), np.full(count - self.smooth, ratio)])
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Shares of penalties by one way of grouping frames, and what was left over."""
+    """Shares of the penalties for one grouping, with the held-out residuals."""
 
     shares: Array
-    """a, by axis, ratio and penalty, shape (3, ratios, penalties)."""
+    """a for each axis, ratio and penalty, shape (3, ratios, penalties)."""
     residuals: Array
-    """rho minus prediction of held-out frames in order of time, rad, shape (n, 3)."""
+    """rho minus prediction of held-out frames, in order of time, rad, shape (n, 3)."""
 
 
 def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
-    """Leave out each group in turn; stack the predictions of all penalties, axis by axis.
+    """Hold out each group in turn and stack the predictions of all penalties for each axis.
 
-    One eigendecomposition a group and ratio serves all penalties.
+    One eigendecomposition per group and ratio serves all penalties.
     """
-    said = np.empty((len(RATIOS), len(PENALTIES), *rho.shape))
+    predicted = np.empty((len(RATIOS), len(PENALTIES), *rho.shape))
     for held in groups:
         kept = basis.g[~held]
         gram, moment = kept.T @ kept, kept.T @ rho[~held]
+
         for i, ratio in enumerate(RATIOS):
             root = np.sqrt(basis.shape(ratio))
             values, vectors = np.linalg.eigh(gram / np.outer(root, root))
             turned = vectors.T @ (moment / root[:, None])
             seen = (basis.g[held] / root) @ vectors
             for j, penalty in enumerate(PENALTIES):
-                said[i, j, held] = seen @ (turned / (values + penalty * len(kept))[:, None])
+                predicted[i, j, held] = seen @ (turned / (values + penalty * len(kept))[:, None])
+
+    # Shares of the penalties, axis by axis.
     shares, residuals = [], np.empty_like(rho)
     for axis in range(rho.shape[1]):
-        A = said[:, :, :, axis].reshape(-1, len(rho)).T
+        A = predicted[:, :, :, axis].reshape(-1, len(rho)).T
         found = stacked(A, rho[:, axis])
         residuals[:, axis] = rho[:, axis] - A @ found
         shares.append(found.reshape(len(RATIOS), len(PENALTIES)))
@@ -120,19 +129,19 @@ def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
 
 
 def stacked(predictions: Array, y: Array) -> Array:
-    """Return shares a >= 0, sum <= 1, of the smallest squared error ``|y - predictions @ a|``.
+    """Return shares a >= 0, sum <= 1, that minimize ``|y - predictions @ a|``.
 
     Parameters
     ----------
     predictions : ndarray, shape (n, p)
     y : ndarray, shape (n,)
     """
-    from scipy.optimize import nnls  # noqa: PLC0415 - fits need it, a running daemon does not
+    from scipy.optimize import nnls  # noqa: PLC0415 - only fits need it, not the running daemon
 
     gram = predictions.T @ predictions
     count = len(gram)
     size = np.trace(gram) / count + 1e-12
-    # one more column, of zeros, takes what is missing to one; a heavy row holds the sum there
+    # A slack column of zeros takes the rest of the sum; a heavy row fixes the sum at 1.
     whole = np.pad(gram, (0, 1)) + _HEAVY * size + _JITTER * size * np.eye(count + 1)
     moment = np.append(predictions.T @ y, 0.0) + _HEAVY * size
     root = np.linalg.cholesky(whole)
@@ -141,19 +150,20 @@ def stacked(predictions: Array, y: Array) -> Array:
 
 
 def fit(basis: Basis, rho: Array, shares: Array) -> Array:
-    """Return coefficients of raw features, shape (p, 3): ridge fits by their `shares`."""
+    """Return coefficients of raw regressors, shape (p, 3), from ridge fits combined by `shares`."""
     columns = [_robust(basis, rho[:, axis], share) for axis, share in enumerate(shares)]
     found: Array = basis.back @ np.stack(columns, axis=1)
     return found
 
 
 def _robust(basis: Basis, y: Array, shares: Array) -> Array:
-    """Return the coefficients of one axis; Huber weights by what the stack leaves over."""
+    """Return the coefficients of one axis, with Huber weights of the residuals of the stack."""
     g, n = basis.g, len(y)
     taken = [
         (shares[i, j], n * PENALTIES[j] * basis.shape(RATIOS[i]))
         for i, j in zip(*np.nonzero(shares > _SMALLEST_SHARE), strict=True)
     ]
+
     weights: Array = np.ones(n)
     c: Array = np.zeros(g.shape[1])
     for _ in range(PASSES):

@@ -1,4 +1,8 @@
-"""Fit of the linear trend that replaces the kernel correction outside the training range."""
+"""Fit of the linear trend that replaces the kernel correction outside the training range.
+
+The trend is the mean of two fits, one without and one with tilt. With few movements, joint rotation
+and tilt are correlated, and neither fit alone generalizes.
+"""
 
 from __future__ import annotations
 
@@ -20,27 +24,28 @@ if TYPE_CHECKING:
 
 
 PENALTY = 1e-2
+"""Ridge penalty of the trend."""
 
 SMALLEST_SCALE = 0.02
-"""What hardly moved in training is not blown up, rad."""
+"""Added to the RMS of each regressor, rad, so that a nearly constant one is not amplified."""
 
 
 def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
-    """Return the coefficients about x and y, each over ``[1, u]``, rad per unit.
+    """Return the coefficients about x and y, each of ``[1, u]``, rad per unit.
 
     Parameters
     ----------
     u : ndarray, shape (n, 3 m + 3)
         Relative rotations of m sensors, then tilts.
     rho : ndarray, shape (n, 3)
-        What is to be corrected, rad.
+        Target corrections, rad.
     """
     x, y = (_axis(u, rho[:, axis], axis) for axis in LEVEL_AXES)
     return x, y
 
 
 def unseen_trend(u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
-    """Return T of every frame by a fit to all groups but its own, rad, shape (n, 3)."""
+    """Return T of every frame from a fit without its group, rad, shape (n, 3)."""
     found = np.empty_like(rho)
     for held in groups:
         found[held] = trend(fit_trend(u[~held], rho[~held]), u[held])
@@ -50,10 +55,11 @@ def unseen_trend(u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]]) -> A
 def _axis(u: Array, y: Array, axis: int) -> Row:
     """Return the coefficients of one axis: the mean of both fits."""
     width = u.shape[1]
-    # of each further sensor the same axis, after the three columns of the joint
+    # The same axis of each further sensor, after the three columns of the joint rotation.
     pairs = list(range(3 + axis, width - TILTS, 3))
-    # the vertical as seen from the segment leans along y when it turns about x, and the other way
+    # A rotation about x moves the vertical along y of the segment, and vice versa.
     tilt = width - TILTS + (1 - axis)
+
     row = np.zeros(1 + width)
     for columns in (pairs, [*pairs, tilt]):
         phi = np.concatenate([np.ones((len(u), 1)), u[:, columns]], axis=1)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.limb_model import FARTHEST, WITHIN, Spread
+from jointfit_daemon.limb_model import FARTHEST, WITHIN, LeverageVariance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,21 +16,28 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 
-FAR, FAR_FACTOR, FAR_SHARE = 1.5, 3.0, 0.1
-"""Beforehand, at this ratio errors are taken to be so many times larger, and this counts as much as
-so many parts of the trials: training shows little of what lies far outside of it."""
+FAR = 1.5
+"""Leverage ratio of a prior observation of the variance: training contains few frames far
+outside."""
+FAR_FACTOR = 3.0
+"""Error of the prior observation relative to the RMS error."""
+FAR_SHARE = 0.1
+"""Weight of the prior observation relative to all frames."""
 
 LEAST = 0.15
-"""Neither a nor b is less than so many parts of the mean square."""
+"""Lower bound of a and b as a share of the mean square error."""
 
 PASSES = 5
+"""Iterations of the gamma regression."""
 
 SMALLEST_VARIANCE = 1e-8
+"""Lower bound of the mean square error, rad²."""
 
 HULL_PENALTY = 1e-2
+"""Ridge penalty of the leverage matrix."""
 
 SMALLEST_LEVERAGE = 1e-12
-"""Who only stood still and straight has none; whatever moves lies far outside of that."""
+"""Lower bound of the leverage quantile: a static training movement has no leverage."""
 
 
 def hull(smooth: Array) -> Array:
@@ -43,36 +50,36 @@ def hull(smooth: Array) -> Array:
     return found
 
 
-def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> Spread:
-    """Fit variance against distance over all frames that some fit has not seen.
+def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> LeverageVariance:
+    """Fit the variance as a function of the leverage ratio over all held-out frames.
 
-    Every way of leaving frames out adds its own: blocks of a trial lie near the rest of it, whole
-    trials far. What is taken of a movement that nobody made is `FAR_FACTOR`.
+    Every grouping contributes: blocks of a trial are close to the rest of it, whole trials are far.
+    A prior observation (`FAR`, `FAR_FACTOR`) represents movements absent from all trials.
 
     Parameters
     ----------
     ratios_of : sequence of ndarray, shape (n,)
-        By way of leaving out: how far each frame lies outside all groups but its own.
+        Leverage ratio of each frame relative to the other groups, for each grouping.
     residuals : sequence of ndarray, shape (n, 3)
-        By way: what is left over of each frame when its group is left out, rad.
+        Residual of each frame with its group held out, for each grouping, rad.
     """
     distances = np.concatenate(ratios_of)
     squares = np.concatenate([each**2 for each in residuals])
     shares = np.full(len(distances), 1.0 / len(distances))
     found = [_line(distances, square, shares) for square in squares.T]
     (ax, bx), (ay, by), (az, bz) = found
-    return Spread((ax, ay, az), (bx, by, bz))
+    return LeverageVariance((ax, ay, az), (bx, by, bz))
 
 
 def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
-    """Return how far each frame lies outside all groups but its own, shape (n,).
+    """Return the leverage ratio of each frame relative to all other groups, shape (n,).
 
     Parameters
     ----------
     smooth : ndarray, shape (n, s)
-        Smooth terms of all frames of training.
+        Smooth terms of all training frames.
     groups : sequence of ndarray of bool, shape (n,)
-        One way of leaving out.
+        Held-out masks of one grouping.
     """
     found = np.empty(len(smooth))
     for held in groups:
@@ -83,15 +90,17 @@ def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
 
 
 def _line(distances: Array, squares: Array, shares: Array) -> tuple[float, float]:
-    """Return a, b of E(square) = a + b max(r - 1/2, 0): gamma regression, five passes."""
+    """Return a, b of E(square) = a + b max(r - 1/2, 0) by gamma regression in five iterations."""
     typical = float(np.mean(squares)) + SMALLEST_VARIANCE
     distances = np.append(distances, FAR)
     squares = np.append(squares, FAR_FACTOR**2 * typical)
     shares = np.append(shares, FAR_SHARE)
+
     beyond = np.maximum(distances - WITHIN, 0.0)
     design = np.stack([np.ones_like(beyond), beyond], axis=1)
-    from scipy.optimize import nnls  # noqa: PLC0415 - fits need it, a running daemon does not
+    from scipy.optimize import nnls  # noqa: PLC0415 - only fits need it, not the running daemon
 
+    # Weights are the inverse of the current variance.
     line = np.array([typical, 0.0])
     for _ in range(PASSES):
         scale = np.sqrt(shares) / (design @ line)

@@ -1,8 +1,7 @@
-"""Redundancy models for every set of sensors that may be alive, and their judgement.
+"""Fits of the segment models of a limb for every set of available sensors, and their errors.
 
-Law: judged on the contiguous last part of the trial, fitted to the first; then fitted again to all
-of it. So the figures say what the method does on unseen movement of this kind, and the stored
-models are those of all data, which no figure judges.
+The evaluation fits the models to the first part of a trial and measures errors on the contiguous
+last part. The stored models are then fitted to the whole trial.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.soft_tissue._segment_fit import fit_segment
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import Method, alive_key, flexion_sign, fuse, neighbor
+from jointfit_daemon.limb_model import Method, flexion_sign, fuse, model_key, neighbor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,27 +27,28 @@ if TYPE_CHECKING:
 
 
 METHODS: tuple[Method, ...] = get_args(Method)
+"""All fusion methods."""
 MAX_SUBSET_SENSORS = 3
-"""With more sensors on a segment only all, all but one and each alone are trained."""
+"""With more sensors on a segment, only all sensors, all but one, and each alone get a model."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimbTraining:
-    """What all models of a limb are fitted to, at common instants."""
+    """Training frames of a limb at common instants."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment as each sensor says it through its bias, shape (n, 4)."""
+    """q_optical_segment of each sensor through its mount, shape (n, 4)."""
     reference: Mapping[str, Array]
-    """q_optical_segment by optics, shape (n, 4)."""
+    """q_optical_segment from optical markers, shape (n, 4)."""
     trials: NDArray[np.int64] | None = None
-    """Which kind of movement each frame belongs to, shape (n,); None: all to one."""
+    """Movement label of each frame, shape (n,); None if there is one movement."""
 
     def part(self, chosen: slice) -> LimbTraining:
         """Return a contiguous part."""
         return self.rows(chosen)
 
     def rows(self, chosen: slice | NDArray[np.int64] | NDArray[np.bool_]) -> LimbTraining:
-        """Return chosen frames."""
+        """Return selected frames."""
         return LimbTraining(
             {name: q[chosen] for name, q in self.sensors.items()},
             {name: q[chosen] for name, q in self.reference.items()},
@@ -59,8 +59,8 @@ class LimbTraining:
         return min((len(q) for q in self.reference.values()), default=0)
 
 
-def alive_sets(sensors: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the sets of one segment's sensors that get a model, largest first."""
+def sensor_sets(sensors: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return the sets of sensors of one segment that get a model, largest first."""
     n = len(sensors)
     sizes = range(n, 0, -1) if n <= MAX_SUBSET_SENSORS else (n, n - 1, 1)
     return [alive for size in sizes for alive in combinations(sensors, size)]
@@ -69,20 +69,20 @@ def alive_sets(sensors: tuple[str, ...]) -> list[tuple[str, ...]]:
 def fit_models(
     chain: Chain, training: LimbTraining, method: Method
 ) -> dict[str, dict[str, SegmentModel]]:
-    """Fit, per segment, a model for every alive set with every one of its neighbor, and without.
+    """Fit a model of each segment for every set of its sensors and of its neighbor.
 
-    Without the neighbor only the weighted mean is possible for ``anchored``; the other methods
-    never look at it, so each alive set has one model under every key.
+    Without a neighbor, ``anchored`` reduces to the weighted mean. The other methods do not use the
+    neighbor, so each set of sensors has the same model under every key.
     """
     out: dict[str, dict[str, SegmentModel]] = {}
     for i, segment in enumerate(chain.segments):
         reference, models = training.reference[segment], {}
-        for alive in alive_sets(chain.sensors[i]):
+        for alive in sensor_sets(chain.sensors[i]):
             x = [training.sensors[s] for s in alive]
             alone = fit_segment(method, x, None, reference, training.trials)
-            models[alive_key(alive, None)] = alone
-            for near in alive_sets(neighbor(chain, i)):
-                models[alive_key(alive, "+".join(near))] = (
+            models[model_key(alive, None)] = alone
+            for near in sensor_sets(neighbor(chain, i)):
+                models[model_key(alive, "+".join(near))] = (
                     fit_segment(method, x, mean_of(training, near), reference, training.trials)
                     if method == "anchored"
                     else alone
@@ -92,20 +92,21 @@ def fit_models(
 
 
 def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
-    """Judge every method, and every sensor alone, on the last `share` of the trial.
+    """Evaluate every method and every single sensor on the last `share` of the trial.
 
     Returns
     -------
     dict
-        ``frames``, ``share``; ``segments``: per segment and method the RMS orientation error, rad,
-        and under ``sensors`` that of each alone; ``flexion``: the same per inner joint.
+        ``frames``, ``share``; ``segments``: RMS orientation error of each segment and method, rad,
+        and of each sensor under ``sensors``; ``flexion``: the same for each inner joint.
     """
     cut = round(len(training) * (1.0 - share))
     first, last = training.part(slice(None, cut)), training.part(slice(cut, None))
-    said: dict[str, dict[str, Array]] = {}
+
+    estimates: dict[str, dict[str, Array]] = {}
     for method in METHODS:
-        said[method] = {
-            segment: all_alive(chain, i, method, first, last)
+        estimates[method] = {
+            segment: predict_all_sensors(chain, i, method, first, last)
             for i, segment in enumerate(chain.segments)
         }
     return {
@@ -113,7 +114,7 @@ def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
         "frames": len(last),
         "segments": {
             segment: {
-                **{m: _rms_angle(said[m][segment], last.reference[segment]) for m in METHODS},
+                **{m: _rms_angle(estimates[m][segment], last.reference[segment]) for m in METHODS},
                 "sensors": {
                     s: _rms_angle(last.sensors[s], last.reference[segment])
                     for s in chain.sensors[i]
@@ -121,16 +122,17 @@ def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
             }
             for i, segment in enumerate(chain.segments)
         },
-        "flexion": _flexions(chain, said, last),
+        "flexion": _flexions(chain, estimates, last),
     }
 
 
-def all_alive(
+def predict_all_sensors(
     chain: Chain, i: int, method: Method, first: LimbTraining, last: LimbTraining
 ) -> Array:
-    """Return what one segment's model for all sensors, fitted to `first`, says of `last`."""
+    """Return one segment in `last` by a model of all its sensors, fitted to `first`."""
     segment, sensors = chain.segments[i], chain.sensors[i]
     near = neighbor(chain, i)
+
     model = fit_segment(
         method,
         [first.sensors[s] for s in sensors],
@@ -142,12 +144,12 @@ def all_alive(
 
 
 def mean_of(training: LimbTraining, sensors: Sequence[str]) -> Array:
-    """Return the mean of some sensors of one segment, shape (n, 4)."""
+    """Return the mean of sensors of one segment, shape (n, 4)."""
     return fuse([training.sensors[s] for s in sensors], (1.0 / len(sensors),) * len(sensors))
 
 
 def _flexions(
-    chain: Chain, said: Mapping[str, Mapping[str, Array]], last: LimbTraining
+    chain: Chain, estimates: Mapping[str, Mapping[str, Array]], last: LimbTraining
 ) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for i, joint in enumerate(chain.joints[1:-1]):
@@ -155,7 +157,8 @@ def _flexions(
         sign = flexion_sign(joint)
         truth = sign * flexion(last.reference[above], last.reference[below])
         out[joint] = {
-            m: _rms_wrapped(sign * flexion(said[m][above], said[m][below]) - truth) for m in METHODS
+            m: _rms_wrapped(sign * flexion(estimates[m][above], estimates[m][below]) - truth)
+            for m in METHODS
         }
         out[joint]["sensors"] = {
             f"{a}+{b}": _rms_wrapped(sign * flexion(last.sensors[a], last.sensors[b]) - truth)
@@ -165,7 +168,7 @@ def _flexions(
 
 
 def flexion(q_above: Array, q_below: Array) -> Array:
-    """Return phi of R = Rx(phi) Ry(theta) Rz(psi), rad, shape (n,); knees flex negatively."""
+    """Return phi of R = Rx(phi) Ry(theta) Rz(psi), rad, shape (n,); knee flexion is negative."""
     w, x, y, z = rotation.multiply(rotation.conjugate(q_above), q_below).T
     phi: Array = np.arctan2(2.0 * (w * x - y * z), 1.0 - 2.0 * (x * x + y * y))
     return phi

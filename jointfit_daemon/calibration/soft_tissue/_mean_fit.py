@@ -8,7 +8,7 @@ import numpy as np
 
 from jointfit_daemon.calibration.soft_tissue._segment_training import (
     SegmentTraining,
-    cross_validated_sd,
+    held_out_sd,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import MeanModel, fuse
@@ -24,15 +24,16 @@ if TYPE_CHECKING:
 
 
 _SMALLEST_VARIANCE = 1e-12  # rad^2; a sensor that is its own reference still gets a finite weight
+"""Lower bound of an error variance, rad²: a sensor equal to the reference gets a finite weight."""
 
 
 def fusion_weights(sensors: Sequence[Array], q_reference: Array) -> Array:
-    """Return weights 1 / mean(e^2), normalised to sum 1, e the angle to the reference.
+    """Return weights 1 / mean(e²), normalized to sum 1, with e the angle to the reference.
 
     Parameters
     ----------
     sensors : sequence of ndarray, shape (n, 4)
-        Bone-aligned orientations, one array a sensor.
+        Bone-aligned orientations, one array for each sensor.
     q_reference : ndarray, shape (n, 4)
 
     Returns
@@ -46,15 +47,15 @@ def fusion_weights(sensors: Sequence[Array], q_reference: Array) -> Array:
 
 
 def plain_mean(training: SegmentTraining) -> MeanModel:
-    """Return the mean with equal weights: the baseline that learns nothing but its own error."""
+    """Return the mean with equal weights, with its RMS error in training: a baseline."""
     weights = (1.0 / len(training.sensors),) * len(training.sensors)
-    said = fuse(training.sensors, weights)
-    angles = rotation.angle_between(said, training.q_reference)
+    mean = fuse(training.sensors, weights)
+    angles = rotation.angle_between(mean, training.q_reference)
     return MeanModel(weights, float(np.sqrt(np.mean(angles**2) / 3.0)))
 
 
 def best_single(training: SegmentTraining) -> MeanModel:
-    """Return the sensor that is nearest to the reference in training, alone: weight 1, others 0."""
+    """Return the sensor with the smallest error in training: weight 1, all others 0."""
 
     def best(part: SegmentTraining) -> int:
         errors = [rotation.angle_between(q, part.q_reference) for q in part.sensors]
@@ -66,15 +67,15 @@ def best_single(training: SegmentTraining) -> MeanModel:
 
     chosen = best(training)
     weights = tuple(float(k == chosen) for k in range(len(training.sensors)))
-    return MeanModel(weights, cross_validated_sd(training, fit))
+    return MeanModel(weights, held_out_sd(training, fit))
 
 
 def fit_mean(training: SegmentTraining) -> MeanModel:
-    """Return the mean weighted by each sensor's own error against the reference."""
+    """Return the mean weighted by the error of each sensor relative to the reference."""
 
     def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
         weights = tuple(fusion_weights(part.sensors, part.q_reference).tolist())
         return lambda test: fuse(test.sensors, weights)
 
     weights = tuple(fusion_weights(training.sensors, training.q_reference).tolist())
-    return MeanModel(weights, cross_validated_sd(training, fit))
+    return MeanModel(weights, held_out_sd(training, fit))

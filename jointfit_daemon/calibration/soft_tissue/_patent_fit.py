@@ -8,11 +8,11 @@ import numpy as np
 
 from jointfit_daemon.calibration.soft_tissue._segment_training import (
     SegmentTraining,
-    cross_validated_sd,
+    held_out_sd,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
-from jointfit_daemon.limb_model import PatentModel, Reading
+from jointfit_daemon.limb_model import PatentModel, PatentReading
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 
-def fit_patent(reading: Reading, training: SegmentTraining) -> PatentModel:
-    """Return the regression of `reading`, judged on hold-out blocks.
+def fit_patent(reading: PatentReading, training: SegmentTraining) -> PatentModel:
+    """Return the regression of one reading, with its error on held-out blocks.
 
-    Least squares by orthogonal decomposition: the normal equations would square condition numbers
-    that are near a thousand already.
+    Least squares by orthogonal decomposition: normal equations would square condition numbers close
+    to a thousand.
     """
 
     def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
         model = _regressed(reading, part, 0.0)
         return lambda test: model.predict(test.sensors)
 
-    return _regressed(reading, training, cross_validated_sd(training, fit))
+    return _regressed(reading, training, held_out_sd(training, fit))
 
 
-def _regressed(reading: Reading, training: SegmentTraining, sd: float) -> PatentModel:
+def _regressed(reading: PatentReading, training: SegmentTraining, sd: float) -> PatentModel:
     q_sign = training.q_reference[0]
     inputs = [rotation.align_hemisphere(q, q_sign) for q in training.sensors]
     target = rotation.align_hemisphere(training.q_reference, q_sign)
@@ -44,7 +44,7 @@ def _regressed(reading: Reading, training: SegmentTraining, sd: float) -> Patent
 
 
 def _separate(inputs: list[Array], target: Array) -> Array:
-    """Fit each component alone: four systems of len(inputs) + 1 parameters."""
+    """Fit each component separately: four systems of len(inputs) + 1 parameters."""
     rows = []
     for k in range(4):
         A = np.column_stack([*(q[:, k] for q in inputs), np.ones(len(target))])
@@ -53,7 +53,7 @@ def _separate(inputs: list[Array], target: Array) -> Array:
 
 
 def _shared(inputs: list[Array], target: Array) -> Array:
-    """Fit one system of all components: one coefficient a sensor, one intercept a component."""
+    """Fit one system of all components: one coefficient per sensor, one intercept per component."""
     n, count = len(target), len(inputs)
     A = np.zeros((4 * n, count + 4))
     for m, q in enumerate(inputs):

@@ -1,8 +1,8 @@
-r"""Ridge regression through the origin with Huber weights, its penalty chosen by held-out blocks.
+r"""Ridge regression through the origin with Huber weights.
 
 .. math:: H = \sum_i w_i g_i g_i^T + \lambda n I, \qquad C = H^{-1} \sum_i w_i g_i \rho_i^T
 
-Law: regressors are scaled but never centred; centring would be an intercept by another name.
+Regressors are scaled but not centered, because the regression must have no intercept.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 PASSES = 5
+"""Reweighting iterations."""
 _SMALLEST_SCALE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Ridge:
-    """A fit, in units of the regressors as given."""
+    """A fit, in units of the raw regressors."""
 
     coefficients: Array
     """Shape (p, k): k targets per unit of regressor."""
     leverage: Array
-    """Shape (p, p): ``phi @ leverage @ phi`` is n g^T H^-1 g, how far phi lies outside the hull."""
+    """Shape (p, p): ``phi @ leverage @ phi`` is the leverage n g^T H^-1 g of a row."""
     scales: Array
     """RMS of each regressor in training, shape (p,): g = phi / scales."""
 
@@ -41,13 +42,15 @@ class Ridge:
 def fit_ridge(
     phi: Array, rho: Array, penalty: float, smallest_scale: float = _SMALLEST_SCALE
 ) -> Ridge:
-    """Fit rho (n, k) on phi (n, p); five passes of Huber weights on the residual length.
+    """Fit rho (n, k) on phi (n, p) with five iterations of Huber weights on the residual norm.
 
-    `smallest_scale` is added to the RMS of each regressor: what hardly moved is not blown up.
+    `smallest_scale` is added to the RMS of each regressor, so that a nearly constant one is not
+    amplified.
     """
     n, p = phi.shape
     scales = np.sqrt(np.mean(phi**2, axis=0)) + smallest_scale
     g = phi / scales
+
     weights = np.ones(n)
     H, C = np.eye(p), np.zeros((p, rho.shape[1]))
     for _ in range(PASSES):
@@ -56,5 +59,6 @@ def fit_ridge(
         C = np.linalg.solve(H, weighted.T @ rho)
         sizes = np.linalg.norm(rho - g @ C, axis=1)
         weights = huber_weights(sizes, robust_scale(sizes))
+
     inverse = n * np.linalg.inv(H) / np.outer(scales, scales)
     return Ridge(C / scales[:, None], 0.5 * (inverse + inverse.T), scales)

@@ -1,8 +1,4 @@
-"""Several sensors on one segment, some of them dead or alive: which model, and how it is fitted.
-
-Law: the one door to the segment models. A fit is given bone-aligned sensors in the world of the
-reference; what is trained for one set of sensors is used for exactly that set.
-"""
+"""Fit of one segment model by any method."""
 
 from __future__ import annotations
 
@@ -35,19 +31,18 @@ def fit_segment(
     Parameters
     ----------
     method : {"anchored", "patent12", "patent6", "markley", "mean", "single"}
-        ``anchored`` without a neighbour gives the weighted mean: it has nothing else to look at.
-        ``markley`` turns each sensor by a heading and a mount of its own, and weighs them by what
-        they err; ``mean`` weighs all sensors alike; ``single`` takes the best one alone.
+        ``anchored`` is the kernel model; without a neighbor it reduces to the weighted mean.
+        ``markley`` aligns each sensor by a heading and a mount and weights sensors by their errors;
+        ``mean`` weights all sensors equally; ``single`` uses the best sensor.
     sensors : sequence of array_like, shape (n, 4)
-        q_world_segment as each sensor says it through its static mount. Any number: means
-        weigh each, the regressions have a column for each, ``anchored`` a difference for each.
+        q_world_segment of each sensor through its static mount; any number of sensors.
     q_other : array_like, shape (n, 4), or None
-        The same of the neighbouring segment: of one sensor, or the mean of several.
+        Orientation of the neighboring segment: of one sensor, or the mean of several.
     q_reference : array_like, shape (n, 4)
-        q_world_segment by optics, same world. Frames with NaN anywhere are left out.
+        q_world_segment from optical markers, same world. Frames with any NaN are ignored.
     trials : array_like of int, shape (n,), optional
-        Which trial, that is kind of movement, each frame belongs to; one if None. What carries
-        over from one to another decides how much is corrected, and how sure it is.
+        Movement label of each frame; one movement by default. Generalization between movements
+        determines the size of the correction and its claimed uncertainty.
 
     Raises
     ------
@@ -67,4 +62,4 @@ def fit_segment(
         return fit_aligned(training)
     if method == "single":
         return best_single(training)
-    raise ValueError(f"method {method!r}; known: {', '.join(get_args(Method))}")
+    raise ValueError(f"method {method!r} is unknown; known: {', '.join(get_args(Method))}")

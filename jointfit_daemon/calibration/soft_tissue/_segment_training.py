@@ -18,20 +18,21 @@ if TYPE_CHECKING:
 
 
 FEWEST_FRAMES = 30
+"""Smallest number of complete training frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentTraining:
-    """Frames of one segment with their optical reference; only finite ones, in order of time."""
+    """Training frames of one segment with their optical reference; all finite, in order of time."""
 
     sensors: tuple[Array, ...]
-    """Bone-aligned, one array a sensor, shape (n, 4)."""
+    """Bone-aligned orientations, one array for each sensor, shape (n, 4)."""
     q_other: Array | None
-    """The neighbouring segment as one of its sensors says it, shape (n, 4)."""
+    """Orientation of the neighboring segment from its sensors, shape (n, 4)."""
     q_reference: Array
-    """q_world_segment by optics, shape (n, 4)."""
+    """q_world_segment from optical markers, shape (n, 4)."""
     trials: NDArray[np.int64]
-    """Which trial, that is kind of movement, each frame belongs to, shape (n,)."""
+    """Movement label of each frame, shape (n,)."""
 
     @staticmethod
     def of(
@@ -40,12 +41,12 @@ class SegmentTraining:
         q_reference: ArrayLike,
         trials: ArrayLike | None = None,
     ) -> SegmentTraining:
-        """Return the frames of which everything is known.
+        """Return the complete frames.
 
         Raises
         ------
         ValueError
-            There is no sensor, or fewer than 30 frames are complete: too few to judge any fit.
+            There is no sensor, or fewer than 30 frames are complete: too few to evaluate a fit.
         """
         if not sensors:
             raise ValueError("a segment model needs at least one sensor")
@@ -55,6 +56,7 @@ class SegmentTraining:
         found = int(np.count_nonzero(complete))
         if found < FEWEST_FRAMES:
             raise ValueError(f"{found} complete frames; at least {FEWEST_FRAMES} are needed")
+
         q = rotation.normalize(stacked[:, complete])
         count = len(sensors)
         labels = np.zeros(len(complete), dtype=np.int64)
@@ -67,21 +69,22 @@ class SegmentTraining:
         return len(self.q_reference)
 
     def part(self, chosen: NDArray[np.bool_]) -> SegmentTraining:
-        """Return the chosen frames."""
+        """Return selected frames."""
         other = None if self.q_other is None else self.q_other[chosen]
         sensors = tuple(q[chosen] for q in self.sensors)
         return SegmentTraining(sensors, other, self.q_reference[chosen], self.trials[chosen])
 
     @property
     def movements(self) -> int:
-        """Kinds of movement: trials."""
+        """Number of distinct movements."""
         return len(np.unique(self.trials))
 
     def folds(self, of_one: int = 5) -> Iterator[NDArray[np.bool_]]:
-        """Yield masks of hold-out blocks, contiguous in time.
+        """Yield masks of held-out blocks, contiguous in time.
 
-        `of_one` blocks of a single trial, three of each of several. Never random frames:
-        neighbouring frames are nearly copies, and would tell the fit what it is judged on.
+        `of_one` blocks of a single trial, three of each of several. Random frames are unsuitable:
+        neighboring frames are almost identical, so a fit would have seen the frames of its
+        evaluation.
         """
         labels = np.unique(self.trials)
         blocks = of_one if len(labels) == 1 else 3
@@ -92,19 +95,19 @@ class SegmentTraining:
                 yield held
 
 
-def cross_validated_sd(
+def held_out_sd(
     training: SegmentTraining, fit: Callable[[SegmentTraining], Callable[[SegmentTraining], Array]]
 ) -> float:
-    """Return the RMS error per axis, rad, over all hold-out blocks of `training`.
+    """Return the RMS error per axis over all held-out blocks of `training`, rad.
 
     Parameters
     ----------
     fit : callable
-        Takes training frames, returns what takes frames and gives their orientations (n, 4).
+        Fits training frames and returns a function from frames to orientations (n, 4).
     """
     squares = []
     for held in training.folds():
         test = training.part(held)
-        said = fit(training.part(~held))(test)
-        squares.append(rotation.angle_between(said, test.q_reference) ** 2)
+        estimate = fit(training.part(~held))(test)
+        squares.append(rotation.angle_between(estimate, test.q_reference) ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares)) / 3.0))

@@ -11,7 +11,7 @@ import numpy as np
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
     LEAST_LEVEL,
-    Kind,
+    LinkKind,
     SensorLink,
     level_axis,
     posture_one,
@@ -28,33 +28,39 @@ if TYPE_CHECKING:
 
 
 RIDGE = 1e-3
+"""Ridge penalty."""
 
 BLOCKS = 5
+"""Held-out blocks, contiguous in time."""
 
 FEWEST_FRAMES = 100
+"""Smallest number of complete frames."""
 
 LEAST_SPREAD = radians(0.3)
+"""Lower bound of the residual standard deviation, rad."""
 
 
 def fit_links(
     chain: Chain, sensors: Mapping[str, Array], q_static: Mapping[str, ArrayLike]
 ) -> tuple[SensorLink, ...]:
-    """Learn all links of a limb from a movement.
+    """Fit all links of a limb to a movement, by ridge regression on posture.
+
+    The standard deviation of a link is its RMS residual on held-out blocks.
 
     Parameters
     ----------
     chain : Chain
-        Who sits where.
+        Segments and their sensors.
     sensors : mapping of str to ndarray, shape (n, 4)
-        q_optical_segment as each sensor says it through its mount, at common instants in order
-        of time; frames with NaN are left out.
+        q_optical_segment of each sensor through its mount, at common instants in order of time;
+        frames with NaN are ignored.
     q_static : mapping
-        q_optical_segment in the static pose, by segment.
+        q_optical_segment of each segment in the static pose.
 
     Returns
     -------
     tuple of SensorLink
-        Empty where there are fewer than 100 complete frames.
+        Empty with fewer than 100 complete frames.
     """
     links = []
     for i, group in enumerate(chain.sensors):
@@ -71,14 +77,14 @@ def fit_links(
 
 
 def _near(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the next segment, the last looks back, a lone one at itself."""
+    """Return the sensors of the neighboring segment, or of the only segment itself."""
     if len(chain.sensors) == 1:
         return chain.sensors[0]
     return chain.sensors[i + 1 if i + 1 < len(chain.sensors) else i - 1]
 
 
 def _fit(
-    kind: Kind,
+    kind: LinkKind,
     ends: tuple[str, str],
     near: tuple[str, ...],
     sensors: Mapping[str, Array],
@@ -90,17 +96,21 @@ def _fit(
         wanted = rotation.log(rotation.multiply(rotation.conjugate(q_a), q_b))
     else:
         wanted = _wrapped(_axis_headings(q_a, q_b) - standing)[:, None]
+
     shown = _postures(q_a, q_near)
     known = np.isfinite(wanted).all(axis=1) & np.isfinite(shown).all(axis=1)
     shown, wanted = shown[known], wanted[known]
     if len(shown) < FEWEST_FRAMES:
         return None
-    left = []
+
+    # Residuals on held-out blocks.
+    residuals = []
     for held in np.array_split(np.arange(len(shown)), BLOCKS):
         rest = np.ones(len(shown), dtype=bool)
         rest[held] = False
-        left.append(wanted[held] - shown[held] @ _ridge(shown[rest], wanted[rest]))
-    spread = float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+        residuals.append(wanted[held] - shown[held] @ _ridge(shown[rest], wanted[rest]))
+
+    spread = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
     return SensorLink(
         a=a,
         b=b,
@@ -115,7 +125,7 @@ def _fit(
 
 
 def _ridge(shown: Array, wanted: Array) -> Array:
-    """Return the weights, shape (10, components), without intercept: upright is upright."""
+    """Return the weights, shape (10, components); no intercept, as upright gives zero."""
     scale = np.sqrt(np.mean(shown**2, axis=0)) + 1e-6
     g = shown / scale
     H = g.T @ g + RIDGE * len(g) * np.eye(g.shape[1])

@@ -1,7 +1,8 @@
-"""The frames a calibration was taught with, in few bytes: what later learning must not forget.
+"""Compact storage of training frames, so that later online learning retains earlier movements.
 
-Law: a bounded number of frames, postures evenly, of each posture the newest. Text in, text out, so
-that the JSON form stays exact; a component is kept to 1/32767, an orientation to 0.003°.
+Frames are limited in number and spread evenly over postures, with the newest frames of each
+posture. They are encoded as text; a quaternion component is rounded to 1/32767, an orientation to
+0.003°.
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ if TYPE_CHECKING:
 
 
 MOST = 800
-"""Frames kept: the models have some hundred unknowns, and each frame costs 50 bytes."""
+"""Largest number of frames: the models have some hundred parameters; a frame has 50 bytes."""
 CELL = 0.25
-"""Width of a posture, rad."""
+"""Width of a posture cell, rad."""
 MOVEMENTS = 3
-"""Kinds of movement told apart; the oldest ones are taken together."""
+"""Number of distinct movement labels; older movements are merged."""
 _ONE = 32767
+"""Integer that represents 1."""
 
 
 def pack(chain: Chain, training: LimbTraining) -> str:
-    """Return frames as text; in order of time, with the kind of movement of each."""
+    """Return frames in order of time, with their movement labels, as text."""
     columns = [training.sensors[s] for group in chain.sensors for s in group]
     columns += [training.reference[name] for name in chain.segments]
     counts = np.round(np.concatenate(columns, axis=1) * _ONE)
@@ -42,7 +44,7 @@ def pack(chain: Chain, training: LimbTraining) -> str:
 
 
 def unpack(chain: Chain, text: str) -> LimbTraining | None:
-    """Return the frames of a text; None where there are none, or they are of another chain."""
+    """Return the frames of a text; None if it is empty or belongs to another chain."""
     sensors = [s for group in chain.sensors for s in group]
     width = 4 * (len(sensors) + len(chain.segments)) + 1
     table = np.frombuffer(b64decode(text), dtype="<i2")
@@ -59,7 +61,7 @@ def unpack(chain: Chain, text: str) -> LimbTraining | None:
 
 
 def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
-    """Return both, in this order, the new one as another kind of movement."""
+    """Return both sets in this order, the new one labeled as another movement."""
     before = _labels(old)
     labels = np.concatenate([before, np.full(len(new), before.max(initial=-1) + 1)])
     labels = np.maximum(labels - max(int(labels.max()) - MOVEMENTS + 1, 0), 0)
@@ -71,27 +73,31 @@ def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
 
 
 def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraining:
-    """Return at most `most` frames: every posture's newest, then every posture's second, and so on.
+    """Return at most `most` frames, evenly over postures.
 
-    So a posture seen once stays, and of one seen often the old frames give way to new ones.
+    The newest frame of every posture is selected first, then the second newest, and so on. Rare
+    postures are thus retained, and frequent ones are renewed.
     """
     if len(training) <= most:
         return training
     cells = postures(chain, training)
     _, which = np.unique(cells, axis=0, return_inverse=True)
     which = np.ravel(which)
+
+    # Rank of every frame within its posture, newest first.
     newest = np.arange(len(which))[::-1]
     by_cell = newest[np.argsort(which[newest], kind="stable")]
     edges = np.flatnonzero(np.diff(which[by_cell], prepend=-1))
     starts = np.repeat(edges, np.diff(np.append(edges, len(by_cell))))
     turn = np.empty(len(which), dtype=np.int64)
     turn[by_cell] = np.arange(len(by_cell)) - starts
+
     order = np.lexsort((-np.arange(len(which)), turn))
     return training.rows(np.sort(order[:most]))
 
 
 def postures(chain: Chain, training: LimbTraining) -> NDArray[np.int64]:
-    """Return the posture of every frame: where gravity is, and each joint, in cells."""
+    """Return the posture cell of every frame: direction of gravity and joint rotations."""
     means = [
         fuse([training.sensors[s] for s in group], (1.0 / len(group),) * len(group))
         for group in chain.sensors

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.calibration.guidance import first_of
+from jointfit_daemon.calibration.guidance import most_urgent
 from jointfit_daemon.pipeline.calibration_session._stillness_gate import SILENT_NS, StillnessGate
 from jointfit_daemon.pipeline.calibration_session._trial_recorder import TrialRecorder
 from jointfit_daemon.pipeline.events import CalibrationPhase
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationTrial
-    from jointfit_daemon.calibration.guidance import MovementGuide, MovementLook
+    from jointfit_daemon.calibration.guidance import MovementGuide, MovementStatus
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
 _NS = 1_000_000_000
@@ -62,7 +62,7 @@ class PhaseRecording:
     ) -> None:
         self.phase, self.wanted_s = phase, wanted_s
         self._guide, self._min_s = guide, min(min_s, wanted_s)
-        self._look: MovementLook | None = None
+        self._look: MovementStatus | None = None
         self._start_ns = self._progress_ns = start_ns
         self._recorder = TrialRecorder()
 
@@ -129,7 +129,7 @@ class PhaseRecording:
         }
 
         if not look.ready or silent:
-            return self._share(elapsed_s), first_of(look.missing) or "keep moving", data
+            return self._share(elapsed_s), most_urgent(look.missing) or "keep moving", data
         left_s = self._min_s - elapsed_s
         if left_s > 0.0:
             return self._share(elapsed_s), f"all joints known; keep moving, {left_s:.0f} s", data

@@ -44,7 +44,7 @@ from jointfit_daemon.pipeline.online_learning import OnlineRefits
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, Fresh
+    from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, OnlineFrames
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
     from jointfit_daemon.pipeline.sources import LagMonitor
@@ -225,7 +225,7 @@ class CalibrationSession:
             self._status(request.t_ns, self.phase, text),
         ]
 
-    def request_refit(self, fresh: Fresh) -> list[Output]:
+    def request_refit(self, fresh: OnlineFrames) -> list[Output]:
         """Request a refit of the models to new frames; call only while ``may_learn``."""
         if self.calibration is None:
             return []

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.calibration import Fresh
+from jointfit_daemon.calibration import OnlineFrames
 from jointfit_daemon.kinematics.rotation_scalar import interpolate_one, multiply_one
 from jointfit_daemon.pipeline.online_learning._learning_state import LearningMonitor, not_visible
 
@@ -156,7 +156,7 @@ class OnlineFrameCollector:
             else:
                 self._monitor.add_obstacle(t_ns, f"sensor fault: {', '.join(faults)}")
 
-    def take_due(self, now_ns: int) -> Fresh | None:
+    def take_due(self, now_ns: int) -> OnlineFrames | None:
         """Return and remove the collected frames if a refit is due; otherwise None."""
         if len(self._kept) < MIN_FRAMES:
             return None
@@ -173,7 +173,7 @@ class OnlineFrameCollector:
             for i, name in enumerate(names)
         }
         bodies = {n for n, (_, body) in zip(names, self._clusters, strict=True) if body}
-        return Fresh(
+        return OnlineFrames(
             {name: sensors[:, i] for i, name in enumerate(self._sensors)},
             {name: x for name, x in mocap.items() if name not in bodies},
             {name: x for name, x in mocap.items() if name in bodies},

@@ -12,7 +12,7 @@ from jointfit_daemon.pipeline.events import FitJob, Notice
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.calibration import CalibrationSettings, Fresh
+    from jointfit_daemon.calibration import CalibrationSettings, OnlineFrames
     from jointfit_daemon.model import Chain
     from jointfit_daemon.pipeline.events import JobFinished
     from jointfit_daemon.pipeline.online_learning._frame_collector import OnlineFrameCollector
@@ -43,7 +43,7 @@ class OnlineRefits:
         calibration: Calibration,
         chain: Chain,
         settings: CalibrationSettings,
-        fresh: Fresh,
+        fresh: OnlineFrames,
     ) -> FitJob:
         """Return the job of a refit."""
         self.job = job

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.driver import ImuSettings
-from jointfit_daemon.limb_model import live_cluster, rigid_fit
+from jointfit_daemon.limb_model import restore_cluster, rigid_fit
 from jointfit_daemon.pipeline.events import Notice
 from jointfit_daemon.timing.lag import (
     LagEstimate,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.limb_model import Calibration, Cluster
+    from jointfit_daemon.limb_model import Calibration, MarkerCluster
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.timing.lag import TrackedLag
 
@@ -119,7 +119,9 @@ class LagMonitor:
     ) -> None:
         clusters = {} if calibration is None else calibration.clusters
         self._clusters = {
-            name: live_cluster(name, clusters[name]) for name in chain.segments if name in clusters
+            name: restore_cluster(name, clusters[name])
+            for name in chain.segments
+            if name in clusters
         }
         self._segment = {
             sensor: segment
@@ -325,7 +327,7 @@ def _rounded_ms(value_ns: float | None) -> float | None:
 
 
 def _orientations(
-    cluster: Cluster, rows: list[tuple[int, MocapFrame]]
+    cluster: MarkerCluster, rows: list[tuple[int, MocapFrame]]
 ) -> Generator[None, None, Track]:
     """Return the orientations of a segment from its markers, in steps of a few frames."""
     layout = rows[0][1].layout

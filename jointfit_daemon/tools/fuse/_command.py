@@ -89,12 +89,14 @@ def evaluate(
     from jointfit_daemon.tools.output_files import check_plot
 
     check_plot(plot)
-    limb, read, mounts, doubts = _inputs(trials, segment, joints, static, markers=markers, up=up)
+    limb, read, mounts, trial_warnings = _inputs(
+        trials, segment, joints, static, markers=markers, up=up
+    )
     _refuse_unmoved(limb, read)
     found = evaluate(limb.chain, read, mounts, holdout=holdout)
-    _warn(doubts)
+    _warn(trial_warnings)
     if json:
-        _echo_json(_report.evaluation_json(found) | {"notes": doubts})
+        _echo_json(_report.evaluation_json(found) | {"notes": trial_warnings})
     else:
         typer.echo(_report.evaluation_table(found))
     if plot is not None:
@@ -129,7 +131,9 @@ def fit(
 
     check_output("--out", out, (".json",))
     chosen = _method(method)
-    limb, read, mounts, doubts = _inputs(trials, segment, joints, static, markers=markers, up=up)
+    limb, read, mounts, trial_warnings = _inputs(
+        trials, segment, joints, static, markers=markers, up=up
+    )
     if chosen not in METHODS_WITHOUT_MOTION:
         _refuse_unmoved(limb, read)
     if mounts is None:
@@ -139,14 +143,14 @@ def fit(
         read,
         mounts,
         chosen,
-        notes=tuple(doubts),
+        notes=tuple(trial_warnings),
         software=__version__,
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     _write_json(out, calibration.to_dict())
     frames = sum(len(trial.t_s) for trial in read)
     if json:
-        _echo_json({"model": str(out), "frames": frames, "notes": doubts})
+        _echo_json({"model": str(out), "frames": frames, "notes": trial_warnings})
     else:
         typer.echo(_report.fit_summary(calibration, frames))
         typer.echo(f"wrote {out}", err=True)
@@ -201,7 +205,7 @@ def _inputs(
     up: str,
 ) -> tuple[LimbDescription, list[OfflineTrial], dict[str, Any] | None, list[str]]:
     """Return limb, trials, sensor alignments (None: estimated later) and warnings."""
-    from jointfit_daemon.calibration.phases import doubts
+    from jointfit_daemon.calibration.phases import trial_warnings
     from jointfit_daemon.tools.fuse import _trial
 
     limb = _trial.read_limb(segments, joints, markers or (), _axis(up))
@@ -210,7 +214,7 @@ def _inputs(
         mounts, still = _trial.read_static(*_pair(static), limb)
     read = [_trial.read_trial(*_pair(text), limb, still) for text in trials]
     read = _trial.name_trials(read, [_pair(text)[0] for text in trials])
-    warnings = doubts(limb.chain, read, mounts)
+    warnings = trial_warnings(limb.chain, read, mounts)
     if mounts is None:
         warnings.append(
             "no --static: sensor alignments are estimated from the movement and the reference, so"
@@ -241,12 +245,12 @@ def _method(name: str) -> Any:
 def _read_model(path: Path) -> Any:
     from jointfit_daemon.calibration.record import MOST_BYTES
     from jointfit_daemon.files.text import read_json
-    from jointfit_daemon.limb_model import Calibration, UnknownSchema
+    from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
 
     data = read_json(path, MOST_BYTES)
     try:
         return Calibration.from_dict(data if isinstance(data, dict) else {})
-    except UnknownSchema as fault:
+    except CalibrationSchemaError as fault:
         raise ValueError(
             f"{path}: expected a model written by `jointfit fuse fit`: {fault}"
         ) from fault
@@ -265,12 +269,12 @@ def _echo_json(data: dict[str, Any]) -> None:
 
 
 def _refuse_unmoved(limb: LimbDescription, trials: Sequence[OfflineTrial]) -> None:
-    from jointfit_daemon.calibration.phases import unmoved
+    from jointfit_daemon.calibration.phases import unmoved_joint
 
-    if why := unmoved(limb.chain, trials):
+    if why := unmoved_joint(limb.chain, trials):
         raise ValueError(why)
 
 
-def _warn(doubts: Sequence[str]) -> None:
-    for doubt in doubts:
+def _warn(trial_warnings: Sequence[str]) -> None:
+    for doubt in trial_warnings:
         typer.echo(f"warning: {doubt}", err=True)

@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from jointfit_daemon.calibration.phases import Judged, Judgement
+    from jointfit_daemon.calibration.phases import MethodEvaluation, MethodScore
 
 ROW_INCHES = 3.2
 """Height of one row of plots, inches."""
 
 
-def draw_evaluation(path: Path, found: Judgement) -> None:
+def draw_evaluation(path: Path, found: MethodEvaluation) -> None:
     """Write one figure with a row per joint and trial; the file extension selects the format."""
     joints = [*found.rows[0].joints] or [""]
     lines = [(trial, joint) for trial in found.reference for joint in joints]
@@ -41,7 +41,7 @@ def draw_evaluation(path: Path, found: Judgement) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _flexions(axes: Any, found: Judgement, rows: Sequence[Judged], joint: str) -> None:
+def _flexions(axes: Any, found: MethodEvaluation, rows: Sequence[MethodScore], joint: str) -> None:
     trial = rows[0].trial
     t_s = found.t_s[trial]
     for row in rows:
@@ -58,7 +58,7 @@ def _flexions(axes: Any, found: Judgement, rows: Sequence[Judged], joint: str) -
     axes.grid(alpha=0.3)
 
 
-def _bars(axes: Any, rows: Sequence[Judged]) -> None:
+def _bars(axes: Any, rows: Sequence[MethodScore]) -> None:
     names = [*rows[0].segments, *(f"{joint} flexion" for joint in rows[0].joints)]
     width = 0.8 / len(names)
     for k, name in enumerate(names):

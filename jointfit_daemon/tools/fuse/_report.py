@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from jointfit_daemon.calibration.phases import Judged, Judgement
+    from jointfit_daemon.calibration.phases import MethodEvaluation, MethodScore
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.tools.fuse._output import FusedTrial
 
@@ -18,7 +18,7 @@ _DIGITS = 2
 """Decimals of displayed degrees; errors that are equal at this precision count as equal."""
 
 
-def evaluation_table(found: Judgement) -> str:
+def evaluation_table(found: MethodEvaluation) -> str:
     """Return the table of all methods, and the columns in which a method is worse than the mean."""
     first = found.rows[0]
     head = (
@@ -39,11 +39,11 @@ def evaluation_table(found: Judgement) -> str:
     return "\n".join(lines + _comparisons(found))
 
 
-def _figures(row: Judged) -> list[float]:
+def _figures(row: MethodScore) -> list[float]:
     return [*row.segments.values(), *row.joints.values()]
 
 
-def _comparisons(found: Judgement) -> list[str]:
+def _comparisons(found: MethodEvaluation) -> list[str]:
     """Return one line per fitted method: the columns in which it is worse than the mean."""
     base = {row.trial: row for row in found.rows if row.method == BASELINE}
     worse: dict[str, list[str]] = {}
@@ -63,7 +63,7 @@ def _comparisons(found: Judgement) -> list[str]:
     ]
 
 
-def evaluation_json(found: Judgement) -> dict[str, Any]:
+def evaluation_json(found: MethodEvaluation) -> dict[str, Any]:
     """Return the evaluation in SI units (rad); null means unknown."""
     return {
         "judged_on": found.held_out,

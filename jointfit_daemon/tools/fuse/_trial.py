@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.registration import RobustMean
     from jointfit_daemon.files.mocap import Axis
-    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.limb_model import MarkerCluster
 
 
 MARKER_FILES = (".trc", ".c3d")
@@ -67,7 +67,7 @@ class LimbDescription:
 class StaticMarkers:
     """Marker positions on each segment from a static trial; segment axes equal world axes there."""
 
-    clusters: Mapping[str, Cluster]
+    clusters: Mapping[str, MarkerCluster]
 
 
 def read_limb(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration.anatomy._joint_center import fit_center, slide_under
+from jointfit_daemon.calibration.anatomy._joint_center import align_vertically, fit_center
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -79,7 +79,7 @@ def test_a_hinge_shows_its_axis_and_leaves_the_rest_to_the_start() -> None:
     assert abs(found.unseen[0] @ axis) > 0.998
     off = found.center - CENTER
     assert np.linalg.norm(off - axis * (axis @ off)) < 3e-3
-    moved = slide_under(found, CENTER[:2])
+    moved = align_vertically(found, CENTER[:2])
     assert np.linalg.norm(moved.center - CENTER) < 3e-3
     assert np.sqrt(axis @ found.covariance @ axis) == pytest.approx(0.03, rel=0.05)
 

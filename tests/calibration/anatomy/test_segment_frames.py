@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.calibration import CalibrationRefused, CalibrationSettings
+from jointfit_daemon.calibration import CalibrationError, CalibrationSettings
 from jointfit_daemon.calibration.anatomy import (
     Anatomy,
     find_anatomy,
@@ -133,5 +133,5 @@ def test_a_movement_about_the_long_axis_only_is_refused() -> None:
         if name in MARKERS["shank"]:
             positions[:, i] = turned.apply(positions[:, i])
     tracks = track_clusters(replace(still, positions=positions), clusters)
-    with pytest.raises(CalibrationRefused, match="squats"):
+    with pytest.raises(CalibrationError, match="squats"):
         find_anatomy(CHAIN, tracks)

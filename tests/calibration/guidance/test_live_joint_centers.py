@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.calibration.anatomy import static_cluster, track_clusters
-from jointfit_daemon.calibration.guidance import MovementGuide, first_of
-from jointfit_daemon.calibration.guidance._live_joint_centers import LiveCenters
+from jointfit_daemon.calibration.guidance import MovementGuide, most_urgent
+from jointfit_daemon.calibration.guidance._live_joint_centers import LiveJointCenters
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from tests.calibration.synthetic_limb import (
     CHAIN,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack
-    from jointfit_daemon.calibration.guidance import MovementLook
+    from jointfit_daemon.calibration.guidance import MovementStatus
 
 EVERY = 24
 """Frames between two looks."""
@@ -54,7 +54,7 @@ def frames(track: OpticalTrack, positions: np.ndarray | None = None) -> Iterator
         )
 
 
-def watched(static: CalibrationTrial, track: OpticalTrack, positions: np.ndarray) -> MovementLook:
+def watched(static: CalibrationTrial, track: OpticalTrack, positions: np.ndarray) -> MovementStatus:
     """Return the last look at a movement; no payload on the way holds NaN or infinity."""
     guide = MovementGuide(CHAIN, SETTINGS, static)
     look = guide.look({}, 0.0)
@@ -75,12 +75,12 @@ def test_centers_come_near_the_truth_and_the_error_told_is_honest(seed: int) -> 
     static, track = trials(seed)
     assert static.optical is not None
     clusters = {name: static_cluster(static.optical, name, SETTINGS) for name in MARKERS}
-    live = LiveCenters(CHAIN, clusters)
+    live = LiveJointCenters(CHAIN, clusters)
     told = []
     for i, frame in enumerate(frames(track)):
         live.feed(frame)
         if i % EVERY == 0:
-            told.append(live.look())
+            told.append(live.estimate_centers())
     standing = motion(Subject(seed), 6.0, 400.0, still=True)
     truth = {"hip": "thigh", "knee": "shank", "ankle": "foot"}
     off = {
@@ -104,7 +104,7 @@ def test_the_poses_of_a_frame_are_those_of_the_whole_trial() -> None:
     assert static.optical is not None
     clusters = {name: static_cluster(static.optical, name, SETTINGS) for name in MARKERS}
     whole = track_clusters(track, clusters)
-    live = LiveCenters(CHAIN, clusters)
+    live = LiveJointCenters(CHAIN, clusters)
     for i, frame in zip(range(200), frames(track), strict=False):
         live.feed(frame)
         for k, name in enumerate(live.parts.names):
@@ -116,8 +116,8 @@ def test_an_occluded_body_part_is_named_with_its_remedy() -> None:
     positions, columns = spoiled("pelvis", track)
     positions[:, columns] = np.nan
     look = watched(static, track, positions)
-    assert "pelvis" in first_of(look.missing)
-    assert "cameras see" in first_of(look.missing)
+    assert "pelvis" in most_urgent(look.missing)
+    assert "toward the cameras" in most_urgent(look.missing)
     assert look.joints["hip"]["predicted_error_mm"] is None
     assert look.joints["hip"]["source"] == "unknown"
     assert look.joints["knee"]["source"] != "sensors", "the others go on"
@@ -158,7 +158,7 @@ def test_without_motion_no_center_is_told_and_every_joint_is_asked_to_move() -> 
     )
     assert still.optical is not None
     look = watched(static, still.optical, still.optical.positions)
-    assert len([text for text in look.missing if "not moved far enough" in text]) == 3
+    assert len([text for text in look.missing if "movement too small" in text]) == 3
     assert all(joint["predicted_error_mm"] is None for joint in look.joints.values())
 
 
@@ -187,7 +187,7 @@ def test_a_frame_without_markers_or_with_other_names_is_no_frame() -> None:
     )
     for _ in range(400):
         guide.add_mocap(nothing)
-    assert "check the names" in first_of(guide.look({}, 3.0).missing)
+    assert "check the names" in most_urgent(guide.look({}, 3.0).missing)
     for frame in frames(track):
         guide.add_mocap(frame)
     looks = [guide.look({}, 30.0) for _ in range(3)]

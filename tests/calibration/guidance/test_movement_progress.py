@@ -21,15 +21,15 @@ def about_x(degrees: float) -> tuple[float, float, float, float]:
 def test_the_arc_is_what_the_segments_turn_against_each_other() -> None:
     progress = MovementProgress(CHAIN)
     for degrees in range(-10, 51, 5):  # both turn along by another 20 degrees
-        progress.look({"S1": about_x(20 + degrees), "S3": about_x(20 + 2 * degrees)})
+        progress.update({"S1": about_x(20 + degrees), "S3": about_x(20 + 2 * degrees)})
     assert math.degrees(progress.arcs()["knee"]) == pytest.approx(60.0)
 
 
 def test_a_sensor_that_takes_over_for_a_lost_one_adds_no_arc() -> None:
     progress = MovementProgress(CHAIN)
-    progress.look({"S1": UPRIGHT, "S2": about_x(90), "S3": UPRIGHT})
-    progress.look({"S1": UPRIGHT, "S2": about_x(90), "S3": about_x(10)})
-    progress.look({"S2": about_x(90), "S3": about_x(10)})  # mounted otherwise; nothing moved
+    progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": UPRIGHT})
+    progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": about_x(10)})
+    progress.update({"S2": about_x(90), "S3": about_x(10)})  # mounted otherwise; nothing moved
     assert math.degrees(progress.arcs()["knee"]) == pytest.approx(10.0)
 
 
@@ -37,8 +37,8 @@ def test_more_arc_and_more_time_promise_a_smaller_error() -> None:
     errors = []
     for arc in (20.0, 60.0):
         progress = MovementProgress(CHAIN)
-        progress.look({"S1": UPRIGHT, "S3": UPRIGHT})
-        progress.look({"S1": UPRIGHT, "S3": about_x(arc)})
+        progress.update({"S1": UPRIGHT, "S3": UPRIGHT})
+        progress.update({"S1": UPRIGHT, "S3": about_x(arc)})
         errors += [progress.predicted_center_errors(s)["knee"] or math.nan for s in (5.0, 20.0)]
     assert errors == sorted(errors, reverse=True)
     assert len(set(errors)) == len(errors)
@@ -46,7 +46,7 @@ def test_more_arc_and_more_time_promise_a_smaller_error() -> None:
 
 def test_without_movement_no_error_is_promised() -> None:
     progress = MovementProgress(CHAIN)
-    progress.look({"S1": UPRIGHT, "S3": UPRIGHT})
+    progress.update({"S1": UPRIGHT, "S3": UPRIGHT})
     assert progress.predicted_center_errors(10.0) == {"knee": None}
     assert MovementProgress(CHAIN).predicted_center_errors(10.0) == {}
 
@@ -60,7 +60,7 @@ def test_a_chain_of_any_length_has_its_inner_joints(segments: int) -> None:
         tuple((f"S{i}",) for i in range(segments)),
     )
     progress = MovementProgress(chain)
-    progress.look({f"S{i}": UPRIGHT for i in range(segments)})
+    progress.update({f"S{i}": UPRIGHT for i in range(segments)})
     assert list(progress.arcs()) == [f"J{i}" for i in range(1, segments)]
 
 
@@ -68,5 +68,5 @@ def test_bends_are_counted_from_the_static_pose_wherever_the_movement_begins() -
     progress = MovementProgress(CHAIN, {"S1": UPRIGHT, "S3": UPRIGHT})
     for _ in range(4):
         for degrees in (60, 20, 40, 5):  # 20 is not straight: 60, 20, 40 is one bend
-            progress.look({"S1": UPRIGHT, "S3": about_x(degrees)})
+            progress.update({"S1": UPRIGHT, "S3": about_x(degrees)})
     assert progress.bends() == {"knee": 4}

@@ -15,7 +15,7 @@ from jointfit_daemon.calibration.anatomy import track_clusters
 from jointfit_daemon.calibration.phases import StaticPose, fit_static, run_job
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.phases._functional import _refined
-from jointfit_daemon.limb_model import Calibration, stored_cluster
+from jointfit_daemon.limb_model import Calibration, cluster_record
 from jointfit_daemon.outputs.payloads._quality_units import shown
 from jointfit_daemon.tools.calibrate import report
 from tests.calibration.synthetic_limb import (
@@ -32,7 +32,7 @@ from tests.calibration.synthetic_limb import (
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack
-    from jointfit_daemon.limb_model import Cluster
+    from jointfit_daemon.limb_model import MarkerCluster
 
 KNOCKED, KNOCK = "thigh1", np.array([0.011, -0.009, 0.006])
 WORN = Subject(5, flaws=Imperfections(sensor_deg=0.3, tissue_deg=3.0, skin_m=0.002, occluded=0.03))
@@ -69,7 +69,7 @@ def refined() -> RefinedClusters:
     return refine_clusters(pose().clusters, tracks, 0.4)
 
 
-def bias_deg(cluster: Cluster) -> float:
+def bias_deg(cluster: MarkerCluster) -> float:
     """Return how far the thigh's orientation is off the bone's on average, the pose being zero."""
     _, functional, moving = trials()
     optical = optical_of(functional)
@@ -183,7 +183,7 @@ def test_the_worker_stores_and_tells_what_refining_did() -> None:
     assert figures["parts"]["thigh"]["after_m"] < figures["parts"]["thigh"]["before_m"]
     stored = Calibration.from_dict(result["calibration"])
     assert stored.quality["markers"] == result["quality"]["markers"]
-    assert stored.clusters["thigh"] == stored_cluster(refined().clusters["thigh"])
+    assert stored.clusters["thigh"] == cluster_record(refined().clusters["thigh"])
     lines = report(shown(stored.quality))
     assert any(line.startswith("thigh: markers ") and "refined" in line for line in lines)
     assert any(line.startswith(f"{KNOCKED}: ") and "knocked off?" in line for line in lines)
@@ -207,7 +207,7 @@ def test_a_new_pose_fits_the_refined_markers() -> None:
     new = fit_static(knocked, SETTINGS, CHAIN).clusters["thigh"]
     old, used = pose().clusters["thigh"], refined().clusters["thigh"]
 
-    def off(cluster: Cluster) -> float:
+    def off(cluster: MarkerCluster) -> float:
         seen, _ = Rotation.align_vectors(new.template, cluster.template)
         return float(np.degrees(seen.magnitude()))
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration import CalibrationRefused, CalibrationSettings, Fresh
-from jointfit_daemon.calibration.phases import learn, run_job
+from jointfit_daemon.calibration import CalibrationError, CalibrationSettings, OnlineFrames
+from jointfit_daemon.calibration.phases import refit_models, run_job
 from jointfit_daemon.calibration.record._content_check import content_faults
 from jointfit_daemon.calibration.soft_tissue import evenly, joined, pack, unpack
 from jointfit_daemon.calibration.soft_tissue._training_memory import MOST, postures
@@ -61,12 +61,12 @@ def test_only_models_memory_and_figures_change(learned: dict[str, Any]) -> None:
 
 def test_more_of_what_is_known_teaches_nothing(learned: dict[str, Any]) -> None:
     after = Calibration.from_dict(learned["calibration"])
-    result = learn(after, fresh(moving(400, 0.5, 3)), CHAIN)
+    result = refit_models(after, fresh(moving(400, 0.5, 3)), CHAIN)
     assert "calibration" not in result
     assert "newest frames" in result["kept"]
 
 
-def spoilt(kind: str) -> Fresh:
+def spoilt(kind: str) -> OnlineFrames:
     good = fresh(moving(400, 1.2, 1))
     thigh = good.markers["thigh"].copy()
     if kind == "two names swapped":
@@ -86,18 +86,18 @@ def spoilt(kind: str) -> Fresh:
     "kind", ["two names swapped", "a marker knocked off", "cluster turned", "segments swapped"]
 )
 def test_nothing_is_learned_from_wrong_cameras(kind: str) -> None:
-    with pytest.raises(CalibrationRefused, match="marker"):
-        learn(calibration(), spoilt(kind), CHAIN)
+    with pytest.raises(CalibrationError, match="marker"):
+        refit_models(calibration(), spoilt(kind), CHAIN)
 
 
 def test_a_calibration_without_memory_is_refused_with_a_remedy() -> None:
-    with pytest.raises(CalibrationRefused, match="functional phase once more"):
-        learn(replace(calibration(), memory=""), fresh(moving(400, 1.2)), CHAIN)
+    with pytest.raises(CalibrationError, match="repeat the functional phase"):
+        refit_models(replace(calibration(), memory=""), fresh(moving(400, 1.2)), CHAIN)
 
 
 def test_few_frames_are_refused() -> None:
-    with pytest.raises(CalibrationRefused, match="200 are needed"):
-        learn(calibration(), fresh(moving(100, 1.2)), CHAIN)
+    with pytest.raises(CalibrationError, match="200 are needed"):
+        refit_models(calibration(), fresh(moving(100, 1.2)), CHAIN)
 
 
 # --- memory -----------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jointfit_daemon.calibration.record import CalibrationStore, CalibrationUnreadable
+from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
 from jointfit_daemon.calibration.record._content_check import content_faults
 from jointfit_daemon.calibration.record._store import checksum
 from jointfit_daemon.limb_model import (
@@ -65,13 +65,13 @@ def test_a_damaged_version_is_named_and_the_one_before_is_used(
     store.save(numbered("good"))
     store.save(numbered("bad"))
     store.path(2).write_bytes(damage)
-    with pytest.raises(CalibrationUnreadable, match=r"0002\.json"):
+    with pytest.raises(CalibrationFileError, match=r"0002\.json"):
         store.load(2)
     latest = store.latest()
     assert latest is not None
     assert latest.version == 1
     assert "0002.json" in latest.notes[0]
-    assert "set aside as 0002.json.bad" in latest.notes[0]
+    assert "renamed to 0002.json.bad" in latest.notes[0]
     assert store.save(numbered("next")) == 3
     assert store.path(2).with_name("0002.json.bad").read_bytes() == damage
     again = store.latest()
@@ -83,9 +83,9 @@ def test_nothing_readable_is_no_silence(tmp_path: Path) -> None:
     store = CalibrationStore(tmp_path, "s")
     store.save(PLAIN)
     store.path(1).write_text("x", encoding="utf-8")
-    with pytest.raises(CalibrationUnreadable, match=r"0001\.json"):
+    with pytest.raises(CalibrationFileError, match=r"0001\.json"):
         store.latest()
-    with pytest.raises(CalibrationUnreadable, match="no such version; stored: none"):
+    with pytest.raises(CalibrationFileError, match="no such version; stored: none"):
         store.load(9)
     assert store.latest() is None
 
@@ -232,14 +232,14 @@ def test_wrong_content_is_set_aside_even_with_a_matching_checksum(
     latest = store.latest()
     assert latest is not None
     assert latest.version == 1
-    assert "set aside as 0002.json.bad" in latest.notes[0]
+    assert "renamed to 0002.json.bad" in latest.notes[0]
 
 
 def test_an_edit_by_hand_is_refused_with_what_to_do(tmp_path: Path) -> None:
     store = CalibrationStore(tmp_path, "s")
     path = store.path(store.save(PLAIN))
     path.write_text(path.read_text().replace("0.42", "0.43"))
-    with pytest.raises(CalibrationUnreadable, match=r"checksum differs.*edited.*calibrate again"):
+    with pytest.raises(CalibrationFileError, match=r"checksum differs.*edited.*calibrate again"):
         store.load(1)
 
 
@@ -280,7 +280,7 @@ def test_a_mutated_file_is_refused_or_has_the_same_content(
     store.path(1).write_bytes(WRITTEN[:at] + inserted + WRITTEN[at + cut :])
     try:
         found = store.load(1)
-    except CalibrationUnreadable:
+    except CalibrationFileError:
         return
     assert found == PLAIN
 
@@ -295,6 +295,6 @@ def test_no_flipped_bit_changes_the_content(tmp_path: Path) -> None:
         path.write_bytes(flipped)
         try:
             found = store.load(1)
-        except CalibrationUnreadable:
+        except CalibrationFileError:
             continue
         assert found == PLAIN

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bench.subjects.recorded_knee import load
-from jointfit_daemon.calibration.registration import SKIN, ChosenLag, seen_lags, segment_lags
-from jointfit_daemon.calibration.registration._lags import FLESH_SD_NS, MARKERS_SD_NS
+from jointfit_daemon.calibration.registration import SKIN, SensorLag, segment_lags, tracked_lags
+from jointfit_daemon.calibration.registration._lags import MARKER_TISSUE_SD_NS, SENSOR_TISSUE_SD_NS
 from jointfit_daemon.timing.lag import LagEstimate, estimate_lag
 
 if TYPE_CHECKING:
@@ -34,8 +34,10 @@ def test_flesh_keeps_a_lag_on_skin_from_looking_sure() -> None:
     chosen = segment_lags({"S1": said(9.0, 0.05)}, {})["S1"]
     assert chosen.source == "movement"
     assert chosen.lag_ns == 9 * MS
-    assert chosen.sigma_ns == pytest.approx(np.hypot(FLESH_SD_NS, MARKERS_SD_NS), rel=0.01)
-    assert seen_lags({"S1": (9 * MS, 0.05 * MS)})["S1"].sigma_ns == pytest.approx(
+    assert chosen.sigma_ns == pytest.approx(
+        np.hypot(SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS), rel=0.01
+    )
+    assert tracked_lags({"S1": (9 * MS, 0.05 * MS)})["S1"].sigma_ns == pytest.approx(
         chosen.sigma_ns, rel=0.01
     )
 
@@ -62,7 +64,7 @@ def test_a_sensor_known_from_the_plate_tells_the_markers_flesh_to_its_neighbor()
 def test_what_refuses_is_left_to_the_plate_and_a_changed_clock_to_the_movement() -> None:
     plate = {"S1": (round(5 * MS), 0.1 * MS), "S2": (round(5 * MS), 0.1 * MS)}
     chosen = segment_lags({"S1": said(9.0, 1.0, "no"), "S2": said(40.0, 1.0)}, plate)
-    assert chosen["S1"] == ChosenLag(round(5 * MS), 0.1 * MS, "plate")
+    assert chosen["S1"] == SensorLag(round(5 * MS), 0.1 * MS, "plate")
     assert chosen["S2"].source == "movement"
     assert chosen["S2"].lag_ns == 40 * MS
     assert segment_lags({"S1": said(9.0, 1.0, "no")}, {}) == {}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.calibration import (
-    CalibrationRefused,
+    CalibrationError,
     CalibrationSettings,
     CalibrationTrial,
     SensorTrack,
@@ -15,9 +15,9 @@ from jointfit_daemon.calibration.phases import fit_static
 from jointfit_daemon.calibration.registration import (
     RobustMean,
     StaticLimits,
-    redonning_problems,
+    redonning_notes,
     robust_mean,
-    static_bias,
+    static_mount,
     static_problems,
 )
 from jointfit_daemon.kinematics import rotation as rot
@@ -58,8 +58,8 @@ def test_the_mount_takes_the_sensor_to_the_segment() -> None:
     q_segment = rot.exp(rng.normal(0, 0.02, (300, 3)))
     mount = rot.exp([0.2, 0.9, -0.4])
     q_sensor = rot.multiply(q_segment, rot.conjugate(mount))
-    assert rot.angle_between(static_bias(q_sensor, q_segment).q, mount) < 1e-9
-    assert np.allclose(rot.multiply(q_sensor, static_bias(q_sensor, q_segment).q), q_segment)
+    assert rot.angle_between(static_mount(q_sensor, q_segment).q, mount) < 1e-9
+    assert np.allclose(rot.multiply(q_sensor, static_mount(q_sensor, q_segment).q), q_segment)
 
 
 def test_weights_count() -> None:
@@ -85,9 +85,9 @@ def test_a_sensor_that_slipped_is_told_from_a_pose_that_changed() -> None:
     segments = {"thigh": ("S1", "S2", "S9")}
     stooped = rot.exp([0.2, 0.0, 0.0])
     posture = {sensor: rot.multiply(q, stooped) for sensor, q in before.items()}
-    assert redonning_problems(before, posture, segments) == ()
+    assert redonning_notes(before, posture, segments) == ()
     slipped = {**posture, "S2": rot.multiply(posture["S2"], rot.exp([0.0, 0.0, 4 * DEG]))}
-    (problem,) = redonning_problems(before, slipped, segments)
+    (problem,) = redonning_notes(before, slipped, segments)
     assert "S1 and S2 differ by 4.0 deg" in problem
 
 
@@ -98,5 +98,5 @@ def test_a_pose_held_for_three_seconds_is_three_seconds_though_its_samples_span_
     settings = CalibrationSettings(static_s=5.0)
     assert fit_static(CalibrationTrial({"S1": track}, None), settings, chain).still_s < 3.0
     half = SensorTrack(t_ns[:150], track.q_world_sensor[:150])
-    with pytest.raises(CalibrationRefused, match="stand still for longer"):
+    with pytest.raises(CalibrationError, match="stand still for longer"):
         fit_static(CalibrationTrial({"S1": half}, None), settings, chain)

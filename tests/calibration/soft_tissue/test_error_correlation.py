@@ -10,14 +10,14 @@ import pytest
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
     SegmentTraining,
-    all_alive,
     error_correlation,
-    error_correlations,
+    joint_error_correlations,
+    predict_all_sensors,
 )
 from jointfit_daemon.fusion._forward_kinematics import joint_angle_estimate
 from jointfit_daemon.fusion._segment_fuser import FusedSegment
 from jointfit_daemon.kinematics import rotation as rot
-from jointfit_daemon.limb_model import Calibration, UnknownSchema
+from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
 from jointfit_daemon.model import Chain
 from tests.calibration.calibrated_subject import calibration
 
@@ -46,11 +46,11 @@ def limb(alike: float, seed: int = 1) -> LimbTraining:
 @pytest.mark.parametrize("alike", [-0.8, 0.0, 0.8])
 def test_what_is_found_on_held_out_frames_holds_on_later_ones(alike: float) -> None:
     training, later = limb(alike), limb(alike, seed=2)
-    found = error_correlations(CHAIN, training, "anchored")
+    found = joint_error_correlations(CHAIN, training, "anchored")
     assert found.keys() == {"knee"}
     left = []
     for i, segment in enumerate(CHAIN.segments):
-        said = all_alive(CHAIN, i, "anchored", training, later)
+        said = predict_all_sensors(CHAIN, i, "anchored", training, later)
         left.append(rot.log(rot.multiply(rot.conjugate(said), later.reference[segment]))[:, 0])
     actual = np.corrcoef(np.stack(left))
     assert abs(found["knee"] - float(np.asarray(actual)[0, 1])) < 0.15
@@ -68,8 +68,8 @@ def test_a_joint_that_was_hardly_seen_whole_has_none() -> None:
     hidden = training.reference["shank"].copy()
     hidden[29:] = np.nan
     partly = LimbTraining(training.sensors, {**training.reference, "shank": hidden})
-    assert error_correlations(CHAIN, partly, "anchored") == {}
-    assert error_correlations(CHAIN, training, "mean") == {}
+    assert joint_error_correlations(CHAIN, partly, "anchored") == {}
+    assert joint_error_correlations(CHAIN, training, "mean") == {}
 
 
 def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
@@ -112,5 +112,5 @@ def test_a_stored_correlation_that_cannot_be_is_no_calibration(rho: float) -> No
     assert Calibration.from_dict({**data, "correlations": {"knee": -0.3}}).correlations == {
         "knee": -0.3
     }
-    with pytest.raises(UnknownSchema, match="correlation"):
+    with pytest.raises(CalibrationSchemaError, match="correlation"):
         Calibration.from_dict({**data, "correlations": {"knee": rho}})

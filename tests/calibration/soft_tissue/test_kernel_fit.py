@@ -201,18 +201,6 @@ def test_a_trend_of_constant_and_weights_is_found_and_bounded() -> None:
     assert np.max(np.abs(trend(rows, 100.0 * u))) == LARGEST
 
 
-def test_a_model_of_an_earlier_version_has_no_trend_and_still_works() -> None:
-    knee = Knee()
-    model = fit_kernel(knee.training())
-    data = model.to_dict()
-    again = KernelModel.read(data)
-    assert again == model
-    del data["trend"]
-    old = KernelModel.read(data)
-    inside = old.predict(knee.sensors, knee.other)
-    assert knee.error(inside) < 1.2 * knee.error(model.predict(knee.sensors, knee.other))
-
-
 def test_a_stored_model_with_wrong_types_is_found_wherever_they_are() -> None:
     data = fit_kernel(Knee().training()).to_dict()
     assert [*_wrong_types(KernelModel.read(data))] == []

@@ -82,7 +82,7 @@ def test_where_nothing_is_left_to_judge_that_is_told(files: Path) -> None:
     trial.bones["shank"][N // 2 :] = np.nan
     rewrite(files, "begun", trial)
     text = said(run("evaluate", files / "begun.npz", *LIMB, "--static", files / "still.npz"))
-    assert "shank: 0 complete frames in the part of begun that judges" in text
+    assert "shank: 0 complete frames in the held-out part of begun" in text
     assert "--holdout" in text
 
 
@@ -110,7 +110,7 @@ def test_identical_sensors_fit_and_are_told(files: Path) -> None:
         trial.sensors["B"][:] = rotation.multiply(trial.sensors["A"], turned)
         rewrite(files, f"m{k}", trial)
     result = run("evaluate", *trials(files), *LIMB, "--json")
-    assert "A and B say the same in every frame" in result.stderr
+    assert "A and B are identical in every frame" in result.stderr
     assert "C and D" not in result.stderr
     for key, row in rows(result).items():
         assert np.isfinite([*row["segments_rms"].values()]).all(), key
@@ -122,7 +122,7 @@ def test_identical_sensors_fit_and_are_told(files: Path) -> None:
 def test_without_movement_there_is_nothing_to_learn(files: Path, command: str) -> None:
     out = ["--out", files / "model.json"] if command == "fit" else []
     text = said(run(command, files / "still.npz", *LIMB, *out))
-    assert "knee turns by 0.0 deg only" in text
+    assert "knee rotates by only 0.0 deg" in text
     assert "--method mean" in text
 
 
@@ -198,7 +198,7 @@ def test_scalar_last_quaternions_are_pointed_out(files: Path) -> None:
     rewrite(files, "m0", trial)
     result = run("evaluate", *trials(files), *LIMB, "--static", files / "still.npz")
     assert "warning: m0: B is" in result.stderr
-    assert "from the reference of thigh: are its quaternions scalar first" in result.stderr
+    assert "from the reference of thigh; check that quaternions are scalar first" in result.stderr
 
 
 def test_moving_static_trial_is_rejected_with_sensor_names(files: Path) -> None:

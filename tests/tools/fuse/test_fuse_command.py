@@ -89,7 +89,7 @@ def test_the_semireal_squats_reproduce_their_published_figures(shared_data: Path
     result = run(
         "evaluate", folder / "squats1.npz", "--segment", "thigh=S1,S2:femur_r",
         "--segment", "shank=S3,S4:tibia_r", "--joints", "hip,knee,ankle",
-        "--static", folder / "static_bias.json", "--json",
+        "--static", folder / "static_mount.json", "--json",
     )  # fmt: skip
     found = rows(result)
     published = {
@@ -321,7 +321,7 @@ def test_a_sensor_world_that_is_turned_is_pointed_out(files: Path) -> None:
         write_orientations_npz(files / f"t{k}.npz", OrientationTrial(trial.t_s, sensors, bones, {}))
         found.append(files / f"t{k}.npz")
     result = run("evaluate", *found, *LIMB, "--static", files / "still.npz")
-    assert "A: its world seems turned by -69° about the vertical" in result.stderr
+    assert "A: its world seems rotated by -69° about the vertical" in result.stderr
 
 
 def test_unknown_method_is_reported_with_a_suggestion(files: Path) -> None:
