@@ -5,10 +5,10 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench docs wheel deb sbom audit lock clean
+.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs wheel deb sbom audit lock clean
 
 help:  ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 $(STAMP): pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit("python3 is %d.%d: 3.11 or newer is needed" % sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
@@ -55,14 +55,14 @@ types: $(STAMP)  ## mypy, strict
 imports: $(STAMP)  ## who may import whom
 	@$(BIN)/lint-imports
 
-bench: $(STAMP)  ## measure speed, accuracy and timing; fails where a floor is missed
-	@$(BIN)/python bench/accuracy.py
-	@$(BIN)/python bench/timing.py
-	@$(BIN)/python bench/joint_center.py
-	@$(BIN)/python bench/fusion.py
-	@$(BIN)/python bench/speed.py $(ARGS)
+bench: $(STAMP)  ## headline experiments and a quick one of every kind, 10 minutes; fails where a threshold is missed
+	@$(BIN)/python -m bench $(ARGS)
+
+bench-full: $(STAMP)  ## all experiments, about an hour; writes bench/results and the pages of docs
+	@$(BIN)/python -m bench --full $(ARGS)
 
 docs: $(STAMP)  ## the documentation as a site, warnings are errors
+	@$(BIN)/python -m bench.framework.pages
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir build/site
 
 wheel: $(STAMP)  ## wheel and sdist in build/packages: reproducible, checked, installed in empty environments

@@ -44,7 +44,7 @@ NOT_RUN = {
     r"/etc/|^chown |^mosquitto_passwd ": "needs root: changes an installed broker or service",
     r"^git clone |pip install |^pipx ": "needs the network",
     r"^make ": "minutes of processor time: CI runs the targets",
-    r"python bench/": "minutes of processor time: the options are checked against its --help",
+    r"python -m bench": "minutes of processor time: the options are checked against its --help",
     r"pytest": "the test suite itself",
     r"^jointfit report --cor-study": "12 s of processor time",
     r"/dev/|^candump |^ip link|^udevadm ": "needs hardware",

@@ -10,9 +10,9 @@ interval), angular rates are scaled so that every step turns by the true angle:
 Up to three missing measurements are interpolated. After a longer gap the filter restarts: it keeps
 the gyroscope bias and, without a magnetometer, continues with the last heading, which is uncertain.
 
-A filter that has just started takes its vertical from one accelerometer measurement. In fast
-motion the error is 20 degrees in the first second and 4 degrees in the next two, and normal
-afterwards (``bench/fusion.py E-2``). No orientation is therefore returned until the filter has
+A filter that has just started takes its vertical from one accelerometer measurement. In fast motion
+the error is 20 degrees in the first second and 4 degrees in the next two, and normal afterwards
+(``gateway-orientation-start-in-motion``). No orientation is therefore returned until the filter has
 detected rest or has run for `SETTLE_S`.
 
 Invariant: a function of the readings fed, without a clock of its own: a replay yields identical

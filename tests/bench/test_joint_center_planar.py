@@ -1,4 +1,4 @@
-"""Every short row of the planar joint center table meets its goal."""
+"""Every short experiment on planar joint centers meets its thresholds."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ EXPERIMENTS = (*planar.EXPERIMENTS, *planar_oriented.EXPERIMENTS)
 
 
 @pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if not e.long], ids=lambda e: e.id)
-def test_every_figure_of_a_planar_center_keeps_its_goal(experiment: Experiment) -> None:
+def test_planar_center_experiment_meets_its_thresholds(experiment: Experiment) -> None:
     reason = experiment.missing()
     if reason is not None:
         pytest.skip(reason)
-    figures = experiment.run(DATA)
-    assert figures
-    assert [figure for figure in figures if not figure.kept] == []
+    results = experiment.run(DATA)
+    assert results
+    assert experiment.unexpected(results) == []
 
 
 @pytest.mark.parametrize(

@@ -13,22 +13,24 @@ from bench.framework.experiment import find_experiments
 
 pytestmark = pytest.mark.experiment
 ROOT = Path(__file__).resolve().parents[2]
+NAME = "model-centers-sit-to-stand"
 
 
 @pytest.mark.timeout(180)
 def test_an_error_told_of_a_real_joint_is_not_far_too_small(tmp_path: Path) -> None:
-    row = next(e for e in find_experiments("joint_center_rows") if e.id == "R-2")
+    row = next(e for e in find_experiments("joint_center") if e.id == NAME)
     reason = row.missing()
     if reason is not None:
         pytest.skip(reason)
     # a process of its own: the model's program prints and warns as it likes
-    script = [sys.executable, str(ROOT / "bench" / "joint_center.py"), "R-2"]
+    script = [sys.executable, "-m", "bench", NAME, "--dry-run"]
     done = subprocess.run(
-        [*script, "--json", str(tmp_path / "a.json")], capture_output=True, check=False
+        [*script, "--json", str(tmp_path / "a.json")], cwd=ROOT, capture_output=True, check=False
     )
     assert done.returncode == 0, done.stderr
     figures = {
-        f["name"]: f["value"] for f in json.loads((tmp_path / "a.json").read_text())[0]["figures"]
+        f["name"]: float(f["value"])
+        for f in json.loads((tmp_path / "a.json").read_text())[0]["results"]
     }
     joints = {name.split(":")[0] for name in figures if "refused" not in name}
     assert any("knee, sphere" in joint for joint in joints)

@@ -1,4 +1,4 @@
-"""The speed bench runs, tells goals beside figures, and fails where a floor is missed."""
+"""Speed experiments run as a command, and the command fails where a threshold is missed."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.framework.measurement import Bench, Row, as_json, as_text, fixed_loop, percentile
-from bench.speed import main
+from bench import __main__ as command
+from bench.framework import storage
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SEEDED
+from bench.framework.measurement import fixed_loop, machine, percentile, timed_result
+from bench.framework.table import text_table
 from tests.broker_fixture import MOSQUITTO_MISSING
 
 if TYPE_CHECKING:
@@ -20,37 +24,41 @@ if TYPE_CHECKING:
 PROJECT = Path(__file__).resolve().parents[2]
 
 
-def measured(tmp_path: Path, pattern: str, timeout_s: float = 28.0) -> dict[str, Any]:
-    """Run the command on some benches; return the figures by name, unless a floor was missed."""
+def measured(tmp_path: Path, *ids: str, timeout_s: float = 28.0) -> dict[str, Any]:
+    """Run some experiments in short form; return the results by name."""
     found = tmp_path / "speed.json"
-    words = ["--quick", "--rows", pattern, "--json", str(found)]
+    words = [sys.executable, "-m", "bench", *ids, "--quick", "--dry-run", "--json", str(found)]
     ran = subprocess.run(
-        [sys.executable, str(PROJECT / "bench" / "speed.py"), *words],
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
+        words, cwd=PROJECT, capture_output=True, text=True, timeout=timeout_s, check=False
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    told: dict[str, Any] = json.loads(found.read_text(encoding="utf-8"))
-    assert told["machine"]["python"]
-    return {row["name"]: row for bench in told["benches"] for row in bench["rows"]}
+    contents = json.loads(found.read_text(encoding="utf-8"))
+    assert {content["experiment"] for content in contents} == set(ids)
+    return {entry["name"]: entry for content in contents for entry in content["results"]}
 
 
 @pytest.mark.alone
-def test_codecs_keep_their_floors_and_slcan_is_several_times_cheaper_than_python_cans(
+def test_codecs_keep_their_thresholds_and_slcan_is_several_times_cheaper_than_python_cans(
     tmp_path: Path,
 ) -> None:
-    rows = measured(tmp_path, "xbus|xcdi|natnet|slcan|clock|align")
+    rows = measured(
+        tmp_path,
+        "xbus-codec",
+        "can-codec",
+        "natnet-codec",
+        "slcan-python-can",
+        "clock-time",
+        "frame-alignment-time",
+    )
     assert len(rows) == 11
-    assert rows["slcan: ours over python-can's"]["figure"] < 0.5
+    assert rows["slcan: jointfit over python-can"]["value"] < 0.5
 
 
 @pytest.mark.alone
 @pytest.mark.experiment
 @pytest.mark.timeout(60)
-def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
-    rows = measured(tmp_path, "fusion|core", 55.0)
+def test_fusion_and_core_keep_their_thresholds(tmp_path: Path) -> None:
+    rows = measured(tmp_path, "fusion-frame-time", "core-step-time", timeout_s=55.0)
     assert {row["unit"] for row in rows.values()} == {"µs"}
     assert all(row["ratio"] > 0 for row in rows.values())
 
@@ -59,45 +67,53 @@ def test_a_frame_keeps_its_floor(tmp_path: Path) -> None:
 @pytest.mark.experiment
 @pytest.mark.system
 @pytest.mark.timeout(90)
-def test_the_daemon_is_measured_between_hardware_and_broker(tmp_path: Path) -> None:
-    rows = measured(tmp_path, "gateway100", 85.0)
+def test_daemon_is_measured_between_hardware_and_broker(tmp_path: Path) -> None:
+    rows = measured(tmp_path, "gateway-hundred-hertz", timeout_s=85.0)
     if "4 × 100 Hz: latency, p99" not in rows:
         pytest.skip(MOSQUITTO_MISSING)
-    assert rows["4 × 100 Hz: samples unaccounted for"]["figure"] == 0
-    assert 0 < rows["4 × 100 Hz: latency, median"]["figure"] < 200
+    assert rows["4 × 100 Hz: samples unaccounted for"]["value"] == 0
+    assert 0 < rows["4 × 100 Hz: latency, median"]["value"] < 200
 
 
-def test_a_missed_floor_ends_with_1_and_a_missed_goal_does_not(
+def test_missed_threshold_ends_with_1_and_missed_target_does_not(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = [Row("slow", 5.0, "µs", 1.0, 10.0)]
-    bench = Bench("one", "a bench", lambda _: rows)
-    monkeypatch.setattr("bench.speed.find_benches", lambda: [bench])
-    monkeypatch.setattr("sys.argv", ["speed.py"])
-    assert main() == 0
-    assert "goal missed" in capsys.readouterr().out
-    rows.append(Row("slower", float("nan"), "µs", 1.0, 10.0))
-    assert main() == 1
-    assert "floors missed: slower" in capsys.readouterr().err
+    results = [timed_result("slow", 5.0, "µs", 1.0, 10.0)]
+    experiment = Experiment("one-experiment", "An experiment", lambda _: results, SEEDED)
+    monkeypatch.setattr("bench.framework.experiment._TOPICS", {experiment.id: "timing"})
+    monkeypatch.setattr(command, "find_experiments", lambda: [experiment])
+    assert command.main(["--dry-run"]) == 0
+    assert "target missed" in capsys.readouterr().out
+    results.append(timed_result("slower", float("nan"), "µs", 1.0, 10.0))
+    assert command.main(["--dry-run"]) == 1
+    assert "one-experiment: slower" in capsys.readouterr().err
 
 
-def test_an_unknown_bench_is_a_usage_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["speed.py", "--rows", "no such"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+def test_unknown_experiment_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(["no-such", "--dry-run"]) == 2
+    assert "no experiment no-such" in capsys.readouterr().err
 
 
-def test_figures_are_told_to_people_and_programs() -> None:
-    row = Row("a", 1.5, "ms", 2.0, 8.0, 0.25, "of three")
-    assert "1.5 ms" in as_text([row])
-    told = as_json([(Bench("b", "c", lambda _: [row]), [row])])["benches"][0]["rows"][0]
-    assert told["reached"]
-    assert not told["missed"]
-    assert (told["figure"], told["goal"], told["ratio"]) == (1.5, 2.0, 0.25)
+def test_results_are_printed_and_stored_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = timed_result("a", 1.5, "ms", 2.0, 8.0, ratio=0.25, note="of three")
+    experiment = Experiment("one-experiment", "An experiment", lambda _: [result], SEEDED)
+    monkeypatch.setattr("bench.framework.experiment._TOPICS", {experiment.id: "timing"})
+    assert "1.500 ms" in text_table([(experiment, [result])])
+    storage.store(experiment.id, storage.to_json(experiment, [result]), tmp_path)
+    stored = storage.load(experiment.id, tmp_path)
+    assert storage.results_of(stored) == [result]
+    endless = Result("b", float("inf"))
+    stored = storage.to_json(experiment, [endless])
+    assert storage.results_of(json.loads(json.dumps(stored))) == [endless]
 
 
-def test_a_percentile_is_a_value_that_was_measured() -> None:
+def test_machine_is_described() -> None:
+    assert machine()["python"]
+
+
+def test_percentile_is_a_measured_value() -> None:
     values = [float(k) for k in range(100)]
     assert percentile(values[::-1], 0.99) == 99.0
     assert percentile(values, 0.5) == 50.0

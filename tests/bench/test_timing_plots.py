@@ -5,20 +5,18 @@ from __future__ import annotations
 import subprocess
 import sys
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import orjson
 import pytest
 
-from bench import timing
+from bench.plots import __main__ as plots
 from bench.rigs.core_trace import Trace, traced, true_errors
 from bench.subjects.simulated_clocks import Run, simulated
 from jointfit_daemon.outputs.recording._event_log import FORMAT, encode_event
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
+ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 16.0
 STREAMS = {"S1", "S2", "S3", "S4", "mocap"}
 
@@ -75,7 +73,8 @@ def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
     lines = [orjson.dumps({"log": FORMAT}), *(encode_event(e) for e in simulated(12.0).events)]
     log.write_bytes(b"".join(line + b"\n" for line in lines))
     ran = subprocess.run(
-        [sys.executable, timing.__file__, "--plot", str(pictures), "--replay", str(log)],
+        [sys.executable, "-m", "bench.plots", "clocks", str(pictures), "--replay", str(log)],
+        cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=25.0,
@@ -93,10 +92,10 @@ def test_what_cannot_be_drawn_is_told_and_is_no_crash(
 ) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     (tmp_path / "empty").write_text("")
-    assert timing.plot(tmp_path, tmp_path / "absent") == 2
-    assert timing.plot(tmp_path, tmp_path / "empty") == 2
+    assert plots.draw("clocks", tmp_path, tmp_path / "absent") == 2
+    assert plots.draw("clocks", tmp_path, tmp_path / "empty") == 2
     assert "not an event log" in capsys.readouterr().err
     with monkeypatch.context() as without:
-        without.setattr(timing, "find_spec", lambda _: None)
-        assert timing.plot(tmp_path, None) == 2
+        without.setattr(plots, "find_spec", lambda _: None)
+        assert plots.draw("clocks", tmp_path, None) == 2
     assert "pip install 'jointfitd[plot]'" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Joint angles against SciPy's Euler sequences, finite differences and geometry (row B-16)."""
+"""Joint angles against SciPy's Euler sequences, finite differences and geometry."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def from_sequence(axes: str, angles: NDArray[np.float64]) -> NDArray[np.float64]
     return np.asarray(Rotation.from_euler(axes, angles).as_quat(scalar_first=True))
 
 
-def test_both_sequences_round_trip_on_twenty_thousand_rotations() -> None:  # B-16
+def test_both_sequences_round_trip_on_twenty_thousand_rotations() -> None:
     q = random_rotations(20_000)
     patent, grood = patent_angles(q), grood_suntay(q)
     back = from_sequence("ZYX", patent.angles[:, ::-1])

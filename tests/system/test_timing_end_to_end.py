@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.alone, pytest.mark.experiment]
 
 MOST_ERROR_NS = 500_000
-"""Beyond what a machine short of time excuses; the bench holds a quiet one to it (row T9)."""
+"""Beyond what a machine short of time excuses; a quiet one meets live-rig-restarts."""
 MOST_TIED_ERROR_NS = 250_000
 """Ticks of 100 us, 20 us of jitter on each stamp, and the camera clock's own error."""
 MOST_PTP_ERROR_NS = 50_000

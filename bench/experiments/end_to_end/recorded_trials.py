@@ -10,7 +10,8 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from bench.experiments.fusion.knee_segments import NAMES, KneeModels, Squats
-from bench.framework.experiment import Experiment, Figure, near
+from bench.framework.experiment import Experiment, Result, near
+from bench.framework.material import KNEE
 from bench.rigs import recorded_trial
 from bench.subjects.recorded_knee import FOLDER, load
 
@@ -32,8 +33,8 @@ def _played(data: Path) -> dict[tuple[str, Method], Played]:
     return recorded_trial.run(data, METHODS, WALKERS)
 
 
-def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Figure]]:
-    def run(data: Path) -> list[Figure]:
+def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Result]]:
+    def run(data: Path) -> list[Result]:
         knee = Squats(data)
         held = knee.held if trial == "squats" else load(data, "walking1")
         figures = []
@@ -44,19 +45,52 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Fi
             models = KneeModels(method, [knee.training])
             offline = knee.judge.errors(models.predict(same), same)
             figures += [
-                near(f"{method}: {name} (offline {expected:.3f})", said, expected, ALLOWED_DEG)
+                near(
+                    f"{method}: {name}",
+                    said,
+                    expected,
+                    ALLOWED_DEG,
+                    note=f"offline {expected:.3f}",
+                )
                 for name, said, expected in zip(NAMES, live.errors, offline, strict=True)
             ]
             share = live.frames / len(held)
-            figures.append(Figure(f"{method}: share judged", share, 1.0, least=0.9, unit=""))
+            figures.append(Result(f"{method}: share evaluated", share, 1.0, minimum=0.9, unit=""))
         return figures
 
     return run
 
 
+PATENT_SHARED = (
+    "not known; part of it is that the daemon compensates the relative heading of the sensors and "
+    "the offline evaluation does not"
+)
+HEADING = (
+    "the daemon compensates the relative heading of the sensors and the offline evaluation does "
+    "not; without it patent12 is within the threshold in shank and flexion"
+)
 EXPERIMENTS = (
-    Experiment("E2E-squats", "squats hold-out, bytes to MQTT", _beside("squats", METHODS),
-               (FOLDER,), long=True),
-    Experiment("E2E-walk", "walking, bytes to MQTT, trained on squats",
-               _beside("walking", WALKERS), (FOLDER,), long=True),
-)  # fmt: skip
+    Experiment(
+        "end-to-end-squats",
+        "Squats, hold-out: pose messages of the daemon against the offline evaluation",
+        _beside("squats", METHODS),
+        KNEE,
+        (FOLDER,),
+        long=True,
+        known_misses={"patent6: shank": PATENT_SHARED, "patent6: flexion": PATENT_SHARED},
+    ),
+    Experiment(
+        "end-to-end-walking",
+        "Walking, trained on squats: pose messages of the daemon against the offline evaluation",
+        _beside("walking", WALKERS),
+        KNEE,
+        (FOLDER,),
+        long=True,
+        known_misses={
+            "patent12: thigh": HEADING,
+            "patent12: shank": HEADING,
+            "patent12: flexion": HEADING,
+            "anchored: flexion": HEADING,
+        },
+    ),
+)

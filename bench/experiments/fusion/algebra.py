@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.baselines.recursive_least_squares import InformationForm, RecursiveLeastSquares
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SEEDED
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import grood_suntay, patent_angles
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def recursive(_: Path) -> list[Figure]:
+def recursive(_: Path) -> list[Result]:
     """B-15: 15 regressors, 3 targets, 500 samples, forgetting 0.999."""
     rng = np.random.default_rng(15)
     n, p, forgetting, ridge = 500, 15, 0.999, 0.01
@@ -30,12 +31,19 @@ def recursive(_: Path) -> list[Figure]:
     gram = (g * decay[:, None]).T @ g + ridge * forgetting**n * np.eye(p)
     batch = np.linalg.solve(gram, (g * decay[:, None]).T @ y)
     return [
-        Figure("RLS", float(np.abs(stepwise.coefficients - batch).max()), 1e-9, unit=""),
-        Figure("information", float(np.abs(information.coefficients - batch).max()), 1e-9, unit=""),
+        Result(
+            "recursive least squares",
+            float(np.abs(stepwise.coefficients - batch).max()),
+            1e-9,
+            unit="",
+        ),
+        Result(
+            "information form", float(np.abs(information.coefficients - batch).max()), 1e-9, unit=""
+        ),
     ]
 
 
-def round_trip(_: Path) -> list[Figure]:
+def round_trip(_: Path) -> list[Result]:
     """B-16: 20 000 random rotations to angles and, by elementary rotations, back."""
     q = rotation.normalize(np.random.default_rng(16).normal(size=(20_000, 4)))
     x, y, z = np.eye(3)
@@ -51,11 +59,21 @@ def round_trip(_: Path) -> list[Figure]:
             turn = rotation.exp(found.angles[:, column, None] * axis)
             back = rotation.multiply(back, turn)
         off = rotation.angle_between(back, q)[~found.gimbal].max()
-        figures.append(Figure(label, float(np.rad2deg(off)), 1e-9))
+        figures.append(Result(label, float(np.rad2deg(off)), 1e-9))
     return figures
 
 
 EXPERIMENTS = (
-    Experiment("B-15", "recursive fits against the batch, largest difference", recursive),
-    Experiment("B-16", "angle sequences there and back, largest error", round_trip),
+    Experiment(
+        "recursive-fit-equivalence",
+        "Recursive regression against the batch solution, largest difference",
+        recursive,
+        SEEDED,
+    ),
+    Experiment(
+        "joint-angle-round-trip",
+        "20 000 random rotations to joint angles and back, largest error",
+        round_trip,
+        SEEDED,
+    ),
 )

@@ -18,7 +18,8 @@ from bench.experiments.fusion.recorded_movements import (
     TOLERANCE,
     flexion_scores,
 )
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import BOTH_KNEES
 from bench.subjects.recorded_knee import FOLDER, Judge, training_frames
 from bench.subjects.skin_marker_knees import AS_RECORDED, MOVEMENTS, STATIC, SUBJECT, skin_knee
 from jointfit_daemon.kinematics import rotation
@@ -37,7 +38,7 @@ RIVALS = ("mean", "patent12", "linear", DEFAULT)
 DEEP_DEG = 40.0
 
 
-def sit_to_stand(data: Path) -> list[Figure]:
+def sit_to_stand(data: Path) -> list[Result]:
     """F-7: trained on 60 % of the squats, walking and the jump, judged on sit-to-stand.
 
     The default must be worse in nothing than the mean of two or patent12.
@@ -48,13 +49,13 @@ def sit_to_stand(data: Path) -> list[Figure]:
         for method, errors in found.items():
             goals = _best(found) if method == DEFAULT else (NOTHING,) * 3
             figures += [
-                Figure(f"{side}, {method}: {name}", error, goal)
+                Result(f"{side}, {method}: {name}", error, goal)
                 for name, error, goal in zip(NAMES, errors, goals, strict=True)
             ]
     return figures
 
 
-def exchanged(data: Path) -> list[Figure]:
+def exchanged(data: Path) -> list[Result]:
     """F-11: the same with the filters' errors exchanged between the sensors, RMS of five ways.
 
     The recordings give every sensor one filter's error; which has which is chance.
@@ -67,17 +68,21 @@ def exchanged(data: Path) -> list[Figure]:
             a, b, c = np.sqrt(np.mean(np.square([way[method] for way in ways]), axis=0)).tolist()
             found[method] = (a, b, c)
         figures += [
-            Figure(f"{side}: {name}", error, goal)
+            Result(f"{side}: {name}", error, goal)
             for name, error, goal in zip(NAMES, found[DEFAULT], _best(found), strict=True)
         ]
         kept = [np.less_equal(way[DEFAULT], _best(way)) for way in ways]
         for i, name in enumerate(NAMES):
             count = float(sum(each[i] for each in kept))
-            figures.append(Figure(f"{side}: {name} kept, ways of 5", count, NOTHING, unit=""))
+            figures.append(
+                Result(
+                    f"{side}: {name} within threshold, of 5 assignments", count, NOTHING, unit=""
+                )
+            )
     return figures
 
 
-def left_out(data: Path) -> list[Figure]:
+def left_out(data: Path) -> list[Result]:
     """F-8: each of four movements judged by what the other three have taught."""
     figures = []
     for side, trials in _both(data).items():
@@ -87,13 +92,13 @@ def left_out(data: Path) -> list[Figure]:
             others = [other for name, other in trials.items() if name != movement]
             found = _errors(judge, others, trial)
             figures += [
-                Figure(f"{side}, {movement}: {name}", error, goal)
+                Result(f"{side}, {movement}: {name}", error, goal)
                 for name, error, goal in zip(NAMES, found[DEFAULT], _best(found), strict=True)
             ]
     return figures
 
 
-def coverage(data: Path) -> list[Figure]:
+def coverage(data: Path) -> list[Result]:
     """F-9: how often errors of flexion lie within what is claimed, both legs and all movements.
 
     Movements left out, and the last 40 % of each where the first 60 % of all four have taught.
@@ -106,11 +111,11 @@ def coverage(data: Path) -> list[Figure]:
             unseen.append(flexion_scores(others, trial))
             later.append(flexion_scores(begun, trial.part(slice(training_frames(trial), None))))
     return [
-        Figure(
+        Result(
             f"{label}: flexion within {within:g} sd",
             float(np.mean(np.abs(np.concatenate(scores)) < within)),
             round(share + TOLERANCE, 9),
-            least=round(share - TOLERANCE, 9),
+            minimum=round(share - TOLERANCE, 9),
             unit="",
         )
         for label, scores in (("movements left out", unseen), ("later parts", later))
@@ -118,7 +123,7 @@ def coverage(data: Path) -> list[Figure]:
     ]
 
 
-def standing(data: Path) -> list[Figure]:
+def standing(data: Path) -> list[Result]:
     """F-10: what is corrected in the static pose of people who stand as they stand.
 
     Bones lean and knees are not quite straight there; the mounts of the sensors make the mean the
@@ -134,11 +139,11 @@ def standing(data: Path) -> list[Figure]:
                 said = fusion_methods.fit(method, [taught])(static)
                 errors = Judge.of(squats).errors(said, static)
                 figures += [
-                    Figure(f"{side}, {label}, {method}: {name}", error, NOTHING)
+                    Result(f"{side}, {label}, {method}: {name}", error, NOTHING)
                     for name, error in zip(NAMES, errors, strict=True)
                 ]
         stood = float(np.rad2deg(np.mean(rotation.angle_between(static.thigh, static.shank))))
-        figures.append(Figure(f"{side}, rotation of the knee while standing", stood, NOTHING))
+        figures.append(Result(f"{side}, rotation of the knee in the static pose", stood, NOTHING))
     return figures
 
 
@@ -166,10 +171,65 @@ def _best(found: dict[str, Errors]) -> tuple[float, ...]:
 
 
 _DATA = (FOLDER, SUBJECT)
+WALKING_FLEXION = (
+    "in walking the thigh and shank errors of patent12 are nearly equal and cancel in flexion; the "
+    "training movements do not show which correction extrapolates to walking"
+)
+JUMP_FLEXION = "not known"
+EXCHANGED_FLEXION = (
+    "flexion depends on which sensor has which filter error; the average over the assignments is "
+    "slightly worse than that of the best other method"
+)
+SHORT_TRAINING = (
+    "the first 60 % of a 1.3 s walk contain half a stride, so cross-validation underestimates the "
+    "error of the rest"
+)
 EXPERIMENTS = (
-    Experiment("F-7", "sit-to-stand, trained on three others", sit_to_stand, _DATA),
-    Experiment("F-8", "each of four movements left out, default", left_out, _DATA),
-    Experiment("F-9", "flexion within its claimed deviation, both legs", coverage, _DATA),
-    Experiment("F-10", "corrected in the static pose", standing, _DATA),
-    Experiment("F-11", "sit-to-stand, filters' errors exchanged", exchanged, _DATA),
+    Experiment(
+        "sit-to-stand-both-legs",
+        "Sit-to-stand, trained on squats, walking and drop jump",
+        sit_to_stand,
+        BOTH_KNEES,
+        _DATA,
+        headline=True,
+    ),
+    Experiment(
+        "leave-one-movement-out-both-legs",
+        "Each of four movements left out of the training, default method",
+        left_out,
+        BOTH_KNEES,
+        _DATA,
+        headline=True,
+        known_misses={
+            "right, walking1: flexion": WALKING_FLEXION,
+            "left, walking1: flexion": WALKING_FLEXION,
+            "left, DJ1: flexion": JUMP_FLEXION,
+        },
+    ),
+    Experiment(
+        "flexion-coverage-both-legs",
+        "Share of flexion errors within the stated standard deviation, four movements",
+        coverage,
+        BOTH_KNEES,
+        _DATA,
+        known_misses={
+            "later parts: flexion within 1 sd": SHORT_TRAINING,
+            "later parts: flexion within 1.96 sd": SHORT_TRAINING,
+        },
+    ),
+    Experiment(
+        "static-pose-correction",
+        "Size of the correction in the static pose, where the mean is the reference",
+        standing,
+        BOTH_KNEES,
+        _DATA,
+    ),
+    Experiment(
+        "sit-to-stand-exchanged-filter-errors",
+        "Sit-to-stand with the filter errors exchanged between sensors, five assignments",
+        exchanged,
+        BOTH_KNEES,
+        _DATA,
+        known_misses={"right: flexion": EXCHANGED_FLEXION},
+    ),
 )

@@ -11,7 +11,8 @@ import numpy as np
 
 from bench.baselines import fusion_methods
 from bench.experiments.fusion.knee_segments import Squats
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import KNEE
 from bench.subjects.recorded_knee import FOLDER, load
 from jointfit_daemon.calibration.soft_tissue import BLOCKS, SegmentTraining, fit_expert
 from jointfit_daemon.kinematics import rotation
@@ -31,7 +32,7 @@ ROTATIONS = 3
 """The joint as the means see it, and what the sensors of each segment disagree by."""
 
 
-def joint_itself(data: Path) -> list[Figure]:
+def joint_itself(data: Path) -> list[Result]:
     """B-10: RMS angle of the joint's rotation: by both segments, and by a fit to the joint alone.
 
     The reference's knee is a hinge, so its adduction and rotation follow from flexion: a fit to the
@@ -54,13 +55,13 @@ def joint_itself(data: Path) -> list[Figure]:
         said = rotation.multiply(seen, rotation.exp(alone.correct(u, ROTATIONS)[0]))
         both = joint_rotation(*segments(trial))
         figures += [
-            Figure(f"{name}: by both segments", _rms_degrees(both, truth), float("inf")),
-            Figure(f"{name}: by the joint alone", _rms_degrees(said, truth), JOINT_GOALS[name]),
+            Result(f"{name}: both segments", _rms_degrees(both, truth), float("inf")),
+            Result(f"{name}: joint alone", _rms_degrees(said, truth), JOINT_GOALS[name]),
         ]
     return figures
 
 
-def normalized_errors(data: Path) -> list[Figure]:
+def normalized_errors(data: Path) -> list[Result]:
     """B-14: root of the mean of squared errors over claimed variances, three trained movements."""
     squats = Squats(data)
     walk, jump = load(data, "walking1"), load(data, "DJ1")
@@ -75,7 +76,7 @@ def normalized_errors(data: Path) -> list[Figure]:
             ratios[i].append(squares / np.sum(claimed**2, axis=1))
     low, high = NORMALIZED
     return [
-        Figure(name, float(np.sqrt(np.mean(np.concatenate(found)))), high, low, unit="")
+        Result(name, float(np.sqrt(np.mean(np.concatenate(found)))), high, low, unit="")
         for name, found in zip(("thigh", "shank"), ratios, strict=True)
     ]
 
@@ -95,6 +96,18 @@ def _rms_degrees(said: Array, truth: Array) -> float:
 
 _DATA = (FOLDER,)
 EXPERIMENTS = (
-    Experiment("B-10", "rotation of the joint, trained on squats", joint_itself, _DATA),
-    Experiment("B-14", "errors over claimed deviations", normalized_errors, _DATA),
+    Experiment(
+        "knee-joint-rotation",
+        "Rotation of the knee from both segments, and from a fit to the joint alone",
+        joint_itself,
+        KNEE,
+        _DATA,
+    ),
+    Experiment(
+        "knee-normalized-errors",
+        "Root mean square of error over stated standard deviation, three trained movements",
+        normalized_errors,
+        KNEE,
+        _DATA,
+    ),
 )

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure, near
+from bench.framework.experiment import Experiment, Result, near
+from bench.framework.material import KNEE
 from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, training_frames
 from jointfit_daemon.calibration.soft_tissue import fit_segment
 from jointfit_daemon.kinematics import rotation
@@ -83,11 +84,11 @@ def _mean(trial: KneeTrial) -> tuple[Array, Array]:
     return fuse(trial.sensors[:2], equal), fuse(trial.sensors[2:], equal)
 
 
-def baselines(data: Path) -> list[Figure]:
+def baselines(data: Path) -> list[Result]:
     """B-6: what single sensors, their mean and the patent's regressions give."""
     squats = Squats(data)
     said = {
-        "S2/S4 alone": (_single(1), (9.04, 9.00, 6.15)),
+        "single sensor (S2, S4)": (_single(1), (9.04, 9.00, 6.15)),
         "mean": (_mean, (9.29, 9.61, 3.21)),
         "patent12": (KneeModels("patent12", [squats.training]).predict, (3.45, 2.81, 2.11)),
         "patent6": (KneeModels("patent6", [squats.training]).predict, (5.37, 3.83, 4.21)),
@@ -102,22 +103,22 @@ def baselines(data: Path) -> list[Figure]:
     return figures
 
 
-def _goals(errors: tuple[float, ...], goals: tuple[float, ...], label: str = "") -> list[Figure]:
+def _goals(errors: tuple[float, ...], goals: tuple[float, ...], label: str = "") -> list[Result]:
     return [
-        Figure(f"{label}{name}", error, goal)
+        Result(f"{label}{name}", error, goal)
         for name, error, goal in zip(NAMES, errors, goals, strict=False)
     ]
 
 
-def held_out(data: Path) -> list[Figure]:
+def held_out(data: Path) -> list[Result]:
     """B-7: the anchored correction on the last 40 %."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (1.4, 1.6, 1.2))
 
 
-def _untrained(name: str, goals: tuple[float, ...]) -> Callable[[Path], list[Figure]]:
-    def run(data: Path) -> list[Figure]:
+def _untrained(name: str, goals: tuple[float, ...]) -> Callable[[Path], list[Result]]:
+    def run(data: Path) -> list[Result]:
         squats, other = Squats(data), load(data, name)
         models = KneeModels("anchored", [squats.training])
         return _goals(squats.judge.errors(models.predict(other), other), goals)
@@ -125,7 +126,7 @@ def _untrained(name: str, goals: tuple[float, ...]) -> Callable[[Path], list[Fig
     return run
 
 
-def three_movements(data: Path) -> list[Figure]:
+def three_movements(data: Path) -> list[Result]:
     """B-11: trained on squats, walking and jump together."""
     squats = Squats(data)
     trials = [squats.training, load(data, "walking1"), load(data, "DJ1")]
@@ -133,7 +134,7 @@ def three_movements(data: Path) -> list[Figure]:
     return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (2.0, 1.9, 1.4))
 
 
-def facing_elsewhere(data: Path) -> list[Figure]:
+def facing_elsewhere(data: Path) -> list[Result]:
     """B-12: the largest change of any orientation, seen from a subject who turned around."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
@@ -145,10 +146,10 @@ def facing_elsewhere(data: Path) -> list[Figure]:
         for before, after in zip(straight, turned, strict=True):
             back = rotation.multiply(rotation.heading(-angle), after)
             worst = max(worst, float(np.rad2deg(rotation.angle_between(before, back).max())))
-    return [Figure("largest change", worst, 1e-9)]
+    return [Result("largest change of any orientation", worst, 1e-9)]
 
 
-def one_sensor(data: Path) -> list[Figure]:
+def one_sensor(data: Path) -> list[Result]:
     """B-13: a model for each sensor that may be left alone."""
     squats = Squats(data)
     figures = []
@@ -161,11 +162,55 @@ def one_sensor(data: Path) -> list[Figure]:
 
 _DATA = (FOLDER,)
 EXPERIMENTS = (
-    Experiment("B-6", "squats hold-out, baselines", baselines, _DATA),
-    Experiment("B-7", "squats hold-out, anchored", held_out, _DATA),
-    Experiment("B-8", "walking, trained on squats", _untrained("walking1", (5.0, 3.6, 3.3)), _DATA),
-    Experiment("B-9", "drop jump, trained on squats", _untrained("DJ1", (5.2, 4.5, 3.4)), _DATA),
-    Experiment("B-11", "squats hold-out, trained on three", three_movements, _DATA),
-    Experiment("B-12", "hold-out, subject turned by 10 to 180 deg", facing_elsewhere, _DATA),
-    Experiment("B-13", "hold-out, one sensor left on each segment", one_sensor, _DATA),
+    Experiment(
+        "knee-squat-baselines",
+        "Squats, hold-out: single sensors, mean, and the patent's regressions",
+        baselines,
+        KNEE,
+        _DATA,
+    ),
+    Experiment(
+        "knee-squat-holdout",
+        "Squats, hold-out: default method",
+        held_out,
+        KNEE,
+        _DATA,
+        headline=True,
+    ),
+    Experiment(
+        "knee-walking-from-squats",
+        "Walking, trained on squats: default method",
+        _untrained("walking1", (5.0, 3.6, 3.3)),
+        KNEE,
+        _DATA,
+        headline=True,
+    ),
+    Experiment(
+        "knee-jump-from-squats",
+        "Drop jump, trained on squats: default method",
+        _untrained("DJ1", (5.2, 4.5, 3.4)),
+        KNEE,
+        _DATA,
+    ),
+    Experiment(
+        "knee-squat-three-movements",
+        "Squats, hold-out, trained on squats, walking and drop jump",
+        three_movements,
+        KNEE,
+        _DATA,
+    ),
+    Experiment(
+        "knee-heading-invariance",
+        "Squats, hold-out, with the subject facing 10 to 180° elsewhere",
+        facing_elsewhere,
+        KNEE,
+        _DATA,
+    ),
+    Experiment(
+        "knee-single-sensor",
+        "Squats, hold-out, with one sensor left on each segment",
+        one_sensor,
+        KNEE,
+        _DATA,
+    ),
 )

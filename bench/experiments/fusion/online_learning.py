@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.faulty_wearer import Worn, play
 from bench.subjects.simulated_wearer import NS, bench_rig
 from jointfit_daemon.calibration import (
@@ -194,7 +195,7 @@ def squares(one: Person, calibration: Calibration, span: tuple[float, float]) ->
     return np.array([float(np.nanmean(x**2)) for x in found])
 
 
-def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return errors before and after learning on."""
     taken, people = 0, 0
     rows: dict[tuple[str, str], list[Array]] = {}
@@ -212,9 +213,9 @@ def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
             worst = max(worst, float(np.rad2deg(np.sqrt(pair[1][0]) - np.sqrt(pair[0][0]))))
         person.cache_clear()
     figures = [
-        Figure("people", people, len(seeds), len(seeds) - 2, unit=""),
-        Figure("rounds taken", taken, float("inf"), unit=""),
-        Figure("flexion, worst change of a person", worst, 1.0),
+        Result("subjects accepted", people, len(seeds), len(seeds) - 2, unit=""),
+        Result("refits accepted", taken, float("inf"), unit=""),
+        Result("flexion, largest increase of one subject", worst, 1.0),
     ]
     for kind in KINDS:
         was, now = (
@@ -222,8 +223,8 @@ def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
         )
         for name, a, b in zip(("knee flexion", *SEGMENTS), was, now, strict=True):
             slack = 0.0 if kind == "new movements" else 0.3
-            figures.append(Figure(f"{kind}: {name} before", float(a), float("inf")))
-            figures.append(Figure(f"{kind}: {name} after", float(b), round(float(a) + slack, 3)))
+            figures.append(Result(f"{kind}, {name}: before", float(a), float("inf")))
+            figures.append(Result(f"{kind}, {name}: after", float(b), round(float(a) + slack, 3)))
     return figures
 
 
@@ -266,7 +267,7 @@ SPOILERS: dict[str, Callable[[OnlineFrames], OnlineFrames]] = {
 }
 
 
-def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return how often something was taken from cameras that are wrong."""
     taken = dict.fromkeys(SPOILERS, 0)
     for seed in seeds:
@@ -282,13 +283,13 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
                 )
             except CalibrationError:
                 continue
-    return [Figure(f"taken: {name}", float(n), 0.0, unit="") for name, n in taken.items()]
+    return [Result(f"accepted refits, {name}", float(n), 0.0, unit="") for name, n in taken.items()]
 
 
 # --- put on anew ------------------------------------------------------------------------------
 
 
-def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return errors of taught people whose sensors were turned: with a new static pose only."""
     rows: dict[str, list[Array]] = {"as worn": [], "put on anew": []}
     for seed in seeds:
@@ -311,8 +312,8 @@ def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
     was, now = (np.rad2deg(np.sqrt(np.mean(found, axis=0))) for found in rows.values())
     figures = []
     for name, a, b in zip(("knee flexion", *SEGMENTS), was, now, strict=True):
-        figures.append(Figure(f"{name} as worn", float(a), float("inf")))
-        figures.append(Figure(f"{name} put on anew", float(b), round(float(a) + 1.0, 3)))
+        figures.append(Result(f"{name}: as calibrated", float(a), float("inf")))
+        figures.append(Result(f"{name}: re-donned", float(b), round(float(a) + 1.0, 3)))
     return figures
 
 
@@ -338,7 +339,25 @@ REDONNED = (
     f" {100 * OTHER_SKIN:g} % otherwise, a new static pose only"
 )
 EXPERIMENTS = (
-    Experiment("ONLINE", "walking calibrated, squats and sitting learned on", online, long=True),
-    Experiment("ONLINE-guard", "nothing is learned from wrong cameras", guarded, long=True),
-    Experiment("ONLINE-redon", REDONNED, redonned, long=True),
+    Experiment(
+        "online-learning-new-movements",
+        "Calibrated on walking, learning squats and sitting down online",
+        online,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+    Experiment(
+        "online-learning-wrong-cameras",
+        "Optical references with errors, which online learning must reject",
+        guarded,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+    Experiment(
+        "online-learning-redonning",
+        REDONNED,
+        redonned,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
 )

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration import CalibrationError, CalibrationTrial, SensorTrack
 from jointfit_daemon.calibration.phases import (
@@ -188,47 +189,65 @@ def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
         return None
 
 
-def _row(method: Method) -> Callable[[Path], list[Figure]]:
-    def run(_: Path) -> list[Figure]:
+def _row(method: Method) -> Callable[[Path], list[Result]]:
+    def run(_: Path) -> list[Result]:
         errors = people()[method]
         goal = KNEE_GOAL_DEG if method == "anchored" else float("inf")
         figures = [
-            Figure("people not refused", float(len(errors)), len(SEEDS), len(SEEDS) - 1, unit=""),
-            Figure("knee, the demo's person", errors[0].knee, goal),
+            Result("subjects accepted", float(len(errors)), len(SEEDS), len(SEEDS) - 1, unit=""),
+            Result("knee, subject of the demo", errors[0].knee, goal),
         ]
         for name in ("knee", "thigh", "shank"):
             figures += _spread(name, [getattr(each, name) for each in errors])
         for name, ideal in (("within_1_sd", 0.68), ("within_2_sd", 0.95)):
             share = float(np.mean([getattr(each, name) for each in errors]))
             label = f"knee {name.replace('_', ' ')} (ideal {ideal})"
-            figures.append(Figure(label, share, 1.0, least=ideal - 0.05, unit=""))
+            figures.append(Result(label, share, 1.0, minimum=ideal - 0.05, unit=""))
         return figures
 
     return run
 
 
-def centers(_: Path) -> list[Figure]:
+def centers(_: Path) -> list[Result]:
     """Return how far joint centers are from the true ones in the static pose."""
     errors = people()["anchored"]
-    figures: list[Figure] = []
+    figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):
         figures += _spread(joint, [each.centers_mm[joint] for each in errors], "mm")
     return figures
 
 
-def _spread(name: str, values: list[float], unit: str = "deg") -> list[Figure]:
+def _spread(name: str, values: list[float], unit: str = "deg") -> list[Result]:
     nothing = float("inf")
     return [
-        Figure(f"{name}, median", float(np.median(values)), nothing, unit=unit),
-        Figure(f"{name}, worst", max(values), nothing, unit=unit),
+        Result(f"{name}, median", float(np.median(values)), nothing, unit=unit),
+        Result(f"{name}, worst", max(values), nothing, unit=unit),
     ]
 
 
+IDS: dict[Method, str] = {
+    "anchored": "simulated-leg-anchored",
+    "patent12": "simulated-leg-patent-separate",
+    "patent6": "simulated-leg-patent-shared",
+    "mean": "simulated-leg-mean",
+}
 EXPERIMENTS = (
     *(
-        Experiment(f"SIM-{method}", f"worn simulated leg, {method}, {len(SEEDS)} people",
-                   _row(method), long=True)
+        Experiment(
+            IDS[method],
+            f"Live knee flexion and segments of {len(SEEDS)} simulated subjects, {method}",
+            _row(method),
+            SIMULATED_SUBJECTS,
+            long=True,
+            headline=method == "anchored",
+        )
         for method in METHODS
     ),
-    Experiment("SIM-centers", f"joint centers of {len(SEEDS)} people", centers, long=True),
-)  # fmt: skip
+    Experiment(
+        "simulated-leg-joint-centers",
+        f"Joint centres of {len(SEEDS)} simulated subjects from the functional calibration",
+        centers,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+)

@@ -16,7 +16,8 @@ import numpy as np
 from bench.baselines import fusion_methods
 from bench.experiments.fusion.recorded_movements import DEFAULT, NAMES, NOTHING, flexion_scores
 from bench.experiments.fusion.simulated_leg import take_pose, wear_live
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.recorded_knee import Judge, KneeTrial
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.anatomy import track_clusters
@@ -70,10 +71,10 @@ def _knee(columns: list[Array]) -> KneeTrial:
     return KneeTrial((a, b, c, d), thigh, shank)
 
 
-def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """F-6: errors of all methods; what patent12, mean and the default claim, against them."""
     people = [found for seed in seeds if (found := person(seed)) is not None]
-    figures = [Figure("people not refused", len(people), len(seeds), len(seeds) - 2, unit="")]
+    figures = [Result("subjects accepted", len(people), len(seeds), len(seeds) - 2, unit="")]
     errors = {
         method: np.sqrt(
             np.mean(
@@ -93,13 +94,13 @@ def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
         if method == DEFAULT:
             goals = [min(errors[m][i] for m in fusion_methods.METHODS[:5]) for i in range(3)]
         figures += [
-            Figure(f"{method}: {name}", float(error), round(float(goal), 3))
+            Result(f"{method}: {name}", float(error), round(float(goal), 3))
             for name, error, goal in zip(NAMES, found, goals, strict=True)
         ]
     return figures + _coverage(people)
 
 
-def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Figure]:
+def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
     figures = []
     for method in ("mean", "patent12", "linear", DEFAULT):
         scores = [flexion_scores([taught], later, method) for taught, later in people]
@@ -123,14 +124,14 @@ def _segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
     return np.concatenate(scores)
 
 
-def _shares(label: str, scores: Array, *, held: bool) -> list[Figure]:
+def _shares(label: str, scores: Array, *, held: bool) -> list[Result]:
     tolerance = TOLERANCE if held else NOTHING
     return [
-        Figure(
+        Result(
             f"{label} within {within:g} sd",
             float(np.mean(np.abs(scores) < within)),
             round(share + tolerance, 9),
-            least=round(share - tolerance, 9) if held else -NOTHING,
+            minimum=round(share - tolerance, 9) if held else -NOTHING,
             unit="",
         )
         for share, within in ((0.68, 1.0), (0.95, 1.96))
@@ -138,5 +139,11 @@ def _shares(label: str, scores: Array, *, held: bool) -> list[Figure]:
 
 
 EXPERIMENTS = (
-    Experiment("F-6", f"simulated skin, {len(SEEDS)} people, all methods", simulated, long=True),
+    Experiment(
+        "all-methods-simulated-subjects",
+        f"{len(SEEDS)} simulated subjects with soft-tissue artefact: all methods",
+        simulated,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
 )

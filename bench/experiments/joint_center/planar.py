@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SEEDED
 from bench.subjects.planar_arcs import (
     arc_points,
     runs_on,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
-def three_frames(_: Path) -> list[Figure]:
+def three_frames(_: Path) -> list[Result]:
     """C-1: closed form against Cramer's rule; the misprinted denominator against a meter."""
     rng = np.random.default_rng(1)
     p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
@@ -51,8 +52,8 @@ def three_frames(_: Path) -> list[Figure]:
     solved = np.linalg.solve(normals, heights[..., None])[..., 0]
     off = float(np.abs(three_frame_center(p) - solved).max())
     return [
-        Figure("largest difference", off, 1e-12, unit="m"),
-        Figure("RMS with equation 11 as printed", _as_printed(rng), np.inf, 1.0, "m"),
+        Result("largest difference", off, 1e-12, unit="m"),
+        Result("RMS with equation 11 as printed", _as_printed(rng), np.inf, 1.0, "m"),
     ]
 
 
@@ -65,7 +66,7 @@ def _as_printed(rng: np.random.Generator) -> float:
     return float(np.sqrt(np.mean((above / (2.0 * wrong)) ** 2)))
 
 
-def equal_steps(_: Path) -> list[Figure]:
+def equal_steps(_: Path) -> list[Result]:
     """C-2: equation 15 against 200 000 runs."""
     figures = []
     for step in (45, 60, 90, 120, 150):
@@ -74,12 +75,12 @@ def equal_steps(_: Path) -> list[Figure]:
         p = arc_points(alpha * np.arange(3), 0.2) + rng.normal(0.0, 0.001, (200_000, 3, 2))
         rms = float(np.sqrt((three_frame_center(p) ** 2).sum(axis=1).mean()))
         ratio = rms / float(equal_step_error(alpha, 0.001))
-        figures.append(Figure(f"{step}°: simulated over predicted", ratio, 1.01, 0.99, ""))
+        figures.append(Result(f"{step}°: simulated over predicted", ratio, 1.01, 0.99, ""))
     return figures
 
 
-def forms(_: Path) -> list[Figure]:
-    """C-3: equation 14 by angles, by sides, and the Cramér-Rao bound."""
+def forms(_: Path) -> list[Result]:
+    """C-3: equation 14 by angles, by side lengths, and the Cramér-Rao bound."""
     rng = np.random.default_rng(3)
     t = np.sort(rng.uniform(0.0, 2.0 * np.pi, (500, 3)), axis=1)
     t = t[np.diff(t, axis=1).min(axis=1) > 0.2]
@@ -87,15 +88,15 @@ def forms(_: Path) -> list[Figure]:
     sides = triangle_error(arc_points(t, 0.3), 0.001)
     bound = np.array([circle_rms_bound(row, 0.001) for row in t])
     return [
-        Figure("by sides", float(np.abs(sides / angles - 1.0).max()), 1e-10, unit=""),
-        Figure("Cramér-Rao", float(np.abs(bound / angles - 1.0).max()), 1e-10, unit=""),
+        Result("by side lengths", float(np.abs(sides / angles - 1.0).max()), 1e-10, unit=""),
+        Result("Cramér-Rao", float(np.abs(bound / angles - 1.0).max()), 1e-10, unit=""),
     ]
 
 
 CASES = ((100, 90, 0.002), (100, 45, 0.005), (100, 20, 0.0005), (100, 20, 0.002), (500, 30, 0.002))
 
 
-def plain_hyper(_: Path) -> list[Figure]:
+def plain_hyper(_: Path) -> list[Result]:
     """C-4: the textbook's Hyper over the bound, and Kåsa beside it."""
     figures = []
     for n, arc, noise in CASES:
@@ -103,11 +104,11 @@ def plain_hyper(_: Path) -> list[Figure]:
         for method, limit in (("hyper", goal), ("kasa", np.inf)):
             found = runs_on(n, arc, noise, runs=4000, method=method, tempered=False)
             label = f"{method}, n = {n}, {arc}°, {1000 * noise:g} mm"
-            figures.append(Figure(label, found.rms / found.bound, limit, unit="× bound"))
+            figures.append(Result(label, found.rms / found.bound, limit, unit="× bound"))
     return figures
 
 
-def streaming(_: Path) -> list[Figure]:
+def streaming(_: Path) -> list[Result]:
     """C-5: one frame at a time against all at once, forgetting and windowed, and its time."""
     rng = np.random.default_rng(5)
     n = 2000
@@ -126,31 +127,31 @@ def streaming(_: Path) -> list[Figure]:
         last = slice(-window if window else None, None)
         batch, live = circle_estimate(p[last], weights[last]), running.estimate()
         off = np.abs(batch.center - live.center).max()
-        figures.append(Figure(f"{name}: center", float(off), 1e-9, unit="m"))
+        figures.append(Result(f"{name}: center", float(off), 1e-9, unit="m"))
         off_sd = abs(batch.sd - live.sd)
-        figures.append(Figure(f"{name}: predicted error", float(off_sd), 1e-9, unit="m"))
+        figures.append(Result(f"{name}: predicted error", float(off_sd), 1e-9, unit="m"))
     running, began = RunningCircle(), time.thread_time()
     for x, y in p.tolist():
         running.feed(x, y)
         running.circle()
     took = (time.thread_time() - began) / n
-    return [*figures, Figure("a frame, center found", 1e6 * took, 40.0, unit="µs")]
+    return [*figures, Result("time per frame, center included", 1e6 * took, 40.0, unit="µs")]
 
 
-def claims(_: Path) -> list[Figure]:
+def claims(_: Path) -> list[Result]:
     """C-6: predicted error over actual, and how many short arcs pass the gate."""
     figures = []
     for n, arc, noise in ((100, 22, 0.002), (100, 30, 0.002), *CASES[:3], CASES[4]):
         found = runs_on(n, arc, noise, runs=8000)
-        label = f"n = {n}, {arc}°, {1000 * noise:g} mm: claimed over actual"
-        figures.append(Figure(label, found.claimed / found.rms, 1.15, 0.85, ""))
+        label = f"n = {n}, {arc}°, {1000 * noise:g} mm: predicted over actual"
+        figures.append(Result(label, found.claimed / found.rms, 1.15, 0.85, ""))
     for arc, goal in ((10, 0.01), (15, 0.05)):
         share = float(runs_on(100, arc, 0.002, runs=8000).published.mean())
-        figures.append(Figure(f"{arc}°, 2 mm: share published", share, goal, unit=""))
+        figures.append(Result(f"{arc}°, 2 mm: share accepted", share, goal, unit=""))
     return figures
 
 
-def several(_: Path) -> list[Figure]:
+def several(_: Path) -> list[Result]:
     """C-7a: four markers at different angles round the joint, 20° arc."""
     rng = np.random.default_rng(7)
     t = np.linspace(-0.5, 0.5, 100) * np.deg2rad(20.0)
@@ -168,8 +169,8 @@ def several(_: Path) -> list[Figure]:
         weighted.append(combine(each)[0])
         joint.append(geometric_estimate(p, robust=False, limits=WIDE).center)
     return [
-        Figure("information-weighted", _rms(weighted) / bound, 1.2, unit="× bound"),
-        Figure("all at once", _rms(joint) / bound, 1.2, unit="× bound"),
+        Result("information-weighted", _rms(weighted) / bound, 1.2, unit="× bound"),
+        Result("all at once", _rms(joint) / bound, 1.2, unit="× bound"),
     ]
 
 
@@ -182,17 +183,17 @@ def _rms(centers: list[Array]) -> float:
     return float(np.sqrt((np.array(centers) ** 2).sum(axis=1).mean()))
 
 
-def at_the_bound(_: Path) -> list[Figure]:
+def at_the_bound(_: Path) -> list[Result]:
     """20 000 runs of what is published, upper 95 % limit of the RMS error over the bound."""
     figures = []
     for arc, goal in ((20, 1.15), (30, 1.15), (45, 1.03), (60, 1.03), (90, 1.03), (180, 1.03)):
         found = runs_on(100, arc, 0.002)
         figures.append(
-            Figure(f"{arc}°: drawn in", upper_rms(found) / found.bound, goal, unit="× bound")
+            Result(f"{arc}°: shrinkage", upper_rms(found) / found.bound, goal, unit="× bound")
         )
         plain = runs_on(100, arc, 0.002, tempered=False)
         ratio = upper_rms(plain) / plain.bound
-        figures.append(Figure(f"{arc}°: plain Hyper", ratio, max(goal, 1.16), unit="× bound"))
+        figures.append(Result(f"{arc}°: plain Hyper", ratio, max(goal, 1.16), unit="× bound"))
     return figures
 
 
@@ -207,19 +208,19 @@ ELLIPSES: tuple[tuple[int, float, float, float], ...] = (
 )
 
 
-def ellipses(_: Path) -> list[Figure]:
+def ellipses(_: Path) -> list[Result]:
     """Share of published centers whose 95 % ellipse holds the truth; over 10 % are published."""
     figures = []
     for n, arc, noise, radius in ELLIPSES:
         found = runs_on(n, arc, noise, radius=radius, runs=10_000, correlated=True)
         share = share_covered(found, n)
         label = f"n = {n}, {arc:g}°, {1000 * noise:g} mm of {100 * radius:g} cm"
-        note = f"{label} ({100 * float(found.published.mean()):.0f} % published)"
-        figures.append(Figure(note, share, 0.97, 0.93, ""))
+        accepted = f"{100 * float(found.published.mean()):.0f} % accepted"
+        figures.append(Result(label, share, 0.97, 0.93, "", note=accepted))
     return figures
 
 
-def peers(_: Path) -> list[Figure]:
+def peers(_: Path) -> list[Result]:
     """One run: the PyPI package circle-fit and scipy, time and accuracy, 45° and 5 mm."""
     from circle_fit import hyperLSQ, hyperSVD, lm, taubinSVD  # noqa: PLC0415 - only this row's
     from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import
@@ -250,15 +251,15 @@ def peers(_: Path) -> list[Figure]:
     fit_circles(sets)
     many = (time.thread_time() - began) / len(sets)
     figures = [
-        Figure("here, the circle alone as theirs", 1e6 * mine, np.inf, unit="µs"),
-        Figure("here, with covariance and verdict", 1e6 * judged, np.inf, unit="µs"),
-        Figure("here, 300 at once", 1e6 * many, np.inf, unit="µs"),
-        Figure("here, drawn in: RMS error over plain", drawn_in / error, 1.0, unit=""),
+        Result("jointfit: circle only", 1e6 * mine, np.inf, unit="µs"),
+        Result("jointfit: with covariance and acceptance", 1e6 * judged, np.inf, unit="µs"),
+        Result("jointfit: 300 circles at once", 1e6 * many, np.inf, unit="µs"),
+        Result("jointfit: RMS error, shrinkage over plain", drawn_in / error, 1.0, unit=""),
     ]
     for name, fit in others.items():
         took, off = _timed(fit, sets)
-        figures.append(Figure(f"{name}: our time over theirs", mine / took, 1.0, unit=""))
-        figures.append(Figure(f"{name}: our RMS error over theirs", error / off, 1.005, unit=""))
+        figures.append(Result(f"{name}: time ratio of jointfit", mine / took, 1.0, unit=""))
+        figures.append(Result(f"{name}: RMS error ratio of jointfit", error / off, 1.005, unit=""))
     return figures
 
 
@@ -271,16 +272,67 @@ def _timed(fit: Callable[[Array], object], sets: Array) -> tuple[float, float]:
 
 
 EXPERIMENTS = (
-    Experiment("C-1", "three frames against Cramer's rule", three_frames),
-    Experiment("C-2", "predicted error of equal steps against 200 000 runs", equal_steps),
-    Experiment("C-3", "three forms of the predicted error", forms),
-    Experiment("C-4", "circle fits over the Cramér-Rao bound, 4000 runs", plain_hyper),
-    Experiment("C-5", "one frame at a time against all at once", streaming),
-    Experiment("C-6", "predicted error over actual, 8000 runs; the gate", claims),
-    Experiment("C-7a", "four markers, 20° arc", several),
-    Experiment("C-20", "what is published, at the bound, 20 000 runs", at_the_bound),
-    Experiment("C-21", "95 % ellipses of what is published", ellipses, long=True),
     Experiment(
-        "C-22", "beside circle-fit and scipy, one run", peers, packages=("circle_fit", "scipy")
+        "circle-three-frames",
+        "Circle through three frames against Cramer's rule",
+        three_frames,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-error-prediction",
+        "Predicted error of equal steps against 200 000 simulated runs",
+        equal_steps,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-error-formulas",
+        "Three formulas of the predicted error, largest difference",
+        forms,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-cramer-rao",
+        "RMS error of circle fits over the Cramér-Rao bound, 4000 runs",
+        plain_hyper,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-streaming",
+        "Circle updated frame by frame against the batch fit",
+        streaming,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-claimed-error",
+        "Predicted over actual error, 8000 runs, and the acceptance threshold",
+        claims,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-several-markers",
+        "Four markers on a 20° arc",
+        several,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-published-estimates",
+        "Accepted estimates over the Cramér-Rao bound, 20 000 runs",
+        at_the_bound,
+        SEEDED,
+        headline=True,
+    ),
+    Experiment(
+        "circle-ellipse-coverage",
+        "Coverage of the 95 % ellipses of accepted estimates",
+        ellipses,
+        SEEDED,
+        long=True,
+    ),
+    Experiment(
+        "circle-other-libraries",
+        "Comparison with circle-fit and SciPy in one run",
+        peers,
+        SEEDED,
+        packages=("circle_fit", "scipy"),
     ),
 )

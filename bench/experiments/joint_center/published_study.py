@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from bench.framework.experiment import Experiment, Figure, near
+from bench.framework.experiment import Experiment, Result, near
+from bench.framework.material import SEEDED
 from jointfit_daemon.center_of_rotation.study import PRINTED, PairMaps, StudySetup, run_study
 from jointfit_daemon.tools.report.tables import NEAREST, correlations
 
@@ -21,8 +22,8 @@ def _study() -> list[PairMaps]:
     return run_study(StudySetup())
 
 
-def table_1(_: Path) -> list[Figure]:
-    figures: list[Figure] = []
+def table_1(_: Path) -> list[Result]:
+    figures: list[Result] = []
     for pair in _study():
         clip, (predicted, grid) = NEAREST[pair.name], EXPECTED[pair.name]
         first, second = correlations(pair, "grid", clip)
@@ -39,5 +40,11 @@ def table_1(_: Path) -> list[Figure]:
 
 
 EXPERIMENTS = (
-    Experiment("C-13", "the source's table 1: correlations of error maps", table_1, long=True),
+    Experiment(
+        "published-error-maps",
+        "Correlations of error maps: table 1 of the published numerical experiment",
+        table_1,
+        SEEDED,
+        long=True,
+    ),
 )

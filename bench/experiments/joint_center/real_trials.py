@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.baselines.center_estimators import judged
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import MODEL_CENTERS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,40 +31,53 @@ TRIALS = {
 KNEE_FLOOR_MM = 50.0
 
 
-def compare(trial: str, data: Path) -> list[Figure]:
+def compare(trial: str, data: Path) -> list[Result]:
     """Return distances from the model's centers, and what the estimates said of themselves."""
-    figures: list[Figure] = []
+    figures: list[Result] = []
     for found in judged(data, trial, METHODS):
         floor = KNEE_FLOOR_MM if "knee" in found.joint.name else inf
         for method in METHODS:
             e = found.estimates[method]
             name = f"{found.joint.name}, {e.method}"
             if e.refused is not None:
-                name += " (refused)"
-            figures.append(Figure(f"{name}: error it tells", 1000 * e.sd, inf, unit="mm"))
+                name += " (rejected)"
+            figures.append(Result(f"{name}: stated error", 1000 * e.sd, inf, unit="mm"))
             if np.isfinite(e.center).all():
                 told = 1000 * found.told_across(method)
                 figures.append(
-                    Figure(f"{name}: error it tells across the axis", told, inf, unit="mm")
+                    Result(f"{name}: stated error across the axis", told, inf, unit="mm")
                 )
                 off, across = 1000 * found.off(method), 1000 * found.off_axis(method)
                 figures += [
-                    Figure(f"{name}: from the model", off, inf, unit="mm"),
-                    Figure(f"{name}: across the axis", across, floor, unit="mm"),
+                    Result(f"{name}: distance to the model", off, inf, unit="mm"),
+                    Result(
+                        f"{name}: distance to the model across the axis", across, floor, unit="mm"
+                    ),
                 ]
     return figures
 
 
-def _row(number: int, trial: str, movement: str) -> Experiment:
+IDS = {
+    "squats": "model-centers-squats",
+    "sit to stand": "model-centers-sit-to-stand",
+    "drop jump": "model-centers-drop-jump",
+    "walking": "model-centers-walking",
+    "walking, three markers a segment": "model-centers-gait",
+}
+
+
+def _comparison(trial: str, movement: str) -> Experiment:
     folder = "opensim_gait2354" if trial == "gait2354" else "opencap_subject4"
     return Experiment(
-        f"R-{number}",
-        f"{movement}, beside the model",
+        IDS[movement],
+        f"Functional joint centres against those of the model: {movement}",
         partial(compare, trial),
+        MODEL_CENTERS,
         recordings=(folder,),
         packages=("opensim",),
         long=True,
+        headline=movement == "squats",
     )
 
 
-EXPERIMENTS = tuple(_row(i, *item) for i, item in enumerate(TRIALS.items(), start=1))
+EXPERIMENTS = tuple(_comparison(*item) for item in TRIALS.items())

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.experiments.fusion.simulated_leg import SEEDS, SEGMENTS, errors_of, take_pose, wear_live
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.anatomy import track_cluster
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
@@ -37,7 +38,7 @@ NOTHING = float("inf")
 COSTS_NOTHING_DEG = 0.1
 
 
-def refined(_: Path) -> list[Figure]:
+def refined(_: Path) -> list[Result]:
     """SIM-markers: change of live errors by refining, deg; negative is better."""
     rig = bench_rig()
     worn: list[Array] = []
@@ -62,13 +63,18 @@ def refined(_: Path) -> list[Figure]:
         phases.cache_clear()
     before, after = np.mean(off_mm, axis=(0, 1))
     return [
-        Figure("people", float(len(worn)), NOTHING, unit=""),
-        Figure("markers off a rigid part, static places", float(before), NOTHING, unit="mm"),
-        Figure(
-            "markers off a rigid part, refined", float(after), round(float(before), 2), unit="mm"
+        Result("subjects", float(len(worn)), NOTHING, unit=""),
+        Result(
+            "distance from a rigid segment, static positions", float(before), NOTHING, unit="mm"
         ),
-        *_changes("as worn", worn, COSTS_NOTHING_DEG),
-        *_changes(f"a marker each knocked off, {len(knocked)} people", knocked, 0.0),
+        Result(
+            "distance from a rigid segment, refined positions",
+            float(after),
+            round(float(before), 2),
+            unit="mm",
+        ),
+        *_changes("markers as placed", worn, COSTS_NOTHING_DEG),
+        *_changes(f"one marker per segment displaced, {len(knocked)} subjects", knocked, 0.0),
     ]
 
 
@@ -87,13 +93,13 @@ def _change(
     return better - plain, found[1]
 
 
-def _changes(label: str, found: list[Array], goal: float) -> list[Figure]:
+def _changes(label: str, found: list[Array], goal: float) -> list[Result]:
     table = np.array(found)
     figures = []
     for i, name in enumerate(("knee", *SEGMENTS)):
         mean, worst = float(table[:, i].mean()), float(table[:, i].max())
-        figures.append(Figure(f"{label}: {name}, mean change", mean, goal, -NOTHING))
-        figures.append(Figure(f"{label}: {name}, worst change", worst, NOTHING, -NOTHING))
+        figures.append(Result(f"{label}: {name}, mean change", mean, goal, -NOTHING))
+        figures.append(Result(f"{label}: {name}, worst change", worst, NOTHING, -NOTHING))
     return figures
 
 
@@ -112,5 +118,11 @@ def _knocked(functional: CalibrationTrial, pose: StaticPose, seed: int) -> Calib
 
 
 EXPERIMENTS = (
-    Experiment("SIM-markers", f"marker places refined, {len(SEEDS)} people", refined, long=True),
+    Experiment(
+        "daemon-marker-refinement",
+        f"Marker positions refined during calibration, {len(SEEDS)} simulated subjects",
+        refined,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
 )

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
-from bench.framework.experiment import Experiment, Figure, near
+from bench.framework.experiment import Experiment, Result, near
+from bench.framework.material import LOWER_LIMBS
 from bench.framework.measurement import cpu_s
 from bench.subjects.adult_lower_limbs import FOLDER, TRIALS, measured, oc4_lower
 from bench.subjects.two_segments import swing, two_segments
@@ -30,7 +31,7 @@ REPEATS = 20
 _ROOT_SHIFT = [3, 4, 5]
 
 
-def slope(data: Path) -> list[Figure]:
+def slope(data: Path) -> list[Result]:
     """D-1: central differences at 5 instants of walking."""
     model = oc4_lower(data)
     state = solve_frames(model, measured(data, "walking1", model)[::26]).state
@@ -41,10 +42,10 @@ def slope(data: Path) -> list[Figure]:
         ahead = marker_positions(model, apply_step(model, state, step))
         behind = marker_positions(model, apply_step(model, state, -step))
         off = max(off, float(np.abs(told[..., k] - (ahead - behind) / (2 * h)).max()))
-    return [Figure("largest difference", off, 1e-7, unit="m/rad")]
+    return [Result("largest difference", off, 1e-7, unit="m/rad")]
 
 
-def fit(data: Path) -> list[Figure]:
+def fit(data: Path) -> list[Result]:
     """D-2: tracking error before any refinement, all instants."""
     model = oc4_lower(data)
     figures = []
@@ -66,7 +67,7 @@ def turns_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> Array:
     return np.degrees(np.delete(step_between(model, a, b), _ROOT_SHIFT, axis=1))
 
 
-def occluded(data: Path) -> list[Figure]:
+def occluded(data: Path) -> list[Result]:
     """D-3: every segment loses one marker in half of all instants; then a fifth of all markers."""
     model, truth, clean = exact(data)
     rng = np.random.default_rng(0)
@@ -81,13 +82,17 @@ def occluded(data: Path) -> list[Figure]:
     scattered[rng.random(scattered.shape[:2]) < 0.2] = np.nan
     loose = turns_off_deg(model, truth, solve_frames(model, scattered).state)
     return [
-        Figure("largest marker error", 1000 * float(np.abs(placed).max()), 1e-6, unit="mm"),
-        Figure(
-            "largest turn error",
+        Result("largest marker error", 1000 * float(np.abs(placed).max()), 1e-6, unit="mm"),
+        Result(
+            "largest orientation error",
             float(np.abs(turns_off_deg(model, truth, found.state)).max()),
             1e-6,
         ),
-        Figure("a fifth of all markers missing: turns", float(np.sqrt(np.mean(loose**2))), 0.25),
+        Result(
+            "a fifth of the markers occluded: orientation error",
+            float(np.sqrt(np.mean(loose**2))),
+            0.25,
+        ),
     ]
 
 
@@ -109,7 +114,7 @@ def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
     return 1e6 * median(took), 1000 * tracking_error(np.array(residuals))
 
 
-def speed(data: Path) -> list[Figure]:
+def speed(data: Path) -> list[Result]:
     """D-12: seven segments, 29 markers, 20 degrees of freedom; then two segments."""
     model = oc4_lower(data)
     y = measured(data, "walking1", model)
@@ -118,20 +123,48 @@ def speed(data: Path) -> list[Figure]:
     took, error = live_us(model, y)
     full = 1000 * tracking_error(solve_frames(model, y).residuals)
     return [
-        Figure("seven segments, from nowhere", batch_us(model, y), 400, unit="µs/instant"),
-        Figure("seven segments, live with covariance", took, 1200, unit="µs/instant"),
-        Figure("live over least tracking error", error / full, 1.001, unit=""),
-        Figure("two segments, from nowhere", batch_us(small, swung), 50, unit="µs/instant"),
-        Figure(
-            "two segments, live with covariance", live_us(small, swung)[0], 300, unit="µs/instant"
+        Result("seven segments, batch", batch_us(model, y), 400, unit="µs/frame"),
+        Result("seven segments, frame by frame with covariance", took, 1200, unit="µs/frame"),
+        Result("tracking error, frame by frame over batch", error / full, 1.001, unit=""),
+        Result("two segments, batch", batch_us(small, swung), 50, unit="µs/frame"),
+        Result(
+            "two segments, frame by frame with covariance",
+            live_us(small, swung)[0],
+            300,
+            unit="µs/frame",
         ),
     ]
 
 
 _RECORDED = (FOLDER,)
 EXPERIMENTS = (
-    Experiment("D-1", "Jacobian against central differences", slope, _RECORDED),
-    Experiment("D-2", "seven segments before refinement", fit, _RECORDED),
-    Experiment("D-3", "occluded markers, no noise", occluded, _RECORDED),
-    Experiment("D-12", "speed of inverse kinematics", speed, _RECORDED, timed=True),
+    Experiment(
+        "chain-jacobian",
+        "Jacobian of the chain against central differences",
+        slope,
+        LOWER_LIMBS,
+        _RECORDED,
+    ),
+    Experiment(
+        "chain-fit-recorded",
+        "Inverse kinematics of seven segments before refinement, RMS marker error",
+        fit,
+        LOWER_LIMBS,
+        _RECORDED,
+    ),
+    Experiment(
+        "chain-occluded-markers",
+        "Occluded markers, without noise",
+        occluded,
+        LOWER_LIMBS,
+        _RECORDED,
+    ),
+    Experiment(
+        "inverse-kinematics-time",
+        "CPU time of inverse kinematics",
+        speed,
+        LOWER_LIMBS,
+        _RECORDED,
+        timed=True,
+    ),
 )

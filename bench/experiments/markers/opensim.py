@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure, near
+from bench.framework.experiment import Experiment, Result, near
+from bench.framework.material import OPENSIM_MODELS
 from bench.subjects.opensim_reference import CONVERGED, OpenSimFollower, judge
 from bench.subjects.opensim_trials import GAIT, OPENCAP, gait2354, opencap
 from jointfit_daemon.calibration.marker_refinement import RefinementSettings, refine_markers, search
@@ -42,7 +43,7 @@ def _less(before: float, after: float) -> float:
     return 100.0 * (1.0 - after / before)
 
 
-def scaled_only(data: Path) -> list[Figure]:
+def scaled_only(data: Path) -> list[Result]:
     """D-14."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
@@ -52,11 +53,11 @@ def scaled_only(data: Path) -> list[Figure]:
     after = subject.verdicts(["walk1"], found.model)["walk1"]
     return [
         near("before", _MM * before, 34.52, 0.05, "mm"),
-        Figure("joint", _MM * after.rms, inf, unit="mm"),
-        Figure("joint, less by", _less(before, after.rms), inf, 66, "%"),
-        Figure("our own inverse kinematics, off by", _off(found, after), 0.2, unit="mm"),
-        Figure("joint angles turned, RMS", float(rms), inf),
-        Figure("joint angles turned, most", float(most), inf),
+        Result("simultaneous: error", _MM * after.rms, inf, unit="mm"),
+        Result("simultaneous: reduction", _less(before, after.rms), inf, 66, "%"),
+        Result("difference of jointfit's inverse kinematics", _off(found, after), 0.2, unit="mm"),
+        Result("change of joint angles, RMS", float(rms), inf),
+        Result("change of joint angles, largest", float(most), inf),
     ]
 
 
@@ -64,7 +65,7 @@ def _off(found: Refinement, verdict: Verdict) -> float:
     return _MM * abs(found.trials[0].after.rms - verdict.rms)
 
 
-def beside_opensim(data: Path) -> list[Figure]:
+def beside_opensim(data: Path) -> list[Result]:
     """D-15: the published search through OpenSim, to its end; the joint method, the same frames."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
@@ -80,26 +81,32 @@ def beside_opensim(data: Path) -> list[Figure]:
     sets = (joint.model, chain.with_markers(found.positions))
     by_joint, by_search = (subject.verdicts(["walk1"], s)["walk1"].rms for s in sets)
     return [
-        Figure("search", _MM * by_search, inf, unit="mm"),
-        Figure("search, less by", _less(before, by_search), inf, 66, "%"),
-        Figure("joint", _MM * by_joint, inf, unit="mm"),
-        Figure("runs of OpenSim's inverse kinematics", found.runs, inf, unit=""),
-        Figure("search", ended - between, inf, unit="s"),
-        Figure("joint, checks and report included", between - began, inf, unit="s"),
-        Figure("search over joint", (ended - between) / (between - began), inf, 100, "times"),
+        Result("coordinate search: error", _MM * by_search, inf, unit="mm"),
+        Result("coordinate search: reduction", _less(before, by_search), inf, 66, "%"),
+        Result("simultaneous: error", _MM * by_joint, inf, unit="mm"),
+        Result("runs of OpenSim's inverse kinematics", found.runs, inf, unit=""),
+        Result("coordinate search: time", ended - between, inf, unit="s"),
+        Result("simultaneous: time with checks and report", between - began, inf, unit="s"),
+        Result(
+            "time, coordinate search over simultaneous",
+            (ended - between) / (between - began),
+            inf,
+            100,
+            "times",
+        ),
     ]
 
 
 def _compared(
     before: Mapping[str, Verdict], after: Mapping[str, Verdict], least: Mapping[str, float]
-) -> list[Figure]:
+) -> list[Result]:
     figures = []
     for name in after:
         was, now = before[name].rms, after[name].rms
         figures += [
-            Figure(f"{name} before", _MM * was, inf, unit="mm"),
-            Figure(f"{name} after", _MM * now, inf, unit="mm"),
-            Figure(f"{name} less by", _less(was, now), inf, least.get(name, -inf), "%"),
+            Result(f"{name}: before", _MM * was, inf, unit="mm"),
+            Result(f"{name}: after", _MM * now, inf, unit="mm"),
+            Result(f"{name}: reduction", _less(was, now), inf, least.get(name, -inf), "%"),
         ]
     return figures
 
@@ -109,20 +116,20 @@ def _untouched(data: Path) -> dict[str, Verdict]:
     return opencap(data).verdicts(EVERYTHING)
 
 
-def walking_alone(data: Path) -> list[Figure]:
+def walking_alone(data: Path) -> list[Result]:
     """D-16."""
     subject = opencap(data)
     found = refine_markers(subject.chain(), [subject.motion("walking1")], PLAIN)
     after = subject.verdicts(EVERYTHING, found.model)
     return [
-        Figure("walking1, learned from", _MM * after["walking1"].rms, 4.9, unit="mm"),
+        Result("walking1, trained", _MM * after["walking1"].rms, 4.9, unit="mm"),
         *_compared(_untouched(data), after, {"squats1": 20, "STS1": 20}),
         *_to_the_end(subject, found),
-        Figure("joint angles turned, RMS", float(np.degrees(found.angle_change()[0])), inf),
+        Result("change of joint angles, RMS", float(np.degrees(found.angle_change()[0])), inf),
     ]
 
 
-def _to_the_end(subject: Subject, found: Refinement) -> list[Figure]:
+def _to_the_end(subject: Subject, found: Refinement) -> list[Result]:
     """What OpenSim finds of the walk when its default accuracy does not stop it."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
@@ -132,17 +139,22 @@ def _to_the_end(subject: Subject, found: Refinement) -> list[Figure]:
     ours = solve_frames(found.model, to_z_up(walk.positions), ones, options=within)
     off = abs(tracking_error(ours.residuals) - after)
     return [
-        Figure("OpenSim to convergence: walking1 before", _MM * before, inf, unit="mm"),
-        Figure("OpenSim to convergence: walking1 after", _MM * after, inf, unit="mm"),
-        Figure("our own inverse kinematics from there, off by", _MM * off, 0.02, unit="mm"),
+        Result("walking1 at tolerance 1e-7: before", _MM * before, inf, unit="mm"),
+        Result("walking1 at tolerance 1e-7: after", _MM * after, inf, unit="mm"),
+        Result(
+            "difference of jointfit's inverse kinematics at tolerance 1e-7",
+            _MM * off,
+            0.02,
+            unit="mm",
+        ),
     ]
 
 
-def three_movements(data: Path) -> list[Figure]:
+def three_movements(data: Path) -> list[Result]:
     """D-17: one set of markers for all; how even trials are weighed, chosen on these three."""
     subject = opencap(data)
     evenness = chosen_evenness(subject, THREE)
-    figures = [Figure("evenness chosen by movements held back", evenness, inf, unit="")]
+    figures = [Result("evenness chosen by cross-validation", evenness, inf, unit="")]
     before = _untouched(data)
     for power in sorted({0.0, evenness}):
         found = refined_evenly(subject, THREE, power)
@@ -150,13 +162,20 @@ def three_movements(data: Path) -> list[Figure]:
         if power == evenness:
             figures += _compared(before, after, {"STS1": 32})
         figures += [
-            Figure(f"{who}: variance across trials, evenness {power:g}", value, goal, unit="mm²")
+            Result(f"variance across trials, {who}: evenness {power:g}", value, goal, unit="mm²")
             for who, value, goal in (
                 ("OpenSim", _MM2 * _across(after), _MM2 * _across(before)),
-                ("ours, training trials", _MM2 * found.variance_of_trials(trained=True)[1], inf),
+                (
+                    "jointfit on training trials",
+                    _MM2 * found.variance_of_trials(trained=True)[1],
+                    inf,
+                ),
             )
         ]
-    return [*figures, Figure("OpenSim: variance before", _MM2 * _across(before), inf, unit="mm²")]
+    return [
+        *figures,
+        Result("variance across trials, OpenSim: before", _MM2 * _across(before), inf, unit="mm²"),
+    ]
 
 
 def _across(verdicts: Mapping[str, Verdict]) -> float:
@@ -189,18 +208,49 @@ def chosen_evenness(subject: Subject, trained: Sequence[str]) -> float:
 
 
 _OPENSIM = ("opensim",)
+UNTRAINED = (
+    "soft-tissue artefact in sit-to-stand does not occur in walking, from which the positions were "
+    "learned; a smaller prior improves walking and impairs the other movements"
+)
+PRIOR = (
+    "a smaller prior meets the threshold and impairs the untrained movements, so the default "
+    "remains; at its default accuracy OpenSim's tool also stops before its own minimum"
+)
 EXPERIMENTS = (
-    Experiment("D-14", "gait2354 judged by OpenSim", scaled_only, (GAIT,), _OPENSIM, long=True),
     Experiment(
-        "D-15", "beside the search through OpenSim", beside_opensim, (GAIT,), _OPENSIM, long=True
+        "opensim-gait-scaled",
+        "gait2354 as scaled: refined markers in OpenSim's inverse kinematics",
+        scaled_only,
+        OPENSIM_MODELS,
+        (GAIT,),
+        _OPENSIM,
+        long=True,
+        headline=True,
     ),
     Experiment(
-        "D-16", "walking alone, judged by OpenSim", walking_alone, (OPENCAP,), _OPENSIM, long=True
+        "opensim-coordinate-search",
+        "gait2354: comparison with the published coordinate search through OpenSim",
+        beside_opensim,
+        OPENSIM_MODELS,
+        (GAIT,),
+        _OPENSIM,
+        long=True,
     ),
     Experiment(
-        "D-17",
-        "three movements, judged by OpenSim",
+        "opensim-walking-only",
+        "Markers refined on walking alone, in OpenSim's inverse kinematics",
+        walking_alone,
+        OPENSIM_MODELS,
+        (OPENCAP,),
+        _OPENSIM,
+        long=True,
+        known_misses={"walking1, trained": PRIOR, "STS1: reduction": UNTRAINED},
+    ),
+    Experiment(
+        "opensim-three-movements",
+        "Markers refined on three movements, in OpenSim's inverse kinematics",
         three_movements,
+        OPENSIM_MODELS,
         (OPENCAP,),
         _OPENSIM,
         long=True,

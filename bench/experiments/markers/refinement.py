@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import LOWER_LIMBS, SIMULATED_MARKERS
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
 from jointfit_daemon.calibration.marker_refinement import (
     MotionTrial,
@@ -65,25 +66,27 @@ def walked(data: Path) -> tuple[Refinement, float]:
     return found, time.process_time() - began
 
 
-def fast(data: Path) -> list[Figure]:
+def fast(data: Path) -> list[Result]:
     """D-4."""
     found, seconds = walked(data)
     return [
-        Figure("walking1", rms_mm(found, "walking1"), 4.85, unit="mm"),
-        Figure("steps", len(found.costs) - 1, 10, unit=""),
-        Figure("time of all, checks and report included", seconds, 1.0, unit="s"),
+        Result("walking1", rms_mm(found, "walking1"), 4.85, unit="mm"),
+        Result("steps", len(found.costs) - 1, 10, unit=""),
+        Result("time with checks and report", seconds, 1.0, unit="s"),
     ]
 
 
-def same_minimum(data: Path) -> list[Figure]:
+def same_minimum(data: Path) -> list[Result]:
     """D-5."""
     settings = RefinementSettings("block", huber_m=None, frames=_ALL, tolerance=1e-6)
     in_turns = refine_markers(oc4_lower(data), [motion(data, "walking1")], settings)
     off = abs(in_turns.costs[-1] / walked(data)[0].costs[-1] - 1.0)
-    return [Figure("what is minimized, block beside joint", 100 * off, 0.1, unit="%")]
+    return [
+        Result("difference of the objective, block against simultaneous", 100 * off, 0.1, unit="%")
+    ]
 
 
-def never_rises(data: Path) -> list[Figure]:
+def never_rises(data: Path) -> list[Result]:
     """D-6: 20 starts, 15 mm an axis."""
     model, trial = oc4_lower(data), motion(data, "walking1", 8)
     rises = steps = 0
@@ -95,7 +98,10 @@ def never_rises(data: Path) -> list[Figure]:
             costs = refine_markers(off, [trial], settings).costs
             rises += int((np.diff(costs) > 0.0).sum())
             steps += len(costs) - 1
-    return [Figure("rises", rises, 0, unit=""), Figure("steps", steps, inf, 1, unit="")]
+    return [
+        Result("increases of the objective", rises, 0, unit=""),
+        Result("steps", steps, inf, 1, unit=""),
+    ]
 
 
 def misplaced(data: Path) -> ChainModel:
@@ -107,7 +113,7 @@ def misplaced(data: Path) -> ChainModel:
     return model.with_markers(model.positions + off).with_locks(held)
 
 
-def beside_search(data: Path, every: int = 1) -> list[Figure]:
+def beside_search(data: Path, every: int = 1) -> list[Result]:
     """D-7, D-9: the published search from a misplaced start, beside the joint method."""
     model, trials = misplaced(data), [motion(data, "walking1", every)]
     validation = [motion(data, "STS1")]
@@ -120,36 +126,48 @@ def beside_search(data: Path, every: int = 1) -> list[Figure]:
     error, reference = rms_mm(joint, "walking1"), rms_mm(found, "walking1")
     before = _MM * joint.trials[0].before.rms
     return [
-        Figure("walking1 before", before, inf, unit="mm"),
-        Figure("walking1, joint", error, reference + 0.1, unit="mm"),
-        Figure("walking1, search", reference, inf, unit="mm"),
-        Figure("less on its training trial, joint", 100 * (1 - error / before), inf, 50, "%"),
-        Figure("STS1, joint", rms_mm(joint, "STS1"), inf, unit="mm"),
-        Figure("STS1, search", rms_mm(found, "STS1"), inf, unit="mm"),
-        Figure("runs of inverse kinematics, search", found.runs, inf, unit=""),
-        Figure("time, search over joint", (ended - between) / (between - began), inf, 10, "times"),
+        Result("walking1 before", before, inf, unit="mm"),
+        Result("walking1, simultaneous", error, reference + 0.1, unit="mm"),
+        Result("walking1, coordinate search", reference, inf, unit="mm"),
+        Result(
+            "reduction on the training trial, simultaneous",
+            100 * (1 - error / before),
+            inf,
+            50,
+            "%",
+        ),
+        Result("STS1, simultaneous", rms_mm(joint, "STS1"), inf, unit="mm"),
+        Result("STS1, coordinate search", rms_mm(found, "STS1"), inf, unit="mm"),
+        Result("runs of inverse kinematics, coordinate search", found.runs, inf, unit=""),
+        Result(
+            "time, coordinate search over simultaneous",
+            (ended - between) / (between - began),
+            inf,
+            10,
+            "times",
+        ),
     ]
 
 
-def unseen(data: Path) -> list[Figure]:
+def unseen(data: Path) -> list[Result]:
     """D-8."""
     trials = [motion(data, "walking1"), motion(data, "squats1", 10), motion(data, "DJ1")]
     found = refine_markers(oc4_lower(data), trials, PLAIN, [motion(data, "STS1")])
     before, after = found.variance_of_trials(trained=True)
     return [
-        Figure("STS1, unseen", rms_mm(found, "STS1"), 6.5, unit="mm"),
-        *(Figure(t.name, _MM * t.after.rms, inf, unit="mm") for t in found.trials if t.trained),
-        Figure("variance of training trials before", 1e6 * before, inf, unit="mm²"),
-        Figure("variance of training trials after", 1e6 * after, 1e6 * before, unit="mm²"),
+        Result("STS1, not trained", rms_mm(found, "STS1"), 6.5, unit="mm"),
+        *(Result(t.name, _MM * t.after.rms, inf, unit="mm") for t in found.trials if t.trained),
+        Result("variance of training trials before", 1e6 * before, inf, unit="mm²"),
+        Result("variance of training trials after", 1e6 * after, 1e6 * before, unit="mm²"),
     ]
 
 
-def invisible(data: Path) -> list[Figure]:
+def invisible(data: Path) -> list[Result]:
     """D-11."""
     gauge = walked(data)[0].gauge
     return [
-        Figure("free directions", gauge.free, 7, 7, unit=""),
-        Figure("the next eigenvalue", gauge.eigenvalues[gauge.free], 0.01, 1e-3, unit=""),
+        Result("free directions", gauge.free, 7, 7, unit=""),
+        Result("next eigenvalue", gauge.eigenvalues[gauge.free], 0.01, 1e-3, unit=""),
     ]
 
 
@@ -162,7 +180,7 @@ def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
     return np.asarray(clean + slide + rng.normal(0.0, 0.001, clean.shape))
 
 
-def people(data: Path, count: int = 8) -> list[Figure]:
+def people(data: Path, count: int = 8) -> list[Result]:
     """D-10: made-up people at three paces; each learns from the first."""
     model = oc4_lower(data)
     held = {m.name: (True, True, True) for m in model.markers[:_PELVIS]}
@@ -181,9 +199,13 @@ def people(data: Path, count: int = 8) -> list[Figure]:
         ]
     e0, e1, v0, v1 = np.array(fits).T
     return [
-        Figure("tracking error, less by", 100 * (1 - e1.mean() / e0.mean()), inf, 50, "%"),
-        Figure("variance over frames, less by", 100 * (1 - v1.mean() / v0.mean()), inf, 20, "%"),
-        Figure("variance over trials, less by", 100 * (1 - e1.var() / e0.var()), inf, 20, "%"),
+        Result("reduction of the tracking error", 100 * (1 - e1.mean() / e0.mean()), inf, 50, "%"),
+        Result(
+            "reduction of the variance over frames", 100 * (1 - v1.mean() / v0.mean()), inf, 20, "%"
+        ),
+        Result(
+            "reduction of the variance over trials", 100 * (1 - e1.var() / e0.var()), inf, 20, "%"
+        ),
     ]
 
 
@@ -224,7 +246,7 @@ def _moved(data: Path) -> dict[str, ChainState]:
     }
 
 
-def truth(data: Path, count: int = 8) -> list[Figure]:
+def truth(data: Path, count: int = 8) -> list[Result]:
     """D-13: 3 mm of noise, 10 mm of misplacement, anatomical markers right and locked."""
     model, truly = oc4_lower(data), _moved(data)
     off_mm, shares, errors = [], [], []
@@ -237,14 +259,14 @@ def truth(data: Path, count: int = 8) -> list[Figure]:
         errors.append((before, after))
     was, is_now = np.degrees(np.mean(errors, axis=0))
     return [
-        Figure("markers off, RMS", float(np.mean(off_mm)), 5.4, unit="mm"),
-        Figure("joint angles off before", was, inf),
-        Figure("joint angles off after", is_now, inf),
-        Figure("joint angles nearer to truth by", float(np.mean(shares)), inf, 30, "%"),
+        Result("marker position error, RMS", float(np.mean(off_mm)), 5.4, unit="mm"),
+        Result("joint angle error, before", was, inf),
+        Result("joint angle error, after", is_now, inf),
+        Result("reduction of the joint angle error", float(np.mean(shares)), inf, 30, "%"),
     ]
 
 
-def feet_let_go(data: Path, count: int = 32) -> list[Figure]:
+def feet_let_go(data: Path, count: int = 32) -> list[Result]:
     """D-13F: heels and toes are off and free, too, so nothing holds how a foot is turned.
 
     What the best of trials would give: the same, learned from movements without noise, by a prior
@@ -258,10 +280,10 @@ def feet_let_go(data: Path, count: int = 32) -> list[Figure]:
         shares.append([100 * (1 - _all_off(model, m, truly, draw.seen) / before) for m in found])
     mean = np.mean(shares, axis=0)
     return [
-        Figure("joint angles nearer to truth by", float(mean[0]), inf, 30, "%"),
-        Figure("scatter from draw to draw", float(np.std(shares, axis=0)[0]), inf, unit="%"),
-        Figure("learned without noise and prior", float(mean[1]), inf, unit="%"),
-        Figure("noise and prior cost", float(mean[1] - mean[0]), inf, unit="%"),
+        Result("reduction of the joint angle error", float(mean[0]), inf, 30, "%"),
+        Result("standard deviation over draws", float(np.std(shares, axis=0)[0]), inf, unit="%"),
+        Result("reduction without noise and prior", float(mean[1]), inf, unit="%"),
+        Result("cost of noise and prior", float(mean[1] - mean[0]), inf, unit="%"),
     ]
 
 
@@ -280,16 +302,78 @@ def _angles_off(model: ChainModel, fitted: ChainModel, true: ChainState, y: Arra
     return float(np.sqrt(np.mean(step**2)))
 
 
+FREE_FEET = (
+    "markers leave the orientation of a foot undetermined; with heel and toe locked the "
+    "improvement exceeds the threshold, and movements without noise give the same value"
+)
 EXPERIMENTS = (
-    Experiment("D-4", "joint method, walking", fast, _RECORDED),
-    Experiment("D-5", "both fast methods find the same", same_minimum, _RECORDED),
-    Experiment("D-6", "what is minimized never rises", never_rises, _RECORDED, long=True),
     Experiment(
-        "D-7, D-9", "misplaced start, beside the search", beside_search, _RECORDED, long=True
+        "marker-refinement-walking",
+        "Simultaneous refinement on walking",
+        fast,
+        LOWER_LIMBS,
+        _RECORDED,
     ),
-    Experiment("D-8", "three movements, an unseen one", unseen, _RECORDED),
-    Experiment("D-10", "eight made-up people, three paces", people, _RECORDED, long=True),
-    Experiment("D-11", "what tracking cannot see", invisible, _RECORDED),
-    Experiment("D-13", "made-up truth, anatomical markers locked", truth, _RECORDED, long=True),
-    Experiment("D-13F", "the same, feet let go", feet_let_go, _RECORDED, long=True),
+    Experiment(
+        "marker-refinement-methods-agree",
+        "Simultaneous and block refinement reach the same minimum",
+        same_minimum,
+        LOWER_LIMBS,
+        _RECORDED,
+    ),
+    Experiment(
+        "marker-refinement-monotonic",
+        "The objective never increases",
+        never_rises,
+        LOWER_LIMBS,
+        _RECORDED,
+        long=True,
+    ),
+    Experiment(
+        "marker-refinement-coordinate-search",
+        "Misplaced markers: simultaneous refinement against coordinate search",
+        beside_search,
+        LOWER_LIMBS,
+        _RECORDED,
+        long=True,
+    ),
+    Experiment(
+        "marker-refinement-unseen-movement",
+        "Refined on three movements, evaluated on a fourth",
+        unseen,
+        LOWER_LIMBS,
+        _RECORDED,
+    ),
+    Experiment(
+        "marker-refinement-simulated-subjects",
+        "Eight simulated subjects, three walking speeds",
+        people,
+        SIMULATED_MARKERS,
+        _RECORDED,
+        long=True,
+    ),
+    Experiment(
+        "marker-refinement-observability",
+        "Directions that the tracking error does not determine",
+        invisible,
+        LOWER_LIMBS,
+        _RECORDED,
+    ),
+    Experiment(
+        "marker-refinement-locked-landmarks",
+        "Simulated truth, anatomical markers locked",
+        truth,
+        SIMULATED_MARKERS,
+        _RECORDED,
+        long=True,
+    ),
+    Experiment(
+        "marker-refinement-free-feet",
+        "Simulated truth, markers of the feet free",
+        feet_let_go,
+        SIMULATED_MARKERS,
+        _RECORDED,
+        long=True,
+        known_misses={"reduction of the joint angle error": FREE_FEET},
+    ),
 )

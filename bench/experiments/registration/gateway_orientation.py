@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import BOARD
 from bench.subjects import raw_imu_trials
 from jointfit_daemon.kinematics import rotation
 from jointfit_drivers.gateway_orientation import SETTLE_S
@@ -31,7 +32,7 @@ ROUNDING_DEG = 1e-6
 """What of a difference is rounding, not another filter."""
 
 
-def raw_orientation(data: Path) -> list[Figure]:
+def raw_orientation(data: Path) -> list[Result]:
     """E-1: bytes of gyroscope, accelerometer and magnetometer in, orientations out."""
     figures = []
     for name in raw_imu_trials.TRIALS:
@@ -40,10 +41,18 @@ def raw_orientation(data: Path) -> list[Figure]:
         moving = trial.moving & np.isfinite(trial.optical[:, 0])
         error = rotation.angle_between(said[moving], trial.optical[moving])
         rms = float(np.rad2deg(np.sqrt(np.mean(error**2))))
-        figures.append(Figure(f"{name[:2]} against optics, RMS", rms, GOALS_DEG[name]))
+        figures.append(
+            Result(f"{name[15:19]} trial: RMS error against optics", rms, GOALS_DEG[name])
+        )
         for magnetometer, kind in ((True, "9D"), (False, "6D")):
             off = _from_package(trial, said if magnetometer else None, kind)
-            figures.append(Figure(f"{name[:2]} {kind} against the package", off, ROUNDING_DEG))
+            figures.append(
+                Result(
+                    f"{name[15:19]} trial, {kind}: largest difference to the VQF package",
+                    off,
+                    ROUNDING_DEG,
+                )
+            )
     return figures
 
 
@@ -59,7 +68,7 @@ def _from_package(trial: raw_imu_trials.BoardTrial, said: Array | None, kind: st
     return float(np.rad2deg(rotation.angle_between(said, direct).max()))
 
 
-def begun_in_motion(data: Path) -> list[Figure]:
+def begun_in_motion(data: Path) -> list[Result]:
     """E-2: RMS error by second after the filter begins, at twenty instants of fast motion."""
     trial = raw_imu_trials.load(data, FAST)
     rng = np.random.default_rng(0)
@@ -76,12 +85,12 @@ def begun_in_motion(data: Path) -> list[Figure]:
             optical = trial.optical[part][-len(said) :]
             errors.append(rotation.angle_between(said, optical)[: 3 * SECOND])
     figures = [
-        Figure(f"given out at once, second {k + 1}", _rms_deg(at_once, k), float("inf"))
+        Result(f"published at once: second {k + 1}", _rms_deg(at_once, k), float("inf"))
         for k in range(3)
     ]
     return [
         *figures,
-        Figure("settled, its first second", _rms_deg(settled, 0), SETTLED_GOAL_DEG),
+        Result("settled: second 1", _rms_deg(settled, 0), SETTLED_GOAL_DEG),
     ]
 
 
@@ -92,17 +101,19 @@ def _rms_deg(errors: list[Array], second: int) -> float:
 
 EXPERIMENTS = (
     Experiment(
-        "E-1",
-        "orientation on the gateway from raw readings, whole trials",
+        "gateway-orientation-whole-trials",
+        "Orientation filter on the gateway, raw readings of whole trials",
         raw_orientation,
+        BOARD,
         recordings=("broad",),
         packages=("vqf", "h5py"),
         long=True,
     ),
     Experiment(
-        "E-2",
-        "the same, begun in fast motion, by second",
+        "gateway-orientation-start-in-motion",
+        "Orientation filter started during fast motion, by second",
         begun_in_motion,
+        BOARD,
         recordings=("broad",),
         packages=("vqf", "h5py"),
         long=True,

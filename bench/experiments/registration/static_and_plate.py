@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import BOARD, SEEDED
 from jointfit_daemon.calibration.registration import (
     fit_observable_alignment,
     fit_sensor_alignment,
@@ -33,7 +34,7 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def stillness(data: Path) -> list[Figure]:
+def stillness(data: Path) -> list[Result]:
     """B-1: rest found, and motion taken for rest, on two whole trials of a board."""
     h5py = import_module("h5py")  # only this bench needs it
     figures = []
@@ -43,13 +44,15 @@ def stillness(data: Path) -> list[Figure]:
             rate = float(trial.attrs["sampling_rate"])
             still = still_from_rates(trial["imu_gyr"][:], trial["imu_acc"][:], rate)
         figures += [
-            Figure(f"{name[:2]} rest", float(still[~moving].mean()), INFINITY, 0.97, ""),
-            Figure(f"{name[:2]} motion", float(still[moving].mean()), 0.002, unit=""),
+            Result(
+                f"{name[15:19]} trial: at rest", float(still[~moving].mean()), INFINITY, 0.97, ""
+            ),
+            Result(f"{name[15:19]} trial: in motion", float(still[moving].mean()), 0.002, unit=""),
         ]
     return figures
 
 
-def static_mean(_: Path) -> list[Figure]:
+def static_mean(_: Path) -> list[Result]:
     """B-2: 1 degree of scatter per axis, a fifth of the frames turned by 30 to 90 degrees."""
     rng = np.random.default_rng(2)
     errors = []
@@ -62,7 +65,7 @@ def static_mean(_: Path) -> list[Figure]:
         turns = rotation.exp(axes * np.deg2rad(rng.uniform(30, 90, (100, 1))))
         q[wrong] = rotation.multiply(truth, turns)
         errors.append(_degrees(rotation.angle_between(robust_mean(q).q, truth)))
-    return [Figure("RMS", _rms(errors), 0.18)]
+    return [Result("RMS error", _rms(errors), 0.18)]
 
 
 def random_walk(
@@ -84,7 +87,7 @@ def random_walk(
     return q_s, q_body, q_world, q_mount
 
 
-def plate(_: Path) -> list[Figure]:
+def plate(_: Path) -> list[Result]:
     """B-3: world and mount of a plate, with and without 15 % random orientations, 10 runs each."""
     figures = []
     for share, label in ((0.0, "clean"), (0.15, "15 % outliers")):
@@ -95,36 +98,36 @@ def plate(_: Path) -> list[Figure]:
             world.append(_degrees(rotation.angle_between(found.q_world, q_world)))
             mount.append(_degrees(rotation.angle_between(found.q_mount, q_mount)))
         figures += [
-            Figure(f"{label}: world", _rms(world), 0.15),
-            Figure(f"{label}: mount", _rms(mount), 0.15),
+            Result(f"{label}: world-to-world", _rms(world), 0.15),
+            Result(f"{label}: sensor-to-segment", _rms(mount), 0.15),
         ]
     return figures
 
 
-def one_axis(_: Path) -> list[Figure]:
+def one_axis(_: Path) -> list[Result]:
     """B-4: turning about one axis only must be refused."""
     q_s, q_body, *_truth = random_walk(np.random.default_rng(4), axis=(1.0, 0.0, 0.0))
     found = fit_observable_alignment(q_s, q_body)
     kappa = fit_sensor_alignment("full", q_s, q_body).kappa
     return [
-        Figure("kappa", kappa, 1.0, 0.999, ""),
-        Figure("full fit accepted", float(found.kind == "full"), 0.0, unit=""),
+        Result("kappa", kappa, 1.0, 0.999, ""),
+        Result("full fit accepted", float(found.kind == "full"), 0.0, unit=""),
     ]
 
 
-def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Figure]:
+def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Result]:
     rng = np.random.default_rng(5)
     q_world, q_mount = rotation.exp(rng.normal(size=3)), rotation.exp(rng.normal(size=3))
     q_body = rotation.multiply(rotation.multiply(q_world, q_opt), q_mount)
     found = fit_observable_alignment(q_s[kept], q_body[kept])
     return [
-        Figure("world", _degrees(rotation.angle_between(found.q_world, q_world)), 1.5),
-        Figure("mount", _degrees(rotation.angle_between(found.q_mount, q_mount)), 1.0),
-        Figure("full fit refused", float(found.kind != "full"), 0.0, unit=""),
+        Result("world-to-world", _degrees(rotation.angle_between(found.q_world, q_world)), 1.5),
+        Result("sensor-to-segment", _degrees(rotation.angle_between(found.q_mount, q_mount)), 1.0),
+        Result("full fit rejected", float(found.kind != "full"), 0.0, unit=""),
     ]
 
 
-def real_plate(data: Path) -> list[Figure]:
+def real_plate(data: Path) -> list[Result]:
     """B-5: a real board, its orientation by a filter; 30 s of motion at 47.6 Hz."""
     h5py, vqf = import_module("h5py"), import_module("vqf")  # only this bench needs them
     with h5py.File(data / "broad" / f"{TRIALS[0]}.hdf5") as trial:
@@ -136,7 +139,7 @@ def real_plate(data: Path) -> list[Figure]:
     return _aligned(q_s, q_opt, slice(first, first + int(30 * rate), 6))
 
 
-def integrated_plate(data: Path) -> list[Figure]:
+def integrated_plate(data: Path) -> list[Result]:
     """The same board, its orientation by adding up the gyro alone; 30 s, 5 s into the motion."""
     with np.load(data / "broad_excerpts" / f"{TRIALS[0]}_60s.npz", allow_pickle=False) as trial:
         rate = float(trial["sampling_rate"])
@@ -153,10 +156,46 @@ def integrated_plate(data: Path) -> list[Figure]:
 
 
 EXPERIMENTS = (
-    Experiment("B-1", "stillness, share of samples", stillness, ("broad",), ("h5py",)),
-    Experiment("B-2", "static mean, a fifth of the frames wrong", static_mean),
-    Experiment("B-3", "plate turned by hand, synthetic", plate),
-    Experiment("B-4", "plate turned about one axis only", one_axis),
-    Experiment("B-5", "real board, filtered", real_plate, ("broad",), ("h5py", "vqf")),
-    Experiment("B-5g", "real board, gyro added up", integrated_plate, ("broad_excerpts",)),
+    Experiment(
+        "stillness-detection",
+        "Share of samples detected as still, at rest and in motion",
+        stillness,
+        BOARD,
+        ("broad",),
+        ("h5py",),
+    ),
+    Experiment(
+        "static-mean-outliers",
+        "Mean orientation with a fifth of the frames wrong, 100 runs",
+        static_mean,
+        SEEDED,
+    ),
+    Experiment(
+        "plate-alignment-simulated",
+        "Alignment on a plate turned by hand, 10 simulated runs",
+        plate,
+        SEEDED,
+    ),
+    Experiment(
+        "plate-alignment-single-axis",
+        "Alignment on a plate turned about one axis only",
+        one_axis,
+        SEEDED,
+    ),
+    Experiment(
+        "board-alignment-filtered",
+        "Alignment of a recorded board, orientation of a filter",
+        real_plate,
+        BOARD,
+        ("broad",),
+        ("h5py", "vqf"),
+    ),
+    Experiment(
+        "board-alignment-integrated",
+        "Alignment of a recorded board, orientation of the integrated gyroscope",
+        integrated_plate,
+        BOARD,
+        ("broad_excerpts",),
+        headline=True,
+    ),
 )

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import KNEE as RECORDED_KNEE
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects import faulty_wearer, recorded_knee
 from bench.subjects.faulty_wearer import SEGMENTS
 from bench.subjects.simulated_wearer import bench_rig
@@ -81,7 +83,7 @@ def _found(
     state: str,
     goal_s: float,
     seeds: tuple[int, ...],
-) -> list[Figure]:
+) -> list[Result]:
     delays, jumps, wrong = [], [], 0
     for at_s, name, told, jump in _cases(seeds, spoil):
         segment = "thigh" if name in ("S1", "S2") else "shank"
@@ -91,27 +93,29 @@ def _found(
         jumps.append(jump.max())
     found = np.array(delays)
     return [
-        Figure("found", 100.0 * float(np.mean(np.isfinite(found))), 100.0, 100.0, unit="%"),
-        Figure("told after, median", float(np.median(found)), float("inf"), unit="s"),
-        Figure("told after, worst", float(found.max()), goal_s, unit="s"),
-        Figure("told within 2 s", 100.0 * float(np.mean(found <= SOON_TOLD_S)), 100.0, 95.0, "%"),
-        Figure("others blamed", float(wrong), 0.0, unit=""),
-        Figure("largest jump / claimed, median", float(np.median(jumps)), 1.0, unit=""),
-        Figure("largest jump / claimed, worst", float(np.max(jumps)), JUMP_GOAL, unit=""),
+        Result("detected", 100.0 * float(np.mean(np.isfinite(found))), 100.0, 100.0, unit="%"),
+        Result("detection delay, median", float(np.median(found)), float("inf"), unit="s"),
+        Result("detection delay, worst", float(found.max()), goal_s, unit="s"),
+        Result(
+            "detected within 2 s", 100.0 * float(np.mean(found <= SOON_TOLD_S)), 100.0, 95.0, "%"
+        ),
+        Result("false attributions", float(wrong), 0.0, unit=""),
+        Result("largest jump over stated error, median", float(np.median(jumps)), 1.0, unit=""),
+        Result("largest jump over stated error, worst", float(np.max(jumps)), JUMP_GOAL, unit=""),
     ]
 
 
-def stuck(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def stuck(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return how soon a sensor that repeats itself is found."""
     return _found(lambda p, name, t, _: faulty_wearer.stuck(p, name, t), "stuck", 0.5, seeds)
 
 
-def silent(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def silent(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return how soon a silent sensor is told."""
     return _found(lambda p, name, t, _: faulty_wearer.silent(p, name, t), "lost", 0.5, seeds)
 
 
-def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Figure]:
+def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return how soon a slip is told."""
     angle = np.deg2rad(degrees)
     figures = _found(
@@ -121,12 +125,12 @@ def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Figure
     if degrees > SLIPS_DEG[0]:
         return figures
     share = figures[0]  # the smallest is at the limit of what skin allows
-    return [Figure(share.name, share.value, 100.0, 80.0, unit="%"), *figures[1:]]
+    return [Result(share.name, share.value, 100.0, 80.0, unit="%"), *figures[1:]]
 
 
 def false_alarms(
     _: Path, seeds: tuple[int, ...] = SEEDS[:4], hours: float = HOURS_EACH
-) -> list[Figure]:
+) -> list[Result]:
     """Return how often healthy people are told anything, per hour."""
     told, played = 0, 0.0
     part_s = 300.0
@@ -142,12 +146,12 @@ def false_alarms(
             told += len(faulty_wearer.play(fuser, moved)[1])
             played += part_s / 3600
     return [
-        Figure("hours played", played, float("inf"), unit="h"),
-        Figure("alarms an hour", told / played, 0.5, unit=""),
+        Result("duration", played, float("inf"), unit="h"),
+        Result("false alarms per hour", told / played, 0.5, unit=""),
     ]
 
 
-def real_skin(data: Path) -> list[Figure]:
+def real_skin(data: Path) -> list[Result]:
     """Return what is told of healthy sensors on real skin, in movements that were not trained."""
     trials = {name: _offline(data, name) for name in ("squats1", "walking1", "DJ1")}
     mounts = {name: rotation.IDENTITY for group in KNEE.sensors for name in group}
@@ -160,8 +164,8 @@ def real_skin(data: Path) -> list[Figure]:
                 told += len(faulty_wearer.play(LimbFuser(KNEE, calibration), person)[1])
                 seconds += float(trial.t_s[-1])
     return [
-        Figure("played", seconds, float("inf"), unit="s"),
-        Figure("alarms", float(told), 0.0, unit=""),
+        Result("duration", seconds, float("inf"), unit="s"),
+        Result("false alarms", float(told), 0.0, unit=""),
     ]
 
 
@@ -172,7 +176,7 @@ def _offline(data: Path, name: str) -> OfflineTrial:
     return OfflineTrial(name, t_s, sensors, {"thigh": knee.thigh, "shank": knee.shank})
 
 
-def drift(_: Path, seeds: tuple[int, ...] = SEEDS[:3]) -> list[Figure]:
+def drift(_: Path, seeds: tuple[int, ...] = SEEDS[:3]) -> list[Result]:
     """Return the error of the knee's rotation after 4 to 5 minutes of drift, without and with."""
     figures = []
     for rate in RATES:
@@ -180,9 +184,9 @@ def drift(_: Path, seeds: tuple[int, ...] = SEEDS[:3]) -> list[Figure]:
             if rate in (0.0, 1.0) and len(names) == 1:
                 continue
             without, taken_out = _drifted(seeds, names, rate)
-            title = f"{rate:g} deg/min, {who}"
-            figures.append(Figure(f"{title}: left in", without, float("inf")))
-            figures.append(Figure(f"{title}: taken out", taken_out, 5.0))
+            title = f"{rate:g}°/min, {who}"
+            figures.append(Result(f"{title}: uncorrected", without, float("inf")))
+            figures.append(Result(f"{title}: compensated", taken_out, 5.0))
     return figures
 
 
@@ -202,16 +206,56 @@ def _drifted(seeds: tuple[int, ...], names: tuple[str, ...], rate: float) -> tup
     return left, taken
 
 
+SLIP_IDS = {
+    10.0: "sensor-slip-ten-degrees",
+    15.0: "sensor-slip-fifteen-degrees",
+    30.0: "sensor-slip-thirty-degrees",
+}
 EXPERIMENTS = (
-    Experiment("FAULT-lost", "a sensor falls silent", silent, long=True),
-    Experiment("FAULT-stuck", "a sensor repeats itself", stuck, long=True),
+    Experiment(
+        "lost-sensor",
+        "A sensor stops sending",
+        silent,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+    Experiment(
+        "stuck-sensor",
+        "A sensor repeats its last orientation",
+        stuck,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
     *(
-        Experiment(f"FAULT-slip-{degrees:g}", f"a sensor slips by {degrees:g} deg in 0.3 s",
-                   partial(slip, degrees=degrees), long=True)
+        Experiment(
+            SLIP_IDS[degrees],
+            f"A sensor slips by {degrees:g}° within 0.3 s",
+            partial(slip, degrees=degrees),
+            SIMULATED_SUBJECTS,
+            long=True,
+        )
         for degrees in SLIPS_DEG
     ),
-    Experiment("FAULT-none", "healthy sensors", false_alarms, long=True),
-    Experiment("FAULT-real", "healthy sensors on real skin, one movement trained, others played",
-               real_skin, recordings=(recorded_knee.FOLDER,), long=True),
-    Experiment("DRIFT", "knee rotation in the fifth minute of heading drift", drift, long=True),
-)  # fmt: skip
+    Experiment(
+        "healthy-sensors-simulated",
+        "False alarms with healthy sensors, two hours",
+        false_alarms,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+    Experiment(
+        "healthy-sensors-recorded",
+        "False alarms with healthy sensors, trained on one recorded movement, run on the others",
+        real_skin,
+        RECORDED_KNEE,
+        recordings=(recorded_knee.FOLDER,),
+        long=True,
+    ),
+    Experiment(
+        "heading-drift",
+        "Knee rotation error in the fifth minute of heading drift",
+        drift,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+)

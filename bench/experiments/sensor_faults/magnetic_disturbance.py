@@ -19,7 +19,8 @@ from bench.experiments.sensor_faults.loss_slip_drift import (
     calibrated_people,
     fuser_of,
 )
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects import faulty_wearer
 from bench.subjects.faulty_wearer import PULL_S, SEGMENTS, STAY_S
 from jointfit_daemon.kinematics import rotation
@@ -133,7 +134,7 @@ def _rms(x: Array) -> float:
 
 def magnet(
     _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = PEOPLE
-) -> list[Figure]:
+) -> list[Result]:
     """Return what is told of a disturbance, and how far the output is from the bones."""
     found = [_pulled(*case) for case in _cases(seeds, groups)]
     delays = np.array([case.delay_s for case in found])
@@ -145,27 +146,52 @@ def magnet(
         [_rms(np.array(x)) for x in zip(*(case.knee for case in found), strict=True)]
     )
     return [
-        Figure("told", 100.0 * float(np.mean(np.isfinite(delays))), 100.0, 100.0, unit="%"),
-        Figure("told after passing 10 deg, median", float(np.median(delays)), 2.0, unit="s"),
-        Figure("told after passing 10 deg, worst", float(delays.max()), 2.0, unit="s"),
-        Figure("over, told after, worst", max(case.ended_s for case in found), 10.0, unit="s"),
-        Figure("others blamed", float(sum(case.others for case in found)), 0.0, unit=""),
-        _share("segments within what is claimed", segment < JUMP_GOAL),
-        _share("flexion within what is claimed", flexion < FLEXION_GOAL),
-        _share("segments, without", healthy < JUMP_GOAL, 0.0),
-        Figure("knee rotation, while it lasts", float(lasting), float("inf")),
-        Figure("knee rotation, after", float(after), round(float(without) + 0.5, 3)),
-        Figure("knee rotation, without", float(without), float("inf")),
+        Result("detected", 100.0 * float(np.mean(np.isfinite(delays))), 100.0, 100.0, unit="%"),
+        Result(
+            "detection delay after exceeding 10°, median", float(np.median(delays)), 2.0, unit="s"
+        ),
+        Result("detection delay after exceeding 10°, worst", float(delays.max()), 2.0, unit="s"),
+        Result(
+            "recovery reported after, worst", max(case.ended_s for case in found), 10.0, unit="s"
+        ),
+        Result("false attributions", float(sum(case.others for case in found)), 0.0, unit=""),
+        _share("segment errors within the stated 95 % bound", segment < JUMP_GOAL),
+        _share("flexion errors within the stated 95 % bound", flexion < FLEXION_GOAL),
+        _share(
+            "segment errors within the stated 95 % bound, undisturbed", healthy < JUMP_GOAL, 0.0
+        ),
+        Result("knee rotation error, disturbed", float(lasting), float("inf")),
+        Result(
+            "knee rotation error, after the disturbance",
+            float(after),
+            round(float(without) + 0.5, 3),
+        ),
+        Result("knee rotation error, undisturbed", float(without), float("inf")),
     ]
 
 
-def _share(name: str, held: NDArray[np.bool_], least: float = 95.0) -> Figure:
-    return Figure(name, 100.0 * float(np.mean(held)), 100.0, least, unit="%")
+def _share(name: str, held: NDArray[np.bool_], least: float = 95.0) -> Result:
+    return Result(name, 100.0 * float(np.mean(held)), 100.0, least, unit="%")
 
 
+NOT_RECOVERED = (
+    "in 1 of the 40 single-sensor cases, recovery was not reported within 10 s: the disagreement "
+    "of the pair remained between the thresholds of alarm and recovery"
+)
 EXPERIMENTS = (
-    Experiment("FAULT-magnet-1", "the heading of one sensor is pulled away by 20 to 40 deg",
-               partial(magnet, groups=ALONE), long=True),
-    Experiment("FAULT-magnet-2", "the headings of both sensors of a segment are",
-               partial(magnet, groups=BOTH), long=True),
-)  # fmt: skip
+    Experiment(
+        "magnetic-disturbance-one-sensor",
+        "The heading of one sensor is disturbed by 20 to 40° for half a minute",
+        partial(magnet, groups=ALONE),
+        SIMULATED_SUBJECTS,
+        long=True,
+        known_misses={"recovery reported after, worst": NOT_RECOVERED},
+    ),
+    Experiment(
+        "magnetic-disturbance-both-sensors",
+        "The headings of both sensors of a segment are disturbed by 20 to 40° for half a minute",
+        partial(magnet, groups=BOTH),
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
+)

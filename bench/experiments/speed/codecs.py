@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import can
 
-from bench.framework.measurement import Bench, Row, per_item, repeats
+from bench.framework.measurement import per_item, repeats, speed_experiment, timed_result
 from bench.subjects import device_bytes
 from jointfit_daemon.driver import CanBusSettings, find_driver
 from jointfit_daemon.model import Chunk, ImuSample, MocapFrame
@@ -25,6 +25,7 @@ from jointfit_simulators.body import CLUSTERS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from bench.framework.experiment import Result
     from jointfit_daemon.driver import Decoder
 
 N = 500
@@ -53,7 +54,7 @@ def _decoding(
     return prepare
 
 
-def xbus_rows(quick: bool) -> list[Row]:
+def xbus_rows(quick: bool) -> list[Result]:
     messages = device_bytes.xbus_messages(ORIENTATIONS, PERIOD_NS)
     chunks = [Chunk(k * PERIOD_NS, data) for k, data in enumerate(messages)]
     driver = find_driver("xbus")
@@ -70,7 +71,7 @@ def xbus_rows(quick: bool) -> list[Row]:
     ]
 
 
-def xcdi_rows(quick: bool) -> list[Row]:
+def xcdi_rows(quick: bool) -> list[Result]:
     groups = device_bytes.xcdi_frames(ORIENTATIONS, PERIOD_NS, IDS)
     lines = device_bytes.slcan_lines(groups)
     driver = find_driver("xcdi")
@@ -96,7 +97,7 @@ def xcdi_rows(quick: bool) -> list[Row]:
     ]
 
 
-def natnet_rows(quick: bool) -> list[Row]:
+def natnet_rows(quick: bool) -> list[Result]:
     datagrams = device_bytes.natnet_datagrams(N, 8_333_333)
     driver = find_driver("natnet")
     settings = driver.Settings(
@@ -169,7 +170,7 @@ def _theirs(bus: Any) -> Callable[[], int]:
     return drain
 
 
-def rival_rows(quick: bool) -> list[Row]:
+def rival_rows(quick: bool) -> list[Result]:
     """Read the same frames from the same pty by both, in turns."""
     line = Line()
     bus: Any = can.Bus(interface="slcan", channel=line.path, sleep_after_open=0)
@@ -190,9 +191,11 @@ def rival_rows(quick: bool) -> list[Row]:
         bus.shutdown()
         line.close()
     return [
-        Row("slcan: ours, one frame from a pty", _us(ours), "µs", 12, 48),
-        Row("slcan: python-can's, the same", _us(theirs), "µs"),
-        Row("slcan: ours over python-can's", round(statistics.median(ratios), 4), "", 0.2, 0.5),
+        timed_result("slcan: jointfit, one frame from a pty", _us(ours), "µs", 12, 48),
+        timed_result("slcan: python-can, one frame from a pty", _us(theirs), "µs"),
+        timed_result(
+            "slcan: jointfit over python-can", round(statistics.median(ratios), 4), "", 0.2, 0.5
+        ),
     ]
 
 
@@ -200,9 +203,25 @@ def _us(times: list[float]) -> float:
     return round(statistics.median(times) * 1e6, 2)
 
 
-BENCHES = (
-    Bench("xbus", "Xbus: codec and decoder", xbus_rows),
-    Bench("xcdi", "CAN: SLCAN codec and XCDI decoder", xcdi_rows),
-    Bench("natnet", "NatNet: codec and decoder", natnet_rows),
-    Bench("slcan", "SLCAN beside python-can's, on a pty", rival_rows),
+EXPERIMENTS = (
+    speed_experiment(
+        "xbus-codec",
+        "Xbus: codec and decoder",
+        xbus_rows,
+    ),
+    speed_experiment(
+        "can-codec",
+        "CAN: SLCAN codec and XCDI decoder",
+        xcdi_rows,
+    ),
+    speed_experiment(
+        "natnet-codec",
+        "NatNet: codec and decoder",
+        natnet_rows,
+    ),
+    speed_experiment(
+        "slcan-python-can",
+        "SLCAN on a pty, compared with python-can",
+        rival_rows,
+    ),
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.measurement import Bench, Row, loop_s, per_item, percentile
+from bench.framework.measurement import loop_s, per_item, percentile, speed_experiment, timed_result
 from bench.subjects import device_bytes
 from bench.subjects.simulated_wearer import bench_rig, fitted, walking
 from jointfit_daemon.fusion import LimbFuser
@@ -26,6 +26,7 @@ from jointfit_simulators.body import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from bench.framework.experiment import Result
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chunk, Quaternion
     from jointfit_daemon.pipeline.events import Event
@@ -41,7 +42,7 @@ def worn() -> Calibration:
     return fitted(bench_rig())
 
 
-def clock_rows(quick: bool) -> list[Row]:
+def clock_rows(quick: bool) -> list[Result]:
     n, period_ns = 4000, 2_500_000
     ticks = TickClock(100_000, 2**32)
     arrivals = [START_NS + k * period_ns + (k * 7919 % 997) * 1000 for k in range(n)]
@@ -55,7 +56,7 @@ def clock_rows(quick: bool) -> list[Row]:
     return [per_item("clock: one sample", work, items=n, goal_us=5, quick=quick)]
 
 
-def align_rows(quick: bool) -> list[Row]:
+def align_rows(quick: bool) -> list[Result]:
     """Four streams at 400 Hz to frames at 100 Hz, time looked at after each, as in the core."""
     period_ns, seconds = 2_500_000, 2
     n = seconds * NS // period_ns
@@ -101,7 +102,7 @@ def _plainly(frames: list[dict[str, Quaternion]]) -> Callable[[], object]:
     return work
 
 
-def fusion_rows(quick: bool) -> list[Row]:
+def fusion_rows(quick: bool) -> list[Result]:
     rig, frames = bench_rig(), _inputs(3.0)
 
     def fuse() -> Callable[[], object]:
@@ -115,7 +116,7 @@ def fusion_rows(quick: bool) -> list[Row]:
     return [
         per_item("fusion: one frame of 4 sensors", fuse, items=n, goal_us=100, quick=quick),
         per_item(
-            "fusion: its two corrections by plain numpy",
+            "fusion: both corrections in plain NumPy",
             lambda: _plainly(frames),
             items=n,
             goal_us=None,
@@ -174,7 +175,7 @@ def frame_times(rate_hz: float, seconds: float) -> list[float]:
     return times[round(SETTLE_S * 100) :]
 
 
-def core_rows(quick: bool) -> list[Row]:
+def core_rows(quick: bool) -> list[Result]:
     rows = []
     for rate_hz, median_us, worst_us in ((100.0, 250, 3000), (400.0, 1500, 3000)):
         gc.collect()
@@ -188,13 +189,31 @@ def core_rows(quick: bool) -> list[Row]:
     return rows
 
 
-def _row(name: str, took_s: float, goal_us: float, loop: float) -> Row:
-    return Row(name, round(took_s * 1e6, 1), "µs", goal_us, 4 * goal_us, round(took_s / loop, 3))
+def _row(name: str, took_s: float, goal_us: float, loop: float) -> Result:
+    return timed_result(
+        name, round(took_s * 1e6, 1), "µs", goal_us, 4 * goal_us, ratio=round(took_s / loop, 3)
+    )
 
 
-BENCHES = (
-    Bench("clock", "device time to host time", clock_rows),
-    Bench("align", "streams to frames", align_rows),
-    Bench("fusion", "aligned frame to limb state to JSON", fusion_rows),
-    Bench("core", "chunks of four IMUs to limb states", core_rows),
+EXPERIMENTS = (
+    speed_experiment(
+        "clock-time",
+        "Device time to host time",
+        clock_rows,
+    ),
+    speed_experiment(
+        "frame-alignment-time",
+        "Samples to frames",
+        align_rows,
+    ),
+    speed_experiment(
+        "fusion-frame-time",
+        "Aligned frame to limb state and JSON",
+        fusion_rows,
+    ),
+    speed_experiment(
+        "core-step-time",
+        "Bytes of four IMUs to limb states",
+        core_rows,
+    ),
 )

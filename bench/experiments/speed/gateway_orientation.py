@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.measurement import Bench, Row, per_item
+from bench.framework.measurement import per_item, speed_experiment
 from bench.subjects import raw_imu_trials
 from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from bench.framework.experiment import Result
 
 N = 500
 
@@ -26,7 +28,7 @@ def _work(count: int) -> Callable[[], object]:
     return lambda: [decoder.feed(chunk) for chunk in chunks]
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[Result]:
     if find_spec("vqf") is None:
         return []
     return [
@@ -42,4 +44,10 @@ def rows(quick: bool) -> list[Row]:
     ]
 
 
-BENCHES = (Bench("raw", "orientation on the gateway", rows),)
+EXPERIMENTS = (
+    speed_experiment(
+        "gateway-orientation-time",
+        "Orientation filter on the gateway",
+        rows,
+    ),
+)

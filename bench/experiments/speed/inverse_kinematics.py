@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
-from bench.framework.experiment import DATA
-from bench.framework.measurement import Bench, Row, per_item
+from bench.framework.experiment import DATA, Result
+from bench.framework.measurement import per_item, speed_experiment
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
 from bench.subjects.two_segments import swing, two_segments
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[Result]:
     small = two_segments()
     found = _of("two segments", small, swing(small, 150)[1], (50, 300), quick=quick)
     if (DATA / FOLDER).is_dir():
@@ -30,7 +30,7 @@ def rows(quick: bool) -> list[Row]:
 
 def _of(
     name: str, model: ChainModel, y: Array, goals_us: tuple[int, int], *, quick: bool
-) -> list[Row]:
+) -> list[Result]:
     batch_us, live_us = goals_us
 
     def batch() -> Callable[[], object]:
@@ -48,4 +48,10 @@ def _of(
     ]
 
 
-BENCHES = (Bench("ik", "inverse kinematics, an instant", rows),)
+EXPERIMENTS = (
+    speed_experiment(
+        "inverse-kinematics-frame-time",
+        "Inverse kinematics, per frame",
+        rows,
+    ),
+)

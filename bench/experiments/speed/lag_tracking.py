@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.measurement import Bench, Row, cpu_s, loop_s, repeats
+from bench.framework.measurement import cpu_s, loop_s, repeats, speed_experiment, timed_result
 from bench.subjects.simulated_wearer import bench_rig, fitted, phases
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.sources import LagMonitor
 
 if TYPE_CHECKING:
+    from bench.framework.experiment import Result
     from jointfit_daemon.model import Quaternion
 
     Event = tuple[int, str, Quaternion | MocapFrame]
@@ -56,7 +57,7 @@ def _play(watch: LagMonitor, events: list[Event]) -> tuple[float, float, float]:
     return adding / len(events), sum(steps) / (FRAMES / 120), float(np.max(steps))
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[Result]:
     events, rig = _events(), bench_rig()
     calibration = fitted(rig)
     tries = min(repeats(quick), 7)
@@ -64,14 +65,22 @@ def rows(quick: bool) -> list[Row]:
     add, second, most = (median(figures) for figures in zip(*played, strict=True))
     loop = loop_s()
     figures = (
-        ("lag watch: one sample or frame in", 1e6 * add, "µs", 5.0),
-        ("lag watch: steps, a second of 4 sensors and 120 Hz cameras", 1e3 * second, "ms", 50.0),
-        ("lag watch: longest step", 1e3 * most, "ms", 8.0),
+        ("lag tracking: one sample or frame in", 1e6 * add, "µs", 5.0),
+        ("lag tracking: steps, a second of 4 sensors and 120 Hz cameras", 1e3 * second, "ms", 50.0),
+        ("lag tracking: longest step", 1e3 * most, "ms", 8.0),
     )
     return [
-        Row(name, round(figure, 3), unit, goal, 4 * goal, round(figure * scale / loop, 4))
+        timed_result(
+            name, round(figure, 3), unit, goal, 4 * goal, ratio=round(figure * scale / loop, 4)
+        )
         for (name, figure, unit, goal), scale in zip(figures, (1e-6, 1e-3, 1e-3), strict=True)
     ]
 
 
-BENCHES = (Bench("lag-watch", "the lag found while it runs", rows),)
+EXPERIMENTS = (
+    speed_experiment(
+        "lag-tracking-time",
+        "Lag estimation while running",
+        rows,
+    ),
+)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bench.framework.measurement import Bench, Row, per_item
+from bench.framework.measurement import per_item, speed_experiment
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.guidance import MovementGuide
 from jointfit_daemon.model import MocapFrame, MocapLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from bench.framework.experiment import Result
 
 FRAMES, LOOKS = 1200, 30
 EVERY = 24
@@ -51,7 +53,7 @@ def _look(frames: list[MocapFrame]) -> Callable[[], object]:
     return lambda: [one.look({}, 10.0) for _ in range(LOOKS)]
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[Result]:
     frames = _frames()
     return [
         per_item(
@@ -63,14 +65,20 @@ def rows(quick: bool) -> list[Row]:
             note="16 markers",
         ),
         per_item(
-            "live centers: one look, five a second",
+            "live centers: one estimate, five a second",
             lambda: _look(frames),
             items=LOOKS,
             goal_us=5000,
             quick=quick,
-            note="one joint anew",
+            note="one joint re-estimated",
         ),
     ]
 
 
-BENCHES = (Bench("live-centers", "joint centers during the functional phase", rows),)
+EXPERIMENTS = (
+    speed_experiment(
+        "live-center-time",
+        "Joint centres during the functional calibration",
+        rows,
+    ),
+)

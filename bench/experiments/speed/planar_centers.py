@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.measurement import Bench, Row, per_item
+from bench.framework.measurement import per_item, speed_experiment
 from jointfit_daemon.center_of_rotation.planar import RunningCircle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from bench.framework.experiment import Result
 
 FRAMES = 2000
 
@@ -24,7 +26,7 @@ def _swing() -> list[list[float]]:
     return noisy
 
 
-def circle_rows(quick: bool) -> list[Row]:
+def circle_rows(quick: bool) -> list[Result]:
     points = _swing()
 
     def feeding(*, robust: bool, window: int | None = None) -> Callable[[], Callable[[], object]]:
@@ -50,11 +52,20 @@ def circle_rows(quick: bool) -> list[Row]:
         per_item(f"center: one frame{name}", prepare, items=FRAMES, goal_us=20, quick=quick)
         for name, prepare in (
             ("", feeding(robust=False)),
-            (", weighed", feeding(robust=True)),
+            (", weighted", feeding(robust=True)),
             (", window", feeding(robust=False, window=300)),
         )
     ]
-    return [*rows, per_item("center: error and verdict", told, items=200, goal_us=60, quick=quick)]
+    return [
+        *rows,
+        per_item("center: error and acceptance", told, items=200, goal_us=60, quick=quick),
+    ]
 
 
-BENCHES = (Bench("center", "planar center of rotation, frame by frame", circle_rows),)
+EXPERIMENTS = (
+    speed_experiment(
+        "planar-center-time",
+        "Planar centre of rotation, frame by frame",
+        circle_rows,
+    ),
+)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.measurement import Bench, Row, per_item
+from bench.framework.measurement import per_item, speed_experiment
 from bench.subjects.simulated_joints import ball_turns, carried
 from jointfit_daemon.center_of_rotation.spatial import RunningSphere
 
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
+
+    from bench.framework.experiment import Result
 
 FRAMES = 1000
 
@@ -48,13 +50,25 @@ def answering() -> Callable[[], object]:
     return lambda: [stream.estimate() for _ in range(10)]
 
 
-def sphere_rows(quick: bool) -> list[Row]:
+def sphere_rows(quick: bool) -> list[Result]:
     n = FRAMES
     return [
         per_item("sphere: a frame of 4 markers", feeding(False), items=n, goal_us=20, quick=quick),
-        per_item("sphere: the same, watched", feeding(True), items=n, goal_us=20, quick=quick),
-        per_item("sphere: an answer", answering, items=10, goal_us=3000, quick=quick),
+        per_item(
+            "sphere: a frame of 4 markers, with outlier check",
+            feeding(True),
+            items=n,
+            goal_us=20,
+            quick=quick,
+        ),
+        per_item("sphere: an estimate", answering, items=10, goal_us=3000, quick=quick),
     ]
 
 
-BENCHES = (Bench("centers-spatial", "center of rotation in space, streaming", sphere_rows),)
+EXPERIMENTS = (
+    speed_experiment(
+        "spatial-center-time",
+        "Spatial centre of rotation, frame by frame",
+        sphere_rows,
+    ),
+)

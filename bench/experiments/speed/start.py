@@ -9,10 +9,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from bench.framework.measurement import Bench, Row
+from bench.framework.measurement import speed_experiment, timed_result
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.phases import fit_plate_alignment, run_job
+
+if TYPE_CHECKING:
+    from bench.framework.experiment import Result
 
 DAEMON = (
     "import jointfit_daemon.__main__, jointfit_daemon.config, jointfit_daemon.supervisor.daemon"
@@ -31,15 +35,19 @@ def _imported(code: str, count: int) -> float:
     return statistics.median(took[code]) - statistics.median(took["pass"])
 
 
-def import_rows(quick: bool) -> list[Row]:
+def import_rows(quick: bool) -> list[Result]:
     count = 3 if quick else 9
     return [
-        Row("start: imports of --check", round(_imported(CHECKING, count), 3), "s", 0.3, 1.5),
-        Row("start: imports of jointfitd", round(_imported(DAEMON, count), 3), "s", 0.6, 3.0),
+        timed_result(
+            "start: imports of --check", round(_imported(CHECKING, count), 3), "s", 0.3, 1.5
+        ),
+        timed_result(
+            "start: imports of jointfitd", round(_imported(DAEMON, count), 3), "s", 0.6, 3.0
+        ),
     ]
 
 
-def fit_rows(quick: bool) -> list[Row]:
+def fit_rows(quick: bool) -> list[Result]:
     """The jobs of the worker, on trials as long as the demo's."""
     del quick  # one fit is quick enough
     trials, rig = phases(), bench_rig()
@@ -53,10 +61,12 @@ def fit_rows(quick: bool) -> list[Row]:
     assert "calibration" in found, found
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     note = f"{wall:.2f} s of wall time, OPENBLAS_NUM_THREADS {threads}"
-    return [Row("fit: 60 s at 100 Hz and 120 Hz", round(cpu, 2), "s", 3.0, 12.0, note=note)]
+    return [
+        timed_result("fit: 60 s at 100 Hz and 120 Hz", round(cpu, 2), "s", 3.0, 12.0, note=note)
+    ]
 
 
-def exposure_rows(quick: bool) -> list[Row]:
+def exposure_rows(quick: bool) -> list[Result]:
     """How open the shipped unit is, as systemd counts: 0 is locked, 10 is open."""
     del quick
     tool = shutil.which("systemd-analyze")
@@ -70,12 +80,24 @@ def exposure_rows(quick: bool) -> list[Row]:
         words = [tool, "security", "--offline=yes", "--no-pager", str(unit)]
         said = subprocess.run(words, check=True, capture_output=True, text=True).stdout  # noqa: S603 - systemd's
         figure = float(said.partition("level for")[2].partition(":")[2].split()[0])
-        rows.append(Row(f"exposure of {unit.name}", figure, "of 10", 1.4, 1.4))
+        rows.append(timed_result(f"exposure of {unit.name}", figure, "of 10", 1.4, 1.4))
     return rows
 
 
-BENCHES = (
-    Bench("unit", "what the shipped units allow", exposure_rows),
-    Bench("import", "starting the program", import_rows),
-    Bench("fit", "a calibration fit", fit_rows),
+EXPERIMENTS = (
+    speed_experiment(
+        "unit-exposure",
+        "Exposure of the shipped systemd units",
+        exposure_rows,
+    ),
+    speed_experiment(
+        "start-imports",
+        "Start of the programs: imports",
+        import_rows,
+    ),
+    speed_experiment(
+        "calibration-fit-time",
+        "A calibration fit",
+        fit_rows,
+    ),
 )

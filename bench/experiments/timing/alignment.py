@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import BOARD, SIMULATED_CLOCKS
 from bench.rigs.core_trace import traced, true_errors
 from bench.subjects.simulated_clocks import REBOOTED, simulated
 from jointfit_daemon.kinematics.rotation_scalar import (
@@ -100,7 +101,7 @@ def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int)
     return _rms(found)
 
 
-def interpolation(_data: Path) -> list[Figure]:
+def interpolation(_data: Path) -> list[Result]:
     """60, 100 and 120 Hz to frames at 100 Hz, in the middle between samples where it is fixed."""
     figures = []
     for rate_hz, goal in ((60.0, 0.025), (100.0, 0.008), (120.0, 0.004)):
@@ -108,8 +109,8 @@ def interpolation(_data: Path) -> list[Figure]:
         frames = aligned(period_ns, shaken, phase_ns=phase_ns)
         slerp = slerped_deg(period_ns, frames, phase_ns)
         figures += [
-            Figure(f"{rate_hz:g} Hz, RMS", _rms(errors_deg(frames, shaken)), goal),
-            Figure(f"{rate_hz:g} Hz, a slerp would have", slerp, float("inf")),
+            Result(f"{rate_hz:g} Hz: RMS error", _rms(errors_deg(frames, shaken)), goal),
+            Result(f"{rate_hz:g} Hz: slerp", slerp, float("inf")),
         ]
     dice = np.random.default_rng(3)
 
@@ -119,7 +120,7 @@ def interpolation(_data: Path) -> list[Figure]:
 
     frames = aligned(NS / 100.0, shaken, phase_ns=5 * MS, noise=scattered)
     name = "100 Hz, samples scatter by 0.1 deg"
-    return [*figures, Figure(name, _rms(errors_deg(frames, shaken)), 0.1)]
+    return [*figures, Result(name, _rms(errors_deg(frames, shaken)), 0.1)]
 
 
 # --- a real board -----------------------------------------------------------------------------
@@ -151,14 +152,14 @@ def _left_out_rms(truth: Sequence[Quaternion], rate_hz: float, step: int) -> flo
     return _rms(errors_deg(between, motion))
 
 
-def board(data: Path) -> list[Figure]:
+def board(data: Path) -> list[Result]:
     """Every third or fifth sample of a real board, judged by those left out."""
     figures = []
     for trial, name, goals in ((FAST, "fast", (0.03, 0.12)), (SLOW, "slow", (0.008, 0.025))):
         truth, rate_hz = _board(data, trial)
         for step, goal in zip((3, 5), goals, strict=True):
             error = _left_out_rms(truth, rate_hz, step)
-            figures.append(Figure(f"{name}, {rate_hz / step:.0f} Hz, RMS", error, goal))
+            figures.append(Result(f"{name}, {rate_hz / step:.0f} Hz: RMS error", error, goal))
     return figures
 
 
@@ -192,7 +193,7 @@ def _ahead_rms(
     return _rms(found)
 
 
-def ahead(data: Path) -> list[Figure]:
+def ahead(data: Path) -> list[Result]:
     """Straight on, bent as it is in the daemon, and bent in full."""
     figures = []
     for trial, name, scatter_deg, goal in (
@@ -206,9 +207,9 @@ def ahead(data: Path) -> list[Figure]:
             for bend in (0.0, CURVATURE_SHARE, 1.0)
         )
         figures += [
-            Figure(f"{name}: RMS", bent, goal),
-            Figure(f"{name}: straight on", straight, float("inf")),
-            Figure(f"{name}: bent in full", full, float("inf")),
+            Result(f"{name}: damped", bent, goal),
+            Result(f"{name}: constant rate", straight, float("inf")),
+            Result(f"{name}: constant acceleration", full, float("inf")),
         ]
     return figures
 
@@ -238,7 +239,7 @@ def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
     return frames
 
 
-def latency(_data: Path) -> list[Figure]:
+def latency(_data: Path) -> list[Result]:
     """Instant of the frame to the moment it is complete, and what its orientations err."""
     figures = []
     goals: dict[Literal["smooth", "fast"], tuple[float, float, float]] = {
@@ -249,9 +250,9 @@ def latency(_data: Path) -> list[Figure]:
         frames = four(mode)
         waited = [(frame.completed_ns - frame.t_ns) / MS for frame in frames[10:]]
         figures += [
-            Figure(f"{mode}: latency, median", float(np.median(waited)), median_ms, unit="ms"),
-            Figure(f"{mode}: latency, 99 %", float(np.quantile(waited, 0.99)), most_ms, unit="ms"),
-            Figure(f"{mode}: error, RMS", _rms(errors_deg(frames, shaken)), error_deg),
+            Result(f"{mode}: latency, median", float(np.median(waited)), median_ms, unit="ms"),
+            Result(f"{mode}: latency, 99 %", float(np.quantile(waited, 0.99)), most_ms, unit="ms"),
+            Result(f"{mode}: error, RMS", _rms(errors_deg(frames, shaken)), error_deg),
         ]
     return figures
 
@@ -259,7 +260,7 @@ def latency(_data: Path) -> list[Figure]:
 # --- whether a frame may call itself synced ---------------------------------------------------
 
 
-def honesty(_data: Path) -> list[Figure]:
+def honesty(_data: Path) -> list[Result]:
     """Five clocks within 50 ppm; one sensor reboots, another is silent for half a second."""
     run = simulated(30.0)
     trace = traced(run.events)
@@ -279,17 +280,50 @@ def honesty(_data: Path) -> list[Figure]:
     ]
     first_s = next((f.t_ns - trace.begin_ns) / NS for f in trace.frames if f.synced)
     return [
-        Figure("largest error of a synced sample", worst_ms, 0.2, unit="ms"),
-        Figure("first synced frame after the start", first_s, 3.5, unit="s"),
-        Figure("synced again after the reboot", settled_s - back_s, 5.0, unit="s"),
-        Figure("synced frames with the rebooted sensor before", float(len(unfit)), 0.0, unit=""),
+        Result("largest error of a sample flagged synchronized", worst_ms, 0.2, unit="ms"),
+        Result("first synchronized frame after the start", first_s, 3.5, unit="s"),
+        Result("synchronized again after the reboot", settled_s - back_s, 5.0, unit="s"),
+        Result(
+            "synchronized frames with the rebooted sensor before that",
+            float(len(unfit)),
+            0.0,
+            unit="",
+        ),
     ]
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment("AL-1", "interpolation, shaken at 550 deg/s RMS", interpolation),
-    Experiment("AL-2", "interpolation, real board", board, ("broad_excerpts",)),
-    Experiment("AL-2e", "one period ahead at 95 Hz, real board", ahead, ("broad_excerpts",)),
-    Experiment("AL-3", "added latency, four IMUs at 100 Hz, shaken", latency),
-    Experiment("AL-4", "what calls itself synced, bytes to frames", honesty),
+    Experiment(
+        "interpolation-shaken",
+        "Interpolation of a body shaken at 550 °/s RMS",
+        interpolation,
+        SIMULATED_CLOCKS,
+    ),
+    Experiment(
+        "interpolation-recorded-board",
+        "Interpolation of a recorded board",
+        board,
+        BOARD,
+        ("broad_excerpts",),
+    ),
+    Experiment(
+        "extrapolation-recorded-board",
+        "Extrapolation by up to one sample period at 95 Hz, recorded board",
+        ahead,
+        BOARD,
+        ("broad_excerpts",),
+    ),
+    Experiment(
+        "alignment-latency",
+        "Latency added by alignment, four IMUs at 100 Hz, shaken",
+        latency,
+        SIMULATED_CLOCKS,
+    ),
+    Experiment(
+        "synchronization-flags",
+        "Samples that are flagged as synchronized, bytes to frames",
+        honesty,
+        SIMULATED_CLOCKS,
+        headline=True,
+    ),
 )

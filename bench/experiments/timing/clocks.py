@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_CLOCKS
 from jointfit_daemon.model import ClockEcho, TickClock
 from jointfit_daemon.timing.clock import DeviceClock
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Delays = Callable[[np.random.Generator, int], NDArray[np.float64]]
-    Figures = Callable[[], list[Figure]]
+    Figures = Callable[[], list[Result]]
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD = 10 * MS
@@ -91,22 +92,22 @@ def spread(values: NDArray[np.float64]) -> tuple[float, float]:
     return float(np.sqrt(np.mean(values**2))), float(np.quantile(np.abs(values), 0.99))
 
 
-def echoes(_: Path, runs: int = 200) -> list[Figure]:
+def echoes(_: Path, runs: int = 200) -> list[Result]:
     """T1: round trips of 0.86 ms and 0.1 ms exponential each way, 1 % spikes of 20 ms."""
     first, last, skew = np.array([echo_run(seed) for seed in range(runs)]).T
     (sd10, p10), (sd60, p60) = spread(first), spread(last)
     return [
-        Figure("after 10 echoes, rms", sd10, 22.0, unit="us"),
-        Figure("after 10 echoes, 99 %", p10, 73.0, unit="us"),
-        Figure("after 60 s, rms", sd60, 7.5, unit="us"),
-        Figure("after 60 s, 99 %", p60, 19.0, unit="us"),
-        Figure("skew after 60 s, rms", spread(skew)[0], 0.22, unit="ppm"),
+        Result("after 10 echoes, RMS", sd10, 22.0, unit="µs"),
+        Result("after 10 echoes, 99 %", p10, 73.0, unit="µs"),
+        Result("after 60 s, RMS", sd60, 7.5, unit="µs"),
+        Result("after 60 s, 99 %", p60, 19.0, unit="µs"),
+        Result("skew after 60 s, RMS", spread(skew)[0], 0.22, unit="ppm"),
     ]
 
 
 def passive(
     delays: Delays, seconds: float, goals: tuple[float, float], runs: int
-) -> tuple[list[Figure], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[list[Result], NDArray[np.float64], NDArray[np.float64]]:
     """Return rms and 99 % of the error at the end, the skews' errors, and errors in sigmas."""
     ends, skews, scaled = [], [], []
     for seed in range(runs):
@@ -117,15 +118,15 @@ def passive(
     rms, most = spread(np.array(ends))
     label = f"{delays.__name__.replace('_', ' ')}, {seconds:g} s"
     figures = [
-        Figure(f"{label}, rms", rms, goals[0], unit="ms"),
-        Figure(f"{label}, 99 %", most, goals[1], unit="ms"),
+        Result(f"{label}, RMS", rms, goals[0], unit="ms"),
+        Result(f"{label}, 99 %", most, goals[1], unit="ms"),
     ]
     return figures, np.array(skews), np.array(scaled)
 
 
-def jitter(_: Path, runs: int = 60) -> list[Figure]:
+def jitter(_: Path, runs: int = 60) -> list[Result]:
     """T2: passive clocks under ordinary jitter."""
-    figures: list[Figure] = []
+    figures: list[Result] = []
     skews = np.zeros(0)
     for delays, seconds, goals in (
         (exponential, 10.0, (0.0015, 0.004)),
@@ -135,18 +136,18 @@ def jitter(_: Path, runs: int = 60) -> list[Figure]:
     ):
         found, skews, _scaled = passive(delays, seconds, goals, runs if seconds < 60 else runs // 3)
         figures += found
-    return [*figures, Figure("skew after 60 s, worst", float(np.abs(skews).max()), 2.0, unit="ppm")]
+    return [*figures, Result("skew after 60 s, worst", float(np.abs(skews).max()), 2.0, unit="ppm")]
 
 
-def timer(_: Path, runs: int = 90) -> list[Figure]:
+def timer(_: Path, runs: int = 90) -> list[Result]:
     """T3: passive clocks under a badly set latency timer."""
     ten, _skews, scaled = passive(latency_timer, 10.0, (0.11, 0.25), runs)
     sixty, _skews, _scaled = passive(latency_timer, 60.0, (0.015, 0.05), runs // 3)
-    honest = Figure("error in sigmas, rms", spread(scaled)[0], 1.5, 0.3, unit="")
+    honest = Result("error over standard deviation, RMS", spread(scaled)[0], 1.5, 0.3, unit="")
     return [*ten, *sixty, honest]
 
 
-def wraps_and_restarts(_: Path) -> list[Figure]:
+def wraps_and_restarts(_: Path) -> list[Result]:
     """T5: a wrap of every clock met, then a reboot."""
     worst, settle, early = 0.0, 0.0, 0
     for tick_ns, modulus in ((1000, 1 << 32), (100_000, 1 << 32), (100_000, 864_000_000)):
@@ -154,9 +155,9 @@ def wraps_and_restarts(_: Path) -> list[Figure]:
             off, took, before = _wrapped(seed, TickClock(tick_ns, modulus))
             worst, settle, early = max(worst, off), max(settle, took), early + before
     return [
-        Figure("across a wrap, worst", worst, 1.0, unit="ms"),
-        Figure("settled after a restart", settle, 5.0, unit="s"),
-        Figure("synced and off by 1 ms after it", early, 0, unit=""),
+        Result("across a wrap, worst", worst, 1.0, unit="ms"),
+        Result("settling time after a restart", settle, 5.0, unit="s"),
+        Result("samples flagged synchronized with an error above 1 ms", early, 0, unit=""),
     ]
 
 
@@ -183,7 +184,7 @@ def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
     return worst, 99.0 if settled_at is None else settled_at, wrong
 
 
-def cost(_: Path) -> list[Figure]:
+def cost(_: Path) -> list[Result]:
     """T10: time of one sample, refits included, best of five minutes of samples."""
     rng = np.random.default_rng(0)
     n = 6000
@@ -202,13 +203,41 @@ def cost(_: Path) -> list[Figure]:
         for ticks, arrival in rows:
             device.feed_sample(ticks, None, arrival, MICROSECONDS)
         best = min(best, time.process_time() - began)
-    return [Figure("clock update, amortized", 1e6 * best / n, 5.0, unit="us")]
+    return [Result("clock update, amortized", 1e6 * best / n, 5.0, unit="µs")]
 
 
 EXPERIMENTS = (
-    Experiment("T1", "server clock by echoes", echoes),
-    Experiment("T2", "device clock by arrivals, ordinary jitter", jitter, long=True),
-    Experiment("T3", "device clock by arrivals, 16 ms latency timer", timer, long=True),
-    Experiment("T5", "wraps and restarts", wraps_and_restarts),
-    Experiment("T10-clock", "cost of a clock update", cost, timed=True),
+    Experiment(
+        "server-clock-echoes",
+        "Clock of the camera server from echo requests",
+        echoes,
+        SIMULATED_CLOCKS,
+    ),
+    Experiment(
+        "device-clock-jitter",
+        "Device clock from arrival times, ordinary jitter",
+        jitter,
+        SIMULATED_CLOCKS,
+        long=True,
+    ),
+    Experiment(
+        "device-clock-latency-timer",
+        "Device clock from arrival times, USB latency timer of 16 ms",
+        timer,
+        SIMULATED_CLOCKS,
+        long=True,
+    ),
+    Experiment(
+        "clock-wraps-and-restarts",
+        "Counter wrap and restart of a device",
+        wraps_and_restarts,
+        SIMULATED_CLOCKS,
+    ),
+    Experiment(
+        "clock-update-time",
+        "CPU time of a clock update",
+        cost,
+        SIMULATED_CLOCKS,
+        timed=True,
+    ),
 )

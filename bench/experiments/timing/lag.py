@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import BOARD, SEEDED
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.timing.lag import (
     LagEstimate,
@@ -132,14 +133,14 @@ def windows(
 
 def excerpts(
     name: str, sd_goals_ms: Mapping[float, float], constant: tuple[float, float], data: Path
-) -> list[Figure]:
+) -> list[Result]:
     recording = excerpt(data, name)
     imu = rates_from_gyro(recording.t_ns, recording.gyro, 0)
     estimate = estimate_lag_of_rates(
         imu, rates_from_orientations(recording.t_ns, recording.optical, 0)
     )
     middle, off = constant
-    figures = [Figure("whole minute", estimate.lag_ns / MS, middle + off, middle - off, "ms")]
+    figures = [Result("whole minute", estimate.lag_ns / MS, middle + off, middle - off, "ms")]
     free = float("inf")
     for length_s in (2.0, 5.0, 10.0, 30.0):
         tries = [windows(recording, length_s, seed=seed) for seed in (6, 7, 8, 9)]
@@ -149,14 +150,16 @@ def excerpts(
         goal = sd_goals_ms[length_s]
         label = f"{length_s:g} s windows"
         figures += [
-            Figure(f"{label}, sd", float(lags.std()), goal, unit="ms"),
-            Figure(f"{label}, worst", float(np.abs(lags - HALF_FRAME_MS).max()), free, unit="ms"),
-            Figure(f"{label}, median sigma", float(np.median(sigmas)), free, unit="ms"),
+            Result(f"{label}, standard deviation", float(lags.std()), goal, unit="ms"),
+            Result(f"{label}, worst", float(np.abs(lags - HALF_FRAME_MS).max()), free, unit="ms"),
+            Result(
+                f"{label}, median standard deviation", float(np.median(sigmas)), free, unit="ms"
+            ),
         ]
     return figures
 
 
-def honest(data: Path) -> list[Figure]:
+def honest(data: Path) -> list[Result]:
     """No accepted window is off by more than four of its own sigmas, whatever is done to it."""
     treatments = {
         "as recorded": AS_IT_IS,
@@ -174,12 +177,14 @@ def honest(data: Path) -> list[Figure]:
                     for one in windows(recording, length_s, treatment=treatment)
                     if one.used
                 ]
-                what = f"{name[15:19]}, {label}, {length_s:g} s: worst of {len(off)} windows"
-                figures.append(Figure(what, max(off, default=0.0), 4.0, unit="sigma"))
+                what = f"{name[15:19]}, {label}: {length_s:g} s"
+                note = f"{len(off)} windows"
+                worst = max(off, default=0.0)
+                figures.append(Result(what, worst, 4.0, unit="sd", note=note))
     return figures
 
 
-def quaternion_input(data: Path) -> list[Figure]:
+def quaternion_input(data: Path) -> list[Result]:
     """Orientations propagated from the gyro lead it by half a sample, also when rounded."""
     recording = excerpt(data, FAST)
     steps = rotation.exp(recording.gyro * 0.0035)
@@ -194,8 +199,8 @@ def quaternion_input(data: Path) -> list[Figure]:
         coarse = path if grid is None else rotation.normalize(np.rint(path * grid) / grid)
         found = np.array([o.lag_ms for o in windows(recording, 10.0, quaternions=coarse) if o.used])
         lead = float(gyro.mean() - found.mean())
-        figures.append(Figure(f"lead, {label}", lead, 1.85, 1.65, "ms"))
-        figures.append(Figure(f"sd, {label}", float(found.std()), 0.02, unit="ms"))
+        figures.append(Result(f"lead of the orientation, {label}", lead, 1.85, 1.65, "ms"))
+        figures.append(Result(f"standard deviation, {label}", float(found.std()), 0.02, unit="ms"))
     return figures
 
 
@@ -238,7 +243,7 @@ def estimate_between(tracks: Tracks, low_s: float, high_s: float) -> LagEstimate
     )
 
 
-def sigma(_: Path) -> list[Figure]:
+def sigma(_: Path) -> list[Result]:
     """T7: deviations over sigma in 32 independent windows, at five levels of optical noise."""
     figures = []
     for noise in (0.05, 0.1, 0.2, 0.3, 0.5):
@@ -247,9 +252,10 @@ def sigma(_: Path) -> list[Figure]:
             found = estimate_between(made_up(seed, 10.0, 5.0, noise=noise), 0.4, 9.6)
             if found.refused is None:
                 ratios.append((found.lag_ns / MS - 5.0) / (found.sigma_ns / MS))
-        label = f"spread of {len(ratios)} windows, {noise:g} deg of noise"
-        figures.append(Figure(label, float(np.std(ratios)), 1.5, 0.5, "sigma"))
-        figures.append(Figure("worst of them", float(np.abs(ratios).max()), 4.0, unit="sigma"))
+        label = f"noise of {noise:g}°, {len(ratios)} windows"
+        spread = float(np.std(ratios))
+        figures.append(Result(f"{label}: standard deviation", spread, 1.5, 0.5, "sd"))
+        figures.append(Result(f"{label}: worst", float(np.abs(ratios).max()), 4.0, unit="sd"))
     return figures
 
 
@@ -265,19 +271,25 @@ def track(drift: float, seed: int) -> tuple[float, float]:
     return 1e6 * tracked.drift, 1e6 * tracked.drift_sigma
 
 
-def drift(_: Path) -> list[Figure]:
+def drift(_: Path) -> list[Result]:
     """T8: no drift is told as none, and 1 ppm is found, over two minutes."""
     figures = []
     for truth, seed in ((0.0, 1), (0.0, 2), (1.0, 3), (-1.0, 4)):
         found, sd = track(truth * 1e-6, seed)
         off = abs(found - truth) / sd
         figures.append(
-            Figure(f"{truth:g} ppm: found {found:.2f} ± {sd:.2f}", off, 2.0, unit="sigma")
+            Result(
+                f"{truth:g} ppm, run {seed}: error",
+                off,
+                2.0,
+                unit="sd",
+                note=f"estimate {found:.2f} ± {sd:.2f} ppm",
+            )
         )
     return figures
 
 
-def cost(data: Path) -> list[Figure]:
+def cost(data: Path) -> list[Result]:
     """T10: a 10 s window at 120 Hz against a gyro at 286 Hz, median of nine; a tracker's update.
 
     CPU time of this thread: what others do does not count.
@@ -300,39 +312,90 @@ def cost(data: Path) -> list[Figure]:
         tracker.feed(k * 2_500_000_000, estimate)
     update = 1e6 * (time.thread_time() - began) / 1000
     return [
-        Figure("lag fit of a 10 s window", 1e3 * float(np.median(took)), 50.0, unit="ms"),
-        Figure("tracker update", update, 100.0, unit="us"),
+        Result("lag fit of a 10 s window", 1e3 * float(np.median(took)), 50.0, unit="ms"),
+        Result("tracker update", update, 100.0, unit="µs"),
     ]
 
 
-def ordinary(data: Path) -> list[Figure]:
+def ordinary(data: Path) -> list[Result]:
     """T6: what ten seconds are worth in vigorous and in ordinary motion, and at rest."""
     figures = []
     for name, label, goal in ((FAST, "vigorous", 0.02), (SLOW, "ordinary", 0.14)):
         recording = excerpt(data, name)
         tries = [windows(recording, 10.0, seed=seed) for seed in (6, 7, 8, 9)]
         lags = [one.lag_ms for found in tries for one in found if one.used]
-        figures.append(Figure(f"{label}, sd of 10 s windows", float(np.std(lags)), goal, unit="ms"))
+        figures.append(
+            Result(
+                f"{label}, standard deviation of 10 s windows", float(np.std(lags)), goal, unit="ms"
+            )
+        )
     recording = whole(data, SLOW)
     rest = recording.t_ns < 30e9
     still = Recording(recording.t_ns[rest], recording.gyro[rest], recording.optical[rest])
     used = sum(one.used for one in windows(still, 5.0))
-    figures.append(Figure("windows accepted at rest", float(used), 0.0, unit=""))
+    figures.append(Result("windows accepted at rest", float(used), 0.0, unit=""))
     return figures
 
 
 EXCERPTS, WHOLE, NEED = ("broad_excerpts",), ("broad",), ("h5py",)
 EXPERIMENTS = (
-    Experiment("T6", "lag from ten seconds of motion", ordinary, EXCERPTS + WHOLE, NEED),
-    Experiment("T7", "lag: is sigma honest", sigma),
-    Experiment("T8", "drift of the lag over two minutes", drift),
-    Experiment("T10-lag", "cost of the lag", cost, EXCERPTS, timed=True),
     Experiment(
-        "LAG-fast", "lag, fast excerpt", partial(excerpts, FAST, FAST_SD_MS, (4.17, 0.05)), EXCERPTS
+        "lag-ten-second-windows",
+        "Lag from ten seconds of motion",
+        ordinary,
+        BOARD,
+        EXCERPTS + WHOLE,
+        NEED,
+        headline=True,
     ),
     Experiment(
-        "LAG-slow", "lag, slow excerpt", partial(excerpts, SLOW, SLOW_SD_MS, (4.05, 0.2)), EXCERPTS
+        "lag-uncertainty-simulated",
+        "Standard deviation of the lag against its scatter, simulated",
+        sigma,
+        SEEDED,
     ),
-    Experiment("LAG-honest", "lag: windows of whole recordings", honest, WHOLE, NEED, long=True),
-    Experiment("LAG-quat", "lag of orientations against the gyro's", quaternion_input, EXCERPTS),
+    Experiment(
+        "lag-drift",
+        "Drift of the lag over two minutes",
+        drift,
+        SEEDED,
+    ),
+    Experiment(
+        "lag-fit-time",
+        "CPU time of the lag estimate",
+        cost,
+        BOARD,
+        EXCERPTS,
+        timed=True,
+    ),
+    Experiment(
+        "lag-fast-excerpt",
+        "Lag, one minute of the fast trial",
+        partial(excerpts, FAST, FAST_SD_MS, (4.17, 0.05)),
+        BOARD,
+        EXCERPTS,
+    ),
+    Experiment(
+        "lag-slow-excerpt",
+        "Lag, one minute of the slow trial",
+        partial(excerpts, SLOW, SLOW_SD_MS, (4.05, 0.2)),
+        BOARD,
+        EXCERPTS,
+    ),
+    Experiment(
+        "lag-uncertainty-recorded",
+        "Largest lag error over its standard deviation, windows of whole trials",
+        honest,
+        BOARD,
+        WHOLE,
+        NEED,
+        long=True,
+    ),
+    Experiment(
+        "lag-orientation-input",
+        "Lag of orientations against the gyroscope",
+        quaternion_input,
+        BOARD,
+        EXCERPTS,
+    ),
 )

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.phases import fit_plate_alignment
 
@@ -22,7 +23,7 @@ MS = 1e6
 FREE = float("inf")
 
 
-def on_the_plate(_: Path) -> list[Figure]:
+def on_the_plate(_: Path) -> list[Result]:
     """LAG-plate: how far the lags of all sensors are off, ms, and in their own sigmas."""
     settings = bench_rig().calibration
     lags, sigmas, refused = [], [], 0
@@ -36,15 +37,23 @@ def on_the_plate(_: Path) -> list[Figure]:
         phases.cache_clear()
     off, sigma = np.abs(lags), np.array(sigmas)
     return [
-        Figure("sensors", float(len(off)), FREE, unit=""),
-        Figure("without a lag", float(refused), 0.0, unit=""),
-        Figure("off by, RMS", float(np.sqrt(np.mean(off**2))), 0.5, unit="ms"),
-        Figure("off by, worst", float(off.max()), 1.0, unit="ms"),
-        Figure("median sigma", float(np.median(sigma)), FREE, unit="ms"),
-        Figure("worst, in its own sigma", float((off / sigma).max()), 4.0, unit="sigma"),
+        Result("sensors", float(len(off)), FREE, unit=""),
+        Result("sensors without a lag estimate", float(refused), 0.0, unit=""),
+        Result("error, RMS", float(np.sqrt(np.mean(off**2))), 0.5, unit="ms"),
+        Result("error, worst", float(off.max()), 1.0, unit="ms"),
+        Result("median standard deviation", float(np.median(sigma)), FREE, unit="ms"),
+        Result(
+            "worst error over its standard deviation", float((off / sigma).max()), 4.0, unit="sd"
+        ),
     ]
 
 
 EXPERIMENTS = (
-    Experiment("LAG-plate", "lag on the plate, eight simulated plates", on_the_plate, long=True),
+    Experiment(
+        "lag-plate",
+        "Lag found in the align phase, eight simulated plates",
+        on_the_plate,
+        SIMULATED_SUBJECTS,
+        long=True,
+    ),
 )

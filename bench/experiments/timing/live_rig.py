@@ -7,7 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.framework.experiment import Experiment, Figure
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import LIVE_RIG
 from bench.rigs.loopback import delays_ns
 
 if TYPE_CHECKING:
@@ -18,14 +19,14 @@ _DATAGRAMS = 3000
 _REBOOTS = ("S1", "mocap", "S2", "S3", "mocap", "S4")
 
 
-def _arrivals(_: Path) -> list[Figure]:
+def _arrivals(_: Path) -> list[Result]:
     stamped, read = (sorted(delays) for delays in delays_ns(_DATAGRAMS))
     at_99 = int(0.99 * _DATAGRAMS)
     free = float("inf")
     return [
-        Figure("kernel stamp, median", stamped[_DATAGRAMS // 2] / _NS_PER_MS, free, unit="ms"),
-        Figure("kernel stamp, 99 %", stamped[at_99] / _NS_PER_MS, 0.1, unit="ms"),
-        Figure("stamp in Python instead, 99 %", read[at_99] / _NS_PER_MS, free, -free, unit="ms"),
+        Result("kernel timestamp, median", stamped[_DATAGRAMS // 2] / _NS_PER_MS, free, unit="ms"),
+        Result("kernel timestamp, 99 %", stamped[at_99] / _NS_PER_MS, 0.1, unit="ms"),
+        Result("timestamp in Python, 99 %", read[at_99] / _NS_PER_MS, free, -free, unit="ms"),
     ]
 
 
@@ -42,25 +43,48 @@ async def _live() -> Outcome:
             broker.stop()
 
 
-def _restarts(_: Path) -> list[Figure]:
+def _restarts(_: Path) -> list[Result]:
     found = asyncio.run(_live())
     frames = found.frame_errors_ns
     late = sum(error > 0.5 * _NS_PER_MS for error in frames)
     figures = [
-        Figure("worst synced frame", max(frames) / _NS_PER_MS, 0.5, unit="ms"),
-        Figure("frames that say synced and are not", float(late), 0.0, unit=""),
-        Figure("frames judged", float(len(frames)), float("inf"), least=1000, unit=""),
-        Figure("samples the truth does not know", found.unknown, 0.01, unit=""),
-        Figure("replayed byte for byte", float(found.replayed), 1.0, least=1.0, unit=""),
+        Result(
+            "largest error of a frame flagged synchronized",
+            max(frames) / _NS_PER_MS,
+            0.5,
+            unit="ms",
+        ),
+        Result("frames flagged synchronized with a larger error", float(late), 0.0, unit=""),
+        Result("frames evaluated", float(len(frames)), float("inf"), minimum=1000, unit=""),
+        Result(
+            "share of samples missing in the log of the simulator", found.unknown, 0.01, unit=""
+        ),
+        Result("replay byte-identical", float(found.replayed), 1.0, minimum=1.0, unit=""),
     ]
     for source in ("S1", "S2", "S3", "S4", "mocap"):
         worst = max(map(abs, found.errors_ns(source))) / _NS_PER_MS
-        figures.append(Figure(f"{source}: worst synced stamp", worst, 0.5, unit="ms"))
+        figures.append(
+            Result(
+                f"{source}: largest error of a sample flagged synchronized", worst, 0.5, unit="ms"
+            )
+        )
     return figures
 
 
 EXPERIMENTS = (
-    Experiment("T4", "arrival stamps, loop blocked 4 ms at a time", _arrivals, timed=True),
-    Experiment("T9", "live rig, ±50 ppm, six reboots", _restarts,
-               packages=("orjson",), long=True),
-)  # fmt: skip
+    Experiment(
+        "arrival-timestamps",
+        "Arrival timestamps with the event loop blocked for 4 ms at a time",
+        _arrivals,
+        LIVE_RIG,
+        timed=True,
+    ),
+    Experiment(
+        "live-rig-restarts",
+        "Live rig, clocks within 50 ppm, six device restarts",
+        _restarts,
+        LIVE_RIG,
+        packages=("orjson",),
+        long=True,
+    ),
+)

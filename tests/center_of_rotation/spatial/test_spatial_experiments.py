@@ -14,7 +14,7 @@ pytestmark = pytest.mark.experiment
 def test_spatial_experiment_meets_its_targets(experiment: Experiment) -> None:
     figures = experiment.run(DATA)
     assert figures
-    assert [figure for figure in figures if not figure.kept] == []
+    assert [figure for figure in figures if not figure.met] == []
 
 
 @pytest.mark.parametrize(("rom", "goals"), [(20.0, AT_20), (45.0, AT_45)])
@@ -22,4 +22,4 @@ def test_a_ball_joint_between_two_noisy_bodies_is_found_as_well_in_fewer_runs(
     rom: float, goals: tuple[float, ...]
 ) -> None:
     figures = ball_joint(rom, goals, runs=40)
-    assert [figure for figure in figures if not figure.kept] == []
+    assert [figure for figure in figures if not figure.met] == []

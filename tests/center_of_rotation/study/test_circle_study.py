@@ -26,7 +26,7 @@ def study() -> dict[str, PairMaps]:
 def test_the_tables_correlations_come_out(
     study: dict[str, PairMaps], name: str, clip: float | None, predicted: float, grid: float
 ) -> None:
-    """C-13, with fewer runs than the bench: the tolerances are the bench's."""
+    """published-error-maps with fewer runs than the bench and the same tolerances."""
     maps = study[name].maps
     analytic = maps["three frames"]
     assert correlation(maps["predicted"], analytic, clip) == pytest.approx(predicted, abs=0.03)

@@ -1,4 +1,4 @@
-"""The rows of bench/timing.py that clocks must keep, with fewer runs."""
+"""Thresholds of the clock experiments of bench, with fewer runs."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import pytest
 from bench.experiments.timing import clocks
 
 if TYPE_CHECKING:
-    from bench.framework.experiment import Figure
+    from bench.framework.experiment import Result
 
 NOWHERE = Path()
 SLACK = 1.5
 """Of a few runs the 99th percentile is the worst, and the root mean square scatters."""
 
 
-def kept(figure: Figure) -> bool:
+def kept(figure: Result) -> bool:
     """Tell whether a figure of fewer runs is what the goal of more runs makes likely."""
-    return figure.value <= SLACK * figure.goal
+    return figure.value <= SLACK * figure.maximum
 
 
 @pytest.mark.parametrize(
@@ -38,4 +38,4 @@ def test_clocks_keep_their_targets(figures: clocks.Figures) -> None:
 
 def test_an_update_costs_microseconds() -> None:
     (figure,) = clocks.cost(NOWHERE)
-    assert figure.value <= 5 * figure.goal  # a busy machine of any kind; the bench says how many
+    assert figure.value <= 5 * figure.maximum  # a busy machine of any kind; the bench says how many

@@ -1,0 +1,59 @@
+"""Subjects and references that experiments share, in the words of the generated pages."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Material(NamedTuple):
+    """What an experiment measures, and against what."""
+
+    subjects: str
+    reference: str
+
+
+SEEDED = Material("none; seeded random numbers", "exact by construction")
+SIMULATED_SUBJECTS = Material(
+    "simulated subjects, one a seed: sensor-to-segment alignment, heading, soft-tissue artefact, "
+    "markers and sensor errors differ",
+    "bones of the simulator, which no estimator receives",
+)
+KNEE = Material(
+    "1 adult (OpenCap subject 4), right leg; 4 virtual IMUs made of skin markers, with the "
+    "orientation errors of recorded filters",
+    "musculoskeletal model fitted to other markers",
+)
+BOTH_KNEES = Material(
+    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs made of skin markers, with the "
+    "orientation errors of recorded filters",
+    "inverse kinematics of the subject's model without any marker of thighs and shanks",
+)
+BOARD = Material(
+    "1 IMU on a rigid board (BROAD, trials 02 slow and 07 fast); no soft tissue",
+    "optical motion capture of the board",
+)
+LOWER_LIMBS = Material(
+    "1 adult (OpenCap subject 4), 7 segments, 29 markers",
+    "measured markers",
+)
+SIMULATED_MARKERS = Material(
+    "markers simulated on the movements of 1 adult (OpenCap subject 4)",
+    "simulated positions of the markers and joint angles",
+)
+OPENSIM_MODELS = Material(
+    "2 adults (OpenCap subject 4, OpenSim gait2354)",
+    "OpenSim's InverseKinematicsTool on the unchanged models, unit weights",
+)
+MODEL_CENTERS = Material(
+    "2 adults (OpenCap subject 4, OpenSim gait2354)",
+    "joint centres of scaled models, posed by OpenSim's inverse kinematics; their joints move "
+    "4 to 18 mm relative to the markers",
+)
+SIMULATED_CLOCKS = Material(
+    "simulated device clocks, transports and movements", "clocks and movements of the simulator"
+)
+LIVE_RIG = Material(
+    "simulated devices, the daemon and a broker as processes on one machine",
+    "instants at which the simulator took the samples",
+)
+THIS_MACHINE = Material("the machine of the run", "CLOCK_MONOTONIC and CPU time of the process")

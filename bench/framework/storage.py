@@ -1,0 +1,123 @@
+"""Results as JSON files in ``bench/results``, one a experiment.
+
+The files are committed; the pages of docs are generated from them. They hold no date and no path,
+and values with the digits that the pages show, so that a repeated run changes nothing but times.
+"""
+
+from __future__ import annotations
+
+import json
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.framework.experiment import Result
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from bench.framework.experiment import Experiment
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+MACHINE = "machine"
+"""Name of the file that describes the machine of the times."""
+
+
+def shown(value: float) -> float:
+    """Return the value with the digits that tables show: three decimals, or three digits."""
+    value = float(value)
+    if 0.0 < abs(value) < 0.01:
+        return float(f"{value:.3g}")
+    return round(value, 3)
+
+
+def to_json(experiment: Experiment, results: Sequence[Result]) -> dict[str, Any]:
+    """Return experiment and results as JSON values; infinite values are strings, no limit null."""
+    return {
+        "experiment": experiment.id,
+        "topic": experiment.topic,
+        "title": experiment.title,
+        "subjects": experiment.material.subjects,
+        "reference": experiment.material.reference,
+        "command": f"python -m bench {experiment.id}",
+        "recordings": list(experiment.recordings),
+        "packages": list(experiment.packages),
+        "part_of": "make bench" if in_short_run(experiment) else "make bench-full",
+        "results": [
+            {
+                "name": result.name,
+                "value": _number(shown(result.value)),
+                "unit": result.unit,
+                "minimum": _limit(result.minimum),
+                "maximum": _limit(result.maximum),
+                **({} if result.target is None else {"target": result.target}),
+                **({} if result.ratio is None else {"ratio": result.ratio}),
+                **({"note": result.note} if result.note else {}),
+                "met": bool(result.met),
+                **(
+                    {"reason": experiment.known_misses[result.name]}
+                    if not result.met and result.name in experiment.known_misses
+                    else {}
+                ),
+            }
+            for result in results
+        ],
+    }
+
+
+def in_short_run(experiment: Experiment) -> bool:
+    """Return whether `make bench` runs the experiment at full length."""
+    if experiment.quick_run is not None:
+        return False
+    return experiment.headline or not (experiment.long or experiment.timed)
+
+
+def _number(value: float) -> float | str:
+    return value if abs(value) < inf else str(value)
+
+
+def _limit(value: float) -> float | None:
+    return float(f"{value:.6g}") if abs(value) < inf else None
+
+
+def store(name: str, content: dict[str, Any], folder: Path = RESULTS) -> Path:
+    """Write one file of `folder` and return its path."""
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.json"
+    path.write_text(_one_line_each(content), encoding="utf-8")
+    return path
+
+
+def _one_line_each(content: dict[str, Any]) -> str:
+    """Return JSON with a line for each key and for each result."""
+    lines = []
+    for key, value in content.items():
+        text = json.dumps(value, ensure_ascii=False)
+        if key == "results":
+            entries = [json.dumps(entry, ensure_ascii=False) for entry in value]
+            text = "[\n  " + ",\n  ".join(entries) + "\n ]"
+        lines.append(f" {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def load(name: str, folder: Path = RESULTS) -> dict[str, Any]:
+    """Return the content of one file of `folder`."""
+    content: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    return content
+
+
+def results_of(content: dict[str, Any]) -> list[Result]:
+    """Return the results of a file; `to_json` of them gives the same file."""
+    return [
+        Result(
+            name=entry["name"],
+            value=float(entry["value"]),
+            maximum=inf if entry["maximum"] is None else entry["maximum"],
+            minimum=-inf if entry["minimum"] is None else entry["minimum"],
+            unit=entry["unit"],
+            target=entry.get("target"),
+            ratio=entry.get("ratio"),
+            note=entry.get("note", ""),
+        )
+        for entry in content["results"]
+    ]

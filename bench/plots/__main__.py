@@ -1,0 +1,50 @@
+"""Plots of a run: ``python -m bench.plots clocks|joint-centers FOLDER``.
+
+``clocks`` draws a simulated run with its truth, or with ``--replay EVENTLOG`` a recorded run, as
+the daemon writes it. ``joint-centers`` draws the recorded trials with estimated and model centers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.plots", description=__doc__)
+    parser.add_argument("subject", choices=("clocks", "joint-centers"))
+    parser.add_argument("folder", type=Path, help="folder of the PNG files")
+    parser.add_argument("--replay", type=Path, metavar="EVENTLOG", help="draw this recorded run")
+    options = parser.parse_args(words)
+    if options.replay is not None and options.subject != "clocks":
+        parser.error("--replay belongs to clocks")
+    return draw(options.subject, options.folder, options.replay)
+
+
+def draw(subject: str, folder: Path, recorded: Path | None = None) -> int:
+    """Draw one subject into `folder`, print the files and return the exit code."""
+    if find_spec("matplotlib") is None:
+        print("matplotlib is not installed: pip install 'jointfitd[plot]'", file=sys.stderr)
+        return 2
+    try:
+        if subject == "clocks":
+            written = import_module("bench.plots.clocks").run(folder, recorded)
+        else:
+            written = import_module("bench.plots.joint_centers").draw(folder)
+    except (OSError, ValueError) as error:  # the event log is missing or unreadable
+        print(error, file=sys.stderr)
+        return 2
+    for path in written:
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
