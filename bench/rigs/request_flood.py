@@ -1,4 +1,4 @@
-"""Malformed and ill-sized requests at 1 kHz: `python -m bench.rigs.request_flood PORT BASE`.
+"""MalformedError and ill-sized requests at 1 kHz: `python -m bench.rigs.request_flood PORT BASE`.
 
 Invariant: none of them is a request that the daemon may run. The process is one MQTT 5 client, as
 an attacker would have it, and prints how many requests it sent and in which time.

@@ -1,6 +1,6 @@
-"""What every codec says about bytes that made no message.
+"""Report of every codec about bytes that contain no message.
 
-Law: a codec never raises on input. Corruption is a value, counted in bytes, with its reason.
+Invariant: a codec never raises on input. Corruption is a value with its number of bytes and reason.
 """
 
 from __future__ import annotations
@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Corrupt(NamedTuple):
-    """A run of input that made no message."""
+class CorruptBytes(NamedTuple):
+    """A run of input without a message."""
 
     discarded: int
-    """Bytes given up."""
+    """Discarded bytes."""
     reason: str
-    """Why, in a few words."""
+    """Reason, in a few words."""

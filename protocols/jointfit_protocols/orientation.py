@@ -1,8 +1,7 @@
-"""From the quaternion a device sends to the canonical one, and the gate on the way.
+"""Conversion of a device's quaternion to the canonical one, and a check of its norm.
 
-Law: plain arithmetic on four floats; no device is named here. Canonical is Hamilton, scalar first,
-unit, sensor to world, world ENU with z up. The axes of the sensor stay as printed on its housing:
-only the world turns.
+Canonical is Hamilton, scalar first, unit, sensor to world, world ENU with z up. Only the world is
+changed: the sensor axes are those printed on the housing.
 
 | native world | v_ENU from native (1, 2, 3) | q_enu_native  |
 |--------------|-----------------------------|---------------|
@@ -21,23 +20,25 @@ Quaternion = tuple[float, float, float, float]
 World = Literal["ENU", "NED", "NWU"]
 
 _S = sqrt(0.5)
-_JUDGED = 100  # samples after which the share of refused ones means something
-_REFUSED = 90  # of them: no noise does that, only a wrong byte order or scale
+_CHECKED = 100
+"""Samples after which the share of rejected ones is evaluated."""
+_MOST_REJECTED = 90
+"""Rejected samples, of `_CHECKED`, that only a wrong byte order or scale explains."""
 
 
 def canonical(
     native: Quaternion, world: World = "ENU", *, world_to_sensor: bool = False
 ) -> Quaternion:
-    """Turn `native` (w, x, y, z, any norm) into sensor to ENU, same norm.
+    """Convert `native` (w, x, y, z, any norm) to sensor-to-ENU, with the same norm.
 
     Parameters
     ----------
-    native
+    native : Quaternion
         As sent, scalar first.
-    world
-        World it refers to.
-    world_to_sensor
-        True where the device sends the inverse.
+    world : World
+        World of the device.
+    world_to_sensor : bool
+        Whether the device sends the inverse.
     """
     w, x, y, z = native
     if world_to_sensor:
@@ -50,7 +51,7 @@ def canonical(
 
 
 def native_of(q_world_sensor: Quaternion, world: World = "ENU") -> Quaternion:
-    """Return what a device with `world` sends for a canonical orientation: for simulators."""
+    """Return the quaternion that a device with `world` sends for a canonical orientation."""
     w, x, y, z = q_world_sensor
     if world == "ENU":
         return (w, x, y, z)
@@ -60,31 +61,33 @@ def native_of(q_world_sensor: Quaternion, world: World = "ENU") -> Quaternion:
 
 
 class OrientationGate:
-    """Finite, norm near 1, then unit and with the sign nearest the previous one.
+    """Rejects quaternions that are not finite or not of norm 1; normalises the others.
 
     Parameters
     ----------
-    tolerance
-        Largest deviation of the norm from 1 before normalising. 0.01 suits floats and fine
-        integers, 0.05 integers in thousandths. A constant small error is normal.
+    tolerance : float
+        Largest deviation of the norm from 1. 0.01 suits floats and fine integers, 0.05 integers in
+        thousandths. A constant small error is normal.
     """
 
     def __init__(self, tolerance: float = 0.01) -> None:
         self._low = (1.0 - tolerance) ** 2
         self._high = (1.0 + tolerance) ** 2
         self._last: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        self._judged = self._refused = 0
+        self._checked = self._rejected = 0
         self._norms: list[float] = []
 
     def admit(self, q: Quaternion) -> Quaternion | None:
-        """Return `q` as a unit quaternion, its sign nearest the last one; None if refused."""
+        """Return `q` as a unit quaternion with the sign nearest the last one; None if rejected."""
         w, x, y, z = q
         square = w * w + x * x + y * y + z * z
         refused = not self._low <= square <= self._high  # NaN compares false: refused
-        if self._judged < _JUDGED:
-            self._judge(square, refused=refused)
+
+        if self._checked < _CHECKED:
+            self._record_norm(square, refused=refused)
         if refused:
             return None
+
         a, b, c, d = self._last
         scale = 1.0 / sqrt(square)
         if a * w + b * x + c * y + d * z < 0.0:
@@ -92,27 +95,27 @@ class OrientationGate:
         self._last = (scale * w, scale * x, scale * y, scale * z)
         return self._last
 
-    def _judge(self, square: float, *, refused: bool) -> None:
-        self._judged += 1
-        self._refused += refused
+    def _record_norm(self, square: float, *, refused: bool) -> None:
+        self._checked += 1
+        self._rejected += refused
         if isfinite(square):
             self._norms.append(sqrt(square))
 
     @property
     def judged(self) -> bool:
-        """Whether ``misconfigured_norm`` has become what it will stay."""
-        return self._judged >= _JUDGED
+        """Whether `misconfigured_norm` is final."""
+        return self._checked >= _CHECKED
 
     @property
     def misconfigured_norm(self) -> float | None:
-        """Median norm, once more than 90 of the first 100 samples failed; else None.
+        """Median norm, if more than 90 of the first 100 samples were rejected; otherwise None.
 
-        Byte order or scale are wrong then. NaN where no norm was finite.
+        Byte order or scale are then wrong. NaN if no norm was finite.
         """
-        if self._judged < _JUDGED or self._refused <= _REFUSED:
+        if self._checked < _CHECKED or self._rejected <= _MOST_REJECTED:
             return None
         return median(self._norms) if self._norms else float("nan")
 
     def forget(self) -> None:
-        """Start sign continuity anew: the device restarted."""
+        """Restart sign continuity: the device restarted."""
         self._last = (1.0, 0.0, 0.0, 0.0)

@@ -19,7 +19,7 @@ from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import HEADER, Bare, MessageId, decode
 from jointfit_protocols.natnet import encode as encode_natnet
 from jointfit_protocols.natnet._frame_encode import encode_frame
@@ -195,7 +195,7 @@ def seeds_slcan() -> list[bytes]:
 def run_can_records(data: bytes) -> None:
     """Unpack records; every byte belongs to a frame or is counted."""
     found = unpack_frames(data)
-    used = sum(item.discarded if isinstance(item, Corrupt) else RECORD_BYTES for item in found)
+    used = sum(item.discarded if isinstance(item, CorruptBytes) else RECORD_BYTES for item in found)
     if used != len(data):
         raise UnaccountedError(f"{len(data)} bytes, {used} in frames or discarded")
     feed_source("S2", [data])
@@ -241,7 +241,7 @@ def run_natnet_codec(data: bytes) -> None:
     """Decode one datagram in every bitstream."""
     for version in VERSIONS:
         found = decode(data, version)
-        if isinstance(found, Corrupt) and found.discarded != len(data):
+        if isinstance(found, CorruptBytes) and found.discarded != len(data):
             raise UnaccountedError(f"{len(data)} bytes, {found.discarded} discarded")
 
 

@@ -212,11 +212,11 @@ def write_rig(folder: Path, mqtt: int, mocap: int) -> Path:
 
 EXPECTED = {
     "slow": ("921600 baud but nothing decodes", "set baud = 115200"),
-    "gps": ("not an Xbus device", "set `port` to the right one, or `driver`"),
+    "gps": ("is not Xbus", "correct `port` or `driver`"),
     "taken": ("is used by another program", "fuser", "ModemManager", "udev rule"),
     "absent": ("is not there", "plug it in, or set `port`"),
     "modem": ("bytes discarded: ",),
-    "twin": ("two sensors send with the same CAN identifiers", "set `ids`"),
+    "twin": ("two sensors use the same CAN identifiers", "set `ids`"),
     "mute": ("no quaternion (0x321) arrives", "check its power and wiring, and `ids`"),
     "mocap": ("marker 'Thigh3' (mocap.markers.thigh) is not in the stream", "The server has", "T3"),
 }

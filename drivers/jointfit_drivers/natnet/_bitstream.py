@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import decode, is_versioned, supported
 
 if TYPE_CHECKING:
@@ -55,17 +55,17 @@ class BitstreamTracker:
         self.version = self._announced = version
         self._confirmed = None
 
-    def decode(self, datagram: bytes) -> Message | Corrupt:
+    def decode(self, datagram: bytes) -> Message | CorruptBytes:
         """Return the message in `datagram`; adopt a candidate that alone decodes it."""
         message = decode(datagram, self.version)
-        if not isinstance(message, Corrupt) or not self.known or not is_versioned(datagram):
+        if not isinstance(message, CorruptBytes) or not self.known or not is_versioned(datagram):
             return message
 
         for candidate in dict.fromkeys((self._announced, self._confirmed, self._wanted)):
             if candidate is None or candidate == self.version:
                 continue
             found = decode(datagram, candidate)
-            if not isinstance(found, Corrupt):
+            if not isinstance(found, CorruptBytes):
                 self.version = candidate
                 return found
         return message

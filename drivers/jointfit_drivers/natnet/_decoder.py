@@ -19,7 +19,7 @@ from jointfit_drivers.natnet._continuity import NatNetContinuity
 from jointfit_drivers.natnet._frame_time import FrameTime
 from jointfit_drivers.natnet._poses import PoseConverter
 from jointfit_drivers.natnet._server_checks import bitstream_response, same_instance, usable_hz
-from jointfit_protocols.corrupt import Corrupt as WireCorrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import (
     FRAME_BITSTREAM_CHANGED,
     FRAME_EDIT_MODE,
@@ -135,7 +135,7 @@ class NatNetDecoder:
         """Return the content of one datagram; never raises."""
         before = self._bitstream.version
         message = self._bitstream.decode(chunk.data)
-        if isinstance(message, WireCorrupt):
+        if isinstance(message, CorruptBytes):
             return self._unreadable(chunk, message)
 
         self._messages += 1
@@ -149,7 +149,7 @@ class NatNetDecoder:
         """Return nothing: datagrams are complete."""
         return []
 
-    def _unreadable(self, chunk: Chunk, corrupt: WireCorrupt) -> list[Decoded]:
+    def _unreadable(self, chunk: Chunk, corrupt: CorruptBytes) -> list[Decoded]:
         """Count a datagram as corrupt, unless the bitstream is not known yet."""
         if not self._bitstream.known and is_versioned(chunk.data):
             self._messages += 1

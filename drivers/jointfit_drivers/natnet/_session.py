@@ -34,7 +34,7 @@ from jointfit_drivers.natnet._server_checks import (
     not_natnet_text,
     same_instance,
 )
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import (
     FRAME_BITSTREAM_CHANGED,
     FRAME_MODEL_CHANGED,
@@ -180,7 +180,7 @@ class NatNetSession:
                 if version is not None and version == self._settings.wanted_version:
                     self._bitstream.confirm(version)
                     self._confirmed = True
-            case Corrupt() | Connect():
+            case CorruptBytes() | Connect():
                 self._foreign_answers += 1
             case _:
                 return

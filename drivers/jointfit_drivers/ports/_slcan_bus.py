@@ -16,7 +16,7 @@ from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_protocols.can import CanFrame, host_corrupt
 from jointfit_protocols.can.slcan import BITRATES, SlcanCodec, SlcanLine, bitrate_code
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -123,7 +123,7 @@ class SlcanBus:
             for item in feed(chunk.data, chunk.t_ns):
                 if isinstance(item, CanFrame):
                     frames.append(item)
-                elif isinstance(item, Corrupt):
+                elif isinstance(item, CorruptBytes):
                     corrupt += item.discarded
             if corrupt:
                 frames.append(host_corrupt(chunk.t_ns, corrupt))

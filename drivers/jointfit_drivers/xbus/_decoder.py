@@ -16,7 +16,7 @@ from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
 from jointfit_drivers.xbus._raw_orientation import RAW, RawMessage
 from jointfit_drivers.xbus._sync_lines import describe_entry
 from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
-from jointfit_protocols.xbus import MAX_MESSAGE, Layout, MessageId, XbusCodec, XbusMessage
+from jointfit_protocols.xbus import MAX_MESSAGE, MessageId, MTData2Layout, XbusCodec, XbusMessage
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Trigger, decode_item, split, world_of
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.xbus._raw_orientation import RawOrientation
-    from jointfit_protocols.corrupt import Corrupt as WireCorrupt
+    from jointfit_protocols.corrupt import CorruptBytes
     from jointfit_protocols.xbus.mtdata2 import Value
 
 _BITS = 10
@@ -77,8 +77,8 @@ class XbusDecoder:
         self._wires = wires or {}
         self._raw = raw
         self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
-        self._layouts: dict[int, Layout | None] = {}
-        """Layout of the first message of each length; a device sends one or two lengths."""
+        self._layouts: dict[int, MTData2Layout | None] = {}
+        """MTData2Layout of the first message of each length; a device sends one or two lengths."""
         self._xbus = XbusCodec()
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
@@ -123,7 +123,7 @@ class XbusDecoder:
         """Discard a pending message and an orientation that waits for confirmation."""
         return self._take(self._xbus.flush()) + self._drop_held()
 
-    def _take(self, found: list[XbusMessage | WireCorrupt]) -> list[Decoded]:
+    def _take(self, found: list[XbusMessage | CorruptBytes]) -> list[Decoded]:
         out: list[Decoded] = []
         for event in found:
             if isinstance(event, XbusMessage):
@@ -168,7 +168,7 @@ class XbusDecoder:
                 world_id = data_id if kind == _QUATERNION else world_id
 
         if len(data) not in self._layouts:
-            self._layouts[len(data)] = Layout.of(items, self._wanted)
+            self._layouts[len(data)] = MTData2Layout.of(items, self._wanted)
         return self._decode_values(message, values, world_id)
 
     def _decode_values(

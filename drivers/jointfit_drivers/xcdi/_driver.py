@@ -16,7 +16,7 @@ from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
 from jointfit_drivers.ports.can_bus import shared_bus, unknown_kind
 from jointfit_drivers.xcdi._decoder import XcdiDecoder
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, unpack_frames
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.orientation import OrientationGate
 from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode
 
@@ -191,7 +191,7 @@ class XcdiImu:
     def _resembles(self, data: bytes) -> bool:
         """Whether `data` could be a quaternion: four integers of norm 1."""
         counts = decode(DataId.QUATERNION, data, self._settings.byte_order)
-        if isinstance(counts, Corrupt):
+        if isinstance(counts, CorruptBytes):
             return False
         w, x, y, z = (count * QUATERNION_SCALE for count in counts)
         return OrientationGate().admit((w, x, y, z)) is not None

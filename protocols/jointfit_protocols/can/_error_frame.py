@@ -1,7 +1,8 @@
-"""CAN error frames in words, as Linux reports them (linux/can/error.h).
+"""Descriptions of CAN error frames in Linux's layout (linux/can/error.h).
 
-Law: bytes to text; any content gives a sentence. An error frame never was on the wire: the
-controller or its driver made it.
+An error frame was never on the wire: the controller or its driver generates it.
+
+Invariant: every content yields a description.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 _CLASSES = (
     (0x040, "bus off: the controller left the bus (check bitrate, wiring and termination)"),
-    (0x020, "no acknowledgment: nobody else on the bus, or another bitrate"),
+    (0x020, "no acknowledgment: no other node on the bus, or another bitrate"),
     (0x008, "protocol violation (noise, wrong bitrate or wrong termination)"),
     (0x010, "transceiver fault (wiring)"),
     (0x002, "arbitration lost"),
@@ -33,19 +34,20 @@ _SERIOUS = 0x040 | 0x020 | 0x010
 
 
 class CanError(NamedTuple):
-    """What an error frame says."""
+    """Description of an error frame."""
 
     text: str
     serious: bool
-    """Communication has stopped, or is about to."""
+    """Communication has stopped, or is about to stop."""
 
 
 def describe_error(frame: CanFrame) -> CanError:
-    """Return what the error frame `frame` says; classes nobody knows are named by number."""
-    said = [text for bit, text in _CLASSES if frame.can_id & bit]
+    """Return the description of error frame `frame`; unknown classes are named by number."""
+    found = [text for bit, text in _CLASSES if frame.can_id & bit]
+
     serious = bool(frame.can_id & _SERIOUS)
     if frame.can_id & _CONTROLLER:
         state = frame.data[1] if len(frame.data) > 1 else 0
-        said += [text for bits, text in _CONTROLLER_STATES if state & bits]
+        found += [text for bits, text in _CONTROLLER_STATES if state & bits]
         serious = serious or bool(state & 0x31)
-    return CanError("; ".join(said) or f"CAN error class 0x{frame.can_id:x}", serious)
+    return CanError("; ".join(found) or f"CAN error class 0x{frame.can_id:x}", serious)

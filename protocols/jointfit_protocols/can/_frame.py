@@ -1,16 +1,17 @@
-"""CAN frames as fixed-size records: what ``Chunk.data`` of a driver with ``wire = "can"`` holds.
+"""CAN frames as fixed-size records: the `Chunk.data` of a driver with ``wire = "can"``.
 
-Law: one record is 24 bytes, whatever the frame; unpacking never raises, a record that is no CAN
-frame becomes ``Corrupt``. Records carry the stamp of every frame, so a chunk of many frames loses
-no time, and a recording of chunks replays exactly.
+A record has 24 bytes and carries the stamp of its frame. A chunk of many frames therefore keeps all
+stamps, and a recording of chunks replays exactly.
 
- 0        8          12      13     14    16         24
-| t_ns i64 | id u32   | flags | size | zero | data[8] |   little-endian
-flags: 1 extended (29-bit), 2 remote request, 4 error frame
+     0        8          12      13     14    16         24
+    | t_ns i64 | id u32   | flags | size | zero | data[8] |   little-endian
 
-Error frames keep Linux's layout (linux/can/error.h): the identifier is a set of error classes.
-Two classes that Linux leaves free carry what only the host knows, see ``host_dropped`` and
-``host_corrupt``.
+    flags: 1 extended (29-bit), 2 remote request, 4 error frame
+
+Error frames have Linux's layout (linux/can/error.h): the identifier is a set of error classes. Two
+classes that Linux leaves free carry notes of the host, see `host_dropped` and `host_corrupt`.
+
+Invariant: unpacking never raises; a record that is no CAN frame becomes `CorruptBytes`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,9 +28,9 @@ RECORD_BYTES = 24
 STANDARD_MAX = 0x7FF
 EXTENDED_MAX = 0x1FFF_FFFF
 HOST_DROPPED = 1 << 28
-"""Error class of ours: the host lost frames; data is their number, u64 little-endian."""
+"""Error class of this project: the host lost frames; data is their number, u64 little-endian."""
 HOST_CORRUPT = 1 << 27
-"""Error class of ours: an adapter's line held bytes that are no frame; data is their number."""
+"""Error class of this project: bytes of an adapter's line without a frame; data is their number."""
 
 _RECORD = struct.Struct("<qIBBxx8s")
 _COUNT = struct.Struct("<Q")
@@ -41,9 +42,9 @@ class CanFrame(NamedTuple):
     """One classic CAN frame."""
 
     t_ns: int
-    """Host CLOCK_MONOTONIC at the start of the frame, as well as it is known."""
+    """Host CLOCK_MONOTONIC at the start of the frame, ns, as exactly as it is known."""
     can_id: int
-    """Identifier; for an error frame its classes."""
+    """Identifier; the error classes of an error frame."""
     data: bytes
     """At most 8 bytes."""
     extended: bool = False
@@ -51,7 +52,7 @@ class CanFrame(NamedTuple):
     error: bool = False
     """An error frame of the controller or a note of the host, not a frame from the wire."""
     remote: bool = False
-    """A remote request: it asks for data and carries none."""
+    """A remote request, which has no data."""
 
 
 def pack_frames(frames: Iterable[CanFrame]) -> bytes:
@@ -64,6 +65,7 @@ def pack_frames(frames: Iterable[CanFrame]) -> bytes:
     """
     pack = _RECORD.pack
     records = []
+
     for t_ns, can_id, data, extended, error, remote in frames:
         size = len(data)
         if size > 8:  # noqa: PLR2004 - classic CAN
@@ -73,23 +75,25 @@ def pack_frames(frames: Iterable[CanFrame]) -> bytes:
     return b"".join(records)
 
 
-def unpack_frames(data: bytes) -> list[CanFrame | Corrupt]:
-    """Return the frames of the records in `data`; any bytes are accepted.
+def unpack_frames(data: bytes) -> list[CanFrame | CorruptBytes]:
+    """Return the frames of the records in `data`; accepts any bytes.
 
-    A record that `pack_frames` cannot have made costs 24 bytes and the search goes on with the
-    next one; an incomplete last record is corrupt too, for records are never split over chunks.
+    A record that `pack_frames` cannot have written is corrupt with 24 bytes, and unpacking
+    continues with the next one. An incomplete last record is corrupt too, because chunks hold
+    complete records.
     """
-    found: list[CanFrame | Corrupt] = []
+    found: list[CanFrame | CorruptBytes] = []
     whole = len(data) - len(data) % RECORD_BYTES
+
     for t_ns, can_id, flags, size, body in _RECORD.iter_unpack(
         data if whole == len(data) else data[:whole]
     ):
         if size > 8 or flags > _FLAGS:  # noqa: PLR2004 - classic CAN
-            found.append(Corrupt(RECORD_BYTES, "no CAN record"))
-        elif not flags and can_id <= STANDARD_MAX:  # by far the most
+            found.append(CorruptBytes(RECORD_BYTES, "no CAN record"))
+        elif not flags and can_id <= STANDARD_MAX:  # the usual case
             found.append(CanFrame(t_ns, can_id, body[:size]))
         elif can_id > (EXTENDED_MAX if flags & (_EXTENDED | _ERROR) else STANDARD_MAX):
-            found.append(Corrupt(RECORD_BYTES, "CAN identifier out of range"))
+            found.append(CorruptBytes(RECORD_BYTES, "CAN identifier out of range"))
         else:
             found.append(
                 CanFrame(
@@ -101,28 +105,29 @@ def unpack_frames(data: bytes) -> list[CanFrame | Corrupt]:
                     bool(flags & _REMOTE),
                 )
             )
+
     if whole != len(data):
-        found.append(Corrupt(len(data) - whole, "incomplete CAN record"))
+        found.append(CorruptBytes(len(data) - whole, "incomplete CAN record"))
     return found
 
 
 def host_dropped(t_ns: int, count: int) -> CanFrame:
-    """Return the note that the host lost `count` frames (a full receive queue) before `t_ns`."""
+    """Return the note that the host lost `count` frames (receive queue full) before `t_ns`."""
     return CanFrame(t_ns, HOST_DROPPED, _COUNT.pack(count), error=True)
 
 
 def host_corrupt(t_ns: int, count: int) -> CanFrame:
-    """Return the note that `count` bytes on an adapter's line were no frame."""
+    """Return the note that `count` bytes of an adapter's line were no frame."""
     return CanFrame(t_ns, HOST_CORRUPT, _COUNT.pack(count), error=True)
 
 
 def host_count(frame: CanFrame) -> int:
-    """Return the number in a note of `host_dropped` or `host_corrupt`; 0 where there is none."""
+    """Return the number in a note of `host_dropped` or `host_corrupt`; 0 if it has none."""
     return int(_COUNT.unpack(frame.data)[0]) if len(frame.data) == _COUNT.size else 0
 
 
 def frame_bits(size: int, extended: bool) -> int:
-    """Return the length of a frame on the wire, bits, stuff bits left out (they depend on content).
+    """Return the length of a frame on the wire, bits, without stuff bits (they depend on content).
 
     47 + 8 n with an 11-bit identifier, 67 + 8 n with a 29-bit one, interframe space included.
     """

@@ -1,18 +1,20 @@
-r"""SLCAN (Lawicel): CAN frames as lines of ASCII over a serial port, decode and encode, both roles.
+"""SLCAN (Lawicel): CAN frames as lines of ASCII on a serial port, for host and adapter.
 
-Law: bytes in, frames and lines out; no port, no clock. Stamps are computed from the arrival that
-the caller gives. On a real line a frame is back-dated by the characters that came with and after
-it. On USB characters take no time, whatever the port's speed says; what came in one read is
-back-dated by its time on the bus, for frames there follow each other.
+Stamps are computed from the arrival that the caller passes. On a serial line, a frame is back-dated
+by the duration of its characters and of those behind it. On USB, characters take no time. Frames of
+one read are then back-dated by their duration on the bus, where they follow each other.
 
     t iii l dd...    11-bit frame, l bytes     T iiiiiiii l dd...   29-bit frame
     r iii l          11-bit remote request     R iiiiiiii l         29-bit remote request
 
-Every line ends in CR (LF is ignored); a frame may be followed by four digits of adapter time, ms
-modulo 60 000, which is a clock of its own and is dropped. The adapter answers a command with CR
-(done) or BELL (refused); the host's commands are ``Sn`` (bit rate), ``O``, ``C``, ``V``, ``N``,
+Every line ends in CR (LF is ignored). Four digits of adapter time may follow a frame, ms modulo
+60 000; they belong to another clock and are dropped. The adapter answers a command with CR
+(done) or BELL (refused). The host's commands are ``Sn`` (bit rate), ``O``, ``C``, ``V``, ``N``,
 ``Z`` and others.
+
 Source: Lawicel CAN232 manual, version 3.
+
+Invariant: bytes in, frames and lines out; no port, no clock.
 """
 
 from __future__ import annotations
@@ -21,21 +23,25 @@ from binascii import unhexlify
 from typing import Literal, NamedTuple
 
 from jointfit_protocols.can._frame import EXTENDED_MAX, STANDARD_MAX, CanFrame, frame_bits
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 Role = Literal["host", "adapter"]
-"""Who decodes: the host reads answers, the adapter reads commands; frames go both ways."""
+"""Role of the decoder: the host reads answers, the adapter reads commands; both read frames."""
 
 BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
-"""bit/s of the commands S0 to S8."""
+"""Bit rates of the commands S0 to S8, bit/s."""
 
 DONE, REFUSED = b"\r", b"\a"
 _CR, _BELL = 0x0D, 0x07
-_LONGEST = 64  # characters of a line; some adapters have long version strings
-_WINDOW = 32  # characters at the end of a broken line that may hold a frame: the longest has 30
-_BITS_A_CHARACTER = 10  # 8N1
+_LONGEST = 64
+"""Characters of the longest line; some adapters have long version strings."""
+_WINDOW = 32
+"""Characters at the end of a broken line that are searched for a frame; the longest frame has 30.
+"""
+_BITS_A_CHARACTER = 10
+"""Bits of one character on the line, 8N1."""
 
-# Letters of lines that are not frames, with the lengths of argument they may have.
+# Letters of lines without a frame, and the permitted lengths of their arguments.
 _ANSWERS: dict[int, range] = {
     ord("V"): range(1, 41),
     ord("v"): range(1, 41),
@@ -54,7 +60,7 @@ _COMMANDS: dict[int, range] = {
 
 
 class SlcanLine(NamedTuple):
-    """A line that is no frame: an answer or a command."""
+    """A line without a frame: an answer or a command."""
 
     letter: str
     """Its first letter; ``""`` for a bare CR (done), ``"\\a"`` for BELL (refused)."""
@@ -62,13 +68,14 @@ class SlcanLine(NamedTuple):
 
 
 def bitrate_code(bitrate: int) -> int | None:
-    """Return n of the command ``Sn`` for `bitrate` in bit/s, or None where there is none."""
+    """Return n of the command ``Sn`` for `bitrate`, bit/s; None if there is none."""
     return BITRATES.index(bitrate) if bitrate in BITRATES else None
 
 
 def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
     """Return `frame` as a line, with `time_ms` modulo 60 000 as its adapter time if given."""
     letter = ("rR" if frame.remote else "tT")[frame.extended]
+
     head = f"{letter}{frame.can_id:0{8 if frame.extended else 3}X}{len(frame.data)}"
     body = "" if frame.remote else frame.data.hex().upper()
     stamp = "" if time_ms is None else f"{time_ms % 60_000:04X}"
@@ -76,7 +83,7 @@ def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
 
 
 def _frame(line: bytes, t_ns: int) -> CanFrame | None:
-    """Return the frame that the whole of `line` (without CR) is, or None."""
+    """Return the frame that fills `line` (without CR), or None."""
     letter = line[0]
     extended = letter in b"TR"
     try:
@@ -84,9 +91,11 @@ def _frame(line: bytes, t_ns: int) -> CanFrame | None:
         raw = unhexlify(b"0" + line[1:] if extended else line[1:])
     except ValueError:
         return None
+
     head = 5 if extended else 2
     if len(raw) < head:
         return None
+
     number = int.from_bytes(raw[:head], "big")
     can_id, size = number >> 4, number & 0xF
     remote = letter in b"rR"
@@ -99,16 +108,16 @@ def _frame(line: bytes, t_ns: int) -> CanFrame | None:
 
 
 class SlcanCodec:
-    """Bytes in pieces of any size in, frames and lines out; never raises.
+    """Decoder of pieces of any size to frames and lines; never raises.
 
     Parameters
     ----------
-    baud
-        Speed of the serial line, bit/s: one character lasts 10/baud seconds. None: USB.
-    role
+    baud : int, optional
+        Speed of the serial line, bit/s: one character lasts 10/baud seconds. None for USB.
+    role : Role
         ``host`` (reads an adapter) or ``adapter`` (reads a host).
-    bitrate
-        Speed of the bus, bit/s.
+    bitrate : int
+        Bit rate of the bus, bit/s.
     """
 
     def __init__(
@@ -123,36 +132,37 @@ class SlcanCodec:
         self.frames = 0
         self.discarded_bytes = 0
 
-    def feed(self, data: bytes, t_ns: int) -> list[CanFrame | SlcanLine | Corrupt]:
-        """Return what `data` completed, in wire order.
+    def feed(self, data: bytes, t_ns: int) -> list[CanFrame | SlcanLine | CorruptBytes]:
+        """Return the content that `data` completed, in wire order.
 
-        A frame's ``t_ns`` is the start of its line: `t_ns`, the arrival of `data`, minus the
-        characters from the line's start on (on USB: minus the frames from it on, as the bus
-        carried them); but for a line that lies in `data` whole never before the previous call's,
-        whatever the configured speed.
+        The ``t_ns`` of a frame is the start of its line: the arrival `t_ns` minus the duration
+        of the characters from the line's start on (on USB: of the frames from it on, on the
+        bus). A line that lies completely in `data` is never stamped before the previous call.
         """
-        found: list[CanFrame | SlcanLine | Corrupt] = []
+        found: list[CanFrame | SlcanLine | CorruptBytes] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
         before = len(self._pending)  # bytes that came with earlier calls
         # from a line's start to the end of `data`
         after_ns = (before + len(data)) * self._character_ns or sum(map(self._on_bus_ns, lines))
+
         for line in lines:
             floor = self._previous_ns if before <= 0 else None
             start = t_ns - round(after_ns)
-            self._line(line, start if floor is None or start > floor else floor, found)
+            self._decode_line(line, start if floor is None or start > floor else floor, found)
             after_ns -= (len(line) + 1) * self._character_ns or self._on_bus_ns(line)
             before -= len(line) + 1
-        self._pending = self._bounded(rest, found)
+
+        self._pending = self._limit_length(rest, found)
         self._previous_ns = t_ns
         return found
 
-    def flush(self) -> list[Corrupt]:
-        """Give up on an unfinished line."""
+    def flush(self) -> list[CorruptBytes]:
+        """Discard an unfinished line."""
         rest, self._pending, self._endless = self._pending, b"", False
         return [self._corrupt(len(rest), "unfinished line")] if rest else []
 
     def _on_bus_ns(self, line: bytes) -> float:
-        """Return how long what `line` tells of was on the bus; 0 for what is no frame."""
+        """Return the duration of the line's frame on the bus, ns; 0 for other lines."""
         if not line or line[0] not in b"tTrR":
             return 0.0
         extended = line[0] in b"TR"
@@ -160,17 +170,17 @@ class SlcanCodec:
         size = int(digit) if digit.isdigit() and line[0] in b"tT" else 0
         return frame_bits(min(size, 8), extended) * self._bit_ns
 
-    def _bounded(self, rest: bytes, found: list[CanFrame | SlcanLine | Corrupt]) -> bytes:
-        """Return the unfinished line; one that is longer than any line loses all but its end."""
-        rest = self._bells(rest, found)
+    def _limit_length(self, rest: bytes, found: list[CanFrame | SlcanLine | CorruptBytes]) -> bytes:
+        """Return the unfinished line; an overlong line is cut to its end."""
+        rest = self._split_bells(rest, found)
         if len(rest) <= _LONGEST:
             return rest
         self._endless = True
         found.append(self._corrupt(len(rest) - _WINDOW, "line without end"))
         return rest[-_WINDOW:]  # a frame may have begun in it
 
-    def _bells(self, line: bytes, found: list[CanFrame | SlcanLine | Corrupt]) -> bytes:
-        """Return what follows the last BELL of `line`: BELL is an answer without CR."""
+    def _split_bells(self, line: bytes, found: list[CanFrame | SlcanLine | CorruptBytes]) -> bytes:
+        """Return the rest of `line` after its last BELL, which is an answer without CR."""
         while _BELL in line:
             junk, line = line.split(REFUSED, 1)
             if junk:
@@ -179,8 +189,10 @@ class SlcanCodec:
             self._endless = False
         return line
 
-    def _line(self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | Corrupt]) -> None:
-        """Append what `line` (without CR) is."""
+    def _decode_line(
+        self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | CorruptBytes]
+    ) -> None:
+        """Append the content of `line` (without CR)."""
         if line and line[0] in b"tTrR":
             frame = _frame(line, t_ns)
             if frame is not None:
@@ -188,17 +200,20 @@ class SlcanCodec:
                 self._endless = False
                 found.append(frame)
                 return
-        line = self._bells(line, found)
+
+        line = self._split_bells(line, found)
         endless, self._endless = self._endless, False
         if not line:
             found.append(SlcanLine(""))
         elif not endless and line.isascii() and len(line) - 1 in self._lines.get(line[0], ()):
             found.append(SlcanLine(chr(line[0]), line[1:].decode()))
         else:
-            self._rescue(line, t_ns, found)
+            self._recover_frame(line, t_ns, found)
 
-    def _rescue(self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | Corrupt]) -> None:
-        """Append the frame that ends the broken `line`, if one does: noise may have come before."""
+    def _recover_frame(
+        self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | CorruptBytes]
+    ) -> None:
+        """Append the frame at the end of a broken `line`, if there is one; noise may precede it."""
         for at in range(max(0, len(line) - _WINDOW), len(line)):
             if line[at] in b"tTrR":
                 frame = _frame(line[at:], t_ns + round(at * self._character_ns))
@@ -208,6 +223,6 @@ class SlcanCodec:
                     return
         found.append(self._corrupt(len(line) + 1, "no SLCAN line"))
 
-    def _corrupt(self, count: int, reason: str) -> Corrupt:
+    def _corrupt(self, count: int, reason: str) -> CorruptBytes:
         self.discarded_bytes += count
-        return Corrupt(count, reason)
+        return CorruptBytes(count, reason)

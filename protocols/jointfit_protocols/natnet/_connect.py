@@ -1,11 +1,11 @@
-"""The five forms of NatNet CONNECT (and DISCOVERY). Law: bytes in, values as sent out.
+"""The five forms of NatNet CONNECT (and DISCOVERY).
 
 | bytes | content | sent by |
 |---|---|---|
 | 0 | nothing | libmotioncapture |
 | 5 | ``Ping`` NUL | PyPI natnet |
 | 264 | name[256], application version[4], NatNet version[4] | NatNetLib 3 |
-| 269 | the 264 above, subscribed data only, wanted bitstream[4] | ``sConnectionOptions`` |
+| 269 | the 264 above, subscribed data only, requested bitstream[4] | ``sConnectionOptions`` |
 | 271 | ``Ping``, zeros to 264, then the five bytes of the 269 form, zeros | NaturalPoint's sample |
 
 Source: NatNetTypes.h 4.1; a capture of NatNetLib 3; the clients named above.
@@ -28,7 +28,7 @@ Version4 = tuple[int, int, int, int]
 
 
 class Connect(NamedTuple):
-    """A client's greeting; ``form`` is the length of its payload, bytes."""
+    """A client's request to connect; ``form`` is the length of its payload, bytes."""
 
     form: int = _FULL.size
     name: str = ""
@@ -36,11 +36,11 @@ class Connect(NamedTuple):
     natnet_version: Version4 = _NONE
     subscribed_only: bool = False
     bitstream: Version4 = _NONE
-    """Bitstream wanted from a unicast 4.x server; zeros leave it to the server."""
+    """Bitstream requested from a unicast 4.x server; zeros leave it to the server."""
 
 
 def decode_connect(data: bytes) -> Connect | None:
-    """Return the greeting in a CONNECT or DISCOVERY payload; None if it has none of the forms."""
+    """Return the request in a CONNECT or DISCOVERY payload; None if it has none of the forms."""
     size = len(data)
     if size == 0:
         return Connect(0)
@@ -48,26 +48,29 @@ def decode_connect(data: bytes) -> Connect | None:
         return Connect(size, "Ping")
     if size not in (_FULL.size, _FULL.size + _OPTIONS.size, _SAMPLE):
         return None
+
     name, a, b, c, d, e, f, g, h = _FULL.unpack_from(data)
     found = Connect(size, fixed_text(name), (a, b, c, d), (e, f, g, h))
     if size == _FULL.size:
         return found
+
     only, i, j, k, m = _OPTIONS.unpack_from(data, _FULL.size)
     return found._replace(subscribed_only=bool(only), bitstream=(i, j, k, m))
 
 
 def encode_connect(connect: Connect) -> bytes:
-    """Return the payload of a greeting in its own form.
+    """Return the payload of a request in its own form.
 
     Raises
     ------
     ValueError
-        No form has that length, or the name does not fit.
+        No form has that length, or the name is too long.
     """
     if connect.form == 0:
         return b""
     if connect.form == len(_PING):
         return _PING
+
     name = put_fixed_text(connect.name, 256)
     full = _FULL.pack(name, *connect.application_version, *connect.natnet_version)
     options = _OPTIONS.pack(connect.subscribed_only, *connect.bitstream)
@@ -76,6 +79,7 @@ def encode_connect(connect: Connect) -> bytes:
         _FULL.size + _OPTIONS.size: full + options,
         _SAMPLE: (full + options).ljust(_SAMPLE, b"\0"),
     }
+
     if connect.form not in forms:
         raise ValueError(f"no form of CONNECT has {connect.form} bytes")
     return forms[connect.form]

@@ -1,8 +1,10 @@
 """A bounded reading position in one NatNet payload.
 
-Law: nothing is read past the end, and no count is believed before the bytes left could hold it.
-What does not fit raises `Malformed` (or `struct.error`, which means the same); the codec's outer
-functions turn both into `Corrupt`, so neither leaves the package.
+Data that contradict the layout raise `MalformedError` (or `struct.error`, with the same
+meaning). The codec's outer functions convert both to `CorruptBytes`, so neither leaves the
+package.
+
+Invariant: no read passes the end, and a count is used only if the remaining bytes can hold it.
 """
 
 from __future__ import annotations
@@ -14,21 +16,21 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_NAME = 255
-"""Longest name believed, bytes; real ones are below 64."""
+"""Longest accepted name, bytes; real ones are below 64."""
 
 I32 = struct.Struct("<i")
 XYZ = struct.Struct("<3f")
 
 BREAKS = (ValueError, struct.error)
-"""What reading a hostile payload may raise inside the codec (`Malformed` is a ValueError)."""
+"""Exceptions of reading a hostile payload (`MalformedError` is a ValueError)."""
 
 
-class Malformed(ValueError):  # noqa: N818 - named for what the payload is
+class MalformedError(ValueError):
     """The payload contradicts the layout of its version."""
 
 
 class Cursor:
-    """A reading position that moves from ``at`` to ``end`` of ``data``.
+    """A reading position that advances from ``at`` to ``end`` of ``data``.
 
     Parameters
     ----------
@@ -47,7 +49,7 @@ class Cursor:
 
     @property
     def left(self) -> int:
-        """Bytes not read yet."""
+        """Remaining bytes."""
         return self.end - self.at
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
@@ -55,7 +57,7 @@ class Cursor:
         at = self.at
         after = at + layout.size
         if after > self.end:
-            raise Malformed("ends inside a record")
+            raise MalformedError("ends inside a record")
         self.at = after
         return layout.unpack_from(self.data, at)
 
@@ -65,18 +67,18 @@ class Cursor:
         return value
 
     def count(self, smallest: int) -> int:
-        """Read a count of items of at least `smallest` bytes; the bytes left must hold them."""
+        """Read a count of items of at least `smallest` bytes, bounded by the rest."""
         n = self.integer()
         self.check(n, smallest)
         return n
 
     def check(self, n: int, smallest: int) -> None:
-        """Refuse a count that is negative or that the bytes left cannot hold."""
+        """Refuse a count that is negative or that the remaining bytes cannot hold."""
         if n < 0 or n * smallest > self.end - self.at:
-            raise Malformed("a count exceeds the datagram")
+            raise MalformedError("a count exceeds the datagram")
 
     def records(self, layout: struct.Struct, n: int) -> list[tuple[Any, ...]]:
-        """Read `n` records of `layout`; the caller has not checked `n`."""
+        """Read `n` records of `layout`; `n` is checked here."""
         if not n:
             return []
         self.check(n, layout.size)
@@ -88,7 +90,8 @@ class Cursor:
         """Read a NUL-terminated name: at most 255 bytes, UTF-8 with replacement."""
         stop = self.data.find(0, self.at, min(self.end, self.at + MAX_NAME + 1))
         if stop < 0:
-            raise Malformed("a name without an end")
+            raise MalformedError("a name without an end")
+
         found = self.data[self.at : stop]
         self.at = stop + 1
         return found.decode("utf-8", "replace")
@@ -98,13 +101,14 @@ class Cursor:
         return tuple(self.text() for _ in range(self.count(1)))
 
     def window(self, size: int, read: Callable[[], Any]) -> Any:
-        """Call `read` with the end moved to `size` bytes from here, and go there whatever it does.
+        """Call `read` with the end `size` bytes from here, and continue behind it in any case.
 
-        Returns None where `read` broke off or left bytes over: a section that is unknown or
-        malformed is skipped by its size. A size that the payload cannot hold is `Malformed`.
+        Returns None if `read` failed or left bytes: an unknown or malformed section is skipped
+        by its size. A size that the payload cannot hold raises `MalformedError`.
         """
         if size < 0 or size > self.left:
-            raise Malformed("a section exceeds the datagram")
+            raise MalformedError("a section exceeds the datagram")
+
         outer, self.end = self.end, self.at + size
         try:
             found = read()
@@ -122,7 +126,7 @@ def put_text(name: str) -> bytes:
     Raises
     ------
     ValueError
-        The name holds a NUL or exceeds 255 bytes: our own caller's fault.
+        The name contains a NUL or exceeds 255 bytes.
     """
     data = name.encode("utf-8")
     if 0 in data or len(data) > MAX_NAME:
@@ -136,7 +140,7 @@ def put_texts(names: tuple[str, ...]) -> bytes:
 
 
 def put_fixed_text(name: str, size: int) -> bytes:
-    """Return `name` in a field of `size` bytes, padded with NUL, at least one of them.
+    """Return `name` in a field of `size` bytes, padded with at least one NUL.
 
     Raises
     ------
@@ -150,5 +154,5 @@ def put_fixed_text(name: str, size: int) -> bytes:
 
 
 def fixed_text(field: bytes) -> str:
-    """Return the name in a fixed field: cut at the first NUL; stale memory may follow it."""
+    """Return the name in a fixed field, up to the first NUL; stale memory may follow it."""
     return field.partition(b"\0")[0].decode("utf-8", "replace")

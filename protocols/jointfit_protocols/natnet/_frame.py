@@ -1,11 +1,11 @@
-"""NatNet FRAMEOFDATA, bitstreams 3.0 to 4.x. Law: bytes in, values as sent out; no unit, no name.
+"""NatNet FRAMEOFDATA, bitstreams 3.0 to 4.x, as sent: without conversion of units or names.
 
     number | marker sets | other markers | bodies | skeletons | assets | labeled | plates | devices
     timecode | sub-frame | timestamp | exposure | received | transmit | [precision] | params | 0
 
-Little-endian, packed. Each section begins with ``i32 n`` and, from 4.1, ``i32 bytes`` of its items;
+Little-endian, packed. Each section starts with ``i32 n`` and, from 4.1, ``i32 bytes`` of its items;
 assets exist from 4.1 on. Positions are metres in the server's world, quaternions x, y, z, w.
-Bitstreams 2.x are refused by name: they carry no exposure stamp and their servers answer no echo.
+Bitstreams 2.x are refused: they have no exposure stamp, and their servers answer no echo.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 """
@@ -15,8 +15,8 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jointfit_protocols.corrupt import Corrupt
-from jointfit_protocols.natnet._cursor import BREAKS, XYZ, Cursor, Malformed
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.natnet._cursor import BREAKS, XYZ, Cursor, MalformedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -64,9 +64,9 @@ class Body(NamedTuple):
     qz: float
     qw: float
     error: float
-    """Mean marker error, m. No measure of validity: three markers always fit."""
+    """Mean marker error, m. Not a measure of validity: three markers always fit."""
     params: int
-    """Bit 0 tracked; clear means that the last good pose is repeated."""
+    """Bit 0 tracked; clear if the last valid pose is repeated."""
 
 
 class Marker(NamedTuple):
@@ -84,7 +84,7 @@ class Marker(NamedTuple):
 
 
 class MarkerSet(NamedTuple):
-    """Positions of one marker set, in the order of its description; (0, 0, 0) is "not seen"."""
+    """Positions of one marker set, in the order of its description; (0, 0, 0) is missing."""
 
     name: str
     positions: tuple[Position, ...]
@@ -106,7 +106,7 @@ class Asset(NamedTuple):
 
 
 class Analog(NamedTuple):
-    """Samples of one force plate or analog device, a tuple for each channel."""
+    """Samples of one force plate or analog device, a tuple per channel."""
 
     id: int
     channels: tuple[tuple[float, ...], ...]
@@ -117,7 +117,7 @@ class FrameOfData(NamedTuple):
 
     number: int
     timestamp: float
-    """Frame number times nominal period, s: a counter, never a clock."""
+    """Frame number times nominal period, s; not a clock."""
     exposure: int
     """Center of the camera exposure, server ticks; 0 from USB cameras."""
     received: int
@@ -134,30 +134,30 @@ class FrameOfData(NamedTuple):
     timecode: int = 0
     subframe: int = 0
     precision: tuple[int, int] | None = None
-    """Seconds and fraction of an external clock; None where the bitstream has no such field."""
+    """Seconds and fraction of an external clock; None if the bitstream has no such field."""
     skipped: tuple[str, ...] = ()
-    """Sections passed over by their size because their content was not understood."""
+    """Sections skipped by their size because their content is unknown."""
 
 
 def supported(version: Version) -> bool:
-    """Tell whether frames of this bitstream can be decoded: 3.0 and newer, by section size."""
+    """Return whether frames of this bitstream can be decoded: 3.0 and newer, by section size."""
     return version >= OLDEST
 
 
-def decode_frame(datagram: bytes, version: Version) -> FrameOfData | Corrupt:
+def decode_frame(datagram: bytes, version: Version) -> FrameOfData | CorruptBytes:
     """Return the frame in a whole FRAMEOFDATA datagram (header included); never raises.
 
-    A parse is accepted only if it ends exactly at the end of the datagram, end tag included. The
-    precision timestamp is taken to be present if the length says so, whatever the version.
+    A frame is accepted only if it ends exactly at the end of the datagram, end tag included.
+    The length decides whether there is a precision timestamp, in every version.
     """
     if not supported(version):
-        return Corrupt(
+        return CorruptBytes(
             len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
         )
     try:
         return _read_frame(Cursor(datagram, 4), version >= SIZED)
     except BREAKS as problem:
-        return Corrupt(len(datagram), f"frame: {problem}")
+        return CorruptBytes(len(datagram), f"frame: {problem}")
 
 
 # --- reading ----------------------------------------------------------------------------------
@@ -170,18 +170,21 @@ def _read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
         name: _read_section(cursor, name, smallest, read, skipped if sized else None)
         for name, smallest, read in (_SECTIONS_SIZED if sized else _SECTIONS)
     }
+
     tail = STAMPS_LAYOUT.size + _LONG_TAIL
-    while sized and cursor.left > tail:  # a section that a newer bitstream put behind ours
+    while sized and cursor.left > tail:  # a section of a newer bitstream behind the known ones
         _, size = cursor.unpack(TWO_LAYOUT)
         cursor.window(size, _nothing)
         skipped.append("unknown")
+
     timecode, subframe, timestamp, exposure, received, transmit = cursor.unpack(STAMPS_LAYOUT)
     precision = cursor.unpack(PRECISION_LAYOUT) if cursor.left == _LONG_TAIL else None
     if cursor.left != _SHORT_TAIL:
-        raise Malformed(f"{cursor.left - _SHORT_TAIL:+d} bytes where the end should be")
+        raise MalformedError(f"{cursor.left - _SHORT_TAIL:+d} bytes where the end should be")
+
     params, end = cursor.unpack(END_LAYOUT)
     if end:
-        raise Malformed("no end tag")
+        raise MalformedError("no end tag")
     return FrameOfData(
         number, timestamp, exposure, received, transmit, params,
         timecode=timecode, subframe=subframe, precision=precision, skipped=tuple(skipped),
@@ -196,11 +199,12 @@ def _read_section(
     read: Callable[[Cursor, int], tuple[Any, ...]],
     skipped: list[str] | None,
 ) -> tuple[Any, ...]:
-    """Read one section; with sizes (`skipped` given), pass over one that does not fit its size."""
+    """Read one section; with sizes (`skipped` given), skip one that does not fit its size."""
     n = cursor.integer()
     if skipped is None:
         cursor.check(n, smallest)
         return read(cursor, n) if n else ()
+
     size = cursor.integer()
     if n == 0 and size == 0:
         return ()
@@ -217,7 +221,7 @@ def _read_section(
 
 
 def _nothing() -> None:
-    """Read nothing of a section nobody here knows."""
+    """Read nothing of an unknown section."""
 
 
 def _read_sets(cursor: Cursor, n: int) -> tuple[MarkerSet, ...]:

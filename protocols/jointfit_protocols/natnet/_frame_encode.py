@@ -1,6 +1,6 @@
-"""The writing side of NatNet FRAMEOFDATA, for simulators and tests. Law: as `natnet_frame`.
+"""Encoder of NatNet FRAMEOFDATA, for simulators and tests.
 
-What `natnet_frame.decode_frame` reads from a real server is written back byte for byte.
+Invariant: a frame of a real server that `decode_frame` has decoded is encoded byte for byte.
 """
 
 from __future__ import annotations
@@ -46,12 +46,15 @@ def encode_frame(frame: FrameOfData, version: Version) -> bytes:
     """
     if not supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
+
     sized = version >= SIZED
     if not sized and frame.assets:
         raise ValueError("assets exist from bitstream 4.1 on")
     if frame.precision is None and sized:
         frame = frame._replace(precision=(0, 0))
+
     tail = b"" if frame.precision is None else PRECISION_LAYOUT.pack(*frame.precision)
+
     sections: list[tuple[Iterable[Any], Callable[[Any], bytes]]] = [
         (frame.marker_sets, _put_set),
         (frame.other_markers, _put_position),
@@ -62,6 +65,7 @@ def encode_frame(frame: FrameOfData, version: Version) -> bytes:
         (frame.force_plates, _put_analog),
         (frame.devices, _put_analog),
     ]
+
     stamps = (frame.timestamp, frame.exposure, frame.received, frame.transmit)
     return b"".join(
         (

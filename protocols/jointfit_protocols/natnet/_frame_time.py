@@ -1,12 +1,12 @@
-"""Time of other clocks than the server's in a NatNet frame. Law: fields to values; no unit guessed.
+"""Times of other clocks than the server's in a NatNet frame: precision timestamp and timecode.
 
 The precision timestamp, two u32, is that of a PTP clock: seconds, and a fraction whose unit the
-vendor's documents do not tell. A fraction of 10^9 or more proves steps of 2^-32 s; if twenty frames
-have none, it is nanoseconds, for of twenty even spread ones in 2^-32 s one would be that large with
-probability 1 - 0.23^20. Zeros mean that there is no such clock.
+vendor does not document. A fraction of 10^9 or more proves units of 2^-32 s. Without one in twenty
+frames the unit is nanoseconds: of twenty uniformly distributed fractions in 2^-32 s, one would be
+that large with probability 1 - 0.23^20. Zeros mean that there is no such clock.
 
-The timecode (SMPTE, LTC) has hours, minutes, seconds and frames in its bytes 3 to 0, and parts of a
-frame beside it; zeros mean that there is none.
+The timecode (SMPTE, LTC) has hours, minutes, seconds and frames in its bytes 3 to 0, and a separate
+subframe; zeros mean that there is none.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _NS = 10**9
 DECIDING = 20
-"""Frames that decide the unit of the fraction."""
+"""Frames that determine the unit of the fraction."""
 
 
 class Timecode(NamedTuple):
@@ -32,7 +32,7 @@ class Timecode(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Write it as it is spoken."""
+        """Timecode as text, ``HH:MM:SS:FF``."""
         parts = f"{self.hour:02d}:{self.minute:02d}:{self.second:02d}:{self.frame:02d}"
         return f"{parts}.{self.subframe}" if self.subframe else parts
 
@@ -46,25 +46,27 @@ def timecode_of(frame: FrameOfData) -> Timecode | None:
 
 
 class PrecisionTime:
-    """Reads precision timestamps as nanoseconds, once the unit of their fraction is certain."""
+    """Converts precision timestamps to ns, once the unit of their fraction is known."""
 
     def __init__(self) -> None:
         self._binary: bool | None = None
         self._seen = 0
+
         self.absent = 0
-        """Frames in a row without one."""
+        """Consecutive frames without one."""
 
     @property
     def decided(self) -> bool:
-        """Whether the unit is certain."""
+        """Whether the unit is known."""
         return self._binary is not None
 
     def ns(self, precision: tuple[int, int] | None) -> int | None:
-        """Return the instant in ns of its clock; None without one, or while the unit is open."""
+        """Return the time in ns of its clock; None without one, or before the unit is known."""
         if precision is None or precision == (0, 0):
             self.absent += 1
             return None
         self.absent = 0
+
         seconds, fraction = precision
         if fraction >= _NS:
             self._binary = True
@@ -72,6 +74,7 @@ class PrecisionTime:
             self._seen += 1
             if self._seen >= DECIDING:
                 self._binary = False
+
         if self._binary is None:
             return None
         return seconds * _NS + (fraction * _NS >> 32 if self._binary else fraction)

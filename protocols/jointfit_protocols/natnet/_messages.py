@@ -1,9 +1,9 @@
-"""NatNet messages on UDP: who is there, what do you serve, what time is it. Law: sans-IO.
+"""NatNet messages on UDP: connection, description of the server, clock echoes.
 
     | u16 id | u16 payload length | payload |      little-endian; length = the datagram's - 4
 
-`decode` takes a datagram of either direction: a capture holds both, and a simulator reads what a
-driver writes. Frames and model definitions are laid out in `natnet_frame` and `natnet_model`.
+`decode` accepts datagrams of both directions: a capture contains both, and a simulator decodes the
+datagrams of a driver.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h; a capture of Motive 2.1.
 """
@@ -14,7 +14,7 @@ import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._connect import Connect, decode_connect, encode_connect
 from jointfit_protocols.natnet._cursor import fixed_text, put_fixed_text
 from jointfit_protocols.natnet._frame import FrameOfData, Version, decode_frame
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_DATAGRAM = 65_507
+"""Largest payload of a UDP datagram over IPv4, bytes."""
 COMMAND_PORT = 1510
 DATA_PORT = 1511
 GROUP = "239.255.42.99"
@@ -66,9 +67,9 @@ class ServerInfo(NamedTuple):
     application: str
     application_version: Version4
     natnet_version: Version4
-    """The bitstream in use is its first two numbers unless changed."""
+    """Its first two numbers are the bitstream in use unless changed."""
     clock_hz: int | None
-    """Ticks per second of the stamps in the frames; None from a 2.x server."""
+    """Ticks per second of the stamps in frames; None from a 2.x server."""
     data_port: int = DATA_PORT
     multicast: bool = False
     group: str = GROUP
@@ -80,19 +81,19 @@ class ServerInfo(NamedTuple):
 
 
 class Discovery(NamedTuple):
-    """CONNECT to whom it may concern (broadcast); every server answers."""
+    """CONNECT as a broadcast; every server answers."""
 
     connect: Connect
 
 
 class Request(NamedTuple):
-    """A command in words: ``FrameRate``, ``Bitstream,4.1`` and so on."""
+    """A command as text: ``FrameRate``, ``Bitstream,4.1`` and so on."""
 
     command: str
 
 
 class Response(NamedTuple):
-    """The answer to a `Request`: int32, float32 or a string; only who asked knows which."""
+    """The answer to a `Request`: int32, float32 or text, depending on the request."""
 
     data: bytes
 
@@ -103,26 +104,26 @@ class Response(NamedTuple):
 
 
 class MessageString(NamedTuple):
-    """Text for a person."""
+    """Text for the operator."""
 
     text: str
 
 
 class EchoRequest(NamedTuple):
-    """A stamp of the client's choosing."""
+    """A stamp chosen by the client."""
 
     stamp: int
 
 
 class EchoResponse(NamedTuple):
-    """The client's stamp returned, and the server's ticks when it was."""
+    """The client's stamp, and the server's ticks at its arrival."""
 
     stamp: int
     ticks: int
 
 
 class Bare(NamedTuple):
-    """A message that says everything by its id; whatever follows the header has no meaning."""
+    """A message that consists of its id; bytes after the header have no meaning."""
 
     id: MessageId
 
@@ -142,35 +143,38 @@ Message = (
 )
 
 
-def decode(datagram: bytes, version: Version) -> Message | Corrupt:
-    """Return the message in `datagram`, frames and models read as bitstream `version`.
+def decode(datagram: bytes, version: Version) -> Message | CorruptBytes:
+    """Return the message in `datagram`, with frames and models in bitstream `version`.
 
-    Never raises: whatever is not a message, whole and exact, is `Corrupt` as a whole.
+    Never raises: a datagram that is no complete and exact message is `CorruptBytes` as a whole.
     """
     if len(datagram) < HEADER.size:
-        return Corrupt(len(datagram), "shorter than a header")
+        return CorruptBytes(len(datagram), "shorter than a header")
+
     number, size = HEADER.unpack_from(datagram)
     if size != len(datagram) - HEADER.size:
-        return Corrupt(len(datagram), "the length in the header is not the datagram's")
+        return CorruptBytes(len(datagram), "the length in the header is not the datagram's")
+
     by_version = _VERSIONED.get(number)
     if by_version is not None:
         return by_version(datagram, version)
     return _decode_plain(datagram, number)
 
 
-def _decode_plain(datagram: bytes, number: int) -> Message | Corrupt:
-    """Read a message that is the same in every bitstream."""
+def _decode_plain(datagram: bytes, number: int) -> Message | CorruptBytes:
+    """Decode a message that is the same in every bitstream."""
     read = _READERS.get(number)
     if read is None:
-        return Corrupt(len(datagram), f"no message has id {number}")
+        return CorruptBytes(len(datagram), f"no message has id {number}")
+
     found = read(datagram[HEADER.size :])
     if found is None:
-        return Corrupt(len(datagram), f"{MessageId(number).name} of {len(datagram)} bytes")
+        return CorruptBytes(len(datagram), f"{MessageId(number).name} of {len(datagram)} bytes")
     return found
 
 
 def is_versioned(datagram: bytes) -> bool:
-    """Tell whether `datagram` is, by its header, a message whose layout needs the bitstream."""
+    """Return whether the layout of the message in `datagram` depends on the bitstream."""
     if len(datagram) < HEADER.size:
         return False
     number, size = HEADER.unpack_from(datagram)
@@ -178,7 +182,7 @@ def is_versioned(datagram: bytes) -> bool:
 
 
 def encode(message: Message, version: Version = (3, 0)) -> bytes:
-    """Return `message` as one datagram; frames and models are written in bitstream `version`.
+    """Return `message` as one datagram, with frames and models in bitstream `version`.
 
     Raises
     ------
@@ -201,6 +205,7 @@ def _read_info(data: bytes) -> ServerInfo | None:
     info = ServerInfo(fixed_text(name), (a, b, c, d), (e, f, g, h), None)
     if len(data) == _INFO.size:
         return info
+
     hz, port, multicast, *group = _INFO_TAIL.unpack_from(data, _INFO.size)
     address = ".".join(map(str, group))
     return info._replace(clock_hz=hz, data_port=port, multicast=bool(multicast), group=address)
@@ -233,7 +238,7 @@ _BARE = (
     MessageId.UNRECOGNIZED_REQUEST,
 )
 
-_VERSIONED: dict[int, Callable[[bytes, Version], FrameOfData | ModelDefinition | Corrupt]] = {
+_VERSIONED: dict[int, Callable[[bytes, Version], FrameOfData | ModelDefinition | CorruptBytes]] = {
     MessageId.FRAMEOFDATA: decode_frame,
     MessageId.MODELDEF: decode_model,
 }

@@ -1,11 +1,11 @@
-"""NatNet MODELDEF: what the ids in the frames mean. Law: bytes in, values as sent out.
+"""NatNet MODELDEF: the descriptions of the ids in frames, as sent.
 
     i32 n, then n x { i32 type, [>= 4.1: i32 bytes], description }
 
-From 4.1 the byte size leads over every description, understood or not. Below, an unknown type ends
-the parse: what was read is kept and `ModelDefinition.complete` is false. The quaternion that some
-4.2 descriptions carry behind the offset was seen in one client only: its presence is decided by
-the size of the description.
+From 4.1, the byte size allows every description to be skipped, known or not. In older versions
+an unknown type ends the decoding: earlier descriptions are returned, and
+`ModelDefinition.complete` is false. Only one client documents the quaternion that some 4.2
+descriptions have behind the offset; the size of the description decides whether it is present.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 """
@@ -16,8 +16,8 @@ import struct
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jointfit_protocols.corrupt import Corrupt
-from jointfit_protocols.natnet._cursor import BREAKS, I32, XYZ, Cursor, Malformed
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.natnet._cursor import BREAKS, I32, XYZ, Cursor, MalformedError
 from jointfit_protocols.natnet._frame import SIZED, Position, Version, supported
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ CAMERA_LAYOUT = struct.Struct("<3f4f")
 ASSET_MARKER_LAYOUT = struct.Struct("<i3ffh")
 BODY_HEAD_LAYOUT = struct.Struct("<ii3f")
 NAMES_FROM: Version = (4, 0)
+"""First bitstream whose body descriptions contain marker names."""
 
 _SMALLEST = 8  # type and size, or type and the shortest description
 
@@ -47,10 +48,10 @@ class BodyDescription(NamedTuple):
 
     name: str
     id: int
-    """Streaming id, editable by the operator: two bodies may share one."""
+    """Streaming id, editable by the operator: two bodies may have the same one."""
     parent: int = -1
     offset: Position = (0.0, 0.0, 0.0)
-    """Already applied to the streamed pose: do not add it."""
+    """Already applied to the streamed pose: not to be added."""
     positions: tuple[Position, ...] = ()
     """Markers in the body, m."""
     labels: tuple[int, ...] = ()
@@ -58,7 +59,7 @@ class BodyDescription(NamedTuple):
     markers: tuple[str, ...] = ()
     """Marker names, from 4.0."""
     rotation: tuple[float, float, float, float] | None = None
-    """Offset quaternion x, y, z, w where the server sends one (some 4.2)."""
+    """Offset quaternion x, y, z, w if the server sends one (some 4.2)."""
 
 
 class SkeletonDescription(NamedTuple):
@@ -119,7 +120,7 @@ class AssetDescription(NamedTuple):
 
 
 class UnknownDescription(NamedTuple):
-    """A description passed over by its size (from 4.1)."""
+    """A description skipped by its size (from 4.1)."""
 
     type: int
     data: bytes
@@ -142,23 +143,24 @@ class ModelDefinition(NamedTuple):
 
     descriptions: tuple[Description, ...]
     complete: bool = True
-    """False where an unknown type ended the parse (below 4.1)."""
+    """False if an unknown type ended the decoding (below 4.1)."""
 
 
-def decode_model(datagram: bytes, version: Version) -> ModelDefinition | Corrupt:
+def decode_model(datagram: bytes, version: Version) -> ModelDefinition | CorruptBytes:
     """Return the descriptions in a whole MODELDEF datagram (header included); never raises."""
     if not supported(version):
-        return Corrupt(
+        return CorruptBytes(
             len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
         )
+
     cursor = Cursor(datagram, 4)
     try:
         n = cursor.count(_SMALLEST)
         found = _read_sized(cursor, n, version) if version >= SIZED else _read(cursor, n, version)
         if found.complete and cursor.left:
-            raise Malformed(f"{cursor.left} bytes behind the last description")
+            raise MalformedError(f"{cursor.left} bytes behind the last description")
     except BREAKS as problem:
-        return Corrupt(len(datagram), f"model: {problem}")
+        return CorruptBytes(len(datagram), f"model: {problem}")
     return found
 
 
@@ -173,7 +175,7 @@ def _read_sized(cursor: Cursor, n: int, version: Version) -> ModelDefinition:
 
 
 def _read_window(cursor: Cursor, size: int, kind: int, version: Version) -> Description | None:
-    """Read one description of `size` bytes, with the 4.2 quaternion or without: what fits."""
+    """Read one description of `size` bytes, with or without the 4.2 quaternion."""
     at = cursor.at
     found: Description | None = None
     for rotated in (False, True):
@@ -227,11 +229,13 @@ class _Reader:
         number, parent, *offset = cursor.unpack(BODY_HEAD_LAYOUT)
         rotation: Any = cursor.unpack(QUATERNION_LAYOUT) if self._rotated else None
         n = cursor.count(XYZ.size + I32.size)
+
         positions = tuple(cursor.records(XYZ, n))
         labels = tuple(label for (label,) in cursor.records(I32, n))
         if self._named:
             cursor.check(n, 1)
         names = tuple(cursor.text() for _ in range(n)) if self._named else ()
+
         x, y, z = offset
         return BodyDescription(
             name,

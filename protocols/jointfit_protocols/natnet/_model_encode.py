@@ -1,4 +1,7 @@
-"""The writing side of NatNet MODELDEF, for simulators and tests. Law: as `natnet_model`."""
+"""Encoder of NatNet MODELDEF, for simulators and tests.
+
+Invariant: a model of a real server that `decode_model` has decoded is encoded byte for byte.
+"""
 
 from __future__ import annotations
 

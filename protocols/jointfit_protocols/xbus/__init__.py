@@ -10,14 +10,14 @@ from jointfit_protocols.xbus._framing import (
     XbusMessage,
     encode,
 )
-from jointfit_protocols.xbus._mtdata2_layout import Layout
+from jointfit_protocols.xbus._mtdata2_layout import MTData2Layout
 
 __all__ = [
     "MASTER",
     "MAX_DATA",
     "MAX_MESSAGE",
     "PREAMBLE",
-    "Layout",
+    "MTData2Layout",
     "MessageId",
     "XbusCodec",
     "XbusMessage",

@@ -1,12 +1,15 @@
-"""Xbus messages of Xsens / Movella devices, UART. Law: bytes in, messages out; no port, no clock.
+"""Xbus messages of Xsens / Movella devices on a UART.
 
- 0    1     2     3     4        4+LEN
-| FA | BID | MID | LEN | data ... | CS |
- 0    1     2     3    4           6        6+n
-| FA | BID | MID | FF | n, 2 bytes | data ... | CS |      extended, n = 255..2048
+     0    1     2     3     4        4+LEN
+    | FA | BID | MID | LEN | data ... | CS |
+     0    1     2     3    4           6        6+n
+    | FA | BID | MID | FF | n, 2 bytes | data ... | CS |      extended, n = 255..2048
 
-All bytes after FA, the checksum included, sum to 0 mod 256. LEN is 0..254. Big-endian
-everywhere. Source: MT0101P, MT Low Level Communication Protocol Documentation, rev. 2020.A.
+All bytes after FA, the checksum included, sum to 0 mod 256. LEN is 0..254. Numbers are big-endian.
+
+Source: MT0101P, MT Low Level Communication Protocol Documentation, rev. 2020.A.
+
+Invariant: bytes in, messages out; no port, no clock.
 """
 
 from __future__ import annotations
@@ -14,15 +17,18 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 PREAMBLE = 0xFA
-MASTER = 0xFF  # the BID of a stand-alone device, and of everything unasked
-MAX_DATA = 2048  # the vendor's bound: without one, a bad length waits for bytes that never come
+MASTER = 0xFF
+"""BID of a stand-alone device, and of every unsolicited message."""
+MAX_DATA = 2048
+"""Most bytes of data, by the vendor's documents. It bounds the wait after a corrupt length."""
 MAX_MESSAGE = MAX_DATA + 7
 _EXTENDED = 0xFF
 _HEAD = 4
-_RUN = MAX_MESSAGE  # a run of noise is reported at least this often, so that its sum stays fresh
+_RUN = MAX_MESSAGE
+"""Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
 
 
 class MessageId(IntEnum):
@@ -69,17 +75,17 @@ class MessageId(IntEnum):
 
 
 class XbusMessage(NamedTuple):
-    """One message whose checksum holds."""
+    """One message with a valid checksum."""
 
     mid: int
     data: bytes
     bid: int = MASTER
     end: int = 0
-    """Bytes fed to the decoder up to and including the checksum: for back-dating."""
+    """Bytes fed to the decoder up to and including the checksum, for back-dating."""
 
     @property
     def size(self) -> int:
-        """Bytes it took on the wire."""
+        """Bytes on the wire."""
         return len(self.data) + (5 if len(self.data) < _EXTENDED else 7)
 
 
@@ -101,10 +107,10 @@ def encode(mid: int, data: bytes = b"", bid: int = MASTER) -> bytes:
 
 
 class XbusCodec:
-    """Bytes in pieces of any size in, messages out; what comes out does not depend on the pieces.
+    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
 
-    A run of bytes without a message comes out as one ``Corrupt``, before the message that ends
-    it, at ``flush``, or every 2055 bytes.
+    A run of bytes without a message becomes one `CorruptBytes`: before the message that ends it, at
+    `flush`, or every 2055 bytes.
     """
 
     def __init__(self) -> None:
@@ -115,13 +121,13 @@ class XbusCodec:
         self.messages = 0
         """Messages so far."""
         self.discarded = 0
-        """Bytes so far that belong to no message."""
+        """Bytes without a message so far."""
         self.checksum_failures = 0
-        """Complete candidates so far whose checksum did not hold."""
+        """Complete candidates with a wrong checksum so far."""
 
     @property
     def pending(self) -> int:
-        """Bytes that wait for the rest of a message."""
+        """Bytes of an incomplete message."""
         return len(self._pending)
 
     @property
@@ -129,22 +135,24 @@ class XbusCodec:
         """Bytes fed so far."""
         return self._fed
 
-    def feed(self, data: bytes) -> list[XbusMessage | Corrupt]:
-        """Return what `data` completed, in wire order; never raises."""
+    def feed(self, data: bytes) -> list[XbusMessage | CorruptBytes]:
+        """Return the messages that `data` completed, in wire order; never raises."""
         return self._scan(data, final=False)
 
-    def flush(self) -> list[XbusMessage | Corrupt]:
-        """Give up waiting: end of input, or silence. A message may hide in what was pending."""
+    def flush(self) -> list[XbusMessage | CorruptBytes]:
+        """End the input, or a silence: return messages hidden in the pending bytes."""
         found = self._scan(b"", final=True)
         self._end_run(found)
         return found
 
-    def _scan(self, data: bytes, *, final: bool) -> list[XbusMessage | Corrupt]:
+    def _scan(self, data: bytes, *, final: bool) -> list[XbusMessage | CorruptBytes]:
         buffer = self._pending + data if self._pending else bytes(data)
         base = self._fed - len(self._pending)
         self._fed += len(data)
-        found: list[XbusMessage | Corrupt] = []
+        found: list[XbusMessage | CorruptBytes] = []
+
         at, end = 0, len(buffer)
+
         while at < end:
             size = _size(buffer, at)
             if at + size > end and not final:
@@ -161,27 +169,27 @@ class XbusCodec:
                 after = end if after < 0 else after
                 self._skip(after - at, reason, found)
                 at = after
-            else:  # a good message may begin inside a bad one: move on by one byte only
+            else:  # a valid message may start inside a corrupt one: skip one byte only
                 self._skip(1, reason, found)
                 at += 1
         self._pending = buffer[at:]
         return found
 
-    def _skip(self, count: int, reason: str, found: list[XbusMessage | Corrupt]) -> None:
-        """Count bytes of no message; the first real fault names the run."""
+    def _skip(self, count: int, reason: str, found: list[XbusMessage | CorruptBytes]) -> None:
+        """Count bytes without a message; the first fault names the run."""
         self.discarded += count
         self.checksum_failures += reason == _CHECKSUM
         if self._run == 0 or self._reason == _NO_START:
             self._reason = reason
         self._run += count
         while self._run >= _RUN:
-            found.append(Corrupt(_RUN, self._reason))
+            found.append(CorruptBytes(_RUN, self._reason))
             self._run -= _RUN
             self._reason = reason
 
-    def _end_run(self, found: list[XbusMessage | Corrupt]) -> None:
+    def _end_run(self, found: list[XbusMessage | CorruptBytes]) -> None:
         if self._run:
-            found.append(Corrupt(self._run, self._reason))
+            found.append(CorruptBytes(self._run, self._reason))
             self._run = 0
 
 
@@ -192,12 +200,14 @@ _CUT_OFF = "cut off"
 
 
 def _size(buffer: bytes, at: int) -> int:
-    """Return how many bytes from `at` are needed to judge what starts there."""
+    """Return the bytes from `at` that are needed to decide about a message there."""
     if buffer[at] != PREAMBLE:
         return 1
+
     have = len(buffer) - at
     if have < _HEAD:
         return _HEAD
+
     length = buffer[at + 3]
     if length != _EXTENDED:
         return length + _HEAD + 1
@@ -208,13 +218,13 @@ def _size(buffer: bytes, at: int) -> int:
 
 
 def _message(buffer: bytes, at: int, size: int, end: int) -> XbusMessage:
-    """Cut the message out that was found at `at`."""
+    """Return the message found at `at`."""
     head = _HEAD if buffer[at + 3] != _EXTENDED else _HEAD + 2
     return XbusMessage(buffer[at + 2], buffer[at + head : at + size - 1], buffer[at + 1], end)
 
 
 def _fault(buffer: bytes, at: int, size: int) -> str:
-    """Return why no message of `size` bytes starts at `at`; empty if one does."""
+    """Return the reason why no message of `size` bytes starts at `at`; empty if one does."""
     if buffer[at] != PREAMBLE:
         return _NO_START
     if at + size > len(buffer):

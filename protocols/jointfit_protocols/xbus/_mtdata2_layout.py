@@ -1,8 +1,9 @@
-"""MTData2 messages whose items follow each other as in an earlier one: read in one step.
+"""Fast decoding of MTData2 messages whose items are the same as in an earlier message.
 
-Law: says what ``split`` and ``decode_item`` say, or nothing. A device repeats the items it was
-configured to send, so the heads of one message tell where everything is in the next; a message
-with any other head is none of this layout.
+A device repeats its configured items. The item heads of one message therefore give the place of
+every value in the next one. A message with any other head has another layout.
+
+Invariant: the result equals that of `split` and `decode_item`, or is None.
 """
 
 from __future__ import annotations
@@ -26,18 +27,19 @@ _COUNTED = {
     Item.STATUS_BYTE,
     Item.STATUS_WORD,
 }
-_HEAD = 2  # values: identifier and size
+_HEAD = 2
+"""Values of an item's head: identifier and size."""
 
 
-class Layout:
-    """Places of the wanted items in a message.
+class MTData2Layout:
+    """Places of the requested items in a message.
 
     Parameters
     ----------
     items : sequence of (int, bytes)
-        What ``split`` found in a message whose wanted items ``decode_item`` could read.
+        Result of `split` for a message whose requested items `decode_item` could decode.
     wanted : container of int
-        Identifiers to read, precision and world bits zero.
+        Identifiers to decode, precision and world bits zero.
     """
 
     __slots__ = ("_heads", "_many", "_one", "_read_heads", "_struct", "world_id")
@@ -47,13 +49,15 @@ class Layout:
         self._one: list[tuple[int, int]] = []
         self._many: list[tuple[int, slice]] = []
         self.world_id = 0
-        """Identifier of the last quaternion, which names its world."""
+        """Identifier of the last quaternion, which gives its world."""
         at = 0
+
         for data_id, raw in items:
             kind = data_id & 0xFFF0
             heads += (data_id, len(raw))
             places += (at, at + 1)
             at += _HEAD
+
             count, form = _form(data_id, raw) if kind in wanted else (1, f"{len(raw)}s")
             if kind in wanted and count == 1:
                 self._one.append((kind, at))
@@ -62,24 +66,27 @@ class Layout:
             written += f"HB{form}"
             at += count
             self.world_id = data_id if kind == Item.QUATERNION else self.world_id
+
         self._struct = struct.Struct(written)
         self._heads, self._read_heads = tuple(heads), itemgetter(*places)
 
     @staticmethod
-    def of(items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> Layout | None:
-        """Return the layout of such a message; None where an item takes more than one step."""
+    def of(items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> MTData2Layout | None:
+        """Return the layout of such a message; None if an item has no single code."""
         plain = all(
             data_id & 0xFFF0 not in wanted or _form(data_id, raw)[0] for data_id, raw in items
         )
-        return Layout(items, wanted) if items and plain else None
+        return MTData2Layout(items, wanted) if items and plain else None
 
     def read(self, data: bytes) -> dict[int, Value] | None:
-        """Return the wanted items by identifier; None for a message of another layout."""
+        """Return the requested items by identifier; None for a message of another layout."""
         if len(data) != self._struct.size:
             return None
+
         found = self._struct.unpack(data)
         if self._read_heads(found) != self._heads:
             return None
+
         values: dict[int, Value] = {kind: found[at] for kind, at in self._one}
         for kind, places in self._many:
             values[kind] = found[places]
@@ -87,7 +94,7 @@ class Layout:
 
 
 def _form(data_id: int, raw: bytes) -> tuple[int, str]:
-    """Return how many values an item holds and how they are written; 0 where that is not plain."""
+    """Return an item's number of values and their struct code; 0 if it has none."""
     if data_id in _COUNTED:
         return 1, _COUNTS[len(raw)]
     count = reals_in(data_id)

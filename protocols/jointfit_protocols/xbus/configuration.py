@@ -1,11 +1,11 @@
-"""What is inside the Xbus messages that configure a device. Law: bytes to values and back.
+"""Payloads of the Xbus messages that configure a device.
 
-OutputConfiguration   N x | DataID U2 | rate U2 |                                       N <= 32
-SyncSettings          N x | function | line | polarity | once | skipFirst U2 | skipFactor U2
-                          | pulseWidth U2, 100 us | delay U2, 100 us, or period, ms |   N <= 10
-AlignmentRotation         | frame U1: 0 sensor, 1 local | w x y z float32 |
-FirmwareRev               | major | minor | revision | build U4 | scm U4 |
-CanOutputConfig       N x | data id, 7 bit | 29 bit flag | identifier U4 | rate U2 |    N <= 16
+    OutputConfiguration   N x | DataID U2 | rate U2 |                                   N <= 32
+    SyncSettings          N x | function | line | polarity | once | skipFirst U2 | skipFactor U2
+                              | pulseWidth U2, 100 us | delay U2, 100 us, or period, ms |   N <= 10
+    AlignmentRotation         | frame U1: 0 sensor, 1 local | w x y z float32 |
+    FirmwareRev               | major | minor | revision | build U4 | scm U4 |
+    CanOutputConfig       N x | data id, 7 bit | 29 bit flag | identifier U4 | rate U2 |    N <= 16
 
 Source: MT0101P rev. 2020.A; CAN from the MTi-600 pages of the same vendor.
 """
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MAX_RATE = 0xFFFF
-"""As a request: as fast as you can. Time and status items always report it."""
+"""Request for the highest possible rate. Time and status items always report it."""
 TICK_NS = 100_000
 """One tick of SampleTimeFine, ns."""
 WRAP_32_BIT = 1 << 32
+"""Ticks after which SampleTimeFine of most models wraps."""
 WRAP_DAY = 864_000_000
-"""SampleTimeFine of the MTi-10 and MTi-100 series starts again at midnight."""
+"""Ticks after which SampleTimeFine of the MTi-10 and MTi-100 series wraps, at midnight."""
 CAN_ENABLED = 1 << 8
 
 ERRORS = {
@@ -53,7 +54,8 @@ _BAUD_OF_CODE = {
 }
 _CODE_OF_BAUD = {baud: code for code, baud in reversed(_BAUD_OF_CODE.items())}
 BAUD_RATES = tuple(sorted(_CODE_OF_BAUD))
-_DAY_WRAP_MODELS = {10, 20, 30, 100, 200, 300, 700, 710}  # MTi-10 and MTi-100 series
+_DAY_WRAP_MODELS = {10, 20, 30, 100, 200, 300, 700, 710}
+"""Models of the MTi-10 and MTi-100 series."""
 _OUTPUT = struct.Struct(">HH")
 _SYNC = struct.Struct(">BBBBHHHH")
 _FIRMWARE = struct.Struct(">BBBII")
@@ -67,11 +69,11 @@ class Output(NamedTuple):
 
     data_id: int
     rate: int
-    """Hz; 0 or 0xFFFF is the most the device can do."""
+    """Hz; 0 or 0xFFFF is the highest possible rate."""
 
 
 class SyncSetting(NamedTuple):
-    """One entry of the synchronisation settings; the list sent replaces the old one."""
+    """One entry of the synchronisation settings; a list that is sent replaces the old one."""
 
     function: int
     """3 trigger indication, 4 SyncOut, 8 send latest, 9 clock bias, 11 start sampling, 14 1PPS."""
@@ -98,7 +100,7 @@ class Firmware(NamedTuple):
 
 
 class AlignmentRotation(NamedTuple):
-    """A rotation the device applies to what it sends."""
+    """A rotation that the device applies to its output."""
 
     frame: int
     """0 sensor, 1 local (world)."""
@@ -112,7 +114,7 @@ class CanOutput(NamedTuple):
     extended: bool
     identifier: int
     rate: int
-    """Hz; 0x7FF is the most the device can do."""
+    """Hz; 0x7FF is the highest possible rate."""
 
 
 def encode_outputs(outputs: Iterable[tuple[int, int]]) -> bytes:
@@ -200,22 +202,22 @@ def decode_filter_profile(data: bytes) -> str:
 
 
 def baud_of_code(code: int) -> int | None:
-    """Return the speed a code stands for, bit/s; None if it stands for none."""
+    """Return the speed for a code, bit/s; None for an unknown code."""
     return _BAUD_OF_CODE.get(code)
 
 
 def code_of_baud(baud: int) -> int | None:
-    """Return the code of a speed; None if the device has none for it."""
+    """Return the code for a speed; None if the device does not support it."""
     return _CODE_OF_BAUD.get(baud)
 
 
 def error_text(code: int) -> str:
-    """Say what error `code` means."""
+    """Return a description of error `code`."""
     return f"error 0x{code:02X}, {ERRORS.get(code, 'unknown to this version')}"
 
 
 def fine_time_modulus(product_code: str) -> int | None:
-    """Return the ticks after which SampleTimeFine starts again; None if the model is unknown."""
+    """Return the ticks after which SampleTimeFine wraps; None for an unknown model."""
     model = re.search(r"MTi-(?:G-)?(\d+)", product_code)
     if model is None:
         return None

@@ -1,8 +1,8 @@
-"""The data inside an MTData2 message. Law: counts and floats as sent; no unit is changed here.
+"""Items of an MTData2 message, in counts and floats as sent; no unit is converted.
 
-| DataID U2 | size U1 | size bytes |   repeated; the run ends exactly at the end of the message
+    | DataID U2 | size U1 | size bytes |   repeated; the run ends exactly at the end of the message
 
-The low nibble of a real-valued item says how it is written:
+The low nibble of a real-valued item gives its encoding and its world:
 
 | bits 1:0 | encoding                                  | bytes |   | bits 3:2 | world |
 |----------|-------------------------------------------|-------|   |----------|-------|
@@ -33,7 +33,7 @@ class Item(IntEnum):
 
     UTC_TIME = 0x1010
     PACKET_COUNTER = 0x1020
-    """U2, plus one for each MTData2 of any content, wraps."""
+    """U2, incremented by every MTData2 of any content, wraps."""
     SAMPLE_TIME_FINE = 0x1060
     """U4, 100 us ticks."""
     SAMPLE_TIME_COARSE = 0x1070
@@ -51,10 +51,10 @@ class Item(IntEnum):
     FREE_ACCELERATION = 0x4030
     """m/s^2, gravity removed, world coordinates."""
     TRIGGER_IN1 = 0x4810
-    """An edge on a sync input; only in messages that follow one."""
+    """An edge on a sync input; only in the next message after it."""
     TRIGGER_IN2 = 0x4820
     GNSS_PVT = 0x7010
-    """94 bytes, handed on as they are."""
+    """94 bytes, not decoded."""
     RATE_OF_TURN = 0x8020
     """rad/s."""
     DELTA_Q = 0x8030
@@ -96,7 +96,7 @@ class Trigger(NamedTuple):
     time: int
     """Ticks of SampleTimeFine."""
     frame: int
-    """Counts edges, as far as known."""
+    """Counts edges, as far as documented."""
 
 
 Value = int | Reals | UtcTime | Trigger | bytes
@@ -128,7 +128,8 @@ _COUNTS: dict[int, int] = {
     Item.STATUS_BYTE: 1,
     Item.STATUS_WORD: 4,
 }
-_BYTES = (4, 4, 6, 8)  # of one real, by precision
+_BYTES = (4, 4, 6, 8)
+"""Bytes of one real, by precision."""
 _UTC = struct.Struct(">IHBBBBBB")
 _TRIGGER = struct.Struct(">BBIH")
 _TRIGGERS = {int(Item.TRIGGER_IN1), int(Item.TRIGGER_IN2)}
@@ -138,7 +139,7 @@ _FLOATS = tuple(struct.Struct(f">{count}f") for count in range(10))
 
 
 def world_of(data_id: int) -> World | None:
-    """Return the world an item refers to; None for the reserved bit pattern."""
+    """Return the world of an item; None for the reserved bit pattern."""
     return _WORLDS.get(data_id & 0xC)
 
 
@@ -159,16 +160,18 @@ def split(data: bytes) -> list[tuple[int, bytes]] | None:
 
 
 def decode_reals(data_id: int, raw: bytes, count: int) -> Reals | None:
-    """Return `count` reals written with the precision of `data_id`; None if the size is wrong."""
+    """Return `count` reals in the precision of `data_id`; None if the size is wrong."""
     precision = data_id & 0x3
     if len(raw) != count * _BYTES[precision]:
         return None
     if precision == Precision.FLOAT32:
         return _FLOATS[count].unpack(raw)  # the path every sample takes
+
     if precision == Precision.FLOAT64:
         return struct.unpack(f">{count}d", raw)
     if precision == Precision.FIXED_12_20:
         return tuple(value / 2**20 for value in struct.unpack(f">{count}i", raw))
+
     halves = struct.unpack(">" + count * "Ih", raw)
     return tuple(
         whole + fraction / 2**32 for fraction, whole in zip(halves[::2], halves[1::2], strict=True)
@@ -176,7 +179,7 @@ def decode_reals(data_id: int, raw: bytes, count: int) -> Reals | None:
 
 
 def decode_item(data_id: int, raw: bytes) -> Value | None:
-    """Return the value of one item; None where the item is unknown or its size is wrong."""
+    """Return the value of one item; None if the item is unknown or its size is wrong."""
     if data_id in _COUNTS:
         return int.from_bytes(raw, "big") if len(raw) == _COUNTS[data_id] else None
     if data_id == Item.UTC_TIME:
@@ -185,6 +188,7 @@ def decode_item(data_id: int, raw: bytes) -> Value | None:
         return Trigger(*_TRIGGER.unpack(raw)) if len(raw) == _TRIGGER.size else None
     if data_id == Item.GNSS_PVT:
         return raw if len(raw) == _GNSS_PVT_BYTES else None
+
     count = _REALS.get(data_id & 0xFFF0)
     if count is None or world_of(data_id) is None:
         return None
@@ -192,7 +196,7 @@ def decode_item(data_id: int, raw: bytes) -> Value | None:
 
 
 def encode_reals(data_id: int, values: Iterable[float]) -> bytes:
-    """Write reals with the precision of `data_id`; fixed-point values are rounded.
+    """Encode reals in the precision of `data_id`; fixed-point values are rounded.
 
     Raises
     ------
@@ -212,12 +216,12 @@ def encode_reals(data_id: int, values: Iterable[float]) -> bytes:
 
 
 def encode_item(data_id: int, value: Value) -> bytes:
-    """Write one item with its head.
+    """Encode one item with its head.
 
     Raises
     ------
     KeyError
-        An integer for an item that is none.
+        The value is an integer, and the item is not.
     struct.error, OverflowError
         A value does not fit the encoding.
     """
@@ -235,10 +239,10 @@ def encode_item(data_id: int, value: Value) -> bytes:
 
 
 def encode_items(items: Iterable[tuple[int, Value]]) -> bytes:
-    """Write the data of one MTData2 message."""
+    """Encode the data of one MTData2 message."""
     return b"".join(encode_item(data_id, value) for data_id, value in items)
 
 
 def reals_in(data_id: int) -> int | None:
-    """Return how many reals an item holds; None if it holds none."""
+    """Return the number of reals in an item; None if it has none."""
     return _REALS.get(data_id & 0xFFF0) if world_of(data_id) else None

@@ -1,15 +1,17 @@
-"""Xsens XCDI: the CAN messages of MTi-600, Sirius and Avior, decode and encode.
+"""Xsens XCDI: the CAN messages of MTi-600, Sirius and Avior, decoded and encoded.
 
-Law: frames in, counts out; no bus, no clock, no unit beyond the table. Every quantity is a frame
-of its own, and one sensor's frames of one instant form a group:
+Every quantity has a frame of its own. The frames of one sensor at one instant form a group:
 
     SampleTime  GroupCounter  ...  Quaternion        lowest identifier first
     U4 ticks    U2            ...  4 x I2 / 32767, w x y z, sensor to world, ENU
 
-Frames of other sensors interleave freely, so groups are assembled per sensor. Identifiers are
-configuration: by default the data identifier itself, but any 11- or 29-bit value can be set.
+Frames of other sensors interleave, so groups are assembled per sensor. Identifiers are
+configurable: by default the data identifier itself, but any 11- or 29-bit value is possible.
+
 Source: Xsens MT1604P rev. A (2019) and the vendor's CAN pages; byte order from third-party
-decoders. The unit of SampleTime is disputed (100 us or 1 us): see ``xcdi_unit``.
+decoders. The sources disagree on the unit of SampleTime (100 us or 1 us): see `TickUnit`.
+
+Invariant: frames in, counts out; no bus, no clock.
 """
 
 from __future__ import annotations
@@ -19,22 +21,22 @@ from enum import IntEnum
 from typing import Literal, NamedTuple
 
 from jointfit_protocols.can import STANDARD_MAX, CanFrame
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 ByteOrder = Literal["big", "little"]
 
 TICKS_MODULUS = 2**32
-"""SampleTime wraps here."""
+"""Ticks after which SampleTime wraps."""
 COUNTER_MODULUS = 2**16
-"""GroupCounter wraps here."""
+"""Groups after which GroupCounter wraps."""
 QUATERNION_SCALE = 1 / 32767
-"""0x8000 is -1.00003: normalise, do not refuse."""
+"""Value of one count. 0x8000 is -1.00003: to be normalised, not rejected."""
 OVERFLOW = 1
-"""Error code: the output buffer overflowed, at least one frame is lost."""
+"""Error code: the output buffer overflowed, and at least one frame is lost."""
 
 
 class DataId(IntEnum):
-    """What a frame carries; also its identifier unless configured otherwise."""
+    """Content of a frame; also its identifier unless configured otherwise."""
 
     ERROR = 0x01
     SAMPLE_TIME = 0x05
@@ -48,8 +50,8 @@ class DataId(IntEnum):
     FREE_ACCELERATION = 0x35
 
 
-class Layout(NamedTuple):
-    """How a message is laid out."""
+class XcdiLayout(NamedTuple):
+    """Layout of a message."""
 
     fields: str
     """``struct`` codes, without byte order."""
@@ -58,17 +60,17 @@ class Layout(NamedTuple):
     unit: str
 
 
-_LAYOUTS: dict[DataId, Layout] = {
-    DataId.ERROR: Layout("B", 1, ""),
-    DataId.SAMPLE_TIME: Layout("I", 1, "ticks"),
-    DataId.GROUP_COUNTER: Layout("H", 1, ""),
-    DataId.UTC: Layout("6BH", 1, "year - 2000, month, day, hour, minute, second, 100 us"),
-    DataId.STATUS_WORD: Layout("I", 1, "bits"),
-    DataId.QUATERNION: Layout("4h", QUATERNION_SCALE, ""),
-    DataId.EULER: Layout("3h", 1 / 128, "deg"),
-    DataId.RATE_OF_TURN: Layout("3h", 1 / 512, "rad/s"),
-    DataId.ACCELERATION: Layout("3h", 1 / 256, "m/s^2"),
-    DataId.FREE_ACCELERATION: Layout("3h", 1 / 256, "m/s^2"),
+_LAYOUTS: dict[DataId, XcdiLayout] = {
+    DataId.ERROR: XcdiLayout("B", 1, ""),
+    DataId.SAMPLE_TIME: XcdiLayout("I", 1, "ticks"),
+    DataId.GROUP_COUNTER: XcdiLayout("H", 1, ""),
+    DataId.UTC: XcdiLayout("6BH", 1, "year - 2000, month, day, hour, minute, second, 100 us"),
+    DataId.STATUS_WORD: XcdiLayout("I", 1, "bits"),
+    DataId.QUATERNION: XcdiLayout("4h", QUATERNION_SCALE, ""),
+    DataId.EULER: XcdiLayout("3h", 1 / 128, "deg"),
+    DataId.RATE_OF_TURN: XcdiLayout("3h", 1 / 512, "rad/s"),
+    DataId.ACCELERATION: XcdiLayout("3h", 1 / 256, "m/s^2"),
+    DataId.FREE_ACCELERATION: XcdiLayout("3h", 1 / 256, "m/s^2"),
 }
 _STRUCTS: dict[ByteOrder, dict[DataId, struct.Struct]] = {
     "big": {key: struct.Struct(">" + layout.fields) for key, layout in _LAYOUTS.items()},
@@ -76,18 +78,18 @@ _STRUCTS: dict[ByteOrder, dict[DataId, struct.Struct]] = {
 }
 
 
-def layout(data_id: DataId) -> Layout:
-    """Return how the message `data_id` is laid out."""
+def layout(data_id: DataId) -> XcdiLayout:
+    """Return the layout of message `data_id`."""
     return _LAYOUTS[data_id]
 
 
 def decode(
     data_id: DataId, data: bytes, byte_order: ByteOrder = "big"
-) -> tuple[int, ...] | Corrupt:
+) -> tuple[int, ...] | CorruptBytes:
     """Return the counts in the data field of a message, in wire order; never raises."""
     message = _STRUCTS[byte_order][data_id]
     if len(data) != message.size:
-        return Corrupt(
+        return CorruptBytes(
             len(data), f"{data_id.name}: {len(data)} data bytes instead of {message.size}"
         )
     return message.unpack(data)
@@ -111,7 +113,7 @@ def quaternion_counts(q: tuple[float, float, float, float]) -> tuple[int, int, i
 
 
 class XcdiIds(NamedTuple):
-    """Identifiers of one sensor; None: not listened to."""
+    """Identifiers of one sensor; None: not received."""
 
     sample_time: int | None = int(DataId.SAMPLE_TIME)
     group_counter: int | None = int(DataId.GROUP_COUNTER)
@@ -122,7 +124,7 @@ class XcdiIds(NamedTuple):
     """29-bit identifiers even where the numbers would fit 11 bits."""
 
     def by_id(self) -> dict[tuple[int, bool], DataId]:
-        """Return what each (identifier, is 29-bit) carries."""
+        """Return the content of each (identifier, is 29-bit)."""
         named = {
             DataId.SAMPLE_TIME: self.sample_time,
             DataId.GROUP_COUNTER: self.group_counter,
@@ -138,7 +140,7 @@ class XcdiIds(NamedTuple):
 
 
 def id_block(base: int, *, extended: bool = False) -> XcdiIds:
-    """Return identifiers of a sensor whose every data identifier is moved up by `base`."""
+    """Return the identifiers of a sensor whose data identifiers are all increased by `base`."""
     return XcdiIds(
         sample_time=base + DataId.SAMPLE_TIME,
         group_counter=base + DataId.GROUP_COUNTER,
@@ -150,12 +152,12 @@ def id_block(base: int, *, extended: bool = False) -> XcdiIds:
 
 
 class XcdiGroup(NamedTuple):
-    """One orientation with what came with it, as sent."""
+    """One orientation and the values of its group, as sent."""
 
     t_ns: int
-    """Stamp of the group's first frame; of the Quaternion itself where SampleTime is missing."""
+    """Stamp of the group's first frame; of the Quaternion itself if SampleTime is missing."""
     ticks: int | None
-    """SampleTime; None: the Quaternion came without an open group."""
+    """SampleTime; None if no group was open."""
     counter: int | None
     status: int | None
     quaternion: tuple[int, int, int, int]
@@ -170,7 +172,7 @@ class XcdiError(NamedTuple):
     """1: its output buffer overflowed, at least one frame is lost."""
 
 
-XcdiMessage = XcdiGroup | XcdiError | Corrupt
+XcdiMessage = XcdiGroup | XcdiError | CorruptBytes
 
 
 _QUATERNION, _SAMPLE_TIME = DataId.QUATERNION, DataId.SAMPLE_TIME
@@ -178,18 +180,18 @@ _GROUP_COUNTER, _ERROR = DataId.GROUP_COUNTER, DataId.ERROR
 
 
 class XcdiCodec:
-    """Frames of one sensor in, groups out; never raises.
+    """Decoder of one sensor's frames to groups; never raises.
 
     SampleTime opens a group and Quaternion completes it. A second SampleTime, or a second counter,
-    before the Quaternion counts one incomplete group. A Quaternion without an open group keeps its
-    counter but has no device time. Frames of other identifiers are ignored and counted.
+    before the Quaternion counts as one incomplete group. A Quaternion without an open group has its
+    counter but no device time. Frames with other identifiers are ignored and counted.
 
     Parameters
     ----------
-    ids
+    ids : XcdiIds
         Identifiers of the sensor.
-    byte_order
-        ``big`` unless a device proves otherwise.
+    byte_order : ByteOrder
+        Byte order of the payloads.
     """
 
     def __init__(self, ids: XcdiIds, byte_order: ByteOrder = "big") -> None:
@@ -202,14 +204,14 @@ class XcdiCodec:
         self.messages = 0
         """Well-formed frames of this sensor."""
         self.incomplete = 0
-        """Groups that never got their Quaternion."""
+        """Groups without a Quaternion."""
         self.ungrouped = 0
         """Quaternions without an open group: their SampleTime was lost, or is not sent."""
         self.foreign = 0
-        """Frames that are not this sensor's."""
+        """Frames of other devices."""
 
     def feed(self, frame: CanFrame) -> XcdiMessage | None:
-        """Return what `frame` completed, or None."""
+        """Return the message that `frame` completed, or None."""
         t_ns, can_id, data, extended, error, remote = frame
         data_id = self._by_id.get((can_id, extended))
         if data_id is None or error or remote:
@@ -218,7 +220,8 @@ class XcdiCodec:
         message = self._messages[data_id]
         if len(data) != message.size:
             size = f"{len(data)} data bytes instead of {message.size}"
-            return Corrupt(len(data), f"{data_id.name}: {size}")
+            return CorruptBytes(len(data), f"{data_id.name}: {size}")
+
         self.messages += 1
         counts = message.unpack(data)
         if data_id is _QUATERNION:
@@ -236,7 +239,7 @@ class XcdiCodec:
         return None
 
     def flush(self) -> None:
-        """Give up on an open group: nothing more will come."""
+        """Discard an open group."""
         self._open(0, None)
 
     def _open(self, t_ns: int, ticks: int | None) -> None:
@@ -246,6 +249,7 @@ class XcdiCodec:
         self._counter = self._status = None
 
     def _complete(self, t_ns: int, quaternion: tuple[int, int, int, int]) -> XcdiGroup:
+
         ticks, counter, status = self._ticks, self._counter, self._status
         self._ticks = self._counter = self._status = None
         if ticks is None:

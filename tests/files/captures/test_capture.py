@@ -15,7 +15,7 @@ from jointfit_daemon.files.captures._capture import UnreadableCaptureError
 from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_protocols.can import host_count, unpack_frames
 from jointfit_protocols.can._candump import parse_candump
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -140,17 +140,17 @@ def test_candump_text_becomes_the_records_of_the_codec() -> None:
 )
 def test_a_line_without_a_frame_is_counted_by_its_length(line: bytes) -> None:
     (wanted,) = parse_candump(line)
-    assert isinstance(wanted, Corrupt)
+    assert isinstance(wanted, CorruptBytes)
     (chunk,) = read_candump(line)
     (note,) = unpack_frames(chunk.data)
-    assert not isinstance(note, Corrupt)
+    assert not isinstance(note, CorruptBytes)
     assert host_count(note) == wanted.discarded == len(line)
 
 
 @given(st.binary(max_size=100))
 def test_any_text_gives_records_the_codec_accepts(data: bytes) -> None:
     for chunk in read_candump(data):
-        assert not any(isinstance(frame, Corrupt) for frame in unpack_frames(chunk.data))
+        assert not any(isinstance(frame, CorruptBytes) for frame in unpack_frames(chunk.data))
 
 
 def test_raw_bytes_of_a_stream_come_in_pieces_with_time_going_on(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from jointfit_protocols.can import (
     unpack_frames,
 )
 from jointfit_protocols.can._candump import parse_candump
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 stamps = st.integers(-(2**63), 2**63 - 1)
 payloads = st.binary(max_size=8)
@@ -46,7 +46,7 @@ def test_what_is_packed_is_unpacked(frames: list[CanFrame]) -> None:
 @given(st.binary(max_size=200))
 def test_any_bytes_are_frames_or_counted(data: bytes) -> None:
     found = unpack_frames(data)
-    lost = sum(item.discarded for item in found if isinstance(item, Corrupt))
+    lost = sum(item.discarded for item in found if isinstance(item, CorruptBytes))
     frames = [item for item in found if isinstance(item, CanFrame)]
     assert RECORD_BYTES * len(frames) + lost == len(data)
 
@@ -64,7 +64,7 @@ def test_sizes_flags_and_identifiers_that_cannot_be_are_corrupt() -> None:
     for place, value in ((12, 8), (13, 9), (9, 0x08), (11, 0x20)):
         bad = bytearray(good)
         bad[place] = value
-        assert isinstance(unpack_frames(bytes(bad))[0], Corrupt)
+        assert isinstance(unpack_frames(bytes(bad))[0], CorruptBytes)
 
 
 def test_notes_of_the_host_keep_their_number() -> None:
@@ -108,7 +108,7 @@ def test_a_candump_log_is_read_back(frames: list[CanFrame]) -> None:
 
 @given(st.binary())
 def test_any_text_is_frames_or_counted(log: bytes) -> None:
-    lost = sum(item.discarded for item in parse_candump(log) if isinstance(item, Corrupt))
+    lost = sum(item.discarded for item in parse_candump(log) if isinstance(item, CorruptBytes))
     assert lost <= len(log)
 
 
@@ -128,6 +128,6 @@ no line at all
     assert isinstance(error, CanFrame)
     assert error.error
     assert error.can_id == 4
-    assert [item.discarded for item in corrupt if isinstance(item, Corrupt)] == [36, 15]
+    assert [item.discarded for item in corrupt if isinstance(item, CorruptBytes)] == [36, 15]
     assert isinstance(remote, CanFrame)
     assert remote.remote

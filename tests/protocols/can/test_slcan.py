@@ -14,7 +14,7 @@ from jointfit_protocols.can.slcan import (
     bitrate_code,
     encode_frame,
 )
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 payloads = st.binary(max_size=8)
 
@@ -40,9 +40,9 @@ roles = st.sampled_from(["host", "adapter"])
 def decoded(chunks: list[bytes], role: Role = "host") -> tuple[list[CanFrame | SlcanLine], int]:
     decoder = SlcanCodec(115_200, role)
     found = [item for chunk in chunks for item in decoder.feed(chunk, 0)] + decoder.flush()
-    lost = sum(item.discarded for item in found if isinstance(item, Corrupt))
+    lost = sum(item.discarded for item in found if isinstance(item, CorruptBytes))
     assert lost == decoder.discarded_bytes
-    good = [item for item in found if not isinstance(item, Corrupt)]
+    good = [item for item in found if not isinstance(item, CorruptBytes)]
     assert decoder.frames == sum(isinstance(item, CanFrame) for item in good)
     return [i._replace(t_ns=0) if isinstance(i, CanFrame) else i for i in good], lost
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.files.captures._packet_capture import read_udp
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import (
     MARKER_OCCLUDED,
     BodyDescription,
@@ -42,7 +42,7 @@ def capture(shared_data: Path) -> Path:
 def test_a_captured_message_is_written_back_byte_for_byte(capture: Path, name: str) -> None:
     wire = (capture / f"{name}_packet_v3.bin").read_bytes()
     message = decode(wire, (3, 0))
-    assert not isinstance(message, Corrupt)
+    assert not isinstance(message, CorruptBytes)
     assert encode(message) == wire
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import (
     AssetDescription,
     Bare,
@@ -33,7 +33,7 @@ from jointfit_protocols.natnet import (
     decode,
     encode,
 )
-from jointfit_protocols.natnet._cursor import Cursor, Malformed
+from jointfit_protocols.natnet._cursor import Cursor, MalformedError
 from jointfit_protocols.natnet._frame import Analog, Asset, Skeleton
 from jointfit_protocols.natnet._messages import MessageString
 from jointfit_protocols.natnet._model import (
@@ -177,7 +177,7 @@ def test_a_damaged_message_never_raises_and_corrupt_counts_all_of_it(
     for _ in range(data.draw(st.integers(1, 4))):
         wire[data.draw(st.integers(0, len(wire) - 1))] = data.draw(st.integers(0, 255))
     found = decode(bytes(wire), read_as)
-    assert not isinstance(found, Corrupt) or found.discarded == len(wire)
+    assert not isinstance(found, CorruptBytes) or found.discarded == len(wire)
 
 
 @settings(max_examples=50)
@@ -188,7 +188,7 @@ def test_a_cut_datagram_is_corrupt_as_a_whole(
     wire = encode(*case)
     cut = wire[: data.draw(st.integers(0, len(wire) - 1))]
     found = decode(cut, case[1])
-    assert isinstance(found, Corrupt)
+    assert isinstance(found, CorruptBytes)
     assert found.discarded == len(cut)
 
 
@@ -203,7 +203,7 @@ def test_bytes_left_over_make_a_frame_corrupt(
     if isinstance(found, FrameOfData):  # 8 bytes more can be a precision timestamp, in zeros
         assert case[0].precision is None or found.skipped
     else:
-        assert isinstance(found, Corrupt)
+        assert isinstance(found, CorruptBytes)
 
 
 @pytest.mark.parametrize("place", [8, 12, 16, 20, 24])
@@ -211,18 +211,18 @@ def test_bytes_left_over_make_a_frame_corrupt(
 def test_a_hostile_count_is_corrupt(place: int, count: int) -> None:
     wire = bytearray(encode(FrameOfData(1, 0.0, 1, 2, 3)))
     struct.pack_into("<i", wire, place, count)
-    assert isinstance(decode(bytes(wire), (3, 0)), Corrupt)
+    assert isinstance(decode(bytes(wire), (3, 0)), CorruptBytes)
 
 
 @pytest.mark.parametrize("count", [-1, 3, 2**31 - 1])
 def test_no_count_is_believed_that_the_bytes_left_cannot_hold(count: int) -> None:
-    with pytest.raises(Malformed):
+    with pytest.raises(MalformedError):
         Cursor(struct.pack("<iii", count, 0, 0)).count(4)
 
 
 def test_a_bitstream_before_3_is_refused_by_name() -> None:
     found = decode(encode(FrameOfData(1, 0.0, 1, 2, 3)), (2, 9))
-    assert isinstance(found, Corrupt)
+    assert isinstance(found, CorruptBytes)
     assert "2.9" in found.reason
 
 

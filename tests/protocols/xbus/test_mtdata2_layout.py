@@ -7,7 +7,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_protocols.xbus import Layout
+from jointfit_protocols.xbus import MTData2Layout
 from jointfit_protocols.xbus.mtdata2 import Item, Value, decode_item, encode_item, split
 
 WANTED = {0x1020, 0x1060, 0x2010, 0x8020, 0xE010, 0xE020}
@@ -53,7 +53,7 @@ def one_by_one(data: bytes) -> dict[int, Value]:
 @given(st.data(), st.lists(st.sampled_from(IDS), min_size=1, max_size=7))
 def test_the_next_message_reads_as_item_by_item(data: st.DataObject, ids: list[int]) -> None:
     first, second = data.draw(items(ids)), data.draw(items(ids))
-    layout = Layout.of(split(first) or [], WANTED)
+    layout = MTData2Layout.of(split(first) or [], WANTED)
     if {0x2011, 0x2013} & {*ids}:  # fixed point and doubles take the long way
         assert layout is None
         return
@@ -68,7 +68,7 @@ def test_another_order_or_size_is_not_read(noise: bytes, ids: list[int]) -> None
     usual: list[tuple[int, Value]] = [(0x1020, 7), (0x1060, 8), (0x2010, (1.0, 0.0, 0.0, 0.0))]
     values = dict(usual)
     known = b"".join(encode_item(data_id, value) for data_id, value in usual)
-    layout = Layout.of(split(known) or [], WANTED)
+    layout = MTData2Layout.of(split(known) or [], WANTED)
     assert layout is not None
     other = b"".join(encode_item(data_id, values[data_id]) for data_id in ids)
     assert (layout.read(other) is None) == (other != known)
@@ -78,11 +78,11 @@ def test_another_order_or_size_is_not_read(noise: bytes, ids: list[int]) -> None
 def test_the_world_is_that_of_the_quaternion() -> None:
     ned = Item.QUATERNION | 0x4
     wire = encode_item(Item.PACKET_COUNTER, 1) + encode_item(ned, (1.0, 0.0, 0.0, 0.0))
-    layout = Layout.of(split(wire) or [], WANTED)
+    layout = MTData2Layout.of(split(wire) or [], WANTED)
     assert layout is not None
     assert layout.world_id == ned
     assert layout.read(wire.replace(b"\x20\x14", b"\x20\x10")) is None
 
 
 def test_nothing_has_no_layout() -> None:
-    assert Layout.of([], WANTED) is None
+    assert MTData2Layout.of([], WANTED) is None

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jointfit_protocols import xbus
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.xbus import MAX_MESSAGE, XbusCodec, XbusMessage, encode
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ false_heads = st.sampled_from([b"\xfa", b"\xfa\xff", bytes.fromhex("faff36ff07d0
 wires = st.lists(messages | st.binary(max_size=30) | false_heads, max_size=8).map(b"".join)
 
 
-def decode(chunks: list[bytes]) -> tuple[list[XbusMessage | Corrupt], XbusCodec]:
+def decode(chunks: list[bytes]) -> tuple[list[XbusMessage | CorruptBytes], XbusCodec]:
     decoder = XbusCodec()
     found = [event for chunk in chunks for event in decoder.feed(chunk)]
     return found + decoder.flush(), decoder
@@ -62,14 +62,14 @@ def test_long_noise_is_reported_in_bounded_runs_whatever_the_cut(
     whole, _ = decode([b"".join(noise) + tail])
     assert decode([*noise, tail])[0] == whole
     assert decode([bytes([byte]) for byte in b"".join(noise) + tail])[0] == whole
-    assert all(event.discarded <= MAX_MESSAGE for event in whole if isinstance(event, Corrupt))
+    assert all(event.discarded <= MAX_MESSAGE for event in whole if isinstance(event, CorruptBytes))
 
 
 @given(wires)
 def test_every_byte_is_in_a_message_or_counted(wire: bytes) -> None:
     found, decoder = decode([wire])
     used = sum(event.size for event in found if isinstance(event, XbusMessage))
-    lost = sum(event.discarded for event in found if isinstance(event, Corrupt))
+    lost = sum(event.discarded for event in found if isinstance(event, CorruptBytes))
     assert used + lost == len(wire)
     assert lost == decoder.discarded
     assert decoder.messages == sum(isinstance(event, XbusMessage) for event in found)
@@ -93,7 +93,7 @@ def test_what_waits_is_bounded(chunks: list[bytes]) -> None:
     ],
 )
 def test_a_run_is_named_for_its_first_real_fault(wire: bytes, reason: str) -> None:
-    assert decode([wire])[0] == [Corrupt(len(wire), reason)]
+    assert decode([wire])[0] == [CorruptBytes(len(wire), reason)]
 
 
 @pytest.mark.parametrize("length", [0, 254, 2049, 65535])

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jointfit_protocols.can import CanFrame
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.xcdi import (
     DataId,
     TickUnit,
@@ -54,7 +54,7 @@ def test_the_vectors(shared_data: Path) -> None:
     for vector in known:
         counts = decode(DataId(vector["can_id"]), bytes.fromhex(vector["hex"]))
         if vector["id"] == "xcdi-neg-dlc":
-            assert isinstance(counts, Corrupt)
+            assert isinstance(counts, CorruptBytes)
         elif vector["can_id"] in names:
             assert counts == (vector["decoded"][names[vector["can_id"]]],)
         elif vector["valid"]:
@@ -96,7 +96,7 @@ def test_an_independent_reader_agrees(shared_data: Path, data_id: DataId) -> Non
 def test_any_bytes_are_counts_or_corrupt(data_id: DataId, data: bytes) -> None:
     for byte_order in ("big", "little"):
         counts = decode(data_id, data, byte_order)
-        if not isinstance(counts, Corrupt):
+        if not isinstance(counts, CorruptBytes):
             assert encode(data_id, counts, byte_order) == data
 
 
@@ -183,7 +183,7 @@ def test_11_and_29_bit_identifiers_are_different() -> None:
 def test_any_frames_give_groups_and_every_frame_is_accounted_for(frames: list[CanFrame]) -> None:
     decoder = XcdiCodec(XcdiIds())
     found = [decoder.feed(frame) for frame in frames]
-    corrupt = sum(isinstance(item, Corrupt) for item in found)
+    corrupt = sum(isinstance(item, CorruptBytes) for item in found)
     assert decoder.messages + decoder.foreign + corrupt == len(frames)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-from jointfit_protocols.corrupt import Corrupt
+from jointfit_protocols.corrupt import CorruptBytes
 
 QUATERNION = 0x59
 ACCELERATION = 0x51
@@ -63,11 +63,11 @@ class WitDecoder:
         self.discarded = 0
         """Bytes so far that belong to no frame."""
 
-    def feed(self, data: bytes) -> list[WitFrame | Corrupt]:
+    def feed(self, data: bytes) -> list[WitFrame | CorruptBytes]:
         """Return what `data` completed, in wire order; never raises."""
         buffer, start = self._pending + data, self.fed - len(self._pending)
         self.fed += len(data)
-        found: list[WitFrame | Corrupt] = []
+        found: list[WitFrame | CorruptBytes] = []
         at = 0
         while len(buffer) - at >= SIZE:
             frame = buffer[at : at + SIZE]
@@ -84,7 +84,7 @@ class WitDecoder:
         self._pending = buffer[at:]
         return found
 
-    def flush(self) -> list[WitFrame | Corrupt]:
+    def flush(self) -> list[WitFrame | CorruptBytes]:
         """Give up waiting: what is pending is shorter than a frame, so none hides in it."""
         self._skipped += len(self._pending)
         self.discarded += len(self._pending)
@@ -96,6 +96,6 @@ class WitDecoder:
         """Bytes that wait for the rest of a frame."""
         return len(self._pending)
 
-    def _gap(self) -> list[Corrupt]:
+    def _gap(self) -> list[CorruptBytes]:
         skipped, self._skipped = self._skipped, 0
-        return [Corrupt(skipped, "no frame starts here")] if skipped else []
+        return [CorruptBytes(skipped, "no frame starts here")] if skipped else []

@@ -20,7 +20,7 @@ from jointfit_wit import frames
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
     from jointfit_daemon.model import Chunk, Decoded
-    from jointfit_protocols.corrupt import Corrupt as WireCorrupt
+    from jointfit_protocols.corrupt import CorruptBytes
 
 _BITS = 10  # of one byte on the line, 8N1
 _SILENCE_NS = 250_000_000  # longer than any stall of a host between two halves of a frame
@@ -79,7 +79,7 @@ class WitEvents:
         """Give up waiting for the rest of a pending frame."""
         return self._take(self._wit.flush())
 
-    def _take(self, found: list[frames.WitFrame | WireCorrupt]) -> list[Decoded]:
+    def _take(self, found: list[frames.WitFrame | CorruptBytes]) -> list[Decoded]:
         out: list[Decoded] = []
         for event in found:
             if not isinstance(event, frames.WitFrame):
