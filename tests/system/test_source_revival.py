@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.system
 
 NMEA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
-WRONG = "not an Xbus device"
+WRONG = "is not Xbus"
 
 RIG = """
 [rig]
