@@ -211,7 +211,7 @@ def write_rig(folder: Path, mqtt: int, mocap: int) -> Path:
 
 
 EXPECTED = {
-    "slow": ("921600 baud but nothing decodes", "set baud = 115200"),
+    "slow": ("921600 baud, but no message can be decoded", "set baud = 115200"),
     "gps": ("is not Xbus", "correct `port` or `driver`"),
     "taken": ("is used by another program", "fuser", "ModemManager", "udev rule"),
     "absent": ("is not there", "plug it in, or set `port`"),
