@@ -1,14 +1,14 @@
-"""``jointfit-sim``: virtual hardware on a command line.
+"""Command-line interface of the hardware simulator, ``jointfit-sim``.
 
-Law: nothing but JSON lines on stdout. One when all is ready, one for every ``status``, ``{"error":
-…}`` for a command that was not understood, ``{"motion": …}`` for every motion that ``--follow``
-begins, and one with the counts of all that was sent at the end.
-
-``jointfit-sim play --directory DIR`` reads commands from stdin, one a line: ``play NAME``,
+``jointfit-sim play --directory DIR`` reads one command per line from stdin: ``play NAME``,
 ``unplug ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``, ``drift ID
 DEG``, ``occlude on|off``, ``mocap stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID
-is a sensor, ``can0`` for the bus adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND`` gives
-a command its time beforehand. The end of stdin changes nothing; SIGTERM and SIGINT quit.
+is a sensor, ``can0`` for the bus adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND``
+schedules a command. The simulator continues after the end of stdin. SIGTERM and SIGINT stop it.
+
+Invariant: stdout carries JSON lines only: one when all devices are ready, one for each ``status``,
+``{"error": …}`` for each invalid command, ``{"motion": …}`` for each motion started by
+``--follow``, and finally the numbers of samples sent.
 """
 
 from __future__ import annotations
@@ -57,38 +57,38 @@ if TYPE_CHECKING:
 USAGE = 2
 ORIGIN_NS = 100_000_000
 _COMMAND_BYTES = 4096
-COMMANDS = """commands, one a line on standard input:
+COMMANDS = """commands, one per line on standard input:
   play NAME                   change to another motion
-  unplug ID, plug ID          a sensor, or can0 for the bus adapter
-  reboot ID                   a sensor, or mocap, restarts, and its clock with it
-  stick ID, free ID           a sensor repeats itself, or no more
-  slip ID DEG                 it slides on the skin within 0.3 s
-  drift ID DEG                its world turns by so much a minute; 0 ends it
-  occlude on, occlude off     somebody stands before the cameras
-  mocap stop, mocap start     the motion-capture server is silent
-  mocap restart               it is closed and opened again; its clock goes on
-  pause on, pause off         all wires are silent; time goes on
-  status                      what was sent, as JSON
+  unplug ID, plug ID          disconnect or connect a sensor, or the bus adapter (can0)
+  reboot ID                   restart a sensor or mocap, and its clock
+  stick ID, free ID           start or stop repeating the last sample of a sensor
+  slip ID DEG                 rotate the sensor on the segment within 0.3 s
+  drift ID DEG                heading drift in degrees per minute; 0 stops it
+  occlude on, occlude off     hide all markers from the cameras, or show them
+  mocap stop, mocap start     stop or start the motion-capture stream
+  mocap restart               close and reopen the server; its clock continues
+  pause on, pause off         stop or start all transmission; time continues
+  status                      print the numbers of samples sent, as JSON
   quit                        stop, and print the counts"""
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jointfit-sim",
-        description="Virtual hardware: a moving leg as real bytes.",
-        epilog="Exit codes: 0 stopped as asked, 1 a bug, 2 wrong options, files or ports.",
+        description="Simulate the sensors and cameras of a moving leg on real ports.",
+        epilog="Exit codes: 0 stopped normally, 1 bug, 2 wrong options, files or ports.",
     )
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("knobs", help="list every knob with its default")
     commands.add_parser("motions", help="list every motion")
-    sample = commands.add_parser("sample", help="write short trials, a model, captures and a rig")
-    sample.add_argument("folder", type=Path, help="made when absent; must be empty")
-    sample.add_argument("--seed", type=int, default=1, help="another seed is another wearer")
+    sample = commands.add_parser("sample", help="write sample trials, a model, captures and a rig")
+    sample.add_argument("folder", type=Path, help="output folder; created if absent")
+    sample.add_argument("--seed", type=int, default=1, help="random seed of the subject")
     sample.add_argument(
         "--force", action="store_true", help="write into a folder that is not empty"
     )
     play = commands.add_parser(
-        "play", help="play a scene until told to quit", epilog=COMMANDS,
+        "play", help="simulate in real time until stopped", epilog=COMMANDS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     _add_play_options(play)
@@ -96,41 +96,41 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_play_options(play: argparse.ArgumentParser) -> None:
-    play.add_argument("--directory", type=Path, required=True, help="for ports, rig.toml, truth")
-    play.add_argument("--programme", help="NAME:SECONDS,…; the last one goes on (default stand)")
+    play.add_argument("--directory", type=Path, required=True, help="folder of ports, rig.toml, truth")
+    play.add_argument("--programme", help="NAME:SECONDS,…; the last motion continues (default stand)")
     play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
     play.add_argument("--knobs", type=Path, help="TOML file of knobs")
-    play.add_argument("--perfect", action="store_true", help="no imperfection but those --set")
-    play.add_argument("--rate", type=float, help="IMU samples a second")
-    play.add_argument("--seed", type=int, help="seed of all dice")
+    play.add_argument("--perfect", action="store_true", help="disable all errors except those of --set")
+    play.add_argument("--rate", type=float, help="IMU samples per second")
+    play.add_argument("--seed", type=int, help="random seed")
     play.add_argument("--no-mocap", action="store_true", help="no optical system")
     play.add_argument("--command-port", type=int, metavar="PORT",
-                      help="UDP port of the motion-capture server (default: as in the run before "
-                      "in this directory, else any free one)")  # fmt: skip
+                      help="UDP port of the motion-capture server (default: that of the previous "
+                      "run in this directory, otherwise any free port)")  # fmt: skip
     play.add_argument("--follow", action="store_true",
-                      help="move as the daemon's calibration phase asks: align, static, functional "
-                      "(over MQTT, broker and base as for rig.toml)")  # fmt: skip
+                      help="select the motion by the daemon's calibration phase: align, static, "
+                      "functional (over MQTT, broker and base as in rig.toml)")  # fmt: skip
     play.add_argument("--can", default="slcan", help="slcan, or INTERFACE:CHANNEL of python-can")
     play.add_argument("--motion", action="append", default=[], metavar="NAME=FILE",
-                      help="a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
+                      help="add a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
     play.add_argument("--clock", action="append", default=[], metavar="ID=PPM[,UP_S]",
-                      help="skew of a sensor's or mocap's clock; seconds it is up")  # fmt: skip
+                      help="skew and uptime of the clock of a sensor or mocap")  # fmt: skip
     play.add_argument("--at", action="append", default=[], metavar="SECONDS=COMMAND",
-                      help="a command and its time, from the beginning of the run")  # fmt: skip
+                      help="run a command this many seconds after the start")  # fmt: skip
     play.add_argument("--sync-line", action="store_true",
-                      help="a wire from the cameras' sync output to every UART sensor")  # fmt: skip
+                      help="connect the cameras' sync output to every UART sensor")  # fmt: skip
     play.add_argument("--ptp", action="store_true",
-                      help="cameras on PTP: frames have precision timestamps")  # fmt: skip
+                      help="send PTP precision timestamps with the camera frames")  # fmt: skip
     play.add_argument("--sample-log", action="store_true",
-                      help="write samples.jsonl: when each sample was truly taken")  # fmt: skip
+                      help="write samples.jsonl with the true time of each sample")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
-                      help="a recorded trial: .npz or .sto, with .trc and .json")  # fmt: skip
+                      help="replay a recorded trial: .npz or .sto, with .trc and .json")  # fmt: skip
     for field in dataclasses.fields(RigOptions):
         play.add_argument(
             f"--{field.name.replace('_', '-')}",
             type=type(field.default),
             default=field.default,
-            help=f"for rig.toml (default {field.default})",
+            help=f"value written to rig.toml (default {field.default})",
         )
 
 
@@ -155,7 +155,7 @@ def _subject(options: argparse.Namespace, knobs: Knobs) -> Subject:
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
-    """Split ``A=B`` words; ValueError for one that is none."""
+    """Split ``A=B`` words; raise ValueError for a word without ``=``."""
     found = [word.partition("=") for word in words]
     if wrong := [a for a, equals, _ in found if not equals]:
         raise ValueError(f"{option} {wrong[0]}: expected two parts, A=B: see --help")
@@ -185,20 +185,20 @@ def _say(line: dict[str, object]) -> None:
     try:
         sys.stdout.buffer.write(text)
         sys.stdout.buffer.flush()
-    except BrokenPipeError:  # the reader is gone; the hardware plays on
+    except BrokenPipeError:  # the reader closed the pipe: continue without output
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
 
 
 async def _obey(scene: Scene) -> None:
-    """Read commands from stdin until it ends."""
+    """Run the commands from stdin until end of file."""
     reader = asyncio.StreamReader(limit=_COMMAND_BYTES)
     try:
         transport, _ = await asyncio.get_running_loop().connect_read_pipe(
             lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
         )
-    except (ValueError, OSError):  # a plain file or /dev/null: there is nobody to obey
+    except (ValueError, OSError):  # stdin is a plain file or /dev/null: no commands
         return
     try:
         while line := await reader.readline():
@@ -250,7 +250,7 @@ async def _run_scene(
     *,
     follow: bool,
 ) -> None:
-    # a whole tenth: samples of perfect clocks and lines of the truth then share their instants
+    # start at a multiple of 0.1 s: samples of perfect clocks then coincide with ground-truth lines
     now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS
     scene = Scene(knobs, subject, hardware, now_ns=now_ns)
     directory.remember(scene.command_port)
@@ -267,7 +267,7 @@ async def _run_scene(
 
 
 def _play_motion(scene: Scene, name: str) -> None:
-    """Begin a motion, and report it as JSON like everything else on standard output."""
+    """Start a motion and report it as a JSON line."""
     scene.command(f"play {name}")
     _say({"motion": name})
 
@@ -277,7 +277,7 @@ def _report(text: str) -> None:
 
 
 def _punctual_loop() -> asyncio.AbstractEventLoop:
-    """Return a loop that wakes to the microsecond: epoll rounds up to the next millisecond."""
+    """Return an event loop based on select: epoll rounds timeouts up to the next millisecond."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 

@@ -1,8 +1,10 @@
-"""Every imperfection of the virtual hardware: one knob each, with its default and its meaning.
+"""Settings of the simulator: each error source of the virtual hardware, with its default.
 
-Law: this is an edge, so degrees and millimetres are allowed here and nowhere below. Every random
-choice of a run follows from `seed` and the name of what it is for, so that turning one knob
-leaves all other dice as they fell.
+Angles are in degrees and lengths in millimetres here, because users edit these values. All other
+simulator modules use radians and metres.
+
+Invariant: each random stream is seeded by `Knobs.seed` and the name of its purpose, so changing
+one setting leaves the random draws of all other purposes unchanged.
 """
 
 from __future__ import annotations
@@ -24,79 +26,81 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Knobs:
-    """What is wrong with the sensors, the skin, the clocks and the wires, and how much."""
+    """Magnitudes of the sensor, soft-tissue, clock and transport errors.
+
+    RMS rotations are the root mean square of the rotation-vector length.
+    """
 
     seed: int = 1
     rate_hz: float = 100.0
-    """Samples per second written into rig.toml; a device obeys its host's handshake."""
+    """IMU samples per second written to rig.toml; the driver may configure another rate."""
     mocap_hz: float = 120.0
     transition_s: float = 1.5
-    """Blend between two motions."""
+    """Duration of the blend between two motions."""
 
     orientation_slow_deg: float = 1.0
-    """RMS length of the sensors' slow orientation error (filter drift), world side."""
+    """RMS of the slow orientation error (filter drift), applied in the sensor's world frame."""
     orientation_white_deg: float = 0.3
-    """RMS length of the rotation by which single samples scatter, sensor side."""
+    """RMS of the white orientation noise, applied in the sensor frame."""
     soft_tissue_common_deg: float = 5.0
-    """RMS rotation of all sensors of a segment against the bone, over walking and squats."""
+    """RMS soft-tissue rotation shared by all sensors of a segment, over walking and squats."""
     soft_tissue_sensor_deg: float = 3.0
-    """The same, of each sensor for itself."""
+    """RMS soft-tissue rotation of each single sensor, over walking and squats."""
     soft_tissue_random_share: float = 0.15
-    """Share of the skin's variance that does not repeat with posture.
+    """Share of the soft-tissue variance that does not repeat with posture.
 
-    Skin over a limb slides and bulges with what lies under it, and that follows the adjacent
-    joints: models linear in the two joints' angles reproduce most of the artefact of one person
-    doing one thing (Bonci et al., J. Biomech. 47, 2014). What is left is muscle tension, impact
-    wobble and creep, which differ from step to step; 15 % stands for them.
+    Models that are linear in the two adjacent joint angles reproduce most of the artefact of one
+    subject and one task (Bonci et al., J. Biomech. 47, 2014). The remainder, assumed to be 15 %,
+    represents muscle tension, impact oscillation and creep, which differ from step to step.
     """
     soft_tissue_knee_share: float = 0.65
-    """Share of the repeatable variance that follows the knee; hip or ankle drive the rest."""
+    """Share of the repeatable variance driven by the knee; hip or ankle drive the remainder."""
     mount_deg: float = 20.0
-    """Sensors are strapped on up to this far from the segment's axes, about a random axis."""
+    """Largest sensor-to-segment misalignment, about a random axis."""
     heading_spread_deg: float = 90.0
-    """The sensors' worlds point up to this far apart."""
+    """Largest heading difference between the sensors' world frames."""
     optical_heading_deg: float = 180.0
-    """The wearer faces up to this far to either side of the optical world's own heading."""
+    """Largest heading of the subject in the optical world, to either side."""
     world_tilt_deg: float = 0.0
-    """Radical fault: the vertical of a sensor's world is off by this much."""
+    """Fault: inclination error of a sensor's world frame."""
     world_tilt_sensor: str = ""
-    """The sensor with that fault; empty: all."""
+    """Sensor with the inclination fault; empty: all sensors."""
 
     clock_offset_s: float = 3000.0
-    """Devices were powered up to this long before the run."""
+    """Longest uptime of a device at the start of the run."""
     clock_skew_ppm: float = 50.0
-    """Device clocks run up to this much fast or slow."""
+    """Largest clock skew, fast or slow."""
     clock_jitter_us: float = 20.0
-    """Standard deviation of a device stamp about its clock."""
+    """Standard deviation of the time-stamp jitter."""
     latency_uart_ms: float = 2.0
     latency_can_ms: float = 1.0
     latency_mocap_ms: float = 6.0
-    """Least delay from the sampled instant to the wire, by transport."""
+    """Minimum delays from sampling to transmission, by transport."""
     latency_jitter_ms: float = 0.5
-    """Mean of the exponential delay on top."""
+    """Mean of the exponential delay added to the minimum."""
     dropout: float = 0.005
-    """Share of samples that are taken but never sent."""
+    """Share of samples that are taken but not sent."""
 
     occlusion: float = 0.05
-    """Share of the time that a marker is hidden."""
+    """Share of time for which a marker is occluded."""
     occlusion_burst_s: float = 0.2
-    """Mean length of one hiding."""
+    """Mean duration of an occlusion."""
     marker_soft_tissue_mm: float = 5.0
-    """RMS length by which each marker moves against its bone, over walking and squats."""
+    """RMS soft-tissue displacement of a marker relative to bone, over walking and squats."""
     marker_common_share: float = 0.5
-    """Share of that variance that all markers of a cluster have in common."""
+    """Share of the marker displacement variance common to all markers of a cluster."""
     marker_noise_mm: float = 0.2
-    """RMS length of the cameras' scatter."""
+    """RMS length of the marker position noise."""
 
     line_flip_per_byte: float = 0.0
-    """Probability that one bit of a byte on a serial line is flipped."""
+    """Probability per byte of a flipped bit on a serial line."""
     line_burst_per_byte: float = 0.0
-    """Probability that a byte begins a burst of garbage."""
+    """Probability per byte that a burst of random bytes starts."""
     line_burst_bytes: int = 16
-    """Longest burst."""
+    """Longest burst in bytes."""
 
     def random(self, purpose: str) -> np.random.Generator:
-        """Return the dice for one purpose; the same seed and purpose give the same throws."""
+        """Return the random generator of a purpose; it depends on `seed` and `purpose` only."""
         return np.random.default_rng([self.seed, zlib.crc32(purpose.encode())])
 
 
@@ -122,7 +126,7 @@ _IMPERFECT = (
 
 
 def perfect(knobs: Knobs) -> Knobs:
-    """Return `knobs` with every imperfection turned off."""
+    """Return `knobs` with all errors set to zero."""
     nothing: dict[str, Any] = dict.fromkeys(_IMPERFECT, 0.0)
     return dataclasses.replace(knobs, **nothing)
 
@@ -133,7 +137,8 @@ def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
     Raises
     ------
     ValueError
-        No such knob, or no such value; the message gives the nearest name.
+        The setting does not exist or its value has the wrong type. The message suggests the
+        nearest name.
     """
     kinds = {field.name: type(getattr(knobs, field.name)) for field in dataclasses.fields(Knobs)}
     changed: dict[str, Any] = {}
@@ -149,6 +154,6 @@ def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
 
 
 def knobs_from_toml(path: Path) -> Knobs:
-    """Return the knobs of a TOML file of ``name = value`` lines; the rest keep their defaults."""
+    """Return the settings of a TOML file of ``name = value`` lines; others have defaults."""
     table = read_toml(path)
     return turn(Knobs(), [f"{name}={value}" for name, value in table.items()])

@@ -1,7 +1,7 @@
-"""The virtual devices of a scene, and the tables of rig.toml with which a daemon finds them.
+"""Virtual devices of a scene and their tables in rig.toml.
 
-Law: wiring only. Two sensors sit on UARTs (Xbus on a pty each), two on CAN (XCDI, behind one SLCAN
-adapter on a pty, or on a bus of python-can); the optical system is a NatNet server on loopback.
+By default two sensors use UARTs (Xbus, one pty each) and two use CAN (XCDI, behind one SLCAN
+adapter on a pty or on a python-can bus). The optical system is a NatNet server on loopback.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
-"""Which sensor speaks what, unless asked otherwise."""
+"""Default protocol of each sensor."""
 BUS = "can0"
 _FREE_RUNNING = 0xFFFF
 _TAI_MINUS_UTC_S = 37
-_EVERY = 12  # exposures an edge that is told: ten a second at 120 Hz
+_EVERY = 12  # exposures per reported sync edge: ten edges a second at 120 Hz
 _SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _EVERY - 1),)
 _SYNC_TOML = (
     f'sync = [{{ function = "trigger_indication", line = "in1", skip_factor = {_EVERY - 1} }}]'
@@ -49,14 +49,14 @@ _FIRST_BLOCK = 0x100
 
 @dataclass
 class Hardware:
-    """What is wired up."""
+    """Connected devices and their configuration tables."""
 
     streams: dict[str, ImuStream] = field(default_factory=dict)
     bus: CanWire | None = None
     tables: list[str] = field(default_factory=list)
     """``[[imu]]`` and ``[can.*]`` tables for rig.toml."""
     ports: dict[str, str] = field(default_factory=dict)
-    """Where each device (or bus) is found."""
+    """Port of each device or bus."""
 
 
 def wire_up(
@@ -69,24 +69,24 @@ def wire_up(
     now_ns: int,
     sync_line: bool = False,
 ) -> Hardware:
-    """Return the powered devices of a scene.
+    """Create and power the devices of a scene.
 
     Parameters
     ----------
     knobs
-        What is wrong with them.
+        Error magnitudes.
     sensors
-        Sensor ids and the segment each is worn on.
+        Segment of each sensor id.
     directory
-        Where the links of the ptys go.
+        Directory of the symbolic links to the ptys.
     wires
         ``xbus`` or ``xcdi`` for each sensor.
     can
         ``slcan``, or INTERFACE:CHANNEL of python-can, such as ``socketcan:vcan0``.
     now_ns
-        Host time at which the run begins.
+        Host time of the start of the run, ns.
     sync_line
-        A sync line reaches them: those that can tell of edges are configured to.
+        Whether a sync line is connected; the Xbus devices are then configured to report its edges.
     """
     hardware = Hardware()
     for number, (name, segment) in enumerate(sensors.items(), start=1):
@@ -186,22 +186,22 @@ def optical_server(
     ptp: bool = False,
     command_port: int = 0,
 ) -> NatNetServer:
-    """Return a NatNet server whose project has a body for every cluster of markers.
+    """Return a NatNet server with one rigid body for each marker cluster.
 
     Parameters
     ----------
     knobs
-        Camera rate.
+        Camera rate and random seed.
     clusters
-        Markers of each body part.
+        Marker names of each body part.
     bodies
-        Rigid bodies that are tracked; those without markers come last.
+        Tracked rigid bodies; those without markers are last.
     ticker
-        Whose clock is the server's.
+        Clock of the server.
     ptp
-        Cameras and host are on PTP: frames carry precision timestamps.
+        Whether frames carry PTP precision timestamps.
     command_port
-        UDP port of loopback for its clients' commands; 0: any free one.
+        UDP port on loopback for client commands; 0 selects a free port.
     """
     owned = {part.capitalize(): names for part, names in clusters.items()}
     owned |= {body: () for body in bodies if body not in owned}
@@ -221,13 +221,13 @@ def optical_server(
 
 
 def _ptp_time() -> Callable[[int], int]:
-    """Return the PTP time (TAI) of a host instant: what the host's own clock says now, from now."""
+    """Return the conversion from host time to PTP time (TAI), with the offset measured now."""
     ahead_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
     return lambda host_ns: host_ns + ahead_ns
 
 
 def mocap_table(server: NatNetServer, *, sync_line: bool = False) -> str:
-    """Return the first lines of ``[mocap]`` for that server, its sync output wired or not."""
+    """Return the first lines of the ``[mocap]`` table for the server."""
     wired = "\nsync_line = 0" if sync_line else ""
     wired += '\ntime = "ptp"' if server.options.precision_ns is not None else ""
     where = f'server = "127.0.0.1"\ncommand_port = {server.command_port}'

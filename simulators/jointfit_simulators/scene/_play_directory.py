@@ -1,6 +1,7 @@
-"""The directory of a ``play``: one simulator at a time, and the camera port of the run before.
+"""Lock and stored command port of the directory of a simulation.
 
-Invariant: two simulators never share a directory; the lock goes with the process, however it ends.
+Invariant: only one simulator process uses a directory. The operating system releases the lock when
+the process ends.
 """
 
 from __future__ import annotations
@@ -20,36 +21,36 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 STATE_FILE = ".jointfit-sim.json"
-"""Holds the lock, and for the next run ``{"pid": …, "command_port": …}``."""
-_LARGEST = 1000  # bytes; what is longer was not written here
+"""Lock file; contains ``{"pid": …, "command_port": …}`` for the next run."""
+_LARGEST = 1000  # bytes read of the lock file, more than this module writes
 _PORTS = range(1, 65536)
 
 
 class DirectoryInUseError(ValueError):
-    """Another simulator plays in the directory; the message names it and the remedy."""
+    """Another simulator uses the directory; the message names its process."""
 
 
 class PortInUseError(ValueError):
-    """The command port that was asked for cannot be opened."""
+    """The requested command port cannot be opened."""
 
 
 class PlayDirectory:
-    """A directory that this process owns."""
+    """A simulation directory locked by this process."""
 
     def __init__(self, path: Path, file: int) -> None:
         self._path, self._file = path, file
         self._before = _state(file)
 
     def command_port(self, asked: int | None) -> int:
-        """Return the command port for the NatNet server; 0 is any free port.
+        """Return the command port for the NatNet server; 0 selects any free port.
 
-        A port that was asked for must be free. Otherwise it is the port of the run before in this
-        directory, so that a running daemon finds its cameras again, if that is still free.
+        Without a requested port, the port of the previous run in this directory is returned if it
+        is free, so that a running daemon reconnects to the server.
 
         Raises
         ------
         PortInUseError
-            `asked` is taken, or no port number.
+            `asked` is in use or outside 1 to 65535.
         """
         if asked is not None:
             if asked not in _PORTS:
@@ -66,7 +67,7 @@ class PlayDirectory:
         return 0
 
     def remember(self, command_port: int | None) -> None:
-        """Keep the port for the next run; None: there are no cameras, the old one stays."""
+        """Store the port for the next run; None leaves the stored port unchanged."""
         kept = self._before.get("command_port") if command_port is None else command_port
         os.ftruncate(self._file, 0)
         os.pwrite(self._file, orjson.dumps({"pid": os.getpid(), "command_port": kept}), 0)
@@ -74,12 +75,12 @@ class PlayDirectory:
 
 @contextmanager
 def play_directory(path: Path) -> Iterator[PlayDirectory]:
-    """Create the directory and own it for as long as the block lasts.
+    """Create and lock the directory for the duration of the block.
 
     Raises
     ------
     DirectoryInUseError
-        Another process owns it.
+        Another process has locked the directory.
     """
     path.mkdir(parents=True, exist_ok=True)
     file = os.open(path / STATE_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

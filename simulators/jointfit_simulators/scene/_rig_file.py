@@ -1,4 +1,4 @@
-"""The rig.toml with which a daemon finds a scene: ready to use, nothing to fill in."""
+"""Text of the rig.toml for a scene, complete and ready for the daemon."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PROXIMAL, _DISTAL = "pelvis", "foot"
 
 @dataclass(frozen=True, slots=True)
 class RigOptions:
-    """What the scene does not know."""
+    """Values of rig.toml that do not follow from the scene."""
 
     name: str = "demo"
     output_rate_hz: float = 100.0
@@ -43,17 +43,17 @@ def rig_toml(
     Parameters
     ----------
     options
-        Names, broker, calibration.
+        Names, broker and calibration settings.
     devices
         ``[[imu]]`` and ``[can.*]`` tables.
     mocap
-        First lines of ``[mocap]`` (driver, server); empty: no optical system.
+        First lines of the ``[mocap]`` table; empty without an optical system.
     clusters
-        Markers of each body part.
+        Marker names of each body part.
     bones
-        Segments whose rigid body is the reference instead of markers.
+        Segments with a rigid body as reference instead of markers.
     plate
-        Whether the optical system knows the plate.
+        Whether the optical system tracks the plate.
     """
     parts = [name for name in (_PROXIMAL, _DISTAL) if name in clusters and mocap]
     ends = [f'{end} = "{name}"' for end, name in zip(_ends(parts), parts, strict=True)]

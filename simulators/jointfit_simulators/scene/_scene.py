@@ -1,7 +1,4 @@
-"""A whole scene: somebody moves, sensors and cameras report it as bytes, the truth is written.
-
-Law: wiring and commands only; what moves, errs and is encoded lives in other modules.
-"""
+"""Real-time scene: connects subject, devices, streams and ground-truth log, and runs commands."""
 
 from __future__ import annotations
 
@@ -35,14 +32,14 @@ TRUTH_FILE = "truth.jsonl"
 SAMPLES_FILE = "samples.jsonl"
 OPTICAL = "mocap"
 DOWN_S = 1.0
-"""How long the motion-capture server is away when it restarts."""
+"""Downtime of the motion-capture server during a restart."""
 LINGER_S = 0.3
-"""Ports stay open this long after the last byte, so that it can be read."""
+"""Delay between the last byte and closing the ports, so that the host can read all data."""
 
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Which hardware there is."""
+    """Hardware, clock faults and scheduled commands of a scene."""
 
     directory: Path
     mocap: bool = True
@@ -50,36 +47,36 @@ class SceneOptions:
     wires: Mapping[str, str] = dataclasses.field(default_factory=lambda: WIRES)
     rig: RigOptions = dataclasses.field(default_factory=RigOptions)
     clocks: Mapping[str, ClockFault] = dataclasses.field(default_factory=dict)
-    """Clocks that are asked for, by sensor or ``mocap``; the dice give the others."""
+    """Prescribed clock errors by sensor or ``mocap``; others are random."""
     script: tuple[tuple[float, str], ...] = ()
-    """Commands and when to obey them, s from the beginning of the run."""
+    """Scheduled commands: time since the start of the run in s, and command line."""
     sync_line: bool = False
-    """A wire from the cameras' sync output to the first sync input of every UART sensor."""
+    """Whether the cameras' sync output is connected to the first sync input of UART sensors."""
     ptp: bool = False
-    """Cameras and host are on PTP."""
+    """Whether cameras and host are synchronized by PTP."""
     command_port: int = 0
-    """UDP port of the motion-capture server; 0: any free one."""
+    """UDP port of the motion-capture server; 0 selects a free port."""
     sample_log: bool = False
-    """Tell the true instant of every sample sent."""
+    """Whether the true sampling time of each sample sent is logged."""
 
 
 class BadCommand(ValueError):  # noqa: N818 - named for what happened
-    """A command that means nothing; the message says what would."""
+    """Invalid command; the message names the valid ones."""
 
 
 class Scene:
-    """Virtual hardware at work.
+    """Running virtual hardware.
 
     Parameters
     ----------
     knobs
-        Imperfections.
+        Error magnitudes.
     subject
-        Who wears the sensors.
+        Subject wearing the sensors.
     options
-        Which hardware there is.
+        Hardware configuration.
     now_ns
-        Host time at which the subject's time is 0.
+        Host time at which the subject's time is 0, ns.
     """
 
     def __init__(
@@ -132,7 +129,7 @@ class Scene:
         self._verbs = self._commands(cameras)
 
     def _commands(self, cameras: Cameras) -> dict[str, Callable[[str], None]]:
-        """Return what each command does with the words after it."""
+        """Return the handlers by command name; each receives the arguments as text."""
         return {
             "play": self._play,
             "unplug": lambda name: self._plugs(name)[0](),
@@ -167,12 +164,12 @@ class Scene:
         }
 
     async def run(self, say: Callable[[dict[str, object]], None]) -> None:
-        """Play until `stop`; then send nothing more, linger, and close everything.
+        """Run until `stop`, then wait `LINGER_S` and close all ports.
 
         Parameters
         ----------
         say
-            Told where everything is when all is ready, and what was sent when nothing more is.
+            Called with the ports when all devices are ready, and with the counts at the end.
         """
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -197,11 +194,11 @@ class Scene:
                 await asyncio.sleep(LINGER_S)
                 for task in serving:
                     task.cancel()
-        finally:  # cancelled or failed, too: ports and files stay open otherwise
+        finally:  # also after an error or cancellation
             self.close()
 
     async def _follow_script(self, say: Callable[[dict[str, object]], None]) -> None:
-        """Obey every command of the script in its time."""
+        """Run the scheduled commands."""
         for at_s, line in sorted(self._options.script):
             due_ns = self._origin_ns + round(at_s * NS)
             await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / NS))
@@ -215,7 +212,7 @@ class Scene:
         self._quit.set()
 
     def close(self) -> None:
-        """Close the truth and unplug everything."""
+        """Close the logs and unplug all devices."""
         self._truth.close()
         if self._samples is not None:
             self._samples.close()
@@ -244,16 +241,16 @@ class Scene:
 
     @property
     def command_port(self) -> int | None:
-        """Return the UDP port of the motion-capture server; None without one."""
+        """UDP port of the motion-capture server; None without a server."""
         return None if self._server is None else self._server.command_port
 
     def command(self, line: str) -> dict[str, object] | None:
-        """Obey one line; return the answer of ``status``.
+        """Run one command; return the result of ``status``, otherwise None.
 
         Raises
         ------
         BadCommand
-            No such command, motion, sensor or word.
+            The command, motion, sensor or argument is unknown.
         """
         verb, _, rest = line.strip().partition(" ")
         if verb == "status":
@@ -301,7 +298,7 @@ class Scene:
             self._optical.running = _on(word)
 
     def _restart_server(self, *, clock_anew: bool) -> None:
-        """Close the server and open it a second later; only a reboot begins its clock anew."""
+        """Close the server and reopen it after `DOWN_S`; reset its clock if `clock_anew`."""
         server = self._server
         if server is None:
             raise BadCommand("there is no motion-capture server")
@@ -322,7 +319,7 @@ class Scene:
         return found.unplug, found.plug
 
     def status(self) -> dict[str, object]:
-        """Return what is going on, as JSON values."""
+        """Return the motion and the state of each device, as JSON values."""
         return {
             "t_ns": time.monotonic_ns(),
             "motion": self._player.motion(),
@@ -332,7 +329,7 @@ class Scene:
         }
 
     def account(self) -> dict[str, object]:
-        """Return what was sent in all, as JSON values."""
+        """Return the total numbers of samples sent, dropped, refused and unheard."""
         streams = self._hardware.streams
         return {
             "sent": {**{n: s.device.sent for n, s in streams.items()}, "mocap": self._optical.sent},
