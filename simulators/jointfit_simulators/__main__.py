@@ -96,11 +96,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_play_options(play: argparse.ArgumentParser) -> None:
-    play.add_argument("--directory", type=Path, required=True, help="folder of ports, rig.toml, truth")
-    play.add_argument("--programme", help="NAME:SECONDS,…; the last motion continues (default stand)")
+    play.add_argument("--directory", type=Path, required=True, help="output folder")
+    play.add_argument("--programme", help="NAME:SECONDS,…; the last one continues (default stand)")
     play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
     play.add_argument("--knobs", type=Path, help="TOML file of knobs")
-    play.add_argument("--perfect", action="store_true", help="disable all errors except those of --set")
+    play.add_argument("--perfect", action="store_true", help="no errors except those of --set")
     play.add_argument("--rate", type=float, help="IMU samples per second")
     play.add_argument("--seed", type=int, help="random seed")
     play.add_argument("--no-mocap", action="store_true", help="no optical system")
@@ -124,7 +124,7 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--sample-log", action="store_true",
                       help="write samples.jsonl with the true time of each sample")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
-                      help="replay a recorded trial: .npz or .sto, with .trc and .json")  # fmt: skip
+                      help="replay a trial: .npz or .sto, with .trc and .json")  # fmt: skip
     for field in dataclasses.fields(RigOptions):
         play.add_argument(
             f"--{field.name.replace('_', '-')}",
