@@ -161,7 +161,7 @@ def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]
 
 async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
     """Calibrate on the first 60 % of the squats, go live on the rest."""
-    files = [data / FOLDER / name for name in ("squats1.npz", "static_mount.json")]
+    files = [data / FOLDER / name for name in ("squats1.npz", "static_bias.json")]
     whole = load(data, "squats1")
     cut, last = training_frames(whole), len(whole) - 1
     async with gateway(folder, port, _options(files, SQUATS_HZ, method)) as running:
@@ -175,7 +175,7 @@ async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
 
 async def walking(data: Path, folder: Path, port: int, method: Method) -> Played:
     """Start anew with the calibration that the squats left in `folder`; walk live."""
-    files = [data / FOLDER / name for name in ("walking1.npz", "static_mount.json")]
+    files = [data / FOLDER / name for name in ("walking1.npz", "static_bias.json")]
     async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
         await running.connected(2 * SETTLE_S)  # a millisecond is half a degree at this speed
         await running.live("trial", 1.3)

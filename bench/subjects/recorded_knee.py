@@ -53,7 +53,7 @@ class KneeTrial:
 
 def load(data: Path, name: str) -> KneeTrial:
     """Return a trial: ``squats1``, ``walking1`` or ``DJ1``."""
-    biases = json.loads((data / FOLDER / "static_mount.json").read_text())["q_bias"]
+    biases = json.loads((data / FOLDER / "static_bias.json").read_text())["q_bias"]
     with np.load(data / FOLDER / f"{name}.npz", allow_pickle=False) as arrays:
         columns = [
             rotation.multiply(_unit(arrays[f"S{i}_quat"]), _unit(np.array(biases[f"S{i}"])))

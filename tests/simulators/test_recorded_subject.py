@@ -33,7 +33,7 @@ NONE = np.empty(0)
 def squats(shared_data: Path) -> list[Path]:
     semireal = shared_data / "semireal_knee4imu"
     opencap = shared_data / "opencap_subject4/trc/squats1.trc"
-    return [semireal / "squats1.npz", semireal / "static_mount.json", opencap]
+    return [semireal / "squats1.npz", semireal / "static_bias.json", opencap]
 
 
 def test_sensors_bones_and_markers_are_those_of_the_files(squats: list[Path]) -> None:

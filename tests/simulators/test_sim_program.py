@@ -227,7 +227,7 @@ async def test_a_recorded_trial_plays_from_the_command_line(
     tmp_path: Path, shared_data: Path
 ) -> None:
     semireal = shared_data / "semireal_knee4imu"
-    files = [semireal / "squats1.npz", semireal / "static_mount.json"]
+    files = [semireal / "squats1.npz", semireal / "static_bias.json"]
     markers = shared_data / "opencap_subject4/trc/squats1.trc"
     options = ["--perfect", "--programme", "stand:1,trial", "--trial", *map(str, [*files, markers])]
     async with playing(tmp_path, *options):

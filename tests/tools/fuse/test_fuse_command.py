@@ -89,7 +89,7 @@ def test_the_semireal_squats_reproduce_their_published_figures(shared_data: Path
     result = run(
         "evaluate", folder / "squats1.npz", "--segment", "thigh=S1,S2:femur_r",
         "--segment", "shank=S3,S4:tibia_r", "--joints", "hip,knee,ankle",
-        "--static", folder / "static_mount.json", "--json",
+        "--static", folder / "static_bias.json", "--json",
     )  # fmt: skip
     found = rows(result)
     published = {
