@@ -1,7 +1,7 @@
-"""What a virtual IMU is, whatever its wire: it answers its handshake and sends what it is given.
+"""Protocol class of a virtual IMU, independent of the transport.
 
-Law: no device is named here. A device knows bytes and its own clock; the movement it reports is
-made elsewhere and pushed in, so that one source of truth serves every wire format.
+A device answers its handshake and encodes the orientations passed to `ImuDevice.push`. All
+protocols thus send the same simulated motion.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 WireNoise = Callable[[bytes], bytes]
-"""What the wire does to bytes on their way to the host; the identity is a clean wire."""
+"""Function applied to the bytes sent to the host; the identity is a line without noise."""
 
 Quaternion = tuple[float, float, float, float]
 """Hamilton unit quaternion (w, x, y, z), sensor coordinates to world coordinates (ENU, z up)."""

@@ -1,9 +1,9 @@
-"""A right leg of known geometry: joint angles in, bones and joint centers out. The truth.
+"""Forward kinematics of a right leg: bones and joint centres from joint angles (ground truth).
 
-Law: forward kinematics only, over whole arrays; no noise, no sensor, no clock. Base world: z up,
-the wearer faces +y when the pelvis heading is 0. Segment frames: origin at the proximal joint
-center, z from the distal to the proximal joint center, y anterior, x to the wearer's right, so
-that in upright stance every part's frame equals the base world.
+Base world: z up; the subject faces +y at pelvis heading 0. Segment frames: origin at the proximal
+joint centre, z from the distal to the proximal joint centre, y anterior, x to the right.
+
+Invariant: in upright stance every segment frame is parallel to the base world.
 """
 
 from __future__ import annotations

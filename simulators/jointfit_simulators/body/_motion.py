@@ -1,8 +1,9 @@
-"""What a person does: each motion is a smooth function of time to the coordinates of `limb`.
+"""Built-in motions: functions from time to the leg coordinates.
 
-Law: a motion knows neither sensors nor the wall clock, and has two continuous derivatives. Zero
-joint angles are upright stance, which every calibration calls its zero. The person stays in the
-capture volume: walking is walking on a treadmill.
+Zero joint angles are upright stance, the zero of every calibration. Walking is on a treadmill, so
+the subject stays in the capture volume.
+
+Invariant: a motion has two continuous derivatives.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""What is done when: motions one after the other, blended without a jerk, changed while running.
+"""Sequence of motions with smooth blends, which can be changed during the run.
 
-Law: coordinates are a function of time and of the switches made so far. A switch bends the future
-only; it has two continuous derivatives.
+Invariant: a switch changes later coordinates only, with two continuous derivatives.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Rotations of the simulator's own, over SciPy: whole arrays, scalar first.
+"""Rotations of the simulator, based on SciPy, with scalar-first quaternions.
 
-Law: nothing of the estimator's kinematics is used here, so that a slip there cannot hide behind
-the same slip in the truth it is judged by. The only module of this package that names SciPy's
-rotations.
+Invariant: the estimator's kinematics are not imported, so an error in them cannot also be in the
+ground truth.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Where sensors and markers sit on the wearer.
-
-Law: positions in the frame of the body part that carries them, m; chosen once a run.
-"""
+"""Positions of sensors and markers on the subject, in the frame of their body part, m."""
 
 from __future__ import annotations
 

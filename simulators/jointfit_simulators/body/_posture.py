@@ -1,6 +1,6 @@
-"""From joint angles to posture: what all motions share.
+"""Functions common to all motions: posture coordinates from joint angles.
 
-Law: pure functions of time over whole arrays; two continuous derivatives.
+Invariant: all functions have two continuous derivatives.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Band-limited random signals that can be read at any instant, in any order.
+"""Band-limited random signals that can be evaluated at any time, in any order.
 
-Law: a wander is a function of time and of its seed, nothing else: no state, so two readers at
-different rates see the same movement, and a run repeats exactly.
+Invariant: a signal depends on time and its seed only, so streams of different rates sample the same
+signal and a run is reproducible.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Whoever was recorded: a `Subject` that plays a `Recording`.
+"""A `Subject` that replays a `Recording`.
 
-Law: nothing is added to the recording. The blend between standing and the trial is made up and
-belongs to neither, nor does the pose held after its end: cameras see no bones then, and the truth
-gives no positions, so nobody is trained on it or judged by it.
+Invariant: the recording is not altered. During synthetic intervals (the blend between standing and
+trial, the final pose) the cameras see no bones and the ground truth has no positions, so these
+intervals enter neither training nor evaluation.
 """
 
 from __future__ import annotations

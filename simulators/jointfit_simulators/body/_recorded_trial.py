@@ -1,13 +1,12 @@
-"""A recorded trial in place of a made-up person: its sensors, its bones, its markers.
+"""Recorded trials: sensors, bones and markers, interpolated between samples.
 
-Law: what was recorded is played as it is, between its samples interpolated; soft tissue and mounts
-are in the recording, so nothing is added to them here. Two motions: ``trial`` plays the recording
-once and holds its end; ``stand`` holds the static pose, which is the sensors' bias where that is
-known (so that every segment is upright by definition), else the first instant of the recording.
+The recording already contains soft-tissue artefacts and sensor alignment. The motion ``trial``
+plays it once and holds the last posture. ``stand`` holds the static pose: the sensor biases if
+known (every segment is then upright by definition), otherwise the first instant.
 
-Files, told apart by their ends: ``.npz`` or a ``.sto`` of quaternions for
-the sensors, ``.trc`` for the markers, ``.json`` for the biases (``{"q_bias": {"S1": [w, x, y,
-z]}}``). All of them y up, as OpenSim writes them, but for NPZ that say otherwise.
+File types by suffix: ``.npz`` or ``.sto`` (quaternions) for sensors, ``.trc`` for markers,
+``.json`` for biases (``{"q_bias": {"S1": [w, x, y, z]}}``). Files are y up, as written by OpenSim,
+except NPZ files that specify another axis.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""A made-up person: moving bones under moving skin, with sensors and markers strapped on.
+"""Simulated subject: bones, soft-tissue artefacts, sensors and markers, in the base world.
 
-Law: base world, no clocks and no sensor error; everything follows from time, the knobs' seed and
-the programme.
+Invariant: observations depend only on time, the settings and the sequence of motions.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""How skin moves against bone: what repeats with posture, and what does not.
+"""Soft-tissue artefact: a repeatable part that depends on posture, and a random part.
 
-Law: the repeatable part is a smooth function of the adjacent joints' angles and is zero in upright
-stance; the random part is band-limited and grows with the same posture, so standing still is
-still. One law serves rotations of sensors (rad) and shifts of markers (m).
+One model serves rotations of sensors (rad) and displacements of markers (m).
+
+Invariant: both parts are zero in upright stance. The repeatable part is a smooth function of the
+adjacent joint angles; the random part is band-limited and scales with the same posture.
 """
 
 from __future__ import annotations

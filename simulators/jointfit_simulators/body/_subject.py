@@ -1,7 +1,4 @@
-"""What a scene needs to know of whoever wears the sensors: a made-up person or a recorded one.
-
-Law: base world (z up), m, rad, before any sensor's own world, clock or camera.
-"""
+"""Interface of a subject, simulated or recorded: base world (z up), m, rad."""
 
 from __future__ import annotations
 

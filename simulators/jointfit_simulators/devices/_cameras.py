@@ -1,8 +1,9 @@
-"""What cameras see of markers: scatter, occlusion, and rigid bodies fitted to what is left.
+"""Simulated optical measurement: marker noise, occlusion and rigid-body fits.
 
-Law: bodies come from the markers on the skin, never from bones (but for the reference bones of a
-recording, which are handed through). Optical world, z up, m; what the wire does with axes is the
-server's business.
+Coordinates are in the optical world, z up, m; the server converts to its own axes.
+
+Invariant: rigid bodies are fitted to the skin markers. Only the reference bones of a recording are
+passed through.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
-"""The clocks and transports of virtual devices.
+"""Clock and transport models of virtual devices.
 
-Law: a device takes its samples at whole periods of its *own* clock; what its host sees of that
-clock is an offset, a skew, jitter and a delay. True time is host CLOCK_MONOTONIC.
+A device clock has an offset, a skew and jitter relative to host CLOCK_MONOTONIC (the true time),
+and its transport adds a delay.
+
+Invariant: a device samples at whole periods of its own clock.
 """
 
 from __future__ import annotations

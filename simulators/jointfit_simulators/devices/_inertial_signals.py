@@ -1,12 +1,11 @@
-r"""What a sensor that turns in place feels: angular rate, gravity and the earth's magnetic field.
+r"""Inertial and magnetic signals of a sensor that rotates in place.
 
-Law: from two successive orientations, exact for the interval between them, without noise:
+They follow without noise from two successive orientations:
 
 .. math:: \omega = \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
     m = R_k^{T} (0, \cos\delta, -\sin\delta)
 
-The device is told where it points, not where it is: specific force is gravity alone, as if it only
-turned.
+The device has an orientation but no position, so the specific force contains gravity only.
 """
 
 from __future__ import annotations

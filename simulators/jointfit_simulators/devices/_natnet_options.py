@@ -1,4 +1,4 @@
-"""How a simulated NatNet server behaves, knob by knob. Law: frozen data."""
+"""Options of a simulated NatNet server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The socket of a simulated NatNet server. Law: loopback only; datagrams in and out, no meaning."""
+"""UDP socket of a simulated NatNet server. Invariant: it is bound to loopback only."""
 
 from __future__ import annotations
 

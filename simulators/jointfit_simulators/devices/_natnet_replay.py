@@ -1,8 +1,8 @@
-"""A NatNet server that says again what a real one said. Law: its frames are the recorded bytes.
+"""NatNet server that replays a capture. Invariant: frames are sent as the recorded bytes.
 
-The handshake is answered with the recorded server's name, version, clock frequency and model, but
-in unicast and with this server's own ports; frames leave at their recorded distances once a
-client has its model; echoes are answered by the recorded clock, running on.
+The handshake returns the recorded name, version, clock frequency and model, but in unicast and with
+this server's own ports. Frames are sent at the recorded intervals once a client has received the
+model. Echo requests are answered with the recorded clock, continued.
 """
 
 from __future__ import annotations

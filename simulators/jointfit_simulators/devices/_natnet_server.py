@@ -1,8 +1,7 @@
-"""A NatNet server on loopback: answers like Motive, streams what is pushed into it.
+"""Simulated NatNet server on loopback with the behaviour of Motive.
 
-Law: the same codec as the driver's, from the other side; it knows no driver. Frames go to unicast
-clients only once their REQUEST_MODELDEF was answered or 50 ms after CONNECT, because one real
-client takes the next datagram for the description, whatever it is.
+Invariant: a unicast client receives frames only after the reply to its REQUEST_MODELDEF or 50 ms
+after CONNECT, because one existing client parses the next datagram as the model description.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""What a simulated NatNet server knows of its bodies, and the frames it makes of them.
+"""Rigid bodies of a simulated NatNet server, and conversion of poses to its frames.
 
-Law: poses come in z up and leave in the server's own axes, and what is hidden looks on the wire as
-it does there: a body repeats its last good pose with bit 0 clear; a labeled marker is missing, or
-carries bit 0 and a plausible position.
+Input poses are z up; frames have the server's own axes.
+
+Invariant: an untracked body repeats its last valid pose with bit 0 clear. An occluded labeled
+marker is omitted, or has bit 0 set and a plausible position.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What a sensor makes of its true orientation: its own world, slow drift and scatter.
-
-Law: orientations in, orientations out; where the sensor sits and what its clock says is settled
-elsewhere.
-"""
+"""Orientation error model of an IMU: world frame, slow drift and white noise."""
 
 from __future__ import annotations
 

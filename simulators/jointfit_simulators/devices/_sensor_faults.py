@@ -1,7 +1,7 @@
-"""What goes wrong with a worn sensor while it runs: it sticks, slips, or its world turns.
+"""Faults of a sensor during a run: stuck output, slip and heading drift.
 
-Law: orientations in, orientations out, block by block; the truth is not touched. A command takes
-effect with the next block, a fifth of a second later at most.
+Faults change the measured orientations only. A command takes effect with the next block, at most
+0.2 s later.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SLIP_S = 0.3
-"""How long a slip takes."""
+"""Duration of a slip."""
 _ASKEW = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
-"""Axis of a slip, sensor axes: none of them alone."""
+"""Axis of a slip in the sensor frame, oblique to all sensor axes."""
 
 
 class Mishaps:
-    """The mishaps of one sensor."""
+    """Faults of one sensor."""
 
     def __init__(self) -> None:
         self._stuck = False

@@ -1,9 +1,8 @@
-"""A virtual Xsens / Movella device: Xbus on a pty, with the manners and the faults of real ones.
+"""Virtual Xsens / Movella device: Xbus on a pty, with the behaviour and faults of real devices.
 
-Law: it knows the wire format and its own clock, nothing of drivers. It streams while GoToConfig is
-pending, answers a bad output configuration with error 0x21, tells in its acknowledgement the rates
-it really uses, stores every set in flash at once, and asks on power-up whether to be configured.
-Source: MT0101P rev. 2020.A.
+Invariant: the device streams while GoToConfig is pending, rejects an invalid output configuration
+with error 0x21, acknowledges with the rates in use, stores each setting in flash at once, and sends
+WakeUp after power-up. Source: MT0101P rev. 2020.A.
 """
 
 from __future__ import annotations

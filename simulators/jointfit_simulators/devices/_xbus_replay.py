@@ -1,8 +1,8 @@
-"""A device that says again what a real one said. Law: after the handshake, the recorded bytes.
+"""Xbus device that replays a capture. Invariant: it sends the recorded bytes after the handshake.
 
-The handshake is answered like any Xbus device's; a recording has none. Once told to measure, the
-recorded messages leave at the distances of their own SampleTimeFine. Messages that carry another
-clock's time (a GNSS receiver's, in between) go out with the one before.
+The handshake is simulated. In measurement mode the recorded messages are sent at the intervals of
+their SampleTimeFine. Messages with the time of another clock (such as a GNSS receiver) are sent
+together with the previous message.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The sync inputs of a virtual Xbus device. Law: entries and edges in, triggers out; no clock."""
+"""Sync inputs of a virtual Xbus device: conversion of edges to trigger indications."""
 
 from __future__ import annotations
 

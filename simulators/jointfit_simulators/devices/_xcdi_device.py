@@ -1,7 +1,6 @@
-"""A virtual Xsens MTi-600 on CAN: XCDI groups on a wire that others share, with its faults.
+"""Virtual Xsens MTi-600 on CAN: XCDI groups on a shared wire, with faults.
 
-Law: it knows the messages and its own clock, nothing of drivers. It sends whether or not anybody
-listens; its group counter and its clock run on meanwhile.
+Invariant: clock and group counter continue while the host does not listen.
 """
 
 from __future__ import annotations

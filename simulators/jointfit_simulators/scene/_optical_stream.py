@@ -1,7 +1,8 @@
-"""From poses to camera frames on a wire, planned in blocks and sent one by one.
+"""Stream of camera frames: planned in blocks, sent one by one.
 
-Law: a frame is stamped with its exposure, however late it leaves. The optical world is z up here;
-the server turns it to what its wire has.
+The optical world is z up here; the server converts to its own axes.
+
+Invariant: a frame carries its exposure time, even if it is sent late.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Pose = tuple[Vector, tuple[float, float, float, float]]
 
 
 class OpticalServer(Protocol):
-    """What sends camera frames."""
+    """Server that sends camera frames."""
 
     number: int
     """Of the next frame."""
@@ -44,24 +45,24 @@ class OpticalServer(Protocol):
         markers: Mapping[str, Vector | None],
         bodies: Mapping[str, Pose | None],
     ) -> None:
-        """Send one frame now; None is hidden."""
+        """Send one frame now; None marks an occluded marker or body."""
 
 
 class OpticalStream:
-    """The cameras of a scene and the server that streams what they see.
+    """Cameras of a scene and the server that streams their frames.
 
     Parameters
     ----------
     knobs
         Camera rate.
     cameras
-        What is seen.
+        Source of the frames.
     ticker
-        When they expose, by the server's clock.
+        Exposure times and the server's clock.
     server
-        Where frames go; None: no optical system.
+        Receiver of the frames; None without an optical system.
     told
-        Told of every frame sent, as `mocap`.
+        Called for every frame sent, with the id ``mocap``.
     """
 
     def __init__(
@@ -79,22 +80,22 @@ class OpticalStream:
         self._period_ns = NS / knobs.mocap_hz
         self._waiting: deque[tuple[int, dict[str, Vector | None], dict[str, Pose | None]]] = deque()
         self.running = server is not None
-        """Whether frames are sent; the cameras see on meanwhile."""
+        """Whether frames are sent; the cameras continue to expose."""
 
     @property
     def sent(self) -> int:
-        """Frames put on the wire so far; without a client none are."""
+        """Number of frames sent; zero without a client."""
         return self._server.sent if self._server else 0
 
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
-        """Expose the frames of a block; return their true host instants."""
+        """Plan the exposures of a block and return their true host times, ns."""
         if self._server is None:
             return np.empty(0, dtype=np.int64)
         self._taken = self._ticker.samples(begin_ns, end_ns, self._period_ns)
         return self._taken.host_ns
 
     def fill(self, observation: Observation) -> list[int]:
-        """Give the planned frames their markers; return when each is due on the wire."""
+        """Add markers to the planned frames and return the transmission times, ns."""
         if self._server is None:
             return []
         seen = self.cameras.see(observation)
@@ -116,7 +117,7 @@ class OpticalStream:
         }
 
     def emit(self, *, heard: bool = True) -> None:
-        """Send the next frame, or drop it where nobody is to hear it."""
+        """Send the next frame, or drop it if the stream is stopped."""
         frame = self._waiting.popleft()
         if heard and self.running and self._server is not None:
             before, number = self._server.sent, self._server.number
@@ -125,5 +126,5 @@ class OpticalStream:
                 self._told("mocap", number, frame[0])
 
     def forget(self) -> None:
-        """Drop what is planned and not sent."""
+        """Drop the frames that are planned but not sent."""
         self._waiting.clear()

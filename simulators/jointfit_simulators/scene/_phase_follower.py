@@ -1,7 +1,7 @@
-"""Moves as the calibration phase of a daemon asks for: the only module of the simulator with MQTT.
+"""Selection of motions by the calibration phase that a daemon publishes over MQTT.
 
-Invariant: it reads the published contract (topic ``calibration``, docs/mqtt.md) and nothing else of
-the daemon; it sends nothing.
+Invariant: the module subscribes to the topic ``calibration`` (docs/mqtt.md) only and publishes
+nothing.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _RETRY_S = 1.0
 
 
 class PhaseFollower:
-    """Plays the motions of the phase that a daemon publishes.
+    """Starts the motions of the calibration phase that a daemon publishes.
 
     Parameters
     ----------
     rig
-        Where the broker is, and the daemon's base topic.
+        Broker address and base topic.
     play
-        Begins a motion.
+        Called with the name of the motion to start.
     report
-        Takes a line for people when the broker is lost or found.
+        Called with a message when the broker connection is lost or restored.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class PhaseFollower:
         self._moving: asyncio.Task[None] | None = None
 
     async def run(self) -> None:
-        """Follow until cancelled; a broker that is absent is tried again every second."""
+        """Run until cancelled; retry the broker connection every second."""
         place = f"{self._rig.mqtt_host}:{self._rig.mqtt_port}"
         reported = ""
         try:
@@ -84,7 +84,7 @@ class PhaseFollower:
         )
 
     def _take(self, payload: object) -> None:
-        """Begin the motions of a new phase; a repeated status changes nothing."""
+        """Start the motions of a new phase; ignore a repeated status."""
         try:
             status = orjson.loads(payload) if isinstance(payload, bytes | bytearray) else None
         except orjson.JSONDecodeError:

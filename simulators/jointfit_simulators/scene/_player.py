@@ -1,8 +1,7 @@
-"""Plays a scene in real time: plans a fifth of a second ahead, then sends each sample when due.
+"""Real-time scheduler of a scene: plans blocks 0.2 s ahead and sends each sample at its due time.
 
-Law: one loop, absolute deadlines. Late is late: what was due earlier leaves at once, in order and
-with its own stamp, as from a device whose host was busy. After a stop of seconds (a suspended
-machine) the missed time is left out.
+Deadlines are absolute. Overdue samples are sent at once, in order and with their own time stamps.
+After an interruption of seconds (a suspended machine) the missed time is skipped.
 """
 
 from __future__ import annotations
@@ -35,32 +34,32 @@ _FLUSH_NS = NS // 10
 
 
 class Stream(Protocol):
-    """What has planned samples."""
+    """Stream with planned samples."""
 
     def emit(self, *, heard: bool) -> None:
-        """Send the next one, or drop it where nobody is to hear it."""
+        """Send or drop the next planned sample."""
 
     def forget(self) -> None:
         """Drop all that are planned."""
 
 
 class Player:
-    """The streams of a scene, in time.
+    """Scheduler of all streams of a scene.
 
     Parameters
     ----------
     subject
-        Who moves.
+        Source of the motion.
     imus
-        The worn sensors.
+        IMU streams by sensor id.
     optical
-        The cameras.
+        Stream of the cameras.
     truth
-        Where the truth goes.
+        Ground-truth log.
     origin_ns
-        Host time at which the subject's time is 0.
+        Host time at which the subject's time is 0, ns.
     sync_line
-        A wire goes from the cameras' sync output to all sensors: an edge an exposure.
+        Whether each camera exposure produces an edge on the sync line of all sensors.
     """
 
     def __init__(
@@ -81,12 +80,12 @@ class Player:
         self._planned_ns = origin_ns
         self._due: list[tuple[int, int]] = []  # when, stream; a heap
         self.paused = False
-        """Nothing is sent while set; what is due meanwhile is dropped, not delayed."""
+        """Whether transmission is paused; samples due meanwhile are dropped."""
         self.left_out_ns = 0
-        """Time left out because the machine stood still."""
+        """Time skipped after interruptions, ns."""
 
     def motion(self) -> str:
-        """Return what is being done now."""
+        """Return the name of the current motion."""
         return self._subject.motion_at((time.monotonic_ns() - self._origin_ns) / NS)
 
     def play(self, name: str) -> None:

@@ -1,7 +1,8 @@
-r"""When every sample was truly taken, for whoever judges the clocks: one JSON object a line.
+r"""Log of the true sampling times, one JSON object per line, for clock experiments.
 
-Law: what was sent, and nothing else: samples that were dropped or unheard are not told. A sample is
-named by its device and the number it carries on the wire, which begins anew where the device does::
+Invariant: only samples that were sent are logged.
+
+A sample is identified by its device and its number on the wire, which restarts with the device::
 
     {"id": "S1", "number": 4711, "host_ns": true instant of sampling, host CLOCK_MONOTONIC}
 """
@@ -17,19 +18,19 @@ if TYPE_CHECKING:
 
 
 class SampleLog:
-    """A file that grows with every sample sent.
+    """Writer of the sample log.
 
     Parameters
     ----------
     path
-        Where; overwritten.
+        Output file; overwritten.
     """
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("wb")
 
     def add(self, name: str, number: int, host_ns: int) -> None:
-        """Tell of one sample."""
+        """Append one sample."""
         line = {"id": name, "number": number, "host_ns": host_ns}
         self._file.write(orjson.dumps(line, option=orjson.OPT_APPEND_NEWLINE))
 

@@ -1,8 +1,7 @@
-"""From poses to samples on a wire: one stream a device, planned in blocks, sent one by one.
+"""Streams of IMU samples: one stream per device, planned in blocks, sent one by one.
 
-Law: a sample is stamped with its true instant, however late it reaches the wire; every sample
-taken while the device measures is sent, dropped by the knob, or refused by a full line, and
-counted as such.
+Invariant: a sample carries its sampling time, even if it is sent late. Every sample taken while the
+device measures is counted as sent, dropped (`Knobs.dropout`) or refused by a full line.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ if TYPE_CHECKING:
 
 
 SampleTold = Callable[[str, int, int], None]
-"""Told of every sample sent: device, its number as sent, true instant on the host's clock, ns."""
+"""Callback for every sample sent: device, number on the wire, true host time in ns."""
 
 
 _EDGES = 4096
 
 
 class WornDevice(ImuDevice, Protocol):
-    """A virtual IMU with the faults this scene plays."""
+    """Virtual IMU with the faults that a scene can trigger."""
 
     def edge(self, device_ns: int) -> None:
         """Take an edge on its sync input, at a time of its own clock; nothing where it has none."""
@@ -58,24 +57,24 @@ class WornDevice(ImuDevice, Protocol):
 
 
 class ImuStream:
-    """One worn sensor: its error, its clock, its device.
+    """Stream of one sensor: orientation errors, clock and device.
 
     Parameters
     ----------
     knobs
-        Everything that is wrong with it.
+        Error magnitudes.
     name
-        Its id.
+        Sensor id.
     device
-        Where samples go.
+        Device that sends the samples.
     latency_ms
-        Least delay of its transport.
+        Minimum delay of the transport, ms.
     shared_wire
-        Others use its wire: unplugging it means that it falls silent.
+        Whether other devices use the wire; unplugging then only stops this sensor.
     now_ns
-        Host time at which the run begins.
+        Host time of the start of the run, ns.
     told
-        Told of every sample sent.
+        Called for every sample sent.
     """
 
     def __init__(
@@ -97,24 +96,24 @@ class ImuStream:
         self._waiting: deque[tuple[int, int, Quaternion | None]] = deque()
         self._edges: deque[int] = deque(maxlen=_EDGES)
         self.dropped_out = 0
-        """Samples taken while measuring and never sent, as the knob wants it."""
+        """Number of samples dropped by `Knobs.dropout` while measuring."""
         self.unheard = 0
-        """Samples that nobody could hear: unplugged, paused, or not told to measure."""
+        """Number of samples taken while unplugged, paused or not measuring."""
         self.refused = 0
-        """Samples the line had no room for."""
+        """Number of samples rejected by a full line."""
 
     def wire(self, edges_ns: NDArray[np.int64]) -> None:
-        """Let edges come on its sync line at these host instants."""
+        """Apply edges to the sync line at these host times, ns."""
         self._edges.extend(edges_ns.tolist())
 
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
-        """Take the samples of a block; return their true host instants."""
+        """Plan the samples of a block and return their true host times, ns."""
         rate_hz = self.device.rate_hz or self._fallback_hz
         self._taken = self.ticker.samples(begin_ns, end_ns, NS / rate_hz)
         return self._taken.host_ns
 
     def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
-        """Give the planned samples their orientations; return when each is due on the wire."""
+        """Add orientations to the planned samples and return the transmission times, ns."""
         said = self.mishaps.apply(t_s, self.sensor.report(t_s, q_base_sensor))
         lost = self._taken.dropped | ~np.isfinite(said[:, 0])
         for true_ns, stamp, q, never in zip(
@@ -126,7 +125,7 @@ class ImuStream:
         return cast("list[int]", (self._taken.due_ns + self.device.line_ns).tolist())
 
     def emit(self, *, heard: bool = True) -> None:
-        """Put the next sample on the wire, or drop it where nobody is to hear it."""
+        """Send the next sample, or drop it if the device cannot send."""
         true_ns, stamp, q = self._waiting.popleft()
         while self._edges and self._edges[0] <= true_ns:
             self.device.edge(self.ticker.device_ns(self._edges.popleft()))

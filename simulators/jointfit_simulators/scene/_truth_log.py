@@ -1,10 +1,11 @@
-r"""The truth of a run, one JSON object a line, for whoever judges the estimator.
+r"""Ground-truth log of a run, one JSON object per line.
 
-Law: what was, not what was measured. Optical world, z up; m, rad; quaternions (w, x, y, z). No
-line tells the future: a line is written after its instant, and reaches the file within 0.2 s.
+Values are true, not measured: optical world, z up; m, rad; quaternions (w, x, y, z).
+
+Invariant: a line is written after its instant and is in the file within 0.2 s.
 
 First line: ``{"truth": 1, "t_ns": …, "knobs": {…}, "lengths_m": {…}, "q_segment_sensor": {…}, …}``.
-Then, 100 a second::
+Then, at 100 Hz::
 
     {"t_ns": host CLOCK_MONOTONIC, "motion": "walk",
      "q_world_segment": {"pelvis": [w, x, y, z], "thigh": …, "shank": …, "foot": …},
@@ -38,14 +39,14 @@ _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 
 
 class TruthLog:
-    """A file that grows by the truth as it happens.
+    """Writer of the ground-truth log.
 
     Parameters
     ----------
     path
-        Where; overwritten.
+        Output file; overwritten.
     facts
-        The first line.
+        Contents of the first line.
     """
 
     def __init__(self, path: Path, facts: Mapping[str, object]) -> None:
@@ -57,18 +58,18 @@ class TruthLog:
     def add(
         self, t_ns: NDArray[np.int64], motions: list[str], truth: Truth, world: Rotation
     ) -> None:
-        """Keep the truth of a block until it has happened.
+        """Queue the ground truth of a planned block.
 
         Parameters
         ----------
         t_ns
-            Instants, host time, shape (n,).
+            Host time of each instant, ns, shape (n,).
         motions
-            What was going on at each.
+            Name of the motion at each instant.
         truth
-            In the base world.
+            Ground truth in the base world.
         world
-            Base world to the optical world.
+            Rotation from the base world to the optical world.
         """
         turns = {part: to_wxyz(world * turn).tolist() for part, turn in truth.orientations.items()}
         joints = {joint: world.apply(center).tolist() for joint, center in truth.joints.items()}
@@ -85,12 +86,12 @@ class TruthLog:
             self._waiting.append((at, orjson.dumps(line, option=_OPTIONS)))
 
     def advance(self, now_ns: int) -> None:
-        """Write what has happened by `now_ns`."""
+        """Write the queued lines up to `now_ns`."""
         waiting = self._waiting
         while waiting and waiting[0][0] <= now_ns:
             self._file.write(waiting.popleft()[1])
         self._file.flush()
 
     def close(self) -> None:
-        """Close the file; what has not happened is not told."""
+        """Close the file and discard queued lines."""
         self._file.close()

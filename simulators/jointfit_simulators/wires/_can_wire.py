@@ -1,7 +1,8 @@
-"""Virtual CAN wires: an SLCAN adapter on a pty, and any bus that python-can can send on.
+"""Virtual CAN wires: an SLCAN adapter on a pty, and python-can buses.
 
-Law: frames only; no sensor is named here. Several devices share one wire, as on a real bus: each
-may call ``run``, one of them serves. A wire nobody has opened loses what is sent.
+Several devices share one wire. Each may call ``run``; one of them serves the wire.
+
+Invariant: frames sent while the host has not opened the bus are lost.
 """
 
 from __future__ import annotations

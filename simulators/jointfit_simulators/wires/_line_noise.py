@@ -1,6 +1,7 @@
-"""What a bad serial line does to bytes: flipped bits and bursts of garbage.
+"""Serial line noise: flipped bits and bursts of random bytes.
 
-Law: nothing is lost or added by a flip; a burst is added in between. No noise is the identity.
+Invariant: a flip preserves the number of bytes, a burst is inserted between bytes, and zero noise
+returns the data unchanged.
 """
 
 from __future__ import annotations

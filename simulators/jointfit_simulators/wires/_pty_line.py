@@ -1,7 +1,7 @@
-"""A serial line made of a pty: the device's end, and a link where the host finds its own.
+"""Serial line based on a pty, with a symbolic link to the host's end.
 
-Law: bytes only; no device is named here. The slave is kept open on this side, too, so that the
-host may close and open its port as it likes; only ``unplug`` hangs up.
+Invariant: the slave stays open on this side, so the host can close and reopen its port; only
+``unplug`` hangs up.
 """
 
 from __future__ import annotations
