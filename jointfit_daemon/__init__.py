@@ -1,4 +1,4 @@
-"""Joint positions and angles from body-worn IMUs, live."""
+"""Joint positions and angles from body-worn IMUs in real time."""
 
 from importlib.metadata import PackageNotFoundError, version
 

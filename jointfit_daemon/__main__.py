@@ -1,8 +1,8 @@
-"""The daemon's command line.
+"""The command line of ``jointfitd``.
 
-Invariant: exit 0 stopped as asked, 1 a bug, 2 usage or configuration, 3 state directory in use.
-
-Starts light: what only a running daemon needs is imported once the configuration is known good.
+Invariant: the exit code is 0 after a stop, 1 after a bug, 2 for wrong options or a faulty
+configuration, and 3 if another daemon uses the state directory. Modules that only a running daemon
+needs are imported after the configuration was checked.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("jointfit_daemon")
 
 EXIT_BUG, EXIT_USAGE, EXIT_IN_USE = 1, 2, 3
-LAST_WAIT_S = 2.0
-"""How long leaving may wait for a thread: a name lookup cannot be interrupted."""
+THREADS_TIMEOUT_S = 2.0
+"""Longest wait for threads at the end, s: name resolution cannot be interrupted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,16 +42,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return EXIT_USAGE
     if options.check:
-        print(describe(rig))
+        print(rig_summary(rig))
         return 0
     _start_logging(options.log_level, rig.name)
-    if not _own_state():
+    if not _lock_state_directory():
         return EXIT_IN_USE
     return _run(options.config, rig)
 
 
-def _own_state() -> bool:
-    """Lock the state directory until the process ends; return whether no other daemon has it."""
+def _lock_state_directory() -> bool:
+    """Lock the state directory for this process; return False if another daemon uses it."""
     from jointfit_daemon.supervisor.state_directory import (
         PRIVATE_UMASK,
         StateDirectoryInUseError,
@@ -64,7 +64,7 @@ def _own_state() -> bool:
     try:
         lock_state(state_directory())
     except StateDirectoryInUseError as error:
-        log.error("%s", error)  # noqa: TRY400 - the traceback would add nothing
+        log.error("%s", error)  # noqa: TRY400 - no bug, no traceback
         return False
     make_private(state_directory())
     return True
@@ -73,16 +73,18 @@ def _own_state() -> bool:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jointfitd",
-        description="Reads IMUs and motion capture, publishes joint angles over MQTT.",
-        epilog="Exit codes: 0 stopped as asked, 1 a bug, 2 wrong options or rig.toml.",
+        description="Read IMUs and motion capture, publish joint angles over MQTT.",
+        epilog="Exit codes: 0 stopped, 1 bug, 2 options or rig.toml, 3 state directory in use.",
     )
-    parser.add_argument("--config", type=Path, required=True, metavar="rig.toml", help="the rig")
-    parser.add_argument("--check", action="store_true", help="check the rig and end")
+    parser.add_argument(
+        "--config", type=Path, required=True, metavar="rig.toml", help="configuration of the rig"
+    )
+    parser.add_argument("--check", action="store_true", help="check rig.toml and exit")
     parser.add_argument(
         "--log-level",
         choices=("debug", "info", "warning", "error"),
         default="info",
-        help="least level to log (default: info)",
+        help="lowest level of log lines (default: info)",
     )
     parser.add_argument("--version", action="version", version=f"jointfitd {__version__}")
     return parser
@@ -93,14 +95,14 @@ def _start_logging(level: str, rig: str) -> None:
 
     logging.setLogRecordFactory(PrintableRecord)
     faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
-    logging.basicConfig(
-        level=level.upper(), handlers=[_log_handler(rig, all_of_it=level == "debug")]
-    )
-    logging.getLogger("mqtt").setLevel(logging.ERROR)  # aiomqtt's: we tell its troubles ourselves
+    logging.basicConfig(level=level.upper(), handlers=[_log_handler(rig, limited=level != "debug")])
+    logging.getLogger("mqtt").setLevel(
+        logging.ERROR
+    )  # of aiomqtt; the daemon logs its faults itself
 
 
-def _log_handler(rig: str, *, all_of_it: bool) -> logging.Handler:
-    """Return what writes the log: with fields, with levels, or with the time, by who reads it."""
+def _log_handler(rig: str, *, limited: bool) -> logging.Handler:
+    """Return the handler for the journal, for a service without it, or for a terminal."""
     from jointfit_daemon.outputs.log import (
         JournalHandler,
         LevelFormatter,
@@ -109,8 +111,8 @@ def _log_handler(rig: str, *, all_of_it: bool) -> logging.Handler:
     )
 
     if is_journal(sys.stderr):
-        return JournalHandler(rig, limited=not all_of_it)
-    handler = (logging.StreamHandler if all_of_it else RateLimitedHandler)(sys.stderr)
+        return JournalHandler(rig, limited=limited)
+    handler = (RateLimitedHandler if limited else logging.StreamHandler)(sys.stderr)
     if "JOURNAL_STREAM" in os.environ or "INVOCATION_ID" in os.environ:
         handler.setFormatter(LevelFormatter())
     else:
@@ -118,19 +120,19 @@ def _log_handler(rig: str, *, all_of_it: bool) -> logging.Handler:
     return handler
 
 
-def describe(rig: Rig) -> str:
-    """Return what a checked rig holds, a line each, for people."""
+def rig_summary(rig: Rig) -> str:
+    """Return a summary of a valid rig for the terminal, one line per item."""
     chain, mqtt = rig.chain, rig.mqtt
-    lines = [f"{rig.name}: good, {rig.output_rate_hz:g} limb states a second"]
+    lines = [f"{rig.name}: valid, {rig.output_rate_hz:g} limb states per second"]
     for segment, sensors in zip(chain.segments, chain.sensors, strict=True):
-        alone = " (one sensor: no redundancy)" if len(sensors) == 1 else ""
-        lines.append(f"  {segment}: {', '.join(sensors)}{alone}")
+        note = " (one sensor: no redundancy)" if len(sensors) == 1 else ""
+        lines.append(f"  {segment}: {', '.join(sensors)}{note}")
     lines.append(f"  joints: {', '.join(chain.joints)}")
     for source in rig.sources:
         where = getattr(source.settings, "port", None) or getattr(source.settings, "server", None)
         lines.append(f"  {source.id}: {source.driver}{f' at {where}' if where else ''}")
     if all(source.kind != "mocap" for source in rig.sources):
-        lines.append("  no [mocap]: runs on IMUs alone, calibrates by a static pose only")
+        lines.append("  no [mocap]: IMUs only, calibration by a static pose only")
     lines.append(f"  mqtt {mqtt.version}: {mqtt.host}:{mqtt.tcp_port}, topics {mqtt.base}/…")
     return "\n".join(lines)
 
@@ -139,15 +141,15 @@ def _run(config: Path, rig: Rig) -> int:
     from jointfit_daemon.supervisor.daemon import run_daemon
     from jointfit_daemon.supervisor.process_exit import exit_within
 
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon takes it: no reload yet
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon has its own handler
     code = 0
     with asyncio.Runner() as runner:
         try:
             runner.run(run_daemon(config, rig))
         except Exception:
-            log.exception("a bug ends the daemon; please report it with what follows")
+            log.exception("the daemon ends because of a bug; please report it with this traceback")
             code = EXIT_BUG
-        exit_within(LAST_WAIT_S, code, "a thread")
+        exit_within(THREADS_TIMEOUT_S, code, "a thread")
     return code
 
 

@@ -1,11 +1,12 @@
-"""What a driver is, what it may raise, and how one is found.
+"""The driver interface: settings, decoder, errors, and lookup by entry point.
 
-Law: this file names no device. A driver is found by entry point (group ``jointfit.drivers``), one
-at a time and only when asked for, so that a broken plug-in hurts nobody but its users.
+Invariant: this module names no device. Drivers are registered in the entry point group
+``jointfit.drivers`` and imported one at a time when used, so a broken plug-in affects its users
+only.
 
-A driver has two halves. ``decoder()`` gives the pure half: chunks in, samples in SI out, no clock,
-no port. ``run(emit)`` is the reading half: it opens, configures and reads until cancelled. The
-daemon feeds every emitted chunk to a fresh decoder; a replay does the same with recorded chunks.
+A driver has two parts. ``decoder()`` returns the pure part: it converts chunks to samples in SI
+units, without clock or port. ``run(emit)`` opens and configures the device, and reads until
+cancelled. The daemon feeds every emitted chunk to a new decoder; a replay feeds recorded chunks.
 """
 
 from __future__ import annotations
@@ -23,33 +24,34 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded, TickClock
 
 ENTRY_POINT_GROUP = "jointfit.drivers"
+"""Entry point group in which a package registers its drivers."""
 
 Emit = Callable[[Chunk], None]
-"""Hands one chunk to the daemon. Synchronous; what it raises is a bug and must reach the caller."""
+"""Passes one chunk to the daemon, synchronously. Do not catch its exceptions: they are bugs."""
 
 Wire = Literal["stream", "datagram", "can"]
-"""How chunks are cut: any cut of a byte stream, one datagram each, or runs of CAN records."""
+"""Content of a chunk: any part of a byte stream, one datagram, or a sequence of CAN records."""
 
 
 SLOWEST_BAUD, FASTEST_BAUD = 300, 12_000_000
-"""Speeds of serial ports, baud; no adapter is faster."""
+"""Range of serial port speeds, baud; no adapter is faster."""
 
 
 class DeviceLostError(Exception):
-    """The device is absent, taken, unplugged or silent: worth another try."""
+    """The device is absent, in use, unplugged or silent; a retry may succeed."""
 
 
 class DeviceMisconfiguredError(Exception):
-    """The device cannot work with these settings: the message says what to change.
+    """The device cannot work with these settings; the message names the setting to change.
 
-    The source is stopped until another device is on its port, for a minute, or until a reload.
-    Whatever may pass by itself (a port taken, no descriptor left, a bus that is down) is a
-    ``DeviceLostError``.
+    The source pauses until another device is on its port, for one minute, or until a reload.
+    Faults that can end by themselves (a port in use, no free descriptor, a bus that is down) are a
+    `DeviceLostError`.
     """
 
 
 class Settings(BaseModel):
-    """Base of every table a driver reads from rig.toml: frozen, unknown keys refused."""
+    """Base of all tables of rig.toml: frozen, unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -57,7 +59,8 @@ class Settings(BaseModel):
 _SLCAN_BITRATES = (
     10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
 )  # fmt: skip
-_LONGEST_INTERFACE = 15  # bytes: IFNAMSIZ of the kernel, less its NUL
+_LONGEST_INTERFACE = 15
+"""Longest name of a network interface, bytes: IFNAMSIZ of the kernel without its NUL."""
 INTERFACE_NAME_EXPECTED = (
     "expected the name of a network interface, as `ip link` shows it: up to "
     f"{_LONGEST_INTERFACE} bytes without slash or space"
@@ -65,16 +68,16 @@ INTERFACE_NAME_EXPECTED = (
 
 
 def is_interface_name(name: str) -> bool:
-    """Return whether the kernel allows `name` for a network interface."""
+    """Return whether the kernel permits `name` for a network interface."""
     if name in {"", ".", ".."} or any(letter in "/:" or letter.isspace() for letter in name):
         return False
     return len(name.encode()) <= _LONGEST_INTERFACE
 
 
 class CanBusSettings(Settings):
-    """One ``[can.NAME]`` table: a bus that several devices may share."""
+    """One ``[can.NAME]`` table: a bus for one or several devices."""
 
-    # Further keys go to python-can as they are.
+    # Other keys are passed to python-can.
     model_config = ConfigDict(frozen=True, extra="allow")
 
     interface: str = Field(
@@ -82,7 +85,7 @@ class CanBusSettings(Settings):
     )
     channel: str = Field(description="`can0`, or the serial port of an SLCAN adapter")
     bitrate: int = Field(
-        1_000_000, ge=10_000, le=1_000_000, description="bit/s; ignored where the kernel set it"
+        1_000_000, ge=10_000, le=1_000_000, description="bit/s; ignored if the kernel configures it"
     )
     baud: int = Field(
         115_200,
@@ -92,14 +95,14 @@ class CanBusSettings(Settings):
     )
     transport: Literal["usb", "uart"] = Field(
         "usb",
-        description="what an SLCAN adapter's port is: on `usb` bytes take no time, whatever `baud` "
-        "says; on a real `uart` stamps are back-dated by the bytes that came, at `baud`",
+        description="port of an SLCAN adapter: `usb` transfers without delay, whatever `baud` is; "
+        "for a `uart` stamps are back-dated by the duration of the received bytes at `baud`",
     )
 
     @field_validator("channel")
     @classmethod
-    def _channel_that_can_exist(cls, channel: str, info: ValidationInfo) -> str:
-        """Refuse what no kernel interface can be called."""
+    def _check_channel(cls, channel: str, info: ValidationInfo) -> str:
+        """Refuse names that the kernel does not permit."""
         if not channel:
             raise ValueError("must not be empty")
         if info.data.get("interface") == "socketcan" and not is_interface_name(channel):
@@ -110,54 +113,58 @@ class CanBusSettings(Settings):
 
     @field_validator("bitrate")
     @classmethod
-    def _bitrate_of_the_adapter(cls, bitrate: int, info: ValidationInfo) -> int:
-        """Refuse what an SLCAN adapter has no command for."""
+    def _check_bitrate(cls, bitrate: int, info: ValidationInfo) -> int:
+        """Refuse bit rates for which SLCAN has no command."""
         if info.data.get("interface") == "slcan" and bitrate not in _SLCAN_BITRATES:
             known = ", ".join(map(str, _SLCAN_BITRATES))
-            raise ValueError(f"no such bit rate in SLCAN: expected one of {known}")
+            raise ValueError(f"not a bit rate of SLCAN: expected one of {known}")
         return bitrate
 
 
 class ImuSettings(Settings):
-    """Keys that every ``[[imu]]`` table has; a driver's ``Settings`` derives from this."""
+    """Common keys of all ``[[imu]]`` tables; the ``Settings`` of an IMU driver derive from this."""
 
     id: str = Field(description="name of the sensor; becomes an MQTT topic")
-    segment: str = Field(description="the segment of [chain] it is worn on")
+    segment: str = Field(description="segment of [chain] to which the sensor is attached")
     driver: str = Field(description="driver name, as `jointfit check` lists them")
-    rate_hz: float = Field(100.0, gt=0, le=2000, description="samples per second asked of it")
-    silence_s: float = Field(1.0, gt=0, description="no byte for this long is a lost device")
+    rate_hz: float = Field(
+        100.0, gt=0, le=2000, description="sample rate requested of the device, Hz"
+    )
+    silence_s: float = Field(
+        1.0, gt=0, description="time without a byte after which the device counts as lost, s"
+    )
     least_delay_ms: tuple[float, float] | None = Field(
         None,
-        description="smallest delay from measuring to arrival and its standard deviation, ms; by "
-        "default that of the transport",
+        description="smallest delay from measurement to arrival and its standard deviation, ms; "
+        "default: that of the transport",
     )
     lag_ms: float | None = Field(
         None,
         ge=-1000,
         le=1000,
-        description="stamp of this sensor minus that of the cameras for the same event, ms, where "
-        "it is known: it is used as it is, and the motion only checks it",
+        description="known lag, ms: stamp of this sensor minus stamp of the cameras for the same "
+        "event; the motion only checks it",
     )
     lag_sd_ms: float = Field(0.1, gt=0, le=100, description="standard deviation of `lag_ms`, ms")
 
     @property
     def serial_bits_per_s(self) -> float | None:
-        """What its samples need of a serial line of its own at `baud`; None: no limit is known."""
+        """Bit rate of its samples on a separate serial line, bit/s; None if unlimited."""
         return None
 
     @property
     def can_frames(self) -> tuple[tuple[int, bool], ...]:
-        """Frames of one sample on a CAN bus: data bytes, and whether its identifier has 29 bit."""
+        """CAN frames of one sample: number of data bytes, and whether the identifier has 29 bit."""
         return ()
 
 
 class MocapSettings(Settings):
-    """Keys that every ``[mocap]`` table has; a driver's ``Settings`` derives from this."""
+    """Common keys of all ``[mocap]`` tables; the ``Settings`` of a driver derive from this."""
 
     driver: str = Field(description="driver name")
-    up_axis: Literal["x", "y", "z"] = Field("y", description="the stream's up axis")
+    up_axis: Literal["x", "y", "z"] = Field("y", description="vertical axis of the stream")
     markers: dict[str, tuple[str, ...]] = Field(
-        default_factory=dict, description="markers of each segment, at least three, not on a line"
+        default_factory=dict, description="markers of each segment: at least three, not collinear"
     )
     rigid_body: dict[str, str] = Field(
         default_factory=dict, description="rigid body of each segment, instead of markers"
@@ -165,21 +172,23 @@ class MocapSettings(Settings):
     plate: str | None = Field(
         None, description="rigid body of the plate that carries the sensors in the align phase"
     )
-    silence_s: float = Field(1.0, gt=0, description="no datagram for this long is a lost server")
+    silence_s: float = Field(
+        1.0, gt=0, description="time without a datagram after which the server counts as lost, s"
+    )
     least_delay_ms: tuple[float, float] | None = Field(
         None,
         description="smallest delay from exposure to arrival and its standard deviation, ms; for "
-        "servers that answer no echoes",
+        "servers without echo replies",
     )
     sync_line: int | None = Field(
-        None, description="the sync line that carries an edge at every exposure, if one is wired"
+        None, description="number of the sync line with an edge at every exposure, if connected"
     )
 
 
 def device_path(settings: object) -> str | None:
-    """Return what a driver with `settings` opens: its `port`, or the channel of its bus.
+    """Return the device file or interface of a driver: its `port`, or the channel of its bus.
 
-    None where the table names neither, as that of a network device.
+    None if the table has neither, as for a network device.
     """
     found = getattr(settings, "port", None) or getattr(
         getattr(settings, "can", None), "channel", None
@@ -188,66 +197,74 @@ def device_path(settings: object) -> str | None:
 
 
 class Decoder(Protocol):
-    """The pure half of a driver. Never raises on input.
+    """The pure part of a driver. No input raises an exception.
 
-    One that decodes frames it does not hand on counts them, so that none is lost unseen:
-    ``unpublished`` (nobody has said yet what is in them), ``duplicates``, ``late``, all int.
+    A decoder that decodes frames and does not return them has counters of type int:
+    ``unpublished`` (the content is not described yet), ``duplicates`` and ``late``.
     """
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """How the device counts time, as far as known yet."""
+        """Time base of the device; None while unknown."""
 
     @property
     def messages(self) -> int:
-        """Well-formed messages of any kind so far."""
+        """Number of well-formed messages so far."""
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes that belong to no message so far."""
+        """Number of bytes so far that belong to no message."""
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return what `chunk` completed, in wire order."""
+        """Return the items that `chunk` completes, in wire order."""
 
     def flush(self) -> list[Decoded]:
-        """Give up waiting for the rest of a pending message: end of input, or silence."""
+        """Discard an incomplete message at the end of input, or after silence."""
 
 
 class Driver(Protocol):
-    """A driver class as an entry point names it."""
+    """The interface of a driver class, as registered by an entry point."""
 
     Settings: ClassVar[type[Any]]
-    """Pydantic model of its rig.toml table; derives from ImuSettings or MocapSettings."""
+    """Pydantic model of its table in rig.toml; derives from `ImuSettings` or `MocapSettings`."""
     wire: ClassVar[Wire]
+    """Content of its chunks."""
 
     def __init__(self, settings: Any) -> None: ...
 
     def decoder(self) -> Decoder:
-        """Return a fresh decoder."""
+        """Return a new decoder."""
 
     async def run(self, emit: Emit) -> None:
-        """Open, configure, read until cancelled; raise DeviceLostError or DeviceMisconfiguredError.
+        """Open and configure the device, and read until cancelled.
 
-        Called again, on the same object, for every further attempt.
+        Every further attempt calls this method of the same object again.
+
+        Raises
+        ------
+        DeviceLostError
+            The device is absent, in use or silent.
+        DeviceMisconfiguredError
+            The device cannot work with the settings.
         """
 
 
 class UnknownDriverError(LookupError):
-    """No installed package registers a driver of this name."""
+    """No installed package registers a driver with this name."""
 
 
 def driver_names() -> list[str]:
-    """Return the names of all registered drivers, without importing any."""
+    """Return the names of all registered drivers, without importing them."""
     return sorted({point.name for point in entry_points(group=ENTRY_POINT_GROUP)})
 
 
 def find_driver(name: str) -> type[Driver]:
-    """Return the driver class registered as `name`; only its own module is imported.
+    """Return the driver class registered as `name`; imports no other driver.
 
     Raises
     ------
     UnknownDriverError
-        Nothing registers that name; the message gives the nearest spelling and the choices.
+        The name is not registered; the message lists the nearest and all names.
     """
     found = [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name == name]
     if not found:

@@ -1,9 +1,9 @@
-"""The quantities that move between rooms: frozen, SI, without behaviour.
+"""Data types that packages exchange: frozen, in SI units, without behaviour.
 
-Law: nothing here imports anything of ours; nothing here reads a clock or a file. Quaternions are
-Hamilton, scalar first, and ``q_a_b`` takes b-coordinates to a-coordinates. The world is ENU with
-z up. ``t_ns`` is host CLOCK_MONOTONIC in nanoseconds. Unknown is ``None`` (or NaN inside arrays),
-never 0. See CONVENTIONS.md.
+Invariant: this module imports no other module of the project, and reads no clock or file.
+Quaternions are Hamilton, scalar first; ``q_a_b`` converts b-coordinates to a-coordinates. The world
+is ENU with z up. ``t_ns`` is CLOCK_MONOTONIC of the host, ns. Unknown values are ``None`` (NaN in
+arrays), never 0. See CONVENTIONS.md.
 """
 
 from __future__ import annotations
@@ -24,62 +24,63 @@ Vector = tuple[float, float, float]
 """Three components, SI."""
 
 
-# --- what arrives -----------------------------------------------------------------------------
+# --- inputs -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes as they arrived at the host.
+    """Bytes as received by the host.
 
-    ``t_ns`` is the arrival stamp. A stream chunk is any cut of the byte stream; a datagram chunk
-    is one datagram; a CAN chunk is a run of records (``jointfit_protocols.can._frame``).
+    A stream chunk is any part of the byte stream, a datagram chunk is one datagram, and a CAN chunk
+    is a sequence of records (``jointfit_protocols.can._frame``).
     """
 
     t_ns: int
+    """Arrival stamp, CLOCK_MONOTONIC ns."""
     data: bytes
 
 
 class TickClock(NamedTuple):
-    """How a device counts time."""
+    """Time base of a device."""
 
     tick_ns: int
-    """Nanoseconds a tick (100 000 for 100 us ticks); ignored when ``ticks_per_s`` is set."""
+    """Duration of a tick, ns (100 000 for 100 µs); ignored if ``ticks_per_s`` is set."""
     modulus: int | None
-    """Ticks after which the count starts again at 0; None if it never does."""
+    """Number of ticks after which the counter wraps to 0; None if it never wraps."""
     ticks_per_s: int | None = None
-    """Exact tick frequency where it is no whole number of nanoseconds (NatNet)."""
+    """Exact tick rate, 1/s, if the period is not a whole number of nanoseconds (NatNet)."""
     scale: Literal["own", "monotonic", "unix"] = "own"
-    """What 0 means: nothing (a clock of its own), or, declared by whoever configured the device,
-    this host's CLOCK_MONOTONIC, or UNIX time that PTP keeps on device and host alike."""
+    """Origin of the time base: arbitrary (``own``), CLOCK_MONOTONIC of this host, or UNIX time that
+    PTP synchronizes between device and host. The last two are declared in the configuration."""
 
 
 class ImuSample(NamedTuple):
-    """One orientation of one IMU."""
+    """One sample of one IMU."""
 
     arrival_ns: int
-    """Host time of the first byte of the message (arrival, back-dated by bytes and baud)."""
+    """Arrival of the first byte, CLOCK_MONOTONIC ns (on a UART back-dated by bytes and baud)."""
     q_world_sensor: Quaternion
-    """Canonical: unit, ENU, sensor to the sensor's own world (heading may be arbitrary)."""
+    """Unit quaternion, sensor to ENU world of this sensor (heading may be arbitrary)."""
     q_native: Quaternion
-    """As sent, scaled but neither turned nor normalised."""
+    """Quaternion as sent: scaled, neither rotated nor normalised."""
     ticks: int | None
-    """Device time as sent, in ticks of the decoder's ``tick_clock``; None if it has none."""
+    """Device time as sent, in ticks of the decoder's ``tick_clock``; None without device time."""
     counter: int | None
-    """Sequence number as sent; None if the device has none."""
+    """Sequence number as sent; None without one."""
     status: int | None = None
-    """The device's own status word, if it sent one."""
+    """Status word of the device; None without one."""
     rate: Vector | None = None
-    """Angular rate at the instant of the orientation, in the same sensor frame, rad/s; None where
-    none came. A mean since the sample before is no such rate: leave it out."""
+    """Angular rate at the instant of the orientation, sensor axes, rad/s; None without one. A mean
+    since the last sample does not qualify."""
     acceleration: Vector | None = None
-    """Specific force, sensor axes, m/s^2 (+9.81 upwards at rest); None where none came."""
+    """Specific force, sensor axes, m/s² (+9.81 upwards at rest); None without one."""
     magnetic: Vector | None = None
-    """Magnetic field, sensor axes, in the device's own unit; None where none came."""
+    """Magnetic field, sensor axes, in the unit of the device; None without one."""
 
 
 @dataclass(frozen=True, slots=True)
 class MocapLayout:
-    """Which column of a ``MocapFrame`` is which marker or body. Shared by many frames."""
+    """Names of the markers and rigid bodies of a `MocapFrame`, in its order."""
 
     markers: tuple[str, ...]
     bodies: tuple[str, ...]
@@ -87,12 +88,12 @@ class MocapLayout:
 
 @dataclass(frozen=True, slots=True)
 class MocapFrame:
-    """One camera frame, world already Z up, metres. NaN is "not seen"."""
+    """One frame of the optical system, z up, metres. NaN means occluded."""
 
     arrival_ns: int
     number: int
     ticks: int | None
-    """Instant of exposure in device ticks; None where the server has no clock."""
+    """Instant of exposure in device ticks; None if the server has no clock."""
     layout: MocapLayout
     markers: NDArray[np.float64]
     """Marker positions in the optical world, m, shape (len(layout.markers), 3)."""
@@ -101,12 +102,12 @@ class MocapFrame:
     body_orientations: NDArray[np.float64]
     """q_world_body, shape (len(layout.bodies), 4)."""
     live: bool = True
-    """False when the server plays back a recording."""
+    """False if the server plays back a recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockEcho:
-    """One answered echo: host send and receive stamps, device ticks in between."""
+    """One round trip: host stamps of request and reply, and device ticks in between."""
 
     sent_ns: int
     received_ns: int
@@ -114,26 +115,26 @@ class ClockEcho:
 
 
 class SyncPulse(NamedTuple):
-    """One edge on a hardware sync line, as the device that saw (or made) it stamped it.
+    """One edge on a hardware sync line, with the stamp of the device that detected or generated it.
 
-    Lines are electrical: one edge is the same instant on every device wired to the line, to well
-    below a microsecond, whatever each calls it. That instant is its rising (configured) edge. A
-    decoder yields pulses in wire order among its samples and never invents one that was not seen.
+    An edge is the same instant on all devices connected to the line, within one microsecond: the
+    rising (or configured) edge. A decoder returns pulses in wire order among its samples, and only
+    pulses that the device reported.
     """
 
     arrival_ns: int
-    """Host time of the first byte of the message that tells of it; ms late does not matter."""
+    """Arrival of the first byte of the message, ns; milliseconds do not matter."""
     ticks: int
-    """Device time of the edge itself, in ticks of the decoder's ``tick_clock``."""
+    """Device time of the edge, in ticks of the decoder's ``tick_clock``."""
     line: int = 0
-    """Which wire of the rig, as configured; devices on the same wire say the same number."""
+    """Configured number of the line; equal for all devices connected to it."""
     number: int | None = None
-    """The device's own count of edges on that line; None if it does not count."""
+    """Edge counter of the device; None without one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Corrupt:
-    """Bytes that made no message. An event, never an exception."""
+    """Bytes that belong to no valid message."""
 
     discarded: int
     reason: str
@@ -141,11 +142,11 @@ class Corrupt:
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
-    """Something a device said or did that is not a measurement.
+    """A message or state change of a device that is not a measurement.
 
     Kinds: ``info`` (data: model, serial, firmware, settings read back), ``restart`` (the device
-    began anew), ``clock`` (its time did), ``gap`` (data: lost), ``counter`` (it jumped
-    and nothing was lost), ``setting`` (changed while running), ``warning``, ``error``.
+    restarted), ``clock`` (its time restarted), ``gap`` (data: lost), ``counter`` (it jumped without
+    loss), ``setting`` (changed in operation), ``warning``, ``error``.
     """
 
     kind: str
@@ -154,7 +155,7 @@ class DeviceEvent:
 
 
 Decoded = ImuSample | MocapFrame | ClockEcho | SyncPulse | Corrupt | DeviceEvent
-"""What a driver's decoder yields."""
+"""Items that a decoder returns."""
 
 
 # --- the body ---------------------------------------------------------------------------------
@@ -162,24 +163,24 @@ Decoded = ImuSample | MocapFrame | ClockEcho | SyncPulse | Corrupt | DeviceEvent
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Joints O1..On+1 from proximal to distal and the n segments between them."""
+    """A limb: joints O1 to On+1 from proximal to distal, and the n segments between them."""
 
     joints: tuple[str, ...]
     segments: tuple[str, ...]
     sensors: tuple[tuple[str, ...], ...]
-    """Sensor ids per segment, in the order of ``segments``; at least one each."""
+    """Sensor ids of each segment, in the order of ``segments``; at least one per segment."""
     left_side: bool = False
-    """A left limb: adduction and rotation change sign (CONVENTIONS.md)."""
+    """Whether the limb is a left one: adduction and rotation change sign (CONVENTIONS.md)."""
     origin: Vector | None = None
-    """Fixed position of O1 in the world, m; None: O1 is the origin, or optical where seen."""
+    """Fixed position of O1 in the world, m; None: O1 is the origin, or its optical position."""
     lengths: tuple[float | None, ...] = ()
-    """Configured segment lengths, m; None where calibration must find them."""
+    """Configured segment lengths, m; None if calibration estimates them."""
     proximal: str | None = None
-    """Body part before O1 (pelvis), seen by markers only; None if the rig has none."""
+    """Body part proximal of O1 (pelvis), with markers only; None without one."""
     distal: str | None = None
-    """Body part after the last joint (foot), seen by markers only; None if the rig has none."""
+    """Body part distal of the last joint (foot), with markers only; None without one."""
     static_axes: bool = False
-    """Segment axes are the world's in the static pose; else they come from centers and flexion."""
+    """Segment axes equal the world in the static pose; otherwise joint centres define them."""
 
 
 class JointAngles(NamedTuple):
@@ -198,7 +199,7 @@ class SegmentState(NamedTuple):
     sd: float | None
     """Standard deviation of the orientation, rad (root of the mean variance per axis)."""
     used: tuple[str, ...]
-    """Sensors that took part."""
+    """Ids of the sensors that contributed."""
 
 
 class JointState(NamedTuple):
@@ -210,24 +211,24 @@ class JointState(NamedTuple):
     """Standard deviation of the position, m (root of the mean variance per axis)."""
     angles: JointAngles | None = None
     inner: float | None = None
-    """Included angle between the two segments, rad: pi when straight."""
+    """Included angle between the two segments, rad; π when straight."""
     angle_sd: float | None = None
     """Standard deviation of the flexion angle, rad."""
     rates: JointAngles | None = None
-    """How fast the angles change, over the last 50 ms, rad/s."""
+    """Rates of change of the angles over the last 50 ms, rad/s."""
 
 
 class LimbState(NamedTuple):
-    """The limb at instant ``t_ns``: one of these a frame, whatever sensors are alive."""
+    """State of the limb at ``t_ns``: one per frame, even without sensors."""
 
     seq: int
     t_ns: int
     completed_ns: int
-    """Host arrival of the sample (or the deadline) that completed this frame."""
+    """Arrival of the sample, or the deadline, that completed this frame, ns."""
     mode: str
     """``uncalibrated`` | ``imu`` | ``imu+mocap``."""
     sync: str
-    """``settling`` | ``locked`` | ``stale``: state of the clocks behind this frame."""
+    """``settling`` | ``locked`` | ``stale``: state of the clock estimates of this frame."""
     flags: tuple[str, ...]
     segments: tuple[SegmentState, ...]
     joints: tuple[JointState, ...]

@@ -1,9 +1,9 @@
-"""rig.toml in, a frozen `Rig` in SI out, or every fault of it at once.
+"""Configuration: converts rig.toml to a frozen `Rig` in SI units, or reports all its faults.
 
 Invariant: degrees and millimetres exist in this package only; no device is opened here.
 """
 
-from jointfit_daemon.config._checks import drifting, headings
+from jointfit_daemon.config._checks import drifting_imus, heading_warning
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._load import load_rig, parse_rig
 from jointfit_daemon.config._rig import Rig, Source
@@ -18,9 +18,9 @@ __all__ = [
     "Rig",
     "Source",
     "TlsSettings",
-    "drifting",
+    "drifting_imus",
     "faults_of",
-    "headings",
+    "heading_warning",
     "load_rig",
     "parse_rig",
     "rig_schema",

@@ -1,7 +1,6 @@
-"""Whether a line can carry what its sensors send: bits per second needed, and available.
+"""Check that serial lines and CAN buses have the bit rate that their sensors need.
 
-Both are computed for the worst case, so that what is accepted works: all sensors on a bus at their
-rate, frames with as many stuff bits as their length allows.
+Worst case: all sensors of a bus send at their rate, with the largest number of stuff bits.
 """
 
 from __future__ import annotations
@@ -18,17 +17,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import CanBusSettings
 
 BYTE_BITS = 10
-"""One byte on a serial line, 8N1."""
+"""Bits of one byte on a serial line (8N1)."""
 _BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 3_686_400)
-"""Speeds that serial adapters and devices share."""
+"""Common speeds of serial adapters and devices, baud."""
 _CAN_RATES = (125_000, 250_000, 500_000, 800_000, 1_000_000)
+"""Common bit rates of CAN buses, bit/s."""
 
 
 def frame_bits(data_bytes: int, *, extended: bool) -> int:
-    """Return the longest a CAN frame can be, bit, with stuff bits and the gap after it.
+    """Return the largest length of a CAN frame, bit, with stuff bits and interframe space.
 
-    A stuff bit follows every four bits after the first, of the data and of the 34 (11-bit
-    identifier) or 54 (29-bit) bits from the start to the end of the checksum.
+    With s = 34 (11-bit identifier) or 54 (29-bit) bits from the start to the end of the checksum
+    and d data bytes, at most (s + 8 d − 1) / 4 stuff bits occur (ISO 11898-1).
     """
     plain, stuffed = (64, 54) if extended else (44, 34)
     gap = 3
@@ -36,12 +36,12 @@ def frame_bits(data_bytes: int, *, extended: bool) -> int:
 
 
 def slcan_bits(data_bytes: int, *, extended: bool) -> int:
-    """Return the length of a frame as an SLCAN line: letter, identifier, length, data, CR."""
+    """Return the length of an SLCAN line, bit: letter, identifier, length, data, CR."""
     return BYTE_BITS * (1 + (8 if extended else 3) + 1 + 2 * data_bytes + 1)
 
 
-def serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
-    """Check every sensor that has a serial line of its own."""
+def check_serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
+    """Check every sensor on a separate serial line."""
     for source in sources:
         needed = getattr(source.settings, "serial_bits_per_s", None)
         baud = getattr(source.settings, "baud", None)
@@ -55,30 +55,34 @@ def serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
             )
 
 
-def can_buses(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:
-    """Check every CAN bus with all sensors on it, and the serial line of an SLCAN adapter."""
+def check_can_buses(
+    sources: Sequence[Source], buses: Mapping[str, CanBusSettings]
+) -> Iterator[Fault]:
+    """Check every CAN bus with all its sensors, and the serial line of an SLCAN adapter."""
     users: dict[str, list[Source]] = defaultdict(list)
     for source in sources:
         for name, bus in buses.items():
             if getattr(source.settings, "can", None) == bus:
                 users[name].append(source)
+
     for name, members in users.items():
         bus = buses[name]
         sent = [(source.rate_hz, frame) for source in members for frame in _frames(source)]
-        who = f"{', '.join(source.id for source in members)} need"
+        needing = f"{', '.join(source.id for source in members)} need"
         on_bus = sum(hz * frame_bits(size, extended=ext) for hz, (size, ext) in sent)
         if on_bus > bus.bitrate:
             yield Fault(
                 f"can.{name}.bitrate",
-                f"{who} {on_bus:.0f} bit/s at most, the bus carries {bus.bitrate}: "
+                f"{needing} {on_bus:.0f} bit/s at most, the bus carries {bus.bitrate}: "
                 f"{_faster('bitrate', on_bus, _CAN_RATES)}lower rate_hz, or use two buses",
                 bus.bitrate,
             )
+
         on_line = sum(hz * slcan_bits(size, extended=ext) for hz, (size, ext) in sent)
         if bus.interface == "slcan" and bus.transport == "uart" and on_line > bus.baud:
             yield Fault(
                 f"can.{name}.baud",
-                f"{who} {on_line:.0f} bit/s as SLCAN, the line carries {bus.baud}: "
+                f"{needing} {on_line:.0f} bit/s as SLCAN, the line carries {bus.baud}: "
                 f"{_faster('baud', on_line, _BAUDS)}lower rate_hz",
                 bus.baud,
             )

@@ -1,6 +1,6 @@
-"""What no single table can know: names that must match across tables.
+"""Checks across the tables of rig.toml, and of names.
 
-Law: each check returns its faults; none stops at the first.
+Invariant: every check returns all its faults.
 """
 
 from __future__ import annotations
@@ -24,62 +24,65 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import CanBusSettings, MocapSettings
 
 _FORBIDDEN = "+#/"
+"""Characters with a meaning in MQTT topics."""
 _FOLDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_LONGEST_M = 3.0  # no limb is longer; a length in millimetres is
-_LEAST_MARKERS = 3  # fewer do not define an orientation
+_LONGEST_M = 3.0
+"""Upper limit of a segment length, m; larger numbers are probably millimetres."""
+_LEAST_MARKERS = 3
+"""Smallest number of markers that defines an orientation."""
 
 
-def control_characters(value: object, key: str = "") -> Iterator[Fault]:
-    """Check that no text holds a NUL: no file, port or topic may be named so."""
+def check_control_characters(value: object, key: str = "") -> Iterator[Fault]:
+    """Check that no text contains NUL, which no name of a file, port or topic may contain."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from control_characters(name, f"key {name!r}")
-            yield from control_characters(inner, f"{key}.{name}" if key else str(name))
+            yield from check_control_characters(name, f"key {name!r}")
+            yield from check_control_characters(inner, f"{key}.{name}" if key else str(name))
     elif isinstance(value, list):
         for at, inner in enumerate(value):
-            yield from control_characters(inner, f"{key}[{at}]")
+            yield from check_control_characters(inner, f"{key}[{at}]")
     elif isinstance(value, str) and "\0" in value:
-        yield Fault(key, "must not hold a NUL character", value)
+        yield Fault(key, "must not contain a NUL character", value)
 
 
-def topic_name(key: str, name: str) -> list[Fault]:
-    """Check a name that becomes one level of an MQTT topic."""
+def check_topic_name(key: str, name: str) -> list[Fault]:
+    """Check a name that is used as one level of an MQTT topic."""
     if not name.strip():
         return [Fault(key, "must not be empty: it becomes an MQTT topic", name)]
     if bad := [letter for letter in _FORBIDDEN if letter in name]:
-        return [Fault(key, f"must not hold {' '.join(bad)}: it becomes an MQTT topic", name)]
+        return [Fault(key, f"must not contain {' '.join(bad)}: it becomes an MQTT topic", name)]
     if name.startswith("$") or not name.isprintable() or name != name.strip():
-        what = "must not begin with $, nor hold control characters or outer blanks"
+        what = "must not begin with $, nor contain control characters or outer blanks"
         return [Fault(key, f"{what}: it becomes an MQTT topic", name)]
     return []
 
 
-def topic_base(key: str, base: str) -> list[Fault]:
-    """Check the levels before every topic; they may hold slashes, but no empty level."""
+def check_topic_base(key: str, base: str) -> list[Fault]:
+    """Check the base topic: it may contain slashes, but no empty level."""
     return [
         Fault(key, fault.expected, base)
         for level in base.split("/")
-        for fault in topic_name(key, level)
+        for fault in check_topic_name(key, level)
     ][:1]
 
 
-def folder_name(key: str, name: str) -> list[Fault]:
-    """Check a name that becomes one folder of the calibration store."""
+def check_folder_name(key: str, name: str) -> list[Fault]:
+    """Check a name that is used as a folder of the calibration store."""
     if _FOLDER.fullmatch(name):
         return []
     allowed = "letters, digits, . _ and -, beginning with a letter or digit"
     return [Fault(key, f"must be the plain name of one folder: {allowed}", name)]
 
 
-def chain(table: ChainTable) -> Iterator[Fault]:
-    """Check the limb: its names, and that joints and segments alternate.
+def check_chain(table: ChainTable) -> Iterator[Fault]:
+    """Check the names of the limb, its lengths, and the number of joints.
 
     Keys of `table` that had faults are None.
     """
     for key in ("joints", "segments"):
         names = getattr(table, key) or ()
         for name in names:
-            yield from topic_name(f"chain.{key}", name)
+            yield from check_topic_name(f"chain.{key}", name)
         yield from _repeated(f"chain.{key}", names)
     found = [len(names) for names in (table.joints, table.segments) if names]
     if len(found) == 2 and found[0] != found[1] + 1:  # noqa: PLR2004 - both could be read
@@ -91,7 +94,7 @@ def chain(table: ChainTable) -> Iterator[Fault]:
     yield from _neighbours(table)
     for name, length in (table.lengths_m or {}).items():
         if table.segments:
-            yield from known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
+            yield from check_known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
         if not 0 < length < _LONGEST_M:
             yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
 
@@ -101,20 +104,20 @@ def _neighbours(table: ChainTable) -> Iterator[Fault]:
         name = getattr(table, key)
         if name is None:
             continue
-        yield from topic_name(f"chain.{key}", name)
+        yield from check_topic_name(f"chain.{key}", name)
         if name in (table.segments or ()):
             yield Fault(f"chain.{key}", "is already a segment", name)
 
 
-def known_name(
+def check_known_name(
     key: str, name: str, known: Sequence[str], what: str, taken: Collection[str] = ()
 ) -> list[Fault]:
-    """Check that `name` is one of `known`; propose none of `taken`."""
+    """Check that `name` is one of `known`; the proposal is not one of `taken`."""
     if name in known:
         return []
     choices = ", ".join(known) or "none"
     near = nearest_name(name, [other for other in known if other not in taken])
-    return [Fault(key, f"no such {what}; known: {choices}", name, near)]
+    return [Fault(key, f"unknown {what}; known: {choices}", name, near)]
 
 
 def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
@@ -123,34 +126,34 @@ def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
             yield Fault(key, f"named {times} times, expected once", name)
 
 
-def sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iterator[Fault]:
-    """Check ids and segments of all ``[[imu]]`` tables, as far as they can be read."""
+def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iterator[Fault]:
+    """Check ids and segments of all ``[[imu]]`` tables that can be read."""
     ids = [imu["id"] for imu in imus if isinstance(imu.get("id"), str)]
     yield from _repeated("imu.id", ids)
     for name in dict.fromkeys(ids):
-        yield from topic_name(f"imu[{name}].id", name)
+        yield from check_topic_name(f"imu[{name}].id", name)
         if name == MOCAP:
-            yield Fault(f"imu[{name}].id", "is the name of the optical source", name)
+            yield Fault(f"imu[{name}].id", "is reserved for the optical source", name)
     if table is None or not table.segments:
         return
     worn = [imu["segment"] for imu in imus if isinstance(imu.get("segment"), str)]
     for at, imu in enumerate(imus, 1):
         if isinstance(imu.get("segment"), str):
             key = f"imu[{imu.get('id', f'#{at}')}].segment"
-            yield from known_name(key, imu["segment"], table.segments, "segment")
+            yield from check_known_name(key, imu["segment"], table.segments, "segment")
     for segment in table.segments:
         if segment not in worn:
-            yield Fault("imu", f"no sensor is on segment {segment!r}, expected at least one")
+            yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
 
 
-def markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
+def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
     """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
     for kind in ("markers", "rigid_body"):
         for part in getattr(settings, kind) or ():
             if table is not None and table.segments:
                 parts = [*table.segments, *filter(None, (table.proximal, table.distal))]
                 taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
-                yield from known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
+                yield from check_known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
     for part, names in (settings.markers or {}).items():
         key = f"mocap.markers.{part}"
         yield from _repeated(key, names)
@@ -169,8 +172,8 @@ def _shared_markers(settings: MocapSettings) -> Iterator[Fault]:
                 yield Fault(f"mocap.markers.{part}", f"is a marker of {owner!r} already", name)
 
 
-def ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:
-    """Check that nobody shares a serial port."""
+def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:
+    """Check that no serial port is used twice."""
     users = [
         (f"imu[{source.id}].port", getattr(source.settings, "port", None)) for source in sources
     ]
@@ -181,14 +184,14 @@ def ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Ite
     ]
     taken: dict[str, str] = {}
     for key, port in users:
-        if isinstance(port, str):  # a link and its target are one port
+        if isinstance(port, str):  # a link and its target are the same port
             owner = taken.setdefault(os.path.realpath(port), key)
             if owner != key:
                 yield Fault(key, f"is the port of {owner.rpartition('.')[0]} already", port)
 
 
-def can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
-    """Check that on one bus every message id belongs to one sensor."""
+def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
+    """Check that every message id on a bus belongs to one sensor."""
     owners: dict[tuple[str, int], str] = {}
     for source in sources:
         bus = getattr(source.settings, "can", None)
@@ -197,17 +200,17 @@ def can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
         for message, number in _numbers(getattr(source.settings, "ids", None)):
             owner = owners.setdefault((repr(bus), number), f"{source.id} ({message})")
             if owner != f"{source.id} ({message})":
-                text = f"id {number:#x} on this bus is taken by {owner}; expected one of its own"
+                text = f"id {number:#x} on this bus belongs to {owner}; expected a unique id"
                 yield Fault(f"imu[{source.id}].ids.{message}", text)
 
 
-def drifting(sources: Sequence[Source]) -> frozenset[str]:
-    """Return the IMUs whose heading is worked out on the gateway without a magnetometer."""
+def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:
+    """Return the IMUs whose heading the gateway computes without a magnetometer."""
     return frozenset(_on_gateway(sources)[True])
 
 
 def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
-    """Return the IMUs whose heading is worked out here, by whether it drifts."""
+    """Return the IMUs whose heading the gateway computes, by whether it drifts."""
     drifts: dict[bool, list[str]] = {True: [], False: []}
     for source in sources:
         if getattr(source.settings, "orientation", None) == "gateway":
@@ -215,26 +218,26 @@ def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
     return drifts
 
 
-def headings(sources: Sequence[Source]) -> str | None:
-    """Say what is wrong with IMUs of which some find north on the gateway and others drift.
+def heading_warning(sources: Sequence[Source]) -> str | None:
+    """Return a warning if the gateway uses the magnetometer of some IMUs only; None otherwise.
 
-    A fault it is not: who wants it may have it. Of a device that computes its own orientation it
-    is not known which it is.
+    The configuration is permitted. Devices that compute their own orientation are not considered,
+    since their use of a magnetometer is unknown.
     """
     drifts = _on_gateway(sources)
     if not drifts[True] or not drifts[False]:
         return None
     return (
         f"heading by magnetometer on {', '.join(drifts[False])}, but not on "
-        f"{', '.join(drifts[True])}: it drifts there, and joint rotation with it; "
-        "set `magnetometer` alike on all"
+        f"{', '.join(drifts[True])}: their heading drifts, and joint rotation with it; "
+        "set the same `magnetometer` for all"
     )
 
 
 def _numbers(ids: object) -> Iterator[tuple[str, int]]:
-    """Yield message names and identifiers of an ``ids`` table, be it a model or a dict.
+    """Yield message names and identifiers of an ``ids`` table, a model or a dict.
 
-    A model whose identifiers follow from each other gives them all by ``resolved``.
+    A model that derives identifiers from each other has a method ``resolved``.
     """
     resolved = getattr(ids, "resolved", None)
     if callable(resolved):

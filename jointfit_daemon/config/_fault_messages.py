@@ -1,6 +1,6 @@
-"""What can be wrong in a rig.toml and how it is told: key, value, expectation, nearest spelling.
+"""Faults of rig.toml and their messages: key, value, expectation, and nearest valid name.
 
-Law: faults are collected, never raised one by one.
+Invariant: one `ConfigError` lists all faults.
 """
 
 from __future__ import annotations
@@ -18,44 +18,46 @@ if TYPE_CHECKING:
 
     from pydantic_core import ErrorDetails
 
-_SHOWN = 60  # characters of a value worth repeating
+_LONGEST_VALUE = 60
+"""Longest value in a message, characters."""
 _NO_VALUE = object()
 _SECRET = re.compile(r"passw|passphrase|secret|token|api_?key|private_?key|request_?key")
-"""Names of keys whose values must not be told in a message."""
+"""Names of keys whose values must not appear in a message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong in a rig.toml."""
+    """One fault of a rig.toml."""
 
     key: str
     """Path of the key, as ``imu[S1].rate_hz``."""
     expected: str
+    """Description of a valid value, or of the fault."""
     value: Any = _NO_VALUE
     near: str | None = None
-    """Nearest valid spelling."""
+    """Nearest valid name."""
 
     @property
     def has_value(self) -> bool:
-        """Whether it is about a value that was found, not about one that is missing."""
+        """Whether the fault concerns an existing value, not a missing one."""
         return self.value is not _NO_VALUE
 
     def text(self) -> str:
-        """Return one line for people."""
+        """Return the message, one line."""
         shown = "" if self.value is _NO_VALUE else f" = {_brief(self.value)}"
         hint = f"; did you mean {self.near!r}?" if self.near else ""
         return f"{self.key}{shown}: {self.expected}{hint}"
 
 
 class ConfigError(Exception):
-    """A rig.toml that cannot be used; lists every fault found.
+    """A rig.toml cannot be used; the message lists all faults.
 
     Parameters
     ----------
     source
         Name of the file.
     faults
-        At least one.
+        All faults; at least one.
     """
 
     def __init__(self, source: str, faults: Sequence[Fault]) -> None:
@@ -67,11 +69,11 @@ class ConfigError(Exception):
 
 def _brief(value: object) -> str:
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}…"
 
 
 def faults_of(error: ValidationError, model: type[BaseModel], key: str) -> list[Fault]:
-    """Return what pydantic found in the table at `key`, each in our words."""
+    """Return the faults that pydantic found in the table at `key`."""
     return [_fault(detail, model, key) for detail in error.errors(include_url=False)]
 
 
@@ -86,10 +88,11 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             instead = f" and name it: {' or '.join(files)}" if files else ""
             return Fault(
                 path,
-                f"no place for a secret: others may read rig.toml. Put it into a file{instead}",
+                f"a secret does not belong here: others can read rig.toml. Put it into a "
+                f"file{instead}",
             )
         case "extra_forbidden":
-            known = f"no such key; known here: {', '.join(fields)}"
+            known = f"unknown key; known here: {', '.join(fields)}"
             return Fault(path, known, detail["input"], nearest_name(loc[-1], fields))
         case "missing":
             return Fault(path, f"missing; {_described(fields, loc[-1])}")
@@ -121,7 +124,7 @@ def _described(fields: Mapping[str, Any], name: object) -> str:
 
 
 def _model_at(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseModel] | None:
-    """Return the model that holds the keys at `loc`, where that is a model."""
+    """Return the model whose fields are the keys at `loc`; None if it is not a model."""
     here: type[BaseModel] | None = model
     for part in loc:
         field = here.model_fields.get(str(part)) if here is not None else None

@@ -1,4 +1,7 @@
-"""From the text of a rig.toml to a `Rig`. Law: all faults at once, before anything opens."""
+"""Conversion of rig.toml to a `Rig`.
+
+Invariant: all faults are reported together, before any device is opened.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +50,12 @@ SECTIONS = ("rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recor
 def load_rig(path: Path) -> Rig:
     """Read and check the rig.toml at `path`.
 
-    Relative names of files in ``[mqtt]`` start at the folder of `path`.
+    File names in ``[mqtt]`` are relative to the folder of `path`.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, is not TOML, or describes no usable rig; lists all faults.
+        The file cannot be read, is not TOML, or is invalid; the message lists all faults.
     """
     table, syntax = read_table(path)
     _anchor_files(table, path.absolute().parent)
@@ -60,19 +63,19 @@ def load_rig(path: Path) -> Rig:
 
 
 def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
-    """Check `table`, a parsed rig.toml, and return what it means.
+    """Check `table`, a parsed rig.toml, and return the rig.
 
     Parameters
     ----------
     table
-        As tomllib gives it; not kept, not changed.
+        Result of tomllib; it is copied.
     source
         Name of the file, for messages.
 
     Raises
     ------
     ConfigError
-        Lists every fault of the table.
+        The table is invalid; the message lists all faults.
     """
     if (fault := find_structure_fault(table)) is not None:
         raise ConfigError(source, [Fault("TOML", fault)])
@@ -80,12 +83,12 @@ def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
 
 
 def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
-    reader = _Reader(table)
-    unusable = list(_checks.control_characters(table))
+    reader = _RigReader(table)
+    unusable = list(_checks.check_control_characters(table))
     reader.faults += unusable
     rig = None if unusable else reader.rig()
     faults = [*syntax, *reader.faults]
-    if syntax:  # what seems to be missing may be on a line that could not be parsed
+    if syntax:  # a key that seems to be missing may be on a line with a syntax error
         faults = [*syntax, *(fault for fault in reader.faults if fault.has_value)]
     if rig is None or faults:
         raise ConfigError(source, list({fault.text(): fault for fault in faults}.values()))
@@ -93,7 +96,7 @@ def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
 
 
 def _partial(table: Mapping[str, Any], model: type[Model], error: ValidationError) -> Model:
-    """Return a model that is None at the keys that have faults."""
+    """Return a model without validation, with None for the keys that have faults."""
     wrong = {detail["loc"][0] for detail in error.errors() if detail["loc"]}
     values = {
         name: None
@@ -123,23 +126,23 @@ def _anchor(part: object, keys: Sequence[str], folder: Path) -> None:
                 part[key] = str(folder / part[key])
 
 
-class _Reader:
-    """Reads one table and collects what is wrong with it."""
+class _RigReader:
+    """Reads one rig.toml and collects its faults."""
 
     def __init__(self, table: dict[str, Any]) -> None:
         self.table = table
         self.faults: list[Fault] = []
         self.partial: dict[str, Any] = {}
-        """Tables with faults, by key: models of what is right in them, for the cross-checks."""
-        self.seen: list[Source] = []
-        """The IMUs, also those with faults, as far as they could be read."""
+        """Tables with faults, by key, as partial models for the checks across tables."""
+        self.imus_read: list[Source] = []
+        """All IMUs whose tables could be read, even with faults."""
         for key in table:
             if key not in SECTIONS:
-                known = f"no such table; known: {', '.join(SECTIONS)}"
+                known = f"unknown table; known: {', '.join(SECTIONS)}"
                 self.faults.append(Fault(key, known, near=nearest_name(key, SECTIONS)))
 
     def rig(self) -> Rig | None:
-        """Return the rig if every table could be read; cross-checks add their faults."""
+        """Return the rig if there is no fault; collect the faults of all tables otherwise."""
         head = self._section("rig", RigTable, needed=True)
         chain = self._section("chain", ChainTable, needed=True)
         calibration = self._section("calibration", CalibrationTable)
@@ -147,19 +150,22 @@ class _Reader:
         recording = (
             self._section("recording", RecordingSettings) if "recording" in self.table else None
         )
+
         buses = self._buses()
         limb = chain or self.partial.get("chain")
         sources = self._imus(limb, buses)
         mocap = self._mocap(limb, head)
-        self.faults += _checks.ports(self.seen, buses)
-        self.faults += _checks.can_ids(self.seen)
-        self.faults += _bandwidth.serial_lines(sources)
-        self.faults += _bandwidth.can_buses(sources, buses)
+
+        self.faults += _checks.check_ports(self.imus_read, buses)
+        self.faults += _checks.check_can_ids(self.imus_read)
+        self.faults += _bandwidth.check_serial_lines(sources)
+        self.faults += _bandwidth.check_can_buses(sources, buses)
         self.faults += self._names()
         if limb is not None:
-            self.faults += _checks.chain(limb)
+            self.faults += _checks.check_chain(limb)
         if head is None or chain is None or calibration is None or mqtt is None or self.faults:
             return None
+
         base = mqtt.base or f"jointfit/{head.name}"
         return Rig(
             name=head.name,
@@ -175,12 +181,12 @@ class _Reader:
         )
 
     def _names(self) -> list[Fault]:
-        """Check the names of topics and folders even where another key of their table is wrong."""
+        """Check the names of topics and folders, even if another key of their table is wrong."""
         faults: list[Fault] = []
         for section, key, check in (
-            ("rig", "name", _checks.topic_name),
-            ("calibration", "store", _checks.folder_name),
-            ("mqtt", "base", _checks.topic_base),
+            ("rig", "name", _checks.check_topic_name),
+            ("calibration", "store", _checks.check_folder_name),
+            ("mqtt", "base", _checks.check_topic_base),
         ):
             table = self.table.get(section)
             name = table.get(key) if isinstance(table, dict) else None
@@ -198,7 +204,7 @@ class _Reader:
         if not isinstance(table, dict):
             self.faults.append(Fault(key, "expected a table", table))
             return None
-        try:  # strict JSON: a string is no number, yet an array is a tuple
+        try:  # strict JSON mode: strings are not numbers, but arrays are tuples
             return model.model_validate_json(json.dumps(table, default=str), strict=True)
         except ValidationError as error:
             self.faults += faults_of(error, model, key)
@@ -220,7 +226,7 @@ class _Reader:
         if not isinstance(tables, list) or not all(isinstance(imu, dict) for imu in tables):
             self.faults.append(Fault("imu", "expected [[imu]] tables", tables))
             return []
-        self.faults += _checks.sensors(tables, chain)
+        self.faults += _checks.check_sensors(tables, chain)
         found = []
         for at, imu in enumerate(tables, 1):
             key = f"imu[{imu.get('id', f'#{at}')}]"
@@ -231,13 +237,13 @@ class _Reader:
                 found.append(_imu_source(imu["driver"], settings, driver))
             known = settings or self.partial.get(key)
             if driver is not None and known is not None and known.id is not None:
-                self.seen.append(_imu_source(imu["driver"], known, driver))
+                self.imus_read.append(_imu_source(imu["driver"], known, driver))
         return found
 
     def _with_bus(
         self, key: str, imu: dict[str, Any], buses: Mapping[str, CanBusSettings]
     ) -> dict[str, Any]:
-        """Put the ``[can.NAME]`` table in the place of its name."""
+        """Replace the name of a bus by its ``[can.NAME]`` table."""
         name = imu.get("can")
         if not isinstance(name, str):
             return imu
@@ -247,32 +253,34 @@ class _Reader:
         if isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(buses) or 'none'}"
             self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, buses)))
-        return imu | {"can": CanBusSettings(channel="unknown").model_dump()}  # told already
+        return imu | {
+            "can": CanBusSettings(channel="unknown").model_dump()
+        }  # the fault is reported already
 
     def _driver(
         self, key: str, table: dict[str, Any], base: type[BaseModel]
     ) -> type[Driver] | None:
         name = table.get("driver")
         if not isinstance(name, str):
-            return None  # missing or no text: the settings model says so
+            return None  # missing or not a text: the settings model reports it
         try:
             driver = find_driver(name)
         except UnknownDriverError:
-            self.faults += _checks.known_name(f"{key}.driver", name, driver_names(), "driver")
+            self.faults += _checks.check_known_name(f"{key}.driver", name, driver_names(), "driver")
             return None
-        except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig, not ours
+        except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig
             self.faults.append(Fault(f"{key}.driver", f"cannot be loaded: {error!r}", name))
             return None
         if not issubclass(driver.Settings, base):
             what = "motion capture" if base is ImuSettings else "an IMU"
-            self.faults.append(Fault(f"{key}.driver", f"is a driver of {what}", name))
+            self.faults.append(Fault(f"{key}.driver", f"is a driver for {what}", name))
             return None
         return driver
 
     def _settings(
         self, key: str, table: object, driver: type[Driver] | None, base: type[BaseModel]
     ) -> Any:
-        """Check with the driver's model; without a driver only the keys that all drivers have."""
+        """Validate with the model of the driver; without one, the keys common to all drivers."""
         if driver is not None:
             return self._validate(key, table, driver.Settings)
         if isinstance(table, dict):
@@ -287,7 +295,7 @@ class _Reader:
         settings = self._settings(MOCAP, table, driver, MocapSettings)
         known = settings or self.partial.get(MOCAP)
         if known is not None:
-            self.faults += _checks.markers(known, chain)
+            self.faults += _checks.check_markers(known, chain)
         if settings is None or driver is None or head is None:
             return None
         rate = getattr(settings, "rate_hz", None) or head.output_rate_hz

@@ -19,33 +19,33 @@ MOCAP = "mocap"
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One device to be read, with the driver that reads it."""
+    """One device, with its driver and settings."""
 
     id: str
     kind: Literal["imu", "mocap"]
     driver: str
     rate_hz: float
-    """Samples per second asked of the device; for mocap the configured output rate, a guess."""
+    """Sample rate requested of the device, Hz; for mocap, by default the output rate."""
     segment: str | None
-    """The segment it is worn on; None for mocap."""
+    """Segment to which the sensor is attached; None for mocap."""
     settings: Any
-    """The driver's own validated settings."""
+    """Validated settings of the driver."""
     driver_class: type[Driver]
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """One wearer, one limb, the devices on it and where the results go."""
+    """One subject, one limb, its devices, and the outputs."""
 
     name: str
     output_rate_hz: float
     align_mode: Literal["smooth", "fast"]
     chain: Chain
     sources: tuple[Source, ...]
-    """IMUs in the order of rig.toml, then mocap if there is one."""
+    """IMUs in the order of rig.toml, then mocap, if any."""
     calibration: CalibrationSettings
     calibration_store: str
     mqtt: MqttSettings
     recording: RecordingSettings | None
     table: Mapping[str, Any]
-    """The rig.toml as parsed, for the event log; it never holds a secret (passwords are files)."""
+    """The parsed rig.toml, for the event log; it contains no secrets (passwords are in files)."""

@@ -1,4 +1,4 @@
-"""The JSON schema of rig.toml, drivers' tables included. Law: made from the models that check."""
+"""JSON schema of rig.toml, including the tables of drivers, generated from the models."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SECTIONS: dict[str, type[BaseModel]] = {
 
 
 def rig_schema() -> dict[str, Any]:
-    """Return the JSON schema (2020-12) of rig.toml; a driver that cannot be loaded is left out."""
+    """Return the JSON schema (2020-12) of rig.toml, without drivers that cannot be loaded."""
     drivers = _driver_models()
     models: list[type[BaseModel]] = [*_SECTIONS.values(), CanBusSettings, *drivers.values()]
     refs, definitions = models_json_schema(
@@ -39,7 +39,7 @@ def rig_schema() -> dict[str, Any]:
     for name, model in drivers.items():
         properties = defs[at[model]["$ref"].rpartition("/")[2]]["properties"]
         properties["driver"] = {"const": name, "description": "driver name"}
-        if "can" in properties:  # in the file it is a name; the driver gets the table
+        if "can" in properties:  # a name in the file, a table for the driver
             properties["can"] = {"type": "string", "description": "name of a [can.NAME] table"}
     imus = [at[model] for model in drivers.values() if issubclass(model, ImuSettings)]
     mocaps = [at[model] for model in drivers.values() if not issubclass(model, ImuSettings)]

@@ -1,6 +1,6 @@
-"""The text of a rig.toml to a table, with every syntax error that can be told apart.
+"""Parsing of rig.toml, with all syntax errors.
 
-After an error the line is left out and the rest parsed again, so that one slip hides no other.
+After an error its line is removed and the rest is parsed again, so that further errors are found.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from jointfit_daemon.files.text import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-_MOST_BYTES = 256 * 1024  # a rig of four sensors has 3 kB, and parsing takes 0.5 s per MB
+_MOST_BYTES = 256 * 1024
+"""Largest file, bytes: a rig of four sensors has 3 kB, and parsing takes 0.5 s per MB."""
 _MOST_ERRORS = 20
+"""Largest number of syntax errors that are reported."""
 _OF_SEVERAL_LINES = ("[", "]", "{", "}", '"""', "'''")
 _AT_LINE = re.compile(r"(.*) \(at line (\d+), column \d+\)", re.DOTALL)
 _DECIMAL_COMMA = re.compile(r"[=\[,]\s*[+-]?\d+,\d+\s*(#.*)?$")
 
 
 def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
-    """Return what could be parsed of a rig.toml, and the syntax errors in the rest.
+    """Return the parsed part of a rig.toml, and its syntax errors.
 
     Raises
     ------
     ConfigError
-        Nothing of the file can be used.
+        No part of the file can be used.
     """
     try:
         text = read_text(path, _MOST_BYTES)
@@ -54,7 +56,7 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
 
 
 def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
-    """Return the table, None if what is left out would make up further faults."""
+    """Return the table; None if the removed lines would cause further faults."""
     faults: list[Fault] = []
     last, opened = -1, False
     while len(faults) < _MOST_ERRORS:
@@ -64,14 +66,14 @@ def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
             found = _AT_LINE.fullmatch(str(error))
             number = int(found[2]) if found else 0
             if faults and (found is None or (number == last + 1 and opened)):
-                break  # the line left out was part of a value of several lines
+                break  # the removed line was part of a value of several lines
             if found is None:
                 faults.append(Fault("TOML", str(error)))
                 break
             line = lines[number - 1].strip()
             faults.append(Fault(f"line {number}", f"{_lowered(found[1])}{_remedy(line)}", line))
             if not line or line.startswith("["):
-                break  # its keys would land in another table
+                break  # its keys would belong to another table
             lines[number - 1], last = "", number
             opened = any(mark in line for mark in _OF_SEVERAL_LINES)
     return None, faults
@@ -82,4 +84,4 @@ def _lowered(text: str) -> str:
 
 
 def _remedy(line: str) -> str:
-    return "; decimals take a point, not a comma" if _DECIMAL_COMMA.search(line) else ""
+    return "; use a decimal point, not a comma" if _DECIMAL_COMMA.search(line) else ""

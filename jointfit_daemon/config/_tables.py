@@ -1,7 +1,7 @@
-"""The tables of rig.toml that belong to the daemon itself, one model each.
+"""Models of the tables of rig.toml, except those of drivers.
 
-Law: unknown keys are refused, every field says what it is and in which unit; this text is what
-``jointfit schema`` prints. The tables of devices belong to their drivers.
+Invariant: unknown keys are refused, and the description of every field states its meaning and unit.
+``jointfit schema`` prints the descriptions.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pydantic import Field, ValidationInfo, field_validator
 from jointfit_daemon.driver import Settings
 from jointfit_daemon.limb_model import Method  # noqa: TC001 - pydantic reads it at run time
 
-_PLAIN, _TLS = 1883, 8883  # IANA: mqtt, secure-mqtt
+_PLAIN, _TLS = 1883, 8883
+"""Default ports without and with TLS (IANA: mqtt, secure-mqtt)."""
 
 
 class RigTable(Settings):
@@ -24,8 +25,8 @@ class RigTable(Settings):
     output_rate_hz: float = Field(100.0, gt=0, le=1000, description="limb states per second, Hz")
     align_mode: Literal["smooth", "fast"] = Field(
         "smooth",
-        description="`smooth` waits for samples on both sides of an instant and interpolates; "
-        "`fast` is a sample period earlier and extrapolates by that at most",
+        description="`smooth` waits for samples before and after an instant and interpolates; "
+        "`fast` publishes one sample period earlier and extrapolates by at most that",
     )
 
 
@@ -38,21 +39,22 @@ class ChainTable(Settings):
     segments: tuple[str, ...] = Field(min_length=1, description="segments between the joints")
     side: Literal["right", "left"] = Field("right", description="side of the body: sign of angles")
     proximal: str | None = Field(
-        None, description="body part before the first joint, seen by markers only (pelvis)"
+        None, description="body part proximal of the first joint, with markers only (pelvis)"
     )
     distal: str | None = Field(
-        None, description="body part after the last joint, seen by markers only (foot)"
+        None, description="body part distal of the last joint, with markers only (foot)"
     )
     axes: Literal["anatomical", "static"] = Field(
         "anatomical",
         description="axes of the segments: `anatomical` from joint centers and the flexion axis; "
-        "`static` those of the optical world while the wearer stood still, facing its +y",
+        "`static` equal to the optical world in the static pose, with the subject facing +y",
     )
     origin_m: tuple[float, float, float] | None = Field(
         None, description="fixed position of the first joint in the world, m"
     )
     lengths_m: dict[str, float] = Field(
-        default_factory=dict, description="known segment lengths, m; calibration finds the others"
+        default_factory=dict,
+        description="known segment lengths, m; calibration estimates the others",
     )
 
 
@@ -60,44 +62,47 @@ class CalibrationTable(Settings):
     """``[calibration]``."""
 
     store: str = Field(
-        "default", description="name of the calibration's folder under $STATE_DIRECTORY"
+        "default", description="name of the calibration folder below $STATE_DIRECTORY"
     )
-    method: Method = Field("anchored", description="how redundant sensors are combined")
-    static_s: float = Field(5.0, gt=0, le=120, description="length of the static pose, s")
-    align_s: float = Field(30.0, gt=0, le=600, description="length of the align phase, s")
+    method: Method = Field("anchored", description="method that combines redundant sensors")
+    static_s: float = Field(5.0, gt=0, le=120, description="duration of the static pose, s")
+    align_s: float = Field(30.0, gt=0, le=600, description="duration of the align phase, s")
     functional_s: float = Field(
-        60.0, gt=0, le=600, description="greatest length of the movement phase, s"
+        60.0, gt=0, le=600, description="longest duration of the functional phase, s"
     )
     functional_min_s: float = Field(
         45.0,
         ge=0,
         le=600,
-        description="least length of the movement phase, s; it ends itself when every joint "
-        "center is known to center_target_mm and every joint bent far and often enough",
+        description="shortest duration of the functional phase, s; it then ends when every "
+        "joint center reaches center_target_mm and every joint was flexed far and often enough",
     )
     center_target_mm: float = Field(
         3.0,
         gt=0,
         le=100,
-        description="wanted error of the joint centers by noise, mm; skin motion comes on top "
-        "and is told beside it",
+        description="target error of the joint centers from noise, mm; the error from soft-tissue "
+        "artefacts is reported separately",
     )
     holdout_share: float = Field(
-        0.4, gt=0, lt=1, description="last share of the movement, which judges the fit"
+        0.4,
+        gt=0,
+        lt=1,
+        description="last part of the functional phase, held out to evaluate the fit",
     )
     refine_markers: bool = Field(
         True,
-        description="whether the movement refines where single markers sit on their body parts",
+        description="whether the functional phase refines the positions of markers on body parts",
     )
     learn_online: bool = Field(
         True,
-        description="whether the models go on learning while the cameras see the limb; what is "
-        "learned is taken only if it is better on the newest movement",
+        description="whether the models are updated while the cameras see the limb; an update is "
+        "used only if it has a smaller error on the latest movement",
     )
 
 
 def is_this_host(host: str) -> bool:
-    """Return whether `host` is the loopback of this machine, by name or address."""
+    """Return whether `host` is this machine (loopback), by name or address."""
     if host == "localhost" or host.endswith(".localhost"):  # RFC 6761
         return True
     try:
@@ -107,19 +112,17 @@ def is_this_host(host: str) -> bool:
 
 
 class TlsSettings(Settings):
-    """``[mqtt.tls]``: files in PEM; relative names start at the folder of rig.toml."""
+    """``[mqtt.tls]``: PEM files, relative to the folder of rig.toml."""
 
-    ca: str | None = Field(None, description="certificates to trust; default: the system's")
-    cert: str | None = Field(None, description="own certificate, for brokers that ask for one")
-    key: str | None = Field(
-        None, description="private key of `cert`; default: it is in the same file"
-    )
+    ca: str | None = Field(None, description="trusted certificates; default: those of the system")
+    cert: str | None = Field(None, description="client certificate, for brokers that require one")
+    key: str | None = Field(None, description="private key of `cert`; default: in the same file")
 
     @field_validator("key")
     @classmethod
-    def _has_its_certificate(cls, key: str | None, info: ValidationInfo) -> str | None:
+    def _check_key(cls, key: str | None, info: ValidationInfo) -> str | None:
         if key is not None and info.data.get("cert") is None:
-            raise ValueError("a key without its certificate: set cert, too")
+            raise ValueError("the key has no certificate: set cert, too")
         return key
 
 
@@ -132,33 +135,33 @@ class MqttSettings(Settings):
     username: str | None = Field(None, description="user name for the broker")
     password_file: str | None = Field(
         None,
-        description="file that holds the password; default: the systemd credential "
+        description="file with the password; default: the systemd credential "
         "jointfitd.mqtt-password",
     )
-    tls: TlsSettings | None = Field(None, description="talk TLS to the broker")
+    tls: TlsSettings | None = Field(None, description="TLS connection to the broker")
     insecure: bool = Field(
         False,
         validate_default=True,
-        description="`true`: no TLS to a broker on another machine; who is on the way reads and "
-        "writes all",
+        description="`true` permits plain MQTT to another machine; any host on the network path "
+        "can then read and send all messages",
     )
     request_key_file: str | None = Field(
         None,
-        description="file that holds the key which requests must be signed with; a systemd "
-        "credential of the same name is taken first. Default: the broker decides who may ask",
+        description="file with the key that signs requests; a systemd credential of the same name "
+        "takes precedence. Default: no signatures, the broker's ACL decides",
     )
     version: Literal["5", "3.1.1"] = Field(
-        "5", description="MQTT version; never changed silently: an old broker needs `3.1.1`"
+        "5", description="MQTT version, never changed automatically: old brokers need `3.1.1`"
     )
     pose_ui_hz: float = Field(10.0, gt=0, le=30, description="rate of the topic pose/ui, Hz")
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
-    health_s: float = Field(10.0, gt=0, le=60, description="time between two bridge/health, s")
+    health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")
 
     @field_validator("insecure")
     @classmethod
-    def _is_protected(cls, insecure: bool, info: ValidationInfo) -> bool:
+    def _check_insecure(cls, insecure: bool, info: ValidationInfo) -> bool:
         if not {"host", "tls"} <= info.data.keys():
-            return insecure  # wrong themselves, and told
+            return insecure  # they are faulty, and reported
         host: str = info.data["host"]
         if not (insecure or info.data["tls"] is not None or is_this_host(host)):
             raise ValueError(
@@ -169,18 +172,16 @@ class MqttSettings(Settings):
 
     @property
     def is_local(self) -> bool:
-        """Whether what we say to the broker stays on this machine."""
+        """Whether the broker is on this machine."""
         return is_this_host(self.host)
 
     @property
     def tcp_port(self) -> int:
-        """The port to connect to."""
+        """TCP port of the broker."""
         return self.port or (_TLS if self.tls else _PLAIN)
 
 
 class RecordingSettings(Settings):
-    """``[recording]``: its presence makes the daemon keep a log of all its input events."""
+    """``[recording]``: if present, the daemon records all its input events."""
 
-    directory: str = Field(
-        "recordings", description="folder; a relative name starts at $STATE_DIRECTORY"
-    )
+    directory: str = Field("recordings", description="folder, relative to $STATE_DIRECTORY")

@@ -1,7 +1,7 @@
-"""UNIX time of monotonic stamps. Law: follows the system's clock, and knows when it was set.
+"""UNIX time of CLOCK_MONOTONIC stamps.
 
-Both clocks run at the same rate, however NTP slews them, so their offset changes only when somebody
-steps UNIX time. CLOCK_MONOTONIC also stands still while the host is suspended; that is a step, too.
+The kernel slews both clocks alike (NTP), so their offset changes only if UNIX time is set, or if
+the host was suspended, which stops CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -10,56 +10,50 @@ import time
 from typing import NamedTuple
 
 STEP_NS = 50_000
-"""A change of the offset by more than this, and by more than the looks may err, is a step."""
-_LOOKS = 5
+"""A change of the offset by more than this and the reading errors is a step, ns."""
+_READINGS = 5
+"""Readings per measurement; the one that took the shortest time is used."""
 _NS_PER_S = 1_000_000_000
 
 
-class _Look(NamedTuple):
+class _OffsetReading(NamedTuple):
     """One comparison of both clocks."""
 
     width_ns: int
-    """How long it took: twice what it may err by."""
+    """Duration of the comparison, ns: twice its largest error."""
     offset_ns: int
 
 
 class UnixClock:
-    """The offset from CLOCK_MONOTONIC to UNIX time, measured at most once a second.
+    """Offset of UNIX time from CLOCK_MONOTONIC, measured at most once per second.
 
-    Between steps stamps keep their spacing; a step of the system's clock is followed within a
-    second.
+    Between steps the offset is constant, so the intervals of stamps are preserved. A step of UNIX
+    time is followed within one second.
     """
 
     def __init__(self) -> None:
-        self._look: _Look | None = None
+        self._reading: _OffsetReading | None = None
         self._until_ns = -1
-        self._told_ns: int | None = None
 
     def offset_ns(self) -> int:
-        """Return what to add to a monotonic stamp to get UNIX time."""
-        now_ns, before = time.monotonic_ns(), self._look
+        """Return UNIX time minus CLOCK_MONOTONIC, ns."""
+        now_ns, before = time.monotonic_ns(), self._reading
         if before is not None and now_ns < self._until_ns:
             return before.offset_ns
+
         self._until_ns = now_ns + _NS_PER_S
-        look = min(_looked() for _ in range(_LOOKS))
+        reading = min(_read_offset() for _ in range(_READINGS))
         if before is not None:
-            slack_ns = STEP_NS + (look.width_ns + before.width_ns) // 2
-            if abs(look.offset_ns - before.offset_ns) <= slack_ns:
+            slack_ns = STEP_NS + (reading.width_ns + before.width_ns) // 2
+            if abs(reading.offset_ns - before.offset_ns) <= slack_ns:
                 return before.offset_ns
-        self._look = look
-        return look.offset_ns
 
-    def news_ns(self) -> int | None:
-        """Return the offset if it is another than this has told before; mostly None."""
-        offset_ns = self.offset_ns()
-        if offset_ns == self._told_ns:
-            return None
-        self._told_ns = offset_ns
-        return offset_ns
+        self._reading = reading
+        return reading.offset_ns
 
 
-def _looked() -> _Look:
+def _read_offset() -> _OffsetReading:
     before_ns = time.monotonic_ns()
     unix_ns = time.time_ns()
     after_ns = time.monotonic_ns()
-    return _Look(after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2)
+    return _OffsetReading(after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from jointfit_daemon.config import drifting, headings
+from jointfit_daemon.config import drifting_imus, heading_warning
 from jointfit_daemon.fusion import LimbFuser, SensorMonitor
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
@@ -24,7 +24,6 @@ from jointfit_daemon.pipeline.events import (
     DeviceStatus,
     JobFinished,
     Notice,
-    Reply,
     Request,
     SourceClosed,
     SourceOpened,
@@ -157,7 +156,7 @@ class Core:
         if fuser is not None:
             self._fuser.resume(fuser)
 
-        if (warning := headings(rig.sources)) is not None:
+        if (warning := heading_warning(rig.sources)) is not None:
             outputs.append(Notice(event.t_ns, "device", rig.name, warning, "warning"))
         text = "stored calibration loaded" if event.calibration else "no stored calibration"
         return [*outputs, session.status(event.t_ns, text)]
@@ -181,7 +180,7 @@ class Core:
         rig, calibration = self._rig, self._session.calibration
         if rig is None:
             return
-        no_north = drifting(rig.sources)
+        no_north = drifting_imus(rig.sources)
         self._fuser = LimbFuser(rig.chain, calibration, self._sensor_monitor, no_north)
         usable = calibration if calibration and calibration.fits(rig.chain) else None
 
@@ -348,7 +347,7 @@ class Core:
 
         message = f"unknown request {event.command!r}; known: calibrate"
         error = {"key": "command", "message": message}
-        return [Reply(event.command, event.transaction, "error", {}, error)]
+        return [event.reply("error", {}, error)]
 
     def _set_stored_version(self, event: CalibrationStored) -> list[Output]:
         return self._session.set_stored_version(event)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from jointfit_daemon.model import LimbState
 
@@ -68,15 +68,34 @@ class Tick:
     t_ns: int
 
 
+class ReplyAddress(NamedTuple):
+    """Topic and correlation data that a client requests for its reply (MQTT 5)."""
+
+    topic: str | None = None
+    """Full topic name; None: ``bridge/response/COMMAND``."""
+    correlation: bytes | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """A request of a client, with validated arguments."""
 
     t_ns: int
     command: str
-    """``calibrate`` is the only command."""
+    """``calibrate``."""
     transaction: str
     arguments: Mapping[str, object]
+    reply_to: ReplyAddress = field(default_factory=ReplyAddress)
+    """Where to publish the reply; not part of a recording."""
+
+    def reply(
+        self,
+        status: Literal["ok", "accepted", "error"],
+        data: Mapping[str, object],
+        error: Mapping[str, object] | None = None,
+    ) -> Reply:
+        """Return the reply to this request."""
+        return Reply(self.command, self.transaction, status, data, error, self.reply_to)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +253,7 @@ class Reply:
     status: Literal["ok", "accepted", "error"]
     data: Mapping[str, object] = field(default_factory=dict)
     error: Mapping[str, object] | None = None
+    reply_to: ReplyAddress = field(default_factory=ReplyAddress)
 
 
 Output = (

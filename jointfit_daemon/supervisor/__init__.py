@@ -1,4 +1,6 @@
-"""The async shell: start, retry, stop, reload, tell systemd. Law: moves events, decides nothing.
+"""The asynchronous shell of the daemon: sources, core, outputs, reloads, systemd, worker process.
 
-Nothing is imported here: the worker process lives in this package and needs none of the shell.
+The shell moves events and makes no decisions about measurements. This package exports nothing: its
+public modules are the entry points `daemon`, `worker`, `process_exit` and `state_directory`, and a
+worker process imports its own module only.
 """

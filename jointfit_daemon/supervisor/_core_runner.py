@@ -1,7 +1,7 @@
-"""Moves events into the core and its outputs out, and time with them.
+"""Feeds events and time to the core, and distributes its outputs to the sinks.
 
-Law: synchronous; one event at a time, in order of arrival; the event log sees each before the core
-does. Whatever the core raises is a bug and ends the daemon, wherever the event came from.
+Invariant: events are processed one at a time, in order of arrival, and each sink receives an event
+before the core. An exception of the core is a bug: it propagates and ends the daemon.
 """
 
 from __future__ import annotations
@@ -11,109 +11,120 @@ import time
 from typing import TYPE_CHECKING, Protocol
 
 from jointfit_daemon.model import LimbState
-from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import Tick, UnixOffset
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from jointfit_daemon.outputs.recording import EventLogWriter
+    from jointfit_daemon.outputs.sink import Sink
+    from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
 
 LONGEST_TICK_INTERVAL_NS = 100_000_000
-"""The core hears of time at least this often."""
-_LEAST_NS = 1_000_000  # a deadline that is past and stays past must not spin
+"""Longest time without an event for the core, ns."""
+_SHORTEST_WAIT_NS = 1_000_000
+"""Shortest wait for a deadline, ns: a deadline that stays in the past must not spin the loop."""
 _NS_PER_S = 1e9
 
 
 class CoreInterface(Protocol):
-    """What the shell needs of the core."""
+    """The methods of the core that the shell uses."""
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When a Tick is due at the latest."""
+        """Latest time of the next `Tick`, CLOCK_MONOTONIC ns."""
 
     def feed(self, event: Event) -> list[Output]:
-        """Take one event and return what it brings about."""
+        """Process one event and return its outputs."""
 
     def health(self, now_ns: int) -> dict[str, object]:
-        """Return counters and clocks."""
+        """Return counters and clock estimates."""
 
 
 class CoreRunner:
-    """Feeds the core.
+    """Runs the core on the event loop.
 
     Parameters
     ----------
     core
         The pure core.
-    dispatch
-        Takes every output, synchronously; must not feed events itself.
+    clock
+        Source of the UNIX time offset that the core receives.
     """
 
-    def __init__(self, core: CoreInterface, dispatch: Callable[[Output], None]) -> None:
+    def __init__(self, core: CoreInterface, clock: UnixClock) -> None:
         self.core = core
-        self.log: EventLogWriter | None = None
         self.states = 0
-        """Limb states that came out."""
+        """Number of limb states so far."""
+        self._sinks: list[Sink] = []
         self._fed_ns = time.monotonic_ns()
-        self._dispatch = dispatch
         self._loop = asyncio.get_running_loop()
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_ns = 0
-        self._unix_clock = UnixClock()
+        self._unix_clock = clock
+        self._unix_offset_ns: int | None = None
+
+    def subscribe(self, sink: Sink) -> None:
+        """Pass all further events and outputs to `sink`, which must not call `feed`."""
+        self._sinks.append(sink)
+
+    def unsubscribe(self, sink: Sink) -> None:
+        """End the subscription of `sink`."""
+        self._sinks.remove(sink)
 
     def feed(self, event: Event) -> None:
-        """Give one event to the core and hand out what it says."""
-        log = self.log
-        if log is not None:
-            log.event(event)
+        """Pass one event to the sinks and to the core, and its outputs to the sinks."""
+        for sink in self._sinks:
+            sink.event(event)
+
         self._fed_ns = time.monotonic_ns()
         for output in self.core.feed(event):
             if isinstance(output, LimbState):
                 self.states += 1
-                if log is not None:
-                    log.state(output)
-            self._dispatch(output)
+            for sink in self._sinks:
+                sink.output(output)
         self._arm()
 
     def _arm(self) -> None:
-        """Set the timer, if it must ring earlier than it will; if later, it looks again then."""
+        """Set the timer for the next tick.
+
+        A timer that is due earlier than necessary stays: at its end the deadline is checked again.
+        """
         due_ns = self._fed_ns + LONGEST_TICK_INTERVAL_NS
         deadline_ns = self.core.next_deadline_ns
         if deadline_ns is not None and deadline_ns < due_ns:
-            due_ns = max(deadline_ns, self._fed_ns + _LEAST_NS)
+            due_ns = max(deadline_ns, self._fed_ns + _SHORTEST_WAIT_NS)
+
         if self._timer is None or due_ns < self._timer_ns:
             if self._timer is not None:
                 self._timer.cancel()
             self._timer_ns = due_ns
-            self._timer = self._loop.call_at(due_ns / _NS_PER_S, self._ring)
+            self._timer = self._loop.call_at(due_ns / _NS_PER_S, self._tick)
 
-    def _ring(self) -> None:
+    def _tick(self) -> None:
         self._timer = None
         now_ns = time.monotonic_ns()
         deadline_ns = self.core.next_deadline_ns
         due = deadline_ns is not None and now_ns >= deadline_ns
         try:
-            self._tell_unix_time()
+            self._feed_unix_offset()
             if due or now_ns >= self._fed_ns + LONGEST_TICK_INTERVAL_NS:
                 self.feed(Tick(now_ns))
             else:
                 self._arm()
-        except Exception as error:  # noqa: BLE001 - from here it would only reach a log
+        except Exception as error:  # noqa: BLE001 - a timer callback would only log it
             if not self._failed.done():
                 self._failed.set_exception(error)
 
-    def _tell_unix_time(self) -> None:
-        """Tell the core what UNIX time is, at first and whenever it was set."""
-        offset_ns = self._unix_clock.news_ns()
-        if offset_ns is not None:
+    def _feed_unix_offset(self) -> None:
+        """Feed the offset of UNIX time at the start and after each change."""
+        offset_ns = self._unix_clock.offset_ns()
+        if offset_ns != self._unix_offset_ns:
+            self._unix_offset_ns = offset_ns
             self.feed(UnixOffset(time.monotonic_ns(), offset_ns))
 
     async def run(self) -> None:
-        """Keep time until cancelled; raise what the core raised on a Tick."""
-        self._tell_unix_time()
+        """Feed ticks until cancelled; raise what the core raises on one."""
+        self._feed_unix_offset()
         self._arm()
         try:
             await self._failed

@@ -1,7 +1,7 @@
-"""Runs fits in a worker process, so that acquisition does not stall while a calibration is fitted.
+"""Runs fits in a worker process, so that a calibration fit does not delay acquisition.
 
-Law: one job at a time; a job that is cancelled, or outlives the daemon, is killed. Results pass
-through JSON, so a replay, which reads them from the event log, sees the same values.
+Invariant: one job runs at a time, and its process is killed when it is cancelled or the daemon
+ends. Results pass through JSON, so a replay from the event log uses the same values.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PATIENCE_S = 300.0
-"""A fit that takes longer than this is given up: the wearer will have taken the sensors off."""
+FIT_TIMEOUT_S = 300.0
+"""Longest duration of a fit, s: after it the subject has probably removed the sensors."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-"""Set before the worker starts, for numpy reads it when imported. Threads would take the core that
-the sensors need, and on small matrices they only wait for each other: 11 s instead of 1."""
-_LAST_WORDS = 4000  # characters of a worker's standard error worth logging
+"""Environment of the worker; numpy reads it on import. Threads would use the CPU core of the
+sensors, and slow down on small matrices: 11 s instead of 1 s."""
+_STDERR_TAIL = 4000
+"""Bytes of the worker's standard error that are logged."""
 
 
 class FitRunner:
-    """Starts the worker for a job and delivers ``JobFinished``.
+    """Runs the worker process of a job and delivers `JobFinished`.
 
     Parameters
     ----------
     tasks
-        Owns the task of every job.
+        Owner of the task of every job.
     deliver
         Feeds one event to the core.
     """
@@ -51,12 +52,12 @@ class FitRunner:
         self._running: asyncio.Task[None] | None = None
 
     def start(self, job: FitJob) -> None:
-        """Start a job; one that still runs is cancelled."""
+        """Start a job; a running job is cancelled."""
         self.cancel()
         self._running = self._tasks.create_task(self._run(job), name=f"fit {job.kind}")
 
     def cancel(self) -> None:
-        """Kill the running job, if there is one; nothing is delivered for it."""
+        """Kill the running job, if any; no result is delivered for it."""
         if self._running is not None:
             self._running.cancel()
             self._running = None
@@ -64,10 +65,10 @@ class FitRunner:
     async def _run(self, job: FitJob) -> None:
         began = time.monotonic()
         try:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(FIT_TIMEOUT_S):
                 answer = await _in_worker(job)
         except TimeoutError:
-            answer = {"error": f"not done after {PATIENCE_S:g} s"}
+            answer = {"error": f"the fit did not end within {FIT_TIMEOUT_S:g} s"}
         error = answer.get("error")
         took_s = time.monotonic() - began
         log.info("fit %s: %s, %.1f s", job.kind, "failed" if error else "done", took_s)
@@ -75,7 +76,7 @@ class FitRunner:
 
 
 async def _in_worker(job: FitJob) -> dict[str, Any]:
-    # Pickling minutes of samples takes tens of milliseconds: not in the loop's way.
+    # Pickling minutes of samples takes tens of milliseconds, so it runs in a thread.
     words = await asyncio.to_thread(pickle.dumps, (job.kind, dict(job.payload)))
     command = [sys.executable, "-m", "jointfit_daemon.supervisor.worker"]
     pipe = asyncio.subprocess.PIPE
@@ -94,10 +95,10 @@ async def _in_worker(job: FitJob) -> dict[str, Any]:
         await worker.wait()
         if worker.stdin is not None:
             worker.stdin.close()
-    if text := said.result()[-_LAST_WORDS:].decode("utf-8", "replace").strip():
-        log.warning("fit %s: the worker said:\n%s", job.kind, text)
+    if text := said.result()[-_STDERR_TAIL:].decode("utf-8", "replace").strip():
+        log.warning("fit %s: output of the worker:\n%s", job.kind, text)
     if not answer.result():
-        return {"error": f"the worker ended with {code} and without a result"}
+        return {"error": f"the worker process ended with exit code {code} and without a result"}
     found: dict[str, Any] = orjson.loads(answer.result())
     return found
 
@@ -107,8 +108,10 @@ async def _read(pipe: asyncio.StreamReader | None) -> bytes:
 
 
 async def _write(pipe: asyncio.StreamWriter | None, words: bytes) -> None:
-    """Send the job and leave the pipe open: the worker dies when it closes."""
+    """Send the job and keep the pipe open: the worker exits when it closes."""
     if pipe is not None:
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it ended: told by _read
+        with contextlib.suppress(
+            BrokenPipeError, ConnectionResetError
+        ):  # the worker ended; the missing answer is reported
             pipe.write(HEADER.pack(len(words)) + words)
             await pipe.drain()

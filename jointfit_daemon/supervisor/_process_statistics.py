@@ -1,6 +1,6 @@
-"""How the process itself is: CPU, memory, delay of the loop. Law: cheap, and works in a sandbox.
+"""CPU share, memory and event loop delay of this process.
 
-``/proc/meminfo`` and friends are hidden under systemd's ProcSubset=pid; own pages are not.
+Only ``/proc/self`` is read: systemd's ProcSubset=pid hides the other files of ``/proc``.
 """
 
 from __future__ import annotations
@@ -12,26 +12,27 @@ from pathlib import Path
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _STATM = Path("/proc/self/statm")
-_KEPT = 600
-"""Loop delays kept for the percentile: a minute at ten a second."""
+_DELAYS = 600
+"""Number of loop delays for the percentile: one minute at ten per second."""
 
 
 class ProcessStatistics:
-    """Figures of this process since the last time they were read."""
+    """Statistics of this process since the last call of `figures`."""
 
     def __init__(self) -> None:
         self._wall_s, self._cpu_s = time.monotonic(), time.process_time()
-        self._delays_s: deque[float] = deque(maxlen=_KEPT)
+        self._delays_s: deque[float] = deque(maxlen=_DELAYS)
 
-    def late(self, seconds: float) -> None:
-        """Note by how much a timer of the loop came late."""
+    def add_delay(self, seconds: float) -> None:
+        """Add the delay of one timer of the event loop, s."""
         self._delays_s.append(seconds)
 
     def figures(self) -> dict[str, object]:
-        """Return CPU share since the last call, resident memory, and the loop's delay."""
+        """Return ``process`` of ``bridge/health``."""
         wall_s, cpu_s = time.monotonic(), time.process_time()
         share = (cpu_s - self._cpu_s) / max(1e-9, wall_s - self._wall_s)
         self._wall_s, self._cpu_s = wall_s, cpu_s
+
         delays = sorted(self._delays_s)
         p99 = delays[int(0.99 * len(delays))] if delays else None
         return {

@@ -1,7 +1,7 @@
-"""Whether the core does its work: that, and no bare timer, is what feeds systemd's watchdog.
+"""Progress of the core, the condition for the watchdog of systemd.
 
-Law: samples that ought to become limb states, and do not, are the only complaint. Silent, absent
-or repeating devices are their own trouble: restarting the daemon would not mend them.
+Invariant: only samples that should produce limb states, and do not, stop the watchdog signal.
+Missing or stuck devices do not trip the watchdog, since a restart would not help.
 """
 
 from __future__ import annotations
@@ -11,38 +11,37 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_SPENT = ("late", "duplicate", "dropped", "idle")
-"""Verdicts on samples that need not bring a limb state about."""
+_OUTCOMES_WITHOUT_STATE = ("late", "duplicate", "dropped", "idle")
+"""Outcomes of samples that do not contribute to a limb state."""
 
 
-class Progress:
-    """Compares the core's counters between two looks."""
+class ProgressMonitor:
+    """Compares the counters of the core between two calls."""
 
     def __init__(self) -> None:
-        self._states = self._wanted = 0
+        self._states = self._expected = 0
 
-    def made(self, health: Mapping[str, object], states: int, imus: frozenset[str]) -> bool:
-        """Return whether limb states came out since the last look, or none could.
+    def has_progressed(
+        self, health: Mapping[str, object], states: int, imus: frozenset[str]
+    ) -> bool:
+        """Return whether limb states were produced since the last call, or none was expected.
 
         Parameters
         ----------
         health
-            As the core tells it.
+            Health of the core.
         states
-            Limb states made from samples so far.
+            Number of limb states computed from samples so far.
         imus
-            Ids of the devices whose samples make limb states.
+            Ids of the devices whose samples produce limb states.
         """
-        wanted = _wanted(health, imus)
-        done = states > self._states or wanted <= self._wanted
-        self._states, self._wanted = states, wanted
-        return done
-
-
-def _wanted(health: Mapping[str, object], imus: frozenset[str]) -> int:
-    devices = health.get("devices")
-    total = 0
-    for name, counts in devices.items() if isinstance(devices, dict) else ():
-        if name in imus:
-            total += counts.get("received", 0) - sum(counts.get(word, 0) for word in _SPENT)
-    return total
+        devices = health.get("devices")
+        expected = sum(
+            counts.get("received", 0)
+            - sum(counts.get(outcome, 0) for outcome in _OUTCOMES_WITHOUT_STATE)
+            for name, counts in (devices.items() if isinstance(devices, dict) else ())
+            if name in imus
+        )
+        progressed = states > self._states or expected <= self._expected
+        self._states, self._expected = states, expected
+        return progressed

@@ -1,9 +1,8 @@
-"""One task a source: retry what may heal, pause what needs another device, let bugs through.
+"""One task per source: retries a lost device, pauses a misconfigured one, propagates bugs.
 
-Invariant: a source is opened in the core when its first bytes arrive and closed when its driver
-ends. No source stops for good: one that is misconfigured pauses until another device is on its
-port, for a minute at most, or until a reload. Whatever else a driver raises is a bug: it ends the
-daemon with its traceback.
+Invariant: a source is opened in the core with its first chunk and closed when its driver ends. No
+source stops for good: a misconfigured one is retried with another device on its port, after one
+minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
 """
 
 from __future__ import annotations
@@ -25,52 +24,57 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
     from jointfit_daemon.pipeline.events import Event
 
-FIRST_RETRY_S = 0.1  # a re-plugged port is often there again within a blink
-LAST_RETRY_S = 1.0  # the promise is to resume within two seconds of a re-plug
-HEALTHY_S = 5.0  # after this long a loss is a new one, and is tried again at once
-PAUSE_S = 60.0  # a device may be put right without being unplugged
-LOOK_S = 0.5  # between two looks at the port of a source that pauses; one stat(2) each
+FIRST_RETRY_S = 0.1
+"""Wait before the first retry, s: a device that was plugged in again is available at once."""
+LAST_RETRY_S = 1.0
+"""Longest wait before a retry, s: operation resumes within two seconds of plugging in."""
+HEALTHY_S = 5.0
+"""Duration of operation after which a loss is retried with the first wait again, s."""
+PAUSE_S = 60.0
+"""Pause of a misconfigured source, s: a device may be reconfigured without being unplugged."""
+CHECK_S = 0.5
+"""Interval between checks of the port of a paused source, s; each is one stat(2)."""
 
 
-class _Life:
-    """Reports one source to the core: opened with its first bytes, closed once."""
+class _SourceReporter:
+    """Reports one source to the core: opened with its first chunk, closed once."""
 
     def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
         self._source, self._deliver, self._known = source, deliver, known
         self._open = False
-        self._said = ""
+        self._reported = ""
 
     def emit(self, chunk: Chunk) -> None:
-        """Hand a chunk to the core."""
+        """Pass a chunk to the core."""
         if not self._open:
-            self._open, self._said = True, ""
+            self._open, self._reported = True, ""
             self._known.set()
             self._deliver(SourceOpened(chunk.t_ns, self._source))
         self._deliver(ChunkArrived(self._source, chunk))
 
     def closed(self, reason: Literal["lost", "misconfigured"], text: str) -> None:
-        """Tell the end of the source, unless it never began and the same was said before."""
+        """Report the end of the source; skip a repetition of the last report."""
         self._known.set()
-        if self._open or text != self._said:
+        if self._open or text != self._reported:
             self._deliver(SourceClosed(time.monotonic_ns(), self._source, reason, text))
-        self._open, self._said = False, text
+        self._open, self._reported = False, text
 
     def removed(self) -> None:
-        """Tell the end of a source that nobody wants any more; one that never began just goes."""
+        """Report the removal of the source if it was open."""
         if self._open:
             self._deliver(SourceClosed(time.monotonic_ns(), self._source, "removed", "stopped"))
             self._open = False
 
 
-class _Task:
-    """One running source.
+class _RunningSource:
+    """One source and its task.
 
     Attributes
     ----------
     known
-        Set once the source has sent something or was found absent.
+        Set once the source has sent a chunk or was reported absent.
     paused
-        Whether it waits for another device.
+        Whether the source is misconfigured and waits for another device.
     """
 
     def __init__(self, source: Source) -> None:
@@ -81,59 +85,61 @@ class _Task:
 
 
 async def run_source(
-    source: Source, deliver: Callable[[Event], None], state: _Task | None = None
+    source: Source, deliver: Callable[[Event], None], state: _RunningSource | None = None
 ) -> None:
-    """Run one source for ever.
+    """Run one source until cancelled.
 
     Parameters
     ----------
     source
-        What to run.
+        The source.
     deliver
         Feeds one event to the core.
     state
-        Where to report how it runs.
+        Receives the state of the source.
     """
-    state = state or _Task(source)
-    life = _Life(source.id, deliver, state.known)
-    driver = source.driver_class(source.settings)  # one: it may learn from attempts that failed
+    state = state or _RunningSource(source)
+    reporter = _SourceReporter(source.id, deliver, state.known)
+    driver = source.driver_class(source.settings)  # one object: it may learn from failed attempts
     path = device_path(source.settings)
     loop = asyncio.get_running_loop()
     delay = FIRST_RETRY_S
     while True:
-        began, device = loop.time(), _identity(path)
+        began, device = loop.time(), _device_identity(path)
         try:
-            await driver.run(life.emit)
-            life.closed("lost", "its driver ended by itself")
+            await driver.run(reporter.emit)
+            reporter.closed("lost", "its driver ended by itself")
         except DeviceLostError as lost:
             if loop.time() - began > HEALTHY_S:
                 delay = FIRST_RETRY_S
-            life.closed("lost", str(lost))  # the core reports it, on the log too
+            reporter.closed("lost", str(lost))  # the core logs it
         except DeviceMisconfiguredError as wrong:
-            again = f"tried again with another device on the port, or every {PAUSE_S:g} s"
-            life.closed("misconfigured", f"{wrong} ({again})")
+            again = f"retrying with another device on the port, or every {PAUSE_S:g} s"
+            reporter.closed("misconfigured", f"{wrong} ({again})")
             state.paused = True
-            await _until_changed(path, device)
+            await _wait_for_change(path, device)
             state.paused, delay = False, FIRST_RETRY_S
         except asyncio.CancelledError:
-            life.removed()
+            reporter.removed()
             raise
-        await asyncio.sleep(random.uniform(0, delay))  # noqa: S311 - full jitter: no retry in step
+
+        # Full jitter: sources that are lost together do not retry together.
+        await asyncio.sleep(random.uniform(0, delay))  # noqa: S311 - not security-relevant
         delay = min(2 * delay, LAST_RETRY_S)
 
 
-async def _until_changed(path: str | None, device: object) -> None:
-    """Wait until what is at `path` is no longer `device`; ``PAUSE_S`` at most."""
+async def _wait_for_change(path: str | None, device: object) -> None:
+    """Wait until another device is at `path` than `device`; at most `PAUSE_S`."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(PAUSE_S):
-            while _identity(path) == device:  # noqa: ASYNC110 - a file system sets no event
-                await asyncio.sleep(LOOK_S)
+            while _device_identity(path) == device:  # noqa: ASYNC110 - a file system has no event
+                await asyncio.sleep(CHECK_S)
 
 
-def _identity(path: str | None) -> object:
-    """Return what differs between two devices that are plugged in one after the other.
+def _device_identity(path: str | None) -> object:
+    """Return a value that differs between devices plugged in one after another.
 
-    None where there is no device. A name without folder is that of a network interface (``can0``).
+    None without a device. A name without a slash is a network interface (``can0``).
     """
     if path is None:
         return None
@@ -157,37 +163,34 @@ class SourceTasks:
 
     def __init__(self, tasks: asyncio.TaskGroup, deliver: Callable[[Event], None]) -> None:
         self._tasks, self._deliver = tasks, deliver
-        self._running: dict[str, _Task] = {}
+        self._running: dict[str, _RunningSource] = {}
 
     async def retire(self, sources: Iterable[Source]) -> None:
-        """Stop those that are not among these; one whose settings are the same keeps its port.
+        """Stop the sources that are not among `sources`; unchanged ones keep running.
 
-        One that pauses is stopped, too: what was wrong may be right now, outside rig.toml.
+        Paused sources are stopped, too: the cause may have been removed outside rig.toml.
         """
         wanted = {source.id: source for source in sources}
-        gone = [
+        removed = [
             self._running.pop(name)
             for name, each in list(self._running.items())
             if wanted.get(name) != each.source or each.paused
         ]
-        await stop(each.task for each in gone if each.task is not None)
+        await stop(each.task for each in removed if each.task is not None)
 
     async def apply(self, sources: Iterable[Source]) -> None:
-        """Run exactly these."""
+        """Run exactly `sources`."""
         wanted = {source.id: source for source in sources}
         await self.retire(wanted.values())
         for name, source in wanted.items():
             if name not in self._running:
-                state = self._running[name] = _Task(source)
+                state = self._running[name] = _RunningSource(source)
                 state.task = self._tasks.create_task(
                     run_source(source, self._deliver, state), name=f"source {name}"
                 )
 
     async def known(self, within_s: float) -> None:
-        """Wait until every source has sent something or was found absent.
-
-        One that has done neither within `within_s` is taken for absent: it is silent.
-        """
+        """Wait until every source has sent a chunk or was reported absent; at most `within_s`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 for each in list(self._running.values()):
@@ -195,12 +198,12 @@ class SourceTasks:
 
     async def stop(self) -> None:
         """Stop all sources and wait until their ports are closed."""
-        gone, self._running = list(self._running.values()), {}
-        await stop(each.task for each in gone if each.task is not None)
+        removed, self._running = list(self._running.values()), {}
+        await stop(each.task for each in removed if each.task is not None)
 
 
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> None:
-    """Cancel tasks and wait for their end; their failures reach the group they belong to."""
+    """Cancel tasks and wait for their end; exceptions propagate to their task group."""
     ending = list(tasks)
     for task in ending:
         task.cancel()

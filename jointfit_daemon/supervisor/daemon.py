@@ -1,19 +1,18 @@
-"""The daemon: one TaskGroup, the core in the middle, events in, outputs out.
+"""The daemon: one TaskGroup around the core, with events as input and outputs to the sinks.
 
-Law: cancellation is the only way out. What happens between an event and its outputs is the core's;
-this file moves them.
+Invariant: the daemon ends by cancellation or by a bug only.
 
-    task             what it does                                      ends
-    core time        ticks the core when nothing else does             never
-    source ID        runs one driver, retries it                       with the rig
-    mqtt             keeps the broker link, hands on requests          with its settings
-    ready            tells systemd when every source is known          when it has
-    health           tells health, status and the watchdog             never
+    task             purpose                                           end
+    core time        feeds ticks to the core                           never
+    source ID        runs one driver, with retries                     with the rig
+    mqtt             publishes the outbox, passes on requests          with its settings
+    ready            notifies systemd when every source is known       once notified
+    health           publishes health, resets the watchdog             never
     recording        writes the event log                              when the disk is full
-    fit KIND         one calibration fit in a worker process           with its result
-    store            writes one calibration                            when it is on disk
-    state check      tries to write to the state directory             when it has
-    reload           reads rig.toml again on SIGHUP                    never
+    fit KIND         runs one calibration fit in a worker process      with its result
+    store            writes one calibration                            when written
+    state check      writes a probe to the state directory             when checked
+    reload           loads rig.toml again on SIGHUP                    never
 """
 
 from __future__ import annotations
@@ -28,10 +27,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import ConfigError, load_rig
-from jointfit_daemon.outputs.log import MqttLogHandler, about
+from jointfit_daemon.outputs import topics
+from jointfit_daemon.outputs.log import MqttLogHandler, journal_fields
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.recording import EventLogWriter
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -43,22 +44,25 @@ from jointfit_daemon.pipeline.events import (
     Notice,
     Reply,
 )
-from jointfit_daemon.supervisor import _stored_calibrations
-from jointfit_daemon.supervisor._calibration_writer import CalibrationWriter
+from jointfit_daemon.supervisor._calibration_store import (
+    CalibrationWriter,
+    calibration_age_s,
+    store_of,
+)
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
-from jointfit_daemon.supervisor._progress_monitor import Progress
+from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._source_tasks import SourceTasks, stop
-from jointfit_daemon.supervisor._status_line import Pace, Seen, phase_of, status_line
+from jointfit_daemon.supervisor._status_line import (
+    FrameRateCounter,
+    ServiceStatus,
+    phase_of,
+    status_line,
+)
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.process_exit import exit_within
-from jointfit_daemon.supervisor.requests import (
-    RequestAuthenticator,
-    parse_request,
-    reply_correlation,
-    reply_topic,
-)
+from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
 from jointfit_daemon.supervisor.state_directory import state_directory, write_fault
 
 if TYPE_CHECKING:
@@ -67,74 +71,78 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Incoming
-    from jointfit_daemon.pipeline.events import Output
+    from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.supervisor._core_runner import CoreInterface
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.1
-"""How often the process looks at itself."""
+CHECK_S = 0.1
+"""Interval between checks of the event loop's delay and of due health messages, s."""
 HEALTH_SOON_S = 0.5
-"""Health follows a device that came or went by this much, so that losses show in time."""
+"""Delay of the health message after a device was lost or found, s."""
 KNOWN_S = 2.0
-"""A source that was silent for so long after the start counts as absent."""
+"""Time after the start for which a silent source is awaited, s."""
 FAREWELL_S = 0.5
-"""How long a stop may wait for the broker to take the last words."""
+"""Longest wait for the broker to accept the last messages, s."""
 STOP_S = 4.8
-"""Stopping is promised in five seconds, whatever hangs."""
+"""Longest duration of a stop, s; the documentation promises five seconds."""
 _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
 
 class Daemon:
-    """One rig at work.
+    """One rig in operation; a `Sink` of the core for jobs, calibrations and log lines.
 
     Parameters
     ----------
     config
-        rig.toml, read again at every reload.
+        Path of rig.toml, read again at every reload.
     rig
-        What it said at the start.
+        Its present content.
     core
         The pure core.
     """
 
     def __init__(self, config: Path, rig: Rig, core: CoreInterface) -> None:
         self._config, self._rig = config, rig
-        self._heart = CoreRunner(core, self._send)
+        self._clock = UnixClock()
+        self._core = CoreRunner(core, self._clock)
+        self._core.subscribe(self)
         self._process, self._systemd = ProcessStatistics(), SystemdNotifier()
-        self._progress, self._pace = Progress(), Pace()
-        self._noise = DisconnectErrorFilter()
-        self._asking: Incoming | None = None
+        self._progress, self._frame_rate = ProgressMonitor(), FrameRateCounter()
+        self._loop_errors = DisconnectErrorFilter()
+        self._recorder: EventLogWriter | None = None
         self._online: set[str] = set()
         self._version: int | None = None
-        """Of the calibration in force, as logged last."""
+        """Version of the calibration in force in the last log line."""
         self._state_fault: str | None = None
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
-        self._hung_up = asyncio.Event()
+        self._reload_requested = asyncio.Event()
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._fits: FitRunner
-        self._stores: CalibrationWriter
+        self._calibrations: CalibrationWriter
         self._state_check: asyncio.Task[None]
         self._mqtt: asyncio.Task[None]
         self._use_broker(rig)
 
     def _use_broker(self, rig: Rig) -> None:
-        self._outbox = Outbox(f"{rig.mqtt.base}/bridge/state")
-        self._link = MqttPublisher(rig.mqtt, self._outbox, self._asked)
-        self._reporter = TopicWriter(rig, self._outbox)
-        self._take_request_key(rig)
+        self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base))
+        self._link = MqttPublisher(rig.mqtt, self._outbox, self._receive_request)
+        self._topics = TopicWriter(rig, self._outbox, self._clock)
+        self._core.subscribe(self._topics)
+        self._read_request_key(rig)
 
-    def _take_request_key(self, rig: Rig) -> None:
-        self._guard = RequestAuthenticator(rig.mqtt)
-        if self._guard.fault:
-            log.error("mqtt: all requests are refused: %s", self._guard.fault)
+    def _read_request_key(self, rig: Rig) -> None:
+        self._authenticator = RequestAuthenticator(rig.mqtt)
+        if self._authenticator.fault:
+            log.error("mqtt: all requests are refused: %s", self._authenticator.fault)
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
-        """Leave the old broker in order; the new one gets all that was retained."""
+        """Disconnect from the old broker, and send all retained messages to the new one."""
         await stop([self._mqtt])
         known = self._outbox.retained
+        self._core.unsubscribe(self._topics)
         self._use_broker(rig)
         for topic, payload in known.items():
             leaf = topic.removeprefix(before.mqtt.base)
@@ -142,14 +150,14 @@ class Daemon:
                 self._outbox.retain(rig.mqtt.base + leaf, payload)
         self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
 
-    # --- life --------------------------------------------------------------------------------
+    # --- start and stop ----------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until cancelled; an exception that is not a cancellation is a bug."""
+        """Run until cancelled; any other exception is a bug."""
         loop = asyncio.get_running_loop()
-        loop.set_exception_handler(self._noise)
-        loop.add_signal_handler(signal.SIGHUP, self._hung_up.set)
-        warnings = MqttLogHandler(self._log_line)
+        loop.set_exception_handler(self._loop_errors)
+        loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)
+        warnings = MqttLogHandler(self._publish_log_line)
         logging.getLogger().addHandler(warnings)
         try:
             async with asyncio.TaskGroup() as self._tasks:
@@ -158,223 +166,222 @@ class Daemon:
                     await asyncio.Event().wait()
                 finally:
                     self._systemd.stopping()
-                    self._stores.stop()
+                    self._calibrations.stop()
                     await self._sources.stop()
-                    await self._link.emptied(FAREWELL_S)  # that the devices went, among others
+                    await self._link.emptied(FAREWELL_S)  # "offline" of the devices, among others
         finally:
             logging.getLogger().removeHandler(warnings)
             loop.remove_signal_handler(signal.SIGHUP)
 
     async def _start(self, tasks: asyncio.TaskGroup) -> None:
-        self._sources = SourceTasks(tasks, self._heart.feed)
-        self._fits = FitRunner(tasks, self._heart.feed)
-        self._stores = CalibrationWriter(tasks, self._heart.feed, self._tell_not_stored)
-        self._open_log(tasks)
+        self._sources = SourceTasks(tasks, self._core.feed)
+        self._fits = FitRunner(tasks, self._core.feed)
+        self._calibrations = CalibrationWriter(tasks, self._core.feed, self._report_not_stored)
+        self._start_recording(tasks)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
-        self._configure(self._rig)
-        tasks.create_task(self._heart.run(), name="core time")
-        tasks.create_task(self._look_after(), name="health")
-        tasks.create_task(self._reload_when_asked(), name="reload")
-        await self._sources.apply(self._rig.sources)
-        gc.freeze()  # what a start made stays: going through it all again takes milliseconds
-        log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
-        tasks.create_task(self._ready_when_inputs_are_known(), name="ready")
 
-    async def _ready_when_inputs_are_known(self) -> None:
+        self._configure(self._rig)
+        tasks.create_task(self._core.run(), name="core time")
+        tasks.create_task(self._publish_health_regularly(), name="health")
+        tasks.create_task(self._reload_on_request(), name="reload")
+        await self._sources.apply(self._rig.sources)
+
+        gc.freeze()  # objects of the start live on: scanning them again takes milliseconds
+        log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
+        tasks.create_task(self._notify_when_ready(), name="ready")
+
+    async def _notify_when_ready(self) -> None:
         await self._sources.known(KNOWN_S)
-        self._tell_health()
+        self._publish_health()
         self._systemd.ready()
 
-    def _open_log(self, tasks: asyncio.TaskGroup) -> None:
+    def _start_recording(self, tasks: asyncio.TaskGroup) -> None:
         recording = self._rig.recording
         if recording is None:
             return
         folder = state_directory() / recording.directory
         try:
-            self._heart.log = EventLogWriter(folder, self._rig.name)
+            self._recorder = EventLogWriter(folder, self._rig.name)
         except OSError as fault:
-            self._tell("recording", f"nothing is recorded: {folder}: {fault.strerror}", "error")
+            text = f"recording is off: cannot create a file in {folder}: {fault.strerror}"
+            self._report("recording", text, "error")
         else:
-            log.info("recording events in %s", self._heart.log.path)
-            tasks.create_task(self._heart.log.run(), name="recording")
+            log.info("recording events in %s", self._recorder.path)
+            self._core.subscribe(self._recorder)
+            tasks.create_task(self._recorder.run(), name="recording")
 
     async def _check_state(self) -> None:
-        """Report a state directory that cannot be written before a calibration needs it."""
+        """Report a state directory without write access before a calibration needs it."""
         folder = state_directory() / "calibrations"
         before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)
         self._state_fault = fault
         if fault is not None:
-            self._tell(
+            self._report(
                 "state",
                 f"state directory cannot be written: {fault}. A calibration will be used and "
-                "published, but a restart forgets it: check the mount, rights and free space, or "
+                "published, but lost at a restart: check mount, permissions and free space, or "
                 "set STATE_DIRECTORY",
                 "error",
             )
         elif before is not None:
-            self._tell("state", "state directory can be written again")
-        self._stores.retry()
+            self._report("state", "state directory can be written again")
+        self._calibrations.retry()
 
-    def _tell_not_stored(self, text: str) -> None:
-        self._tell("calibration", text, "error")
+    def _report_not_stored(self, text: str) -> None:
+        self._report("calibration", text, "error")
         if self._calibration is not None:
             now_ns = time.monotonic_ns()
-            self._reporter.handle(replace(self._calibration, t_ns=now_ns, text=text))
+            self._topics.output(replace(self._calibration, t_ns=now_ns, text=text))
 
-    def _log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
-        self._reporter.log_line(level, name, text, suppressed)
+    def _publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
+        self._topics.publish_log_line(level, name, text, suppressed)
 
-    def _tell(self, kind: str, text: str, level: str = "info") -> None:
-        """Tell what only the shell knows, on the log and on ``bridge/event``."""
-        log.log(_LEVELS[level], "%s: %s", kind, text, extra=about(kind, self._rig.name))
+    def _report(self, kind: str, text: str, level: str = "info") -> None:
+        """Report a state of the shell on the log and on ``bridge/event``."""
+        fields = journal_fields(kind, self._rig.name)
+        log.log(_LEVELS[level], "%s: %s", kind, text, extra=fields)
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text)
-        self._reporter.event(notice, level)
+        self._topics.publish_notice(notice, level)
 
     # --- outputs of the core -----------------------------------------------------------------
 
-    def _send(self, output: Output) -> None:
+    def event(self, event: Event) -> None:
+        """Ignore the inputs of the core."""
+
+    def output(self, output: Output) -> None:
+        """Execute jobs, store calibrations, and log notices of the core."""
         match output:
             case FitJob():
                 self._fits.start(output)
             case CancelJob():
                 self._fits.cancel()
             case CalibrationReady(calibration):
-                self._stores.start(self._rig, calibration)
-            case Reply():
-                self._answer(output)
+                self._calibrations.start(self._rig, calibration)
             case Notice():
-                extra = about(output.kind, output.id)
-                log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=extra)
+                fields = journal_fields(output.kind, output.id)
+                log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=fields)
             case CalibrationStatus():
                 self._calibration = output
                 self._log_calibration(output)
-            case DeviceStatus():
-                self._came_or_went(output)
-        self._reporter.handle(output)
+            case DeviceStatus(name, online):
+                (self._online.add if online else self._online.discard)(name)
+                self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
 
     def _log_calibration(self, status: CalibrationStatus) -> None:
-        """Log a change of the calibration, with its file where it was stored or loaded."""
-        text, extra = status.text, about("calibration", status.phase)
+        """Log a change of the calibration, with the file in which it is stored."""
+        text, fields = status.text, journal_fields("calibration", status.phase)
         if status.version is not None and status.version != self._version:
-            path = _stored_calibrations.store_of(self._rig).path(status.version)
+            path = store_of(self._rig).path(status.version)
             text = f"{text} (version {status.version} in {path})"
         self._version = status.version
-        log.log(_LEVELS[status.level], "calibration %s: %s", status.phase, text, extra=extra)
-
-    def _came_or_went(self, status: DeviceStatus) -> None:
-        (self._online.add if status.online else self._online.discard)(status.id)
-        self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
+        log.log(_LEVELS[status.level], "calibration %s: %s", status.phase, text, extra=fields)
 
     # --- requests ----------------------------------------------------------------------------
 
-    def _asked(self, message: Incoming) -> None:
-        """Take one request from the broker: answered once, by the core or for it."""
-        request = parse_request(message, self._guard)
+    def _receive_request(self, message: Incoming) -> None:
+        """Pass one request to the core, or publish the reply that refuses it."""
+        request = parse_request(message, self._authenticator)
         if request is None:
             return
-        self._asking = message
-        try:
-            if isinstance(request, Reply):
-                self._answer(request)
-            else:
-                self._heart.feed(request)
-                if self._state_check.done():  # one at a time, however many requests come
-                    self._state_check = self._tasks.create_task(
-                        self._check_state(), name="state check"
-                    )
-        finally:
-            self._asking = None
+        if isinstance(request, Reply):
+            self._topics.output(request)
+            return
 
-    def _answer(self, reply: Reply) -> None:
-        """Answer where the caller wants it; the core answers while it takes the request."""
-        asked = self._asking
-        if asked is None:
-            self._reporter.reply(reply, None, None)
-        else:
-            self._reporter.reply(reply, reply_topic(asked), reply_correlation(asked))
+        self._core.feed(request)
+        if self._state_check.done():  # one check at a time
+            self._state_check = self._tasks.create_task(self._check_state(), name="state check")
 
     # --- health ------------------------------------------------------------------------------
 
-    async def _look_after(self) -> None:
+    async def _publish_health_regularly(self) -> None:
         loop = asyncio.get_running_loop()
         watchdog_s, fed_s = self._systemd.watchdog_s or math.inf, loop.time()
         self._health_due_s = loop.time() + HEALTH_SOON_S
         while True:
-            due = loop.time() + LOOK_S
-            await asyncio.sleep(LOOK_S)
+            due = loop.time() + CHECK_S
+            await asyncio.sleep(CHECK_S)
             now_s = loop.time()
-            self._process.late(now_s - due)
-            if now_s - fed_s > watchdog_s / 3 and self._at_work():
+            self._process.add_delay(now_s - due)
+
+            if now_s - fed_s > watchdog_s / 3 and self._has_progressed():
                 fed_s = now_s
                 self._systemd.alive()
             if now_s >= self._health_due_s:
                 self._health_due_s = now_s + self._rig.mqtt.health_s
-                self._tell_health()
+                self._publish_health()
 
-    def _at_work(self) -> bool:
-        health = self._heart.core.health(time.monotonic_ns())
+    def _has_progressed(self) -> bool:
+        health = self._core.core.health(time.monotonic_ns())
         imus = frozenset(source.id for source in self._rig.sources if source.kind == "imu")
-        return self._progress.made(health, self._poses(health), imus)
+        return self._progress.has_progressed(health, self._states_from_samples(health), imus)
 
-    def _poses(self, health: Mapping[str, object]) -> int:
-        """Return how many limb states were made from samples."""
+    def _states_from_samples(self, health: Mapping[str, object]) -> int:
+        """Return the number of limb states that were computed from samples."""
         frames = health.get("frames")
         empty = frames.get("empty", 0) if isinstance(frames, dict) else 0
-        return self._heart.states - int(empty)
+        return self._core.states - int(empty)
 
-    def _tell_health(self) -> None:
-        health = self._heart.core.health(time.monotonic_ns())
+    def _publish_health(self) -> None:
+        health = self._core.core.health(time.monotonic_ns())
         health["process"] = self._process.figures()
-        health["link"] = self._link.figures() | {"noise": self._noise.dropped}
-        health["state"] = {"fault": self._state_fault, "not_stored": self._stores.fault}
-        if self._heart.log is not None:
-            health["recording"] = self._heart.log.figures()
-        self._reporter.health(health)
-        pace_hz = self._pace.since(self._poses(health), time.monotonic())
-        seen = Seen(self._online, phase_of(health), pace_hz, self._link.connected)
-        self._systemd.status(status_line(self._rig.sources, seen))
+        health["link"] = self._link.figures() | {"noise": self._loop_errors.dropped}
+        health["state"] = {"fault": self._state_fault, "not_stored": self._calibrations.fault}
+        if self._recorder is not None:
+            health["recording"] = self._recorder.figures()
+        self._topics.publish_health(health)
+
+        rate_hz = self._frame_rate.rate_hz(self._states_from_samples(health), time.monotonic())
+        status = ServiceStatus(self._online, phase_of(health), rate_hz, self._link.connected)
+        self._systemd.status(status_line(self._rig.sources, status))
 
     # --- configuration -----------------------------------------------------------------------
 
     def _configure(self, rig: Rig) -> None:
-        found = self._stores.found(rig)
-        for complaint in found.complaints:
-            self._tell("calibration", complaint, "warning")
-        now_ns = time.monotonic_ns()
-        age_s = 0.0 if found.calibration is None else _stored_calibrations.age_of(found.calibration)
-        self._heart.feed(Configured(now_ns, rig, found.calibration, found.version, age_s))
+        loaded = self._calibrations.load(rig)
+        for warning in loaded.warnings:
+            self._report("calibration", warning, "warning")
 
-    async def _reload_when_asked(self) -> None:
+        now_ns = time.monotonic_ns()
+        age_s = 0.0 if loaded.calibration is None else calibration_age_s(loaded.calibration)
+        self._core.feed(Configured(now_ns, rig, loaded.calibration, loaded.version, age_s))
+
+    async def _reload_on_request(self) -> None:
         while True:
-            await self._hung_up.wait()
-            self._hung_up.clear()
+            await self._reload_requested.wait()
+            self._reload_requested.clear()
             self._systemd.reloading()
             try:
                 rig = await asyncio.to_thread(load_rig, self._config)
             except ConfigError as fault:
-                self._tell("reload", f"refused, the running rig stays: {fault}", "error")
+                text = f"refused, the running configuration stays in force: {fault}"
+                self._report("reload", text, "error")
             except Exception as error:
                 log.exception("reload")
-                text = f"refused, the running rig stays: a bug, please report it: {error!r}"
-                self._tell("reload", text, "error")
+                text = (
+                    "refused because of a bug, the running configuration stays in force; please "
+                    f"report it: {error!r}"
+                )
+                self._report("reload", text, "error")
             else:
                 await self._change_to(rig)
             self._systemd.ready()
 
     async def _change_to(self, rig: Rig) -> None:
-        """Put `rig` in force; what did not change goes on."""
+        """Apply `rig`; sources and connections without changes continue."""
         before, self._rig = self._rig, rig
         if before.recording != rig.recording:
-            self._tell("reload", "[recording] changes at the next start", "warning")
+            self._report("reload", "a change of [recording] requires a restart", "warning")
         await self._sources.retire(rig.sources)
-        self._reporter.configure(rig)  # clears what is gone, before anything is carried over
+
+        self._topics.configure(rig)  # clears topics of removed devices before any are moved
         if before.mqtt != rig.mqtt:
             await self._move_to_broker(before, rig)
         else:
-            self._take_request_key(rig)  # the file may hold a new one
+            self._read_request_key(rig)  # the file may contain a new key
         self._online &= {source.id for source in rig.sources}
-        await self._stores.settle()  # else the store would not have what is in force
+
+        await self._calibrations.settle()  # otherwise the store lacks the calibration in force
         self._configure(rig)
         await self._check_state()
         await self._sources.apply(rig.sources)
@@ -387,11 +394,11 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
     Parameters
     ----------
     config
-        rig.toml, read again on SIGHUP.
+        Path of rig.toml, read again on SIGHUP.
     rig
-        What it says now.
+        Its present content.
     core
-        Makes the core.
+        Creates the core.
     """
     main = asyncio.current_task()
     loop = asyncio.get_running_loop()
@@ -401,7 +408,7 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
         nonlocal stopping
         if not stopping and main is not None:
             stopping = True
-            exit_within(STOP_S, 1, "stopping")
+            exit_within(STOP_S, 1, "the stop")
             main.cancel()
 
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,6 +1,6 @@
-"""The state directory: locked by one daemon, private to its user, checked for writing.
+"""The state directory: exclusive lock, private permissions, and a check for write access.
 
-Invariant: the lock lives in the kernel and ends with its process, so no lock is ever stale.
+Invariant: the kernel holds the lock and releases it when the process ends, so no lock is stale.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 LOCK = "lock"
-"""Name of the lock file; it holds the process id of the daemon."""
+"""Name of the lock file; it contains the process id of the daemon."""
 PRIVATE_UMASK = 0o077
+"""Umask of the daemon: calibrations and recordings are personal data."""
 _DIRECTORY_MODE, _FILE_MODE = 0o700, 0o600
 _OWNED = ("calibrations", "recordings")
-"""Folders whose files a daemon wrote; others in the state directory may belong to somebody else."""
-_PROBE_BYTES = bytes(4096)  # a full disk takes an empty file
+"""Folders written by the daemon; others in the state directory may belong to other programs."""
+_PROBE_BYTES = bytes(4096)
+"""Content of the probe file: a full disk accepts an empty file."""
 _HELD = (errno.EWOULDBLOCK, errno.EACCES)
 
 
@@ -30,20 +32,20 @@ class StateDirectoryInUseError(Exception):
 
 
 def state_directory() -> Path:
-    """Return where the daemon stores what outlives it: systemd's choice, else ./state."""
+    """Return the folder of persistent data: $STATE_DIRECTORY (systemd), by default ./state."""
     return Path(os.environ.get("STATE_DIRECTORY", "state").split(":")[0])
 
 
 def lock_state(directory: Path) -> int | None:
     """Lock `directory` for this process and return the descriptor that holds the lock.
 
-    Returns None where nothing can be locked: a directory that cannot be written has no state to
-    protect, and some network file systems have no locks.
+    Returns None if no lock file can be created: a directory without write access has no state to
+    protect. Some network file systems have no locks.
 
     Raises
     ------
     StateDirectoryInUseError
-        Another daemon uses it.
+        Another daemon uses the directory.
     """
     path = directory / LOCK
     try:
@@ -59,21 +61,21 @@ def lock_state(directory: Path) -> int | None:
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
     except OSError as error:
         holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
-        if error.errno not in _HELD:  # locked, but the disk is full; or no locks here
+        if error.errno not in _HELD:  # locked but the disk is full, or locks are unsupported
             return descriptor
         os.close(descriptor)
         raise StateDirectoryInUseError(
             f"state directory {directory.absolute()} is used by another jointfitd "
-            f"(process {holder or 'unknown'}): stop that one, or set STATE_DIRECTORY to a "
-            "directory of its own for each rig"
+            f"(process {holder or 'unknown'}): stop that process, or set STATE_DIRECTORY to a "
+            "separate directory for each rig"
         ) from error
     return descriptor
 
 
 def make_private(directory: Path) -> None:
-    """Take the rights of group and others away from what earlier daemons wrote.
+    """Remove the permissions of group and others from the files of earlier daemons.
 
-    Only files of this user are changed, and only in the folders that a daemon writes.
+    Only files of this user in the folders of the daemon are changed.
     """
     for path in _written(directory):
         try:
@@ -82,11 +84,11 @@ def make_private(directory: Path) -> None:
             if found.st_uid == os.geteuid() and shared and not S_ISLNK(found.st_mode):
                 path.chmod(_FILE_MODE if S_ISREG(found.st_mode) else _DIRECTORY_MODE)
         except OSError:
-            continue  # read-only or gone: the check for writing reports it
+            continue  # read-only or absent: `write_fault` reports it
 
 
 def _written(directory: Path) -> Iterator[Path]:
-    """Yield what daemons wrote: their files and folders, without links, and the directory."""
+    """Yield the files and folders of daemons, without links, and the directory itself."""
     for name in _OWNED:
         for folder, _, files in os.walk(directory / name):
             yield Path(folder)
@@ -96,7 +98,7 @@ def _written(directory: Path) -> Iterator[Path]:
 
 
 def write_fault(directory: Path) -> str | None:
-    """Return why no file can be written to `directory`, or None if one can."""
+    """Return the reason why no file can be written to `directory`; None if one can."""
     probe = directory / f".probe-{os.getpid()}"
     try:
         directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)

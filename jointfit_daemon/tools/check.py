@@ -42,7 +42,7 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from jointfit_daemon.config import headings
+    from jointfit_daemon.config import heading_warning
     from jointfit_daemon.driver import driver_names
 
     table = Table(title=f"{config}: rig {rig.name!r} is valid", title_justify="left")
@@ -57,6 +57,6 @@ def _summary(console: object, config: Path, rig: Rig) -> None:
             f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
             f"store {rig.calibration_store!r}, method {rig.calibration.method}"
         )
-        if (warning := headings(rig.sources)) is not None:
+        if (warning := heading_warning(rig.sources)) is not None:
             console.print(f"[yellow]warning:[/] {warning}")
         console.print(f"installed drivers: {', '.join(driver_names())}")

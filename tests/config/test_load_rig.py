@@ -1,4 +1,4 @@
-"""rig.toml: what is accepted, and that all that is wrong is told at once."""
+"""Loading of rig.toml: valid rigs, and reports of all faults."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def complaints(table: Table) -> list[str]:
     return [fault.text() for fault in caught.value.faults]
 
 
-def test_a_sound_rig_becomes_si_and_plain_data(table: Table) -> None:
+def test_valid_rig_is_converted_to_si(table: Table) -> None:
     table["chain"] |= {"side": "left", "lengths_m": {"shank": 0.4}, "distal": "foot"}
     rig = parse_rig(table)
     assert rig.chain.sensors == (("S1", "S2"), ("S3", "S4"))
@@ -44,15 +44,15 @@ def test_a_sound_rig_becomes_si_and_plain_data(table: Table) -> None:
     assert rig.table == table
 
 
-def test_the_name_of_a_bus_becomes_its_table(table: Table) -> None:
+def test_bus_name_is_replaced_by_its_table(table: Table) -> None:
     assert parse_rig(table).sources[2].settings.can == CanBusSettings(channel="can0")
 
 
-def test_the_same_table_gives_equal_sources(table: Table) -> None:
+def test_equal_tables_give_equal_sources(table: Table) -> None:
     assert parse_rig(table).sources == parse_rig(deepcopy(table)).sources
 
 
-def test_a_changed_bus_changes_the_sources_on_it_alone(table: Table) -> None:
+def test_changed_bus_changes_its_sources_only(table: Table) -> None:
     before = parse_rig(table).sources
     table["can"]["can0"]["bitrate"] = 500_000
     after = parse_rig(table).sources
@@ -61,7 +61,7 @@ def test_a_changed_bus_changes_the_sources_on_it_alone(table: Table) -> None:
     ]  # fmt: skip
 
 
-def test_the_table_given_is_neither_kept_nor_changed(table: Table) -> None:
+def test_parse_rig_copies_the_table(table: Table) -> None:
     given_table = deepcopy(table)
     rig = parse_rig(table)
     table["rig"]["name"] = "another"
@@ -98,7 +98,7 @@ markers.thigh = ["T1", "T1"]
 """
 
 
-def test_ten_mistakes_are_told_at_once(
+def test_ten_faults_are_reported_together(
     fakes: object, tmp_path: Path, subtests: pytest.Subtests
 ) -> None:
     path = tmp_path / "rig.toml"
@@ -107,20 +107,20 @@ def test_ten_mistakes_are_told_at_once(
         load_rig(path)
     text = str(caught.value)
     for line in (
-        "rig.name = 'bench/1': must not hold /",
+        "rig.name = 'bench/1': must not contain /",
         "rig.output_rate_hz = 'fast': should be a valid number (limb states per second, Hz)",
-        "rig.aling_mode = 'smooth': no such key; known here: name, output_rate_hz, align_mode; "
+        "rig.aling_mode = 'smooth': unknown key; known here: name, output_rate_hz, align_mode; "
         "did you mean 'align_mode'?",
         "chain.joints = ['hip', 'knee']: expected 3 joints, one more than segments",
         "imu.id = 'S1': named 2 times, expected once",
-        "imu[S1].segment = 'tigh': no such segment; known: thigh, shank; did you mean 'thigh'?",
-        "imu[S1].driver = 'fkae': no such driver; known: fake, fakecan, fakemocap; "
+        "imu[S1].segment = 'tigh': unknown segment; known: thigh, shank; did you mean 'thigh'?",
+        "imu[S1].driver = 'fkae': unknown driver; known: fake, fakecan, fakemocap; "
         "did you mean 'fake'?",
         "imu[S1].can = 'can1': no table [can.can1]; known: can0; did you mean 'can0'?",
-        "imu: no sensor is on segment 'thigh'",
+        "imu: segment 'thigh' has no sensor",
         "calibration.method = 'patent21': expected 'anchored', 'patent12', 'patent6', 'markley', "
         "'mean' or 'single'; did you mean 'patent12'?",
-        "mqtt.hots = 'broker': no such key",
+        "mqtt.hots = 'broker': unknown key",
         "did you mean 'host'?",
         "mocap.markers.thigh = ['T1', 'T1']: expected at least three different markers",
     ):
@@ -132,18 +132,18 @@ def test_ten_mistakes_are_told_at_once(
     ("where", "value", "said"),
     [
         (("rig",), None, "[rig]: this table is missing"),
-        (("rigg",), {}, "rigg: no such table"),
+        (("rigg",), {}, "rigg: unknown table"),
         (("imu",), {}, "imu = {}: expected [[imu]] tables"),
         (("can",), 3, "can = 3: expected tables [can.NAME]"),
         (("mocap",), [], "mocap = []: expected a table"),
         (("imu", 0, "port"), None, "imu[S1].port: missing; name of the port"),
         (("imu", 0, "rate_hz"), "100", "imu[S1].rate_hz = '100': should be a valid number"),
-        (("imu", 0, "id"), "mocap", "is the name of the optical source"),
+        (("imu", 0, "id"), "mocap", "is reserved for the optical source"),
         (("imu", 0, "id"), "", "must not be empty"),
         (("imu", 0, "id"), "$S", "must not begin with $"),
-        (("imu", 0, "driver"), "fakemocap", "is a driver of motion capture"),
+        (("imu", 0, "driver"), "fakemocap", "is a driver for motion capture"),
         (("imu", 1, "port"), "/dev/nowhere-S1", "imu[S2].port = '/dev/nowhere-S1': is the port of"),
-        (("imu", 3, "ids", "counter"), 0x21, "id 0x21 on this bus is taken by S3 (quaternion)"),
+        (("imu", 3, "ids", "counter"), 0x21, "id 0x21 on this bus belongs to S3 (quaternion)"),
         (("imu", 2, "can"), None, "imu[S3].can: missing"),
         (("imu", 3, "ids", "quaternoin"), 5, "did you mean 'quaternion'?"),
         (("chain", "segments"), ["thigh", "thigh"], "named 2 times"),
@@ -153,12 +153,12 @@ def test_ten_mistakes_are_told_at_once(
         (("mocap", "markers", "shank"), ["T1", "B", "C"], "is a marker of 'thigh' already"),
         (("mocap", "rigid_body"), {"thigh": "Thigh"}, "has markers already"),
         (("mqtt",), {"base": "a//b"}, "mqtt.base = 'a//b': must not be empty"),
-        (("mqtt",), {"base": "a/#"}, "must not hold #"),
+        (("mqtt",), {"base": "a/#"}, "must not contain #"),
         (("mqtt",), {"version": "3"}, "expected '5' or '3.1.1'"),
         (("calibration",), {"store": "../elsewhere"}, "plain name of one folder"),
     ],
 )
-def test_each_fault_names_key_value_and_expectation(
+def test_fault_names_key_value_and_expectation(
     table: Table, where: tuple[Any, ...], value: object, said: str
 ) -> None:
     part: Any = table
@@ -171,18 +171,18 @@ def test_each_fault_names_key_value_and_expectation(
     assert any(said in line for line in complaints(table)), complaints(table)
 
 
-def test_two_spellings_of_one_port_are_one_port(table: Table, tmp_path: Path) -> None:
+def test_links_to_one_port_are_the_same_port(table: Table, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("/dev/nowhere-S1")
     table["imu"][1]["port"] = str(tmp_path / "link")
     assert any("is the port of imu[S1] already" in line for line in complaints(table))
 
 
-def test_an_unknown_driver_brings_no_second_complaint(table: Table) -> None:
+def test_unknown_driver_causes_one_fault(table: Table) -> None:
     table["imu"][0]["driver"] = "fkae"
     assert len(complaints(table)) == 1
 
 
-def test_a_driver_that_cannot_be_loaded_is_a_fault_of_its_users_alone(
+def test_broken_driver_is_a_fault_of_its_users_only(
     table: Table, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("tests.fake_drivers").fake_drivers.NAMES, "bad", "No")
@@ -200,9 +200,7 @@ def test_a_driver_that_cannot_be_loaded_is_a_fault_of_its_users_alone(
         (None, "cannot be read: No such file or directory"),
     ],
 )
-def test_a_file_that_is_no_toml_says_where(
-    tmp_path: Path, content: bytes | None, said: str
-) -> None:
+def test_syntax_error_names_its_line(tmp_path: Path, content: bytes | None, said: str) -> None:
     path = tmp_path / "rig.toml"
     if content is not None:
         path.write_bytes(content)
@@ -210,7 +208,7 @@ def test_a_file_that_is_no_toml_says_where(
         load_rig(path)
 
 
-def test_names_of_files_start_at_the_folder_of_the_rig(
+def test_file_names_are_relative_to_the_rig_file(
     table: Table, tmp_path: Path, fakes: object
 ) -> None:
     text = TEN_MISTAKES.partition("[mqtt]")[0].replace("fkae", "fake").replace("tigh", "thigh")
@@ -226,7 +224,7 @@ def test_names_of_files_start_at_the_folder_of_the_rig(
     assert mqtt.tcp_port == 8883
 
 
-def test_the_broker_is_reached_without_resolving_a_name() -> None:
+def test_default_broker_is_an_address() -> None:
     example = tomllib.loads((PROJECT / "examples" / "knee.toml").read_text(encoding="utf-8"))
     for host in (MqttSettings().host, RigOptions().mqtt_host, example["mqtt"]["host"]):
         assert ip_address(host).is_loopback  # the name may lack in /etc/hosts
@@ -243,7 +241,7 @@ anything = st.recursive(
 
 @given(data=st.data())
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_table_does_worse_than_config_error(table: Table, data: st.DataObject) -> None:
+def test_any_table_raises_config_error_at_most(table: Table, data: st.DataObject) -> None:
     broken = deepcopy(table)
     section = data.draw(st.sampled_from(sorted(broken)))
     part = broken[section]
@@ -274,15 +272,15 @@ def test_in_the_schema_a_bus_is_a_name(fakes: object) -> None:
     ("content", "said"),
     [
         (b"a = " + b"[" * 5000, "nested more than 32 levels deep"),
-        (b'[rig]\nname = "a\\u0000b"', "rig.name = 'a\\x00b': must not hold a NUL"),
+        (b'[rig]\nname = "a\\u0000b"', "rig.name = 'a\\x00b': must not contain a NUL"),
         (b"[rig]\noutput_rate_hz = 1" + b"0" * 5000, "TOML"),
         (b"\xff\xfe[\0", "is not UTF-8: found UTF-16"),
         (b"# " * 200_000, "larger than"),
         (b"[rig]\nname 'x'\noutput_rate_hz = 99,5\n", "line 3 = 'output_rate_hz = 99,5': "),
-        (b"[rig]\noutput_rate_hz = 99,5\n", "decimals take a point, not a comma"),
+        (b"[rig]\noutput_rate_hz = 99,5\n", "use a decimal point, not a comma"),
     ],
 )
-def test_hostile_text_is_one_clear_fault(tmp_path: Path, content: bytes, said: str) -> None:
+def test_hostile_text_is_one_fault(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "rig.toml"
     path.write_bytes(content)
     with pytest.raises(ConfigError) as caught:
@@ -290,7 +288,9 @@ def test_hostile_text_is_one_clear_fault(tmp_path: Path, content: bytes, said: s
     assert said in str(caught.value)
 
 
-def test_syntax_errors_and_wrong_values_are_told_together(fakes: object, tmp_path: Path) -> None:
+def test_syntax_errors_and_wrong_values_are_reported_together(
+    fakes: object, tmp_path: Path
+) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(
         "[rig]\nname = bench\noutput_rate_hz = 'fast'\n[chain]\njoints = ['hip', 'knee']\n"
@@ -350,25 +350,25 @@ markers.thihg = ["T2", "T3", "T4"]
 """
 
 
-def test_one_pass_finds_what_is_wrong_in_and_between_tables(fakes: object, tmp_path: Path) -> None:
+def test_one_pass_finds_faults_in_and_across_tables(fakes: object, tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(FIFTEEN_MISTAKES, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load_rig(path)
     text = str(caught.value)
     for line in (
-        "rig.name = 'bench/1': must not hold /",
+        "rig.name = 'bench/1': must not contain /",
         "rig.output_rate_hz = 'fast'",
         "chain.joints = ['hip', 'knee']: expected 3 joints",
         "chain.side = 'middle'",
-        "chain.lengths_m.shnak = 'shnak': no such segment",
-        "imu[S1].segment = 'tigh': no such segment",
-        "imu: no sensor is on segment 'thigh'",
+        "chain.lengths_m.shnak = 'shnak': unknown segment",
+        "imu[S1].segment = 'tigh': unknown segment",
+        "imu: segment 'thigh' has no sensor",
         "imu[S1].rate_hz = 'fast'",
         "imu[S2].port = '/dev/a': is the port of imu[S1] already",
         "imu[S2].silence_s = inf",
         "imu[S3].rate_hz = -1",
-        "imu[S4].ids.quaternion: id 0x21 on this bus is taken by S3",
+        "imu[S4].ids.quaternion: id 0x21 on this bus belongs to S3",
         "calibration.store = '../elsewhere': must be the plain name",
         "calibration.method = 'patent21'",
         "mqtt.base = 'a//b': must not be empty",
@@ -411,7 +411,7 @@ def real_rig(**changed: Any) -> Table:
         ({"can": {"channel": "can 0"}}, "expected the name of a network interface"),
         ({"can": {"channel": ""}}, "can.can0.channel = '': must not be empty"),
         ({"can": {"interface": "slcan", "bitrate": 123_456}},
-         "no such bit rate in SLCAN: expected one of 1"),
+         "not a bit rate of SLCAN: expected one of 1"),
         ({"can": {"interface": "socketcn"}}, "did you mean 'socketcan'?"),
         ({"can": {"bitrate": 125_000}, "xcdi": {"rate_hz": 400}},
          "can.can0.bitrate = 125000: S3, S4 need 244000 bit/s at most, the bus carries 125000: "
@@ -420,7 +420,7 @@ def real_rig(**changed: Any) -> Table:
          "can.can0.baud = 115200: S3, S4 need 184000 bit/s as SLCAN"),
     ],
 )  # fmt: skip
-def test_what_a_line_cannot_carry_or_be_called_is_refused(
+def test_insufficient_bit_rates_and_invalid_interface_names_are_refused(
     changed: dict[str, Any], said: str
 ) -> None:
     assert any(said in line for line in complaints(real_rig(**changed))), complaints(
@@ -428,14 +428,14 @@ def test_what_a_line_cannot_carry_or_be_called_is_refused(
     )
 
 
-def test_lines_that_carry_the_data_are_accepted() -> None:
+def test_sufficient_bit_rates_are_accepted() -> None:
     parse_rig(real_rig())
     parse_rig(real_rig(xbus={"baud": 9600, "rate_hz": 26}))
     parse_rig(real_rig(xbus={"baud": 9600, "transport": "usb"}))
     parse_rig(real_rig(can={"bitrate": 500_000}, xcdi={"rate_hz": 400}))
 
 
-def test_the_bit_rates_of_slcan_are_those_of_its_codec() -> None:
+def test_slcan_bit_rates_equal_those_of_the_codec() -> None:
     assert _SLCAN_BITRATES == BITRATES
 
 
@@ -460,7 +460,7 @@ def test_the_bit_rates_of_slcan_are_those_of_its_codec() -> None:
     ),
     rate_hz=st.integers(1, 2000),
 )
-def test_what_the_check_accepts_the_drivers_take(
+def test_drivers_accept_checked_buses(
     xbus: dict[str, Any], can: dict[str, Any], rate_hz: int
 ) -> None:
     try:

@@ -27,6 +27,7 @@ from jointfit_daemon.outputs.mqtt._signature import signed
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.recording import read_events
 from jointfit_daemon.outputs.recording._event_log import encode_event
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
@@ -38,8 +39,6 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.supervisor.requests import (
     RequestAuthenticator,
     parse_request,
-    reply_correlation,
-    reply_topic,
 )
 from tests.fuzz.target import Target
 from tests.fuzz.wire_targets import rig
@@ -94,16 +93,16 @@ def run_request(data: bytes) -> None:
         response_topic=response.decode("utf-8", "replace"),
         correlation=correlation,
     )
-    reporter = TopicWriter(rig(), Outbox("b/bridge/state"))
+    reporter = TopicWriter(rig(), Outbox("b/bridge/state"), UnixClock())
     for guard in guards():
         answer = parse_request(message, guard)
         if isinstance(answer, Reply):
-            reporter.reply(answer, reply_topic(message), reply_correlation(message))
+            reporter.output(answer)
         elif answer is not None:
             core = Core()
             for event in (Configured(BEGIN_NS, rig(), None), answer, Tick(answer.t_ns + 10**9)):
                 for output in core.feed(event):
-                    reporter.handle(output)
+                    reporter.output(output)
 
 
 def seeds_request() -> list[bytes]:
@@ -129,9 +128,9 @@ def run_rig(data: bytes) -> None:
     path = folder() / "rig.toml"
     path.write_bytes(data)
     loaded = load_rig(path)
-    core, reporter = Core(), TopicWriter(loaded, Outbox("b/bridge/state"))
+    core, reporter = Core(), TopicWriter(loaded, Outbox("b/bridge/state"), UnixClock())
     for output in core.feed(Configured(BEGIN_NS, loaded, None)):
-        reporter.handle(output)
+        reporter.output(output)
     encode_event(Configured(BEGIN_NS, loaded, None))
 
 
@@ -156,7 +155,7 @@ def good_calibration() -> Calibration:
 
 def use_calibration(calibration: Calibration) -> None:
     """Run the core with a calibration that was accepted, with samples of every sensor."""
-    core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"))
+    core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"), UnixClock())
     events: list[Event] = [Configured(BEGIN_NS, rig(), calibration, 1)]
     events += [SourceOpened(BEGIN_NS, name) for name in SENSORS]
     for number in range(12):
@@ -166,7 +165,7 @@ def use_calibration(calibration: Calibration) -> None:
             events.append(ChunkArrived(name, Chunk(t_ns, data)))
     for event in events:
         for output in core.feed(event):
-            reporter.handle(output)
+            reporter.output(output)
 
 
 def run_calibration(data: bytes) -> None:

@@ -12,6 +12,7 @@ from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
 from jointfit_daemon.pipeline.sources import SourceState
@@ -84,23 +85,23 @@ def rig() -> Rig:
 
 def feed_core(source: str, chunks: Iterable[bytes]) -> None:
     """Take chunks through decoder, clock, fusion and payloads of the whole core."""
-    core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"))
+    core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"), UnixClock())
     t_ns = BEGIN_NS
     events: list[Event] = [Configured(t_ns, rig(), None), SourceOpened(t_ns, source)]
     if source == "mocap":
         events += camera_hello(t_ns)
     for event in events:
         for output in core.feed(event):
-            reporter.handle(output)
+            reporter.output(output)
 
     for number, data in enumerate(chunks):
         t_ns += PERIOD_NS if number % 16 else 700 * _MS
         for output in core.feed(ChunkArrived(source, Chunk(t_ns, data))):
-            reporter.handle(output)
+            reporter.output(output)
 
-    reporter.health(core.health(t_ns))
+    reporter.publish_health(core.health(t_ns))
     for output in core.feed(SourceClosed(t_ns, source, "lost", "over")):
-        reporter.handle(output)
+        reporter.output(output)
 
 
 def feed_source(source: str, chunks: Iterable[bytes]) -> None:

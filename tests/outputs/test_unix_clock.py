@@ -1,4 +1,4 @@
-"""UNIX time set while the daemon runs: followed, told to the core, and frames keep their order."""
+"""Steps of UNIX time in operation: followed, passed to the core, frames stay in order."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Host:
     return host
 
 
-def test_the_unix_clock_keeps_the_spacing_of_stamps(host: Host) -> None:
+def test_unix_clock_preserves_intervals_of_stamps(host: Host) -> None:
     clock = UnixClock()
     before = clock.offset_ns()
     host.offset_ns += 3_600 * S
@@ -59,25 +59,24 @@ def test_the_unix_clock_keeps_the_spacing_of_stamps(host: Host) -> None:
 
 
 @pytest.mark.parametrize("step_s", [3_600.0, -3_600.0, 0.01, -0.01, 0.0002])
-def test_a_step_is_followed_within_a_second_and_told_once(host: Host, step_s: float) -> None:
+def test_step_is_followed_within_a_second(host: Host, step_s: float) -> None:
     clock = UnixClock()
     before = clock.offset_ns()
     host.offset_ns += round(step_s * S)
     host.now_ns += S
     assert clock.offset_ns() - before == pytest.approx(step_s * S, abs=1_000)
-    assert clock.news_ns() == pytest.approx(before + step_s * S, abs=1_000)
-    assert clock.news_ns() is None
+    assert clock.offset_ns() == pytest.approx(before + step_s * S, abs=1_000)
 
 
-def test_a_busy_machine_is_no_step(host: Host) -> None:
+def test_slow_clock_readings_are_no_step(host: Host) -> None:
     waits = iter([100, 20 * MS, 100, 100, 30 * MS] * 100)
     host.wait_ns = lambda: next(waits)
     clock = UnixClock()
-    told = []
+    offsets = set()
     for _ in range(5):
-        told.append(clock.news_ns())
+        offsets.add(clock.offset_ns())
         host.now_ns += S
-    assert told[1:] == [None] * 4
+    assert len(offsets) == 1
 
 
 async def sent(outbox: Outbox) -> dict[str, list[Any]]:
@@ -91,16 +90,18 @@ async def sent(outbox: Outbox) -> dict[str, list[Any]]:
     return found
 
 
-async def test_poses_across_a_step_back_keep_their_order(table: dict[str, Any], host: Host) -> None:
+async def test_mono_us_is_monotonic_across_a_step_of_unix_time(
+    table: dict[str, Any], host: Host
+) -> None:
     outbox = Outbox("b/bridge/state")
-    reporter = TopicWriter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox)
+    reporter = TopicWriter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox, UnixClock())
     poses: list[dict[str, Any]] = []
     for number in range(400):
         if number == 200:
             host.offset_ns -= 3_600 * S
         host.now_ns += 10 * MS
         t_ns = host.now_ns - 5 * MS
-        reporter.handle(LimbState(number, t_ns, t_ns, "imu", "locked", (), (), ()))
+        reporter.output(LimbState(number, t_ns, t_ns, "imu", "locked", (), (), ()))
         poses += (await sent(outbox)).get("pose", [])
     steps = [b["t_us"] - a["t_us"] for a, b in itertools.pairwise(poses)]
     assert sum(step < 0 for step in steps) == 1
@@ -126,7 +127,7 @@ class Listening:
         return {}
 
 
-async def test_the_core_hears_of_unix_time_before_anything_else_and_again_when_it_was_set(
+async def test_core_receives_the_unix_offset_first_and_after_each_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Through the real heart; the host's clock is set a second after the start."""
@@ -134,7 +135,7 @@ async def test_the_core_hears_of_unix_time_before_anything_else_and_again_when_i
     true_unix_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: true_unix_ns() + set_ns)
     core = Listening()
-    beating = asyncio.create_task(CoreRunner(core, lambda _: None).run(), name="heart")
+    beating = asyncio.create_task(CoreRunner(core, UnixClock()).run(), name="heart")
     await asyncio.sleep(0.3)
     set_ns = -3_600 * S
     await asyncio.sleep(1.5)

@@ -1,4 +1,4 @@
-"""Writing calibrations: in turn, off the loop, and never at odds with what a reload finds."""
+"""Writing of calibrations: in sequence, off the loop, consistent with a reload."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from jointfit_daemon.pipeline.events import (
     Configured,
     Request,
 )
-from jointfit_daemon.supervisor import _stored_calibrations
-from jointfit_daemon.supervisor._calibration_writer import CalibrationWriter
+from jointfit_daemon.supervisor import _calibration_store
+from jointfit_daemon.supervisor._calibration_store import CalibrationWriter
 from jointfit_daemon.supervisor.daemon import Daemon
 from tests.limb_model.plain_calibration import plain_calibration
 
@@ -47,8 +47,8 @@ class SlowDisk:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.go = threading.Event()
         self.writing = self.most = 0
-        self._save = _stored_calibrations.save
-        monkeypatch.setattr("jointfit_daemon.supervisor._stored_calibrations.save", self.save)
+        self._save = _calibration_store.save
+        monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.save", self.save)
 
     def save(self, rig: Rig, calibration: Calibration) -> int:
         self.writing += 1
@@ -75,19 +75,19 @@ async def test_two_calibrations_are_written_one_after_the_other(
     assert disk.most == 1
     assert complaints == []
     assert [event.version for event in events if isinstance(event, CalibrationStored)] == [1, 2]
-    found = runner.found(rig).calibration
+    found = runner.load(rig).calibration
     assert found is not None
     assert found.notes == ("second",)
 
 
-async def test_what_could_not_be_written_stays_in_force_over_a_reload(
+async def test_unwritten_calibration_stays_in_force_over_a_reload(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: Any) -> int:
         raise OSError("no space left")
 
-    _stored_calibrations.save(rig, calibration_of(rig, "old"))
-    monkeypatch.setattr("jointfit_daemon.supervisor._stored_calibrations.save", full)
+    _calibration_store.save(rig, calibration_of(rig, "old"))
+    monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.save", full)
     complaints: list[str] = []
     events: list[Event] = []
     async with asyncio.TaskGroup() as tasks:
@@ -95,10 +95,10 @@ async def test_what_could_not_be_written_stays_in_force_over_a_reload(
         runner.start(rig, calibration_of(rig, "new"))
     assert "no space left" in complaints[0]
     assert events == []
-    found = runner.found(rig)
+    found = runner.load(rig)
     assert found.calibration == calibration_of(rig, "new")
     assert found.version is None
-    assert "not stored" in found.complaints[0]
+    assert "not stored" in found.warnings[0]
 
 
 class ReadyCore:
@@ -130,7 +130,7 @@ async def test_a_reload_while_a_calibration_is_written_finds_it(
     async with asyncio.timeout(8):
         while not core.events:
             await asyncio.sleep(0.01)
-        daemon._heart.feed(Request(1, "calibrate", "t", {}))
+        daemon._core.feed(Request(1, "calibrate", "t", {}))
         reload = asyncio.create_task(daemon._change_to(rig))
         await asyncio.sleep(0.2)
         disk.go.set()
@@ -157,38 +157,36 @@ async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_store
             await asyncio.sleep(0.01)
         assert f"{blocked}/state/calibrations: Not a directory" in caplog.text
 
-        daemon._heart.feed(Request(1, "calibrate", "t", {}))
-        while daemon._stores.fault is None:
+        daemon._core.feed(Request(1, "calibrate", "t", {}))
+        while daemon._calibrations.fault is None:
             await asyncio.sleep(0.01)
         published = daemon._outbox.retained
         assert b"in force but not stored" in published["jointfit/bench-1/calibration"]
-        daemon._tell_health()
+        daemon._publish_health()
         assert b'"not_stored":"' in daemon._outbox.retained["jointfit/bench-1/bridge/health"]
 
         blocked.unlink()
-        daemon._asked(Incoming("x/calibrate", b'{"phase":"abort"}', retained=False))
+        daemon._receive_request(Incoming("x/calibrate", b'{"phase":"abort"}', retained=False))
         while not any(isinstance(event, CalibrationStored) for event in core.events):
             await asyncio.sleep(0.01)
     assert "can be written again" in caplog.text
     running.cancel()
     await asyncio.wait([running])
-    found = _stored_calibrations.stored(rig).calibration
+    found = _calibration_store.load_latest(rig).calibration
     assert found is not None
     assert found.notes == ("new",)
 
 
-async def test_what_could_not_be_written_is_tried_again(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("jointfit_daemon.supervisor._calibration_writer.RETRY_S", 0.05)
-    save, failures = _stored_calibrations.save, ["disk full", "disk full", "gone"]
+async def test_failed_write_is_retried(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.RETRY_S", 0.05)
+    save, failures = _calibration_store.save, ["disk full", "disk full", "gone"]
 
     def failing(*given: Any) -> int:
         if failures:
             raise OSError(failures.pop(0))
         return save(*given)
 
-    monkeypatch.setattr("jointfit_daemon.supervisor._stored_calibrations.save", failing)
+    monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.save", failing)
     events: list[Event] = []
     complaints: list[str] = []
     async with asyncio.TaskGroup() as tasks, asyncio.timeout(5):
@@ -197,10 +195,10 @@ async def test_what_could_not_be_written_is_tried_again(
         while not events:
             await asyncio.sleep(0.01)
     assert [complaint.split(": ")[1] for complaint in complaints] == [
-        "disk full; tried again every 0.05 s", "gone; tried again every 0.05 s",
+        "disk full; retrying every 0.05 s", "gone; retrying every 0.05 s",
     ]  # fmt: skip
-    found = runner.found(rig)
-    assert (found.version, found.complaints) == (1, ())
+    found = runner.load(rig)
+    assert (found.version, found.warnings) == (1, ())
 
 
 @pytest.mark.parametrize(
@@ -213,8 +211,8 @@ async def test_what_could_not_be_written_is_tried_again(
         ("", 0.0),
     ],
 )
-def test_the_age_of_a_calibration_is_known_or_nothing(created: str, age_s: float) -> None:
+def test_calibration_age_is_zero_if_unknown(created: str, age_s: float) -> None:
     """A host without a clock of its own may think it is yesterday."""
     now = datetime.datetime(2026, 3, 1, 11, tzinfo=datetime.UTC)
     calibration = Calibration("mean", (), (), (), {}, {}, {}, created_utc=created)
-    assert _stored_calibrations.age_of(calibration, now) == age_s
+    assert _calibration_store.calibration_age_s(calibration, now) == age_s

@@ -1,4 +1,4 @@
-"""The shell, in this process: sources, reloads, stops, requests; the core is real or a fake."""
+"""The daemon in this process: sources, reloads, stops, requests; real or simulated core."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,
     FitJob,
     JobFinished,
-    Reply,
     Request,
     SourceClosed,
     SourceOpened,
@@ -32,7 +32,7 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_daemon.supervisor._core_runner import LONGEST_TICK_INTERVAL_NS, CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
-from jointfit_daemon.supervisor._progress_monitor import Progress
+from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._source_tasks import run_source
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.daemon import Daemon
@@ -61,7 +61,7 @@ class RecordingCore:
         if self.failure is not None:
             raise self.failure
         if isinstance(event, Request):
-            return [Reply(event.command, event.transaction, "accepted", dict(event.arguments))]
+            return [event.reply("accepted", dict(event.arguments))]
         return self.answers.pop(type(event), [])
 
     def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
@@ -155,7 +155,7 @@ async def run_script(rig: Rig, steps: list[Any]) -> tuple[list[Event], asyncio.T
     return events, task
 
 
-async def test_a_lost_device_is_tried_again_and_told_once_a_reason(table: dict[str, Any]) -> None:
+async def test_lost_device_is_retried_and_reported_once_per_reason(table: dict[str, Any]) -> None:
     gone = DeviceLostError("is not there")
     events, _ = await run_script(
         parse_rig(table), ["send then go", gone, DeviceLostError("is not there"), "send then go"]
@@ -172,7 +172,7 @@ async def test_a_lost_device_is_tried_again_and_told_once_a_reason(table: dict[s
     ]
 
 
-async def test_a_bug_in_a_driver_is_not_swallowed(table: dict[str, Any]) -> None:
+async def test_exception_of_a_driver_propagates(table: dict[str, Any]) -> None:
     _, task = await run_script(parse_rig(table), [ZeroDivisionError("bug")])
     assert isinstance(task.exception(), ZeroDivisionError)
 
@@ -180,7 +180,7 @@ async def test_a_bug_in_a_driver_is_not_swallowed(table: dict[str, Any]) -> None
 # --- the whole shell ----------------------------------------------------------------------------
 
 
-async def test_a_wrong_device_is_retired_and_the_others_run(
+async def test_misconfigured_device_pauses_and_others_run(
     table: dict[str, Any], tmp_path: Path, fakes: type[FakeImu]
 ) -> None:
     core = RecordingCore()
@@ -203,7 +203,7 @@ async def test_a_bug_ends_the_daemon_with_its_exception(
     assert caught.value.subgroup(ZeroDivisionError) is not None
 
 
-async def test_what_the_core_raises_on_a_tick_ends_the_daemon_too(
+async def test_exception_of_the_core_on_a_tick_ends_the_daemon(
     table: dict[str, Any], tmp_path: Path
 ) -> None:
     core = RecordingCore()
@@ -214,7 +214,7 @@ async def test_what_the_core_raises_on_a_tick_ends_the_daemon_too(
     assert isinstance(task.exception(), ExceptionGroup)
 
 
-async def test_configuration_comes_first_and_time_never_stops(
+async def test_configuration_is_the_first_event_and_ticks_continue(
     table: dict[str, Any], tmp_path: Path
 ) -> None:
     core = RecordingCore()
@@ -269,7 +269,7 @@ async def test_a_reload_restarts_only_what_changed(
     ]  # fmt: skip
 
 
-async def test_a_bad_file_changes_nothing_and_says_why(
+async def test_reload_of_a_faulty_file_changes_nothing(
     table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
     rig = parse_rig(small(table, broker.port))
@@ -292,7 +292,7 @@ async def test_a_bad_file_changes_nothing_and_says_why(
         assert len(core.of(Configured)) == 1
 
 
-async def test_a_reload_to_another_base_takes_the_retained_state_along(
+async def test_reload_to_another_base_moves_the_retained_state(
     table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
     rig = small(table, broker.port)
@@ -311,7 +311,7 @@ async def test_a_reload_to_another_base_takes_the_retained_state_along(
     assert found["calibration"]["phase"] == "uncalibrated"
 
 
-async def test_requests_are_answered_once_and_all_their_faults_told(
+async def test_requests_are_answered_once_with_all_faults(
     table: dict[str, Any], tmp_path: Path, broker: Broker
 ) -> None:
     rig = parse_rig(small(table, broker.port))
@@ -368,7 +368,7 @@ async def test_a_run_of_the_real_core_gives_poses_and_health(
 async def test_a_deadline_that_stays_past_does_not_spin() -> None:
     core = RecordingCore()
     core.next_deadline_ns = 0
-    heart = CoreRunner(core, lambda _: None)
+    heart = CoreRunner(core, UnixClock())
     running = asyncio.create_task(heart.run(), name="heart")
     await asyncio.sleep(0.1)
     running.cancel()
@@ -376,9 +376,9 @@ async def test_a_deadline_that_stays_past_does_not_spin() -> None:
     assert 1 < len(core.events) <= 110
 
 
-async def test_the_core_hears_its_deadline_in_time() -> None:
+async def test_core_receives_a_tick_at_its_deadline() -> None:
     core = RecordingCore()
-    heart = CoreRunner(core, lambda _: None)
+    heart = CoreRunner(core, UnixClock())
     core.next_deadline_ns = time.monotonic_ns() + LONGEST_TICK_INTERVAL_NS // 2
     running = asyncio.create_task(heart.run(), name="heart")
     await until(lambda: any(isinstance(event, Tick) for event in core.events))
@@ -406,7 +406,7 @@ def heard(listener: socket.socket) -> list[str]:
     return found
 
 
-async def test_systemd_hears_ready_watchdog_status_and_stopping(
+async def test_systemd_receives_ready_watchdog_status_and_stopping(
     notified: socket.socket,
     monkeypatch: pytest.MonkeyPatch,
     table: dict[str, Any],
@@ -432,7 +432,7 @@ async def test_systemd_hears_ready_watchdog_status_and_stopping(
     assert set(after) <= {"WATCHDOG=1"}  # a stop that takes its time is still alive
 
 
-async def test_a_systemd_that_does_not_listen_does_not_stop_the_loop(
+async def test_unresponsive_systemd_does_not_block_the_loop(
     notified: socket.socket,
 ) -> None:
     systemd = SystemdNotifier()
@@ -443,7 +443,7 @@ async def test_a_systemd_that_does_not_listen_does_not_stop_the_loop(
     assert heard(notified)
 
 
-def test_without_systemd_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     SystemdNotifier().ready()
     monkeypatch.setenv("NOTIFY_SOCKET", "@nobody-listens-here")
@@ -454,14 +454,18 @@ def counters(received: int, late: int = 0) -> dict[str, object]:
     return {"devices": {"S1": {"received": received, "late": late}, "mocap": {"received": 99}}}
 
 
-def test_the_watchdog_starves_only_when_samples_bring_no_state() -> None:
-    progress, imus = Progress(), frozenset({"S1"})
-    assert progress.made(counters(0), 0, imus)  # nothing arrives
-    assert progress.made(counters(10), 5, imus)  # states come
-    assert progress.made(counters(20, late=10), 5, imus)  # arrives, too late for any state
-    assert not progress.made(counters(40, late=10), 5, imus)  # arrives, and nothing comes of it
-    assert progress.made(counters(60, late=10), 6, imus)
-    assert progress.made({}, 6, imus)
+def test_watchdog_trips_only_if_samples_produce_no_state() -> None:
+    progress, imus = ProgressMonitor(), frozenset({"S1"})
+    assert progress.has_progressed(counters(0), 0, imus)  # nothing arrives
+    assert progress.has_progressed(counters(10), 5, imus)  # states come
+    assert progress.has_progressed(
+        counters(20, late=10), 5, imus
+    )  # arrives, too late for any state
+    assert not progress.has_progressed(
+        counters(40, late=10), 5, imus
+    )  # arrives, and nothing comes of it
+    assert progress.has_progressed(counters(60, late=10), 6, imus)
+    assert progress.has_progressed({}, 6, imus)
 
 
 # --- fits ---------------------------------------------------------------------------------------
@@ -478,17 +482,17 @@ async def fit(kind: str, *, cancel_after_s: float | None = None) -> list[JobFini
     return ended
 
 
-async def test_a_fit_that_fails_says_why() -> None:
+async def test_failed_fit_reports_its_reason() -> None:
     (ended,) = await fit("no such kind")
     assert ended.result is None
     assert "KeyError" in str(ended.error)
 
 
-async def test_a_cancelled_fit_is_killed_and_not_heard_of() -> None:
+async def test_cancelled_fit_is_killed_without_a_result() -> None:
     assert await fit("static", cancel_after_s=0.05) == []
 
 
-async def test_a_request_to_nobody_is_harmless(broker: Broker) -> None:
+async def test_request_on_an_invalid_topic_is_ignored(broker: Broker) -> None:
     from jointfit_daemon.config import MqttSettings  # noqa: PLC0415 - here only
 
     async with MqttConnection(MqttSettings(host="127.0.0.1", port=broker.port)) as connection:

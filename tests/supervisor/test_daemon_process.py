@@ -1,4 +1,4 @@
-"""The daemon as a process: what it says, how it ends, what it leaves at the broker."""
+"""The daemon as a process: output, exit codes, files, and final messages at the broker."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_a_bad_rig_ends_it_with_all_faults_and_exit_code_2(process: Process) -> 
         out, said = daemon.communicate(timeout=15)
     assert daemon.returncode == 2
     assert out == ""
-    for fault in ("rgi: no such table", "[rig]: this table is missing", "[chain]: this table"):
+    for fault in ("rgi: unknown table", "[rig]: this table is missing", "[chain]: this table"):
         assert fault in said
     assert "Traceback" not in said
 
@@ -203,7 +203,7 @@ def test_reloads_of_hostile_files_change_nothing(process: Process) -> None:
         daemon.send_signal(signal.SIGTERM)
         _, said = daemon.communicate(timeout=15)
     assert daemon.returncode == 0, said
-    assert said.count("refused, the running rig stays") == len(hostile) + 1
+    assert said.count("refused, the running configuration stays in force") == len(hostile) + 1
     assert "Traceback" not in said
 
 
@@ -249,7 +249,7 @@ def test_damaged_calibrations_are_set_aside_and_the_newest_good_one_used(process
     assert b'"calibration_version":1' in log.read_bytes()
 
 
-def test_all_it_writes_is_private_whatever_the_umask(process: Process) -> None:
+def test_all_files_are_private_with_any_umask(process: Process) -> None:
     process.write(1)
     old = process.state / "calibrations" / "default" / "0001.json"
     old.parent.mkdir(parents=True)
@@ -269,7 +269,7 @@ def test_all_it_writes_is_private_whatever_the_umask(process: Process) -> None:
     assert process.state.stat().st_mode & 0o777 == 0o700
 
 
-def test_under_systemd_lines_carry_levels_and_no_time(process: Process) -> None:
+def test_under_systemd_lines_have_levels_and_no_time(process: Process) -> None:
     process.write(1)
     with running(process, JOURNAL_STREAM="1:2") as daemon:
         assert daemon.stderr is not None
@@ -282,14 +282,14 @@ def test_under_systemd_lines_carry_levels_and_no_time(process: Process) -> None:
     assert all(line[0] == "<" and line[1].isdigit() for line in said.splitlines()), said
 
 
-def test_check_tells_what_it_found(
+def test_check_prints_a_summary(
     process: Process, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("jointfit_daemon.driver.entry_points", fake_drivers.entry_points)
     process.write(1883)
     assert main(["--config", str(process.rig), "--check"]) == 0
     said = capsys.readouterr().out
-    assert "bench: good" in said
+    assert "bench: valid" in said
     assert "one sensor: no redundancy" in said
     assert "127.0.0.1:1883, topics jointfit/bench/" in said
 

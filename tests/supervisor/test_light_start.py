@@ -1,4 +1,4 @@
-"""What a start and a fit load and use: no more than they need."""
+"""Imports and threads of a start and of a fit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_running_daemon_does_without_scipy() -> None:
     assert ran.stdout.strip() == "False"
 
 
-async def test_a_fit_computes_in_one_thread_unless_told_otherwise(
+async def test_fit_uses_one_thread_by_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given: list[dict[str, str]] = []
@@ -41,9 +41,7 @@ async def test_a_fit_computes_in_one_thread_unless_told_otherwise(
 
 
 @pytest.mark.parametrize(("asked", "used"), [(None, "1"), ("2", "2")])
-def test_a_command_computes_in_one_thread_unless_told_otherwise(
-    asked: str | None, used: str
-) -> None:
+def test_command_uses_one_thread_by_default(asked: str | None, used: str) -> None:
     code = """
 import atexit, os, sys
 from jointfit_daemon.tools.__main__ import main

@@ -1,4 +1,4 @@
-"""Learning while it runs, from bytes to a better calibration through the real worker process."""
+"""Online learning from bytes to a better calibration, in the real worker process."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def error(states: list[LimbState]) -> float:
 
 
 @pytest.mark.timeout(120)
-async def test_cameras_make_a_running_daemon_better_and_a_replay_does_the_same() -> None:
+async def test_online_learning_improves_the_calibration_and_replays_identically() -> None:
     bench = Bench()
     bench.feed([*opening(wanted=True), *moved(0, FRAMES)])
     (job,) = (out for out in bench.out if isinstance(out, FitJob))
@@ -122,7 +122,7 @@ async def test_cameras_make_a_running_daemon_better_and_a_replay_does_the_same()
 
 
 @pytest.mark.parametrize(("wanted", "cameras"), [(False, True), (True, False)])
-def test_unwanted_or_without_cameras_nothing_is_asked_for(wanted: bool, cameras: bool) -> None:
+def test_no_learning_job_without_cameras_or_if_disabled(wanted: bool, cameras: bool) -> None:
     bench = Bench()
     bench.feed([*opening(wanted=wanted), *moved(0, FRAMES, cameras=cameras)])
     assert not [out for out in bench.out if isinstance(out, FitJob)]

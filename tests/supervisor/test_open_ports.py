@@ -1,4 +1,4 @@
-"""What other machines could connect to: nothing of the daemon, nothing of the demo."""
+"""Open ports: the daemon has none, and the demo listens on this machine only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests as bytes: whatever arrives, the answer is bounded and nothing is raised."""
+"""Any request gives a reply of limited size, and raises no exception."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from jointfit_daemon.pipeline.events import Reply, Request
 from jointfit_daemon.supervisor.requests import (
     RequestAuthenticator,
     parse_request,
-    reply_correlation,
-    reply_topic,
 )
+from jointfit_daemon.supervisor.requests._validation import _reply_address
 
 
 def incoming(payload: bytes, command: str = "calibrate", **more: Any) -> Incoming:
@@ -40,7 +39,7 @@ def incoming(payload: bytes, command: str = "calibrate", **more: Any) -> Incomin
         (b"\xff", "is not JSON"),
     ],
 )
-def test_a_bad_request_is_told_what_is_wrong(payload: bytes, said: str) -> None:
+def test_faulty_request_is_refused_with_its_faults(payload: bytes, said: str) -> None:
     reply = parse_request(incoming(payload))
     assert isinstance(reply, Reply)
     assert reply.error is not None
@@ -73,9 +72,9 @@ ANSWERS = "b/bridge/response"
         ("", False),
     ],
 )
-def test_an_answer_goes_only_below_the_response_topic(topic: str, usable: bool) -> None:
+def test_reply_topic_must_be_below_the_response_topic(topic: str, usable: bool) -> None:
     asked = incoming(b'{"phase":"static"}', response_topic=topic)
-    assert (reply_topic(asked) == topic) is usable
+    assert (_reply_address(asked).topic == topic) is usable
     found = parse_request(asked)
     assert isinstance(found, Request) is usable
     if isinstance(found, Reply):
@@ -89,8 +88,8 @@ def test_correlation_data_over_the_limit_is_refused_and_not_sent_back() -> None:
     assert isinstance(found, Reply)
     assert found.error is not None
     assert "257 bytes, expected at most 256" in str(found.error["message"])
-    assert reply_correlation(asked) is None
-    assert reply_correlation(incoming(b"{}", correlation=bytes(256))) == bytes(256)
+    assert _reply_address(asked).correlation is None
+    assert _reply_address(incoming(b"{}", correlation=bytes(256))).correlation == bytes(256)
 
 
 @pytest.mark.parametrize("command", ["", "x" * 33, "a b", "a\nb", "caf\xe9", "\x9b2J", "a\0"])
@@ -125,7 +124,7 @@ many_keys = st.integers(1, 1500).map(
 
 
 @given(st.binary(max_size=6000) | deep | odd_tables | many_keys)
-def test_any_payload_gives_a_request_or_a_bounded_answer(payload: bytes) -> None:
+def test_any_payload_gives_a_request_or_a_limited_reply(payload: bytes) -> None:
     for guard in (None, RequestAuthenticator(MqttSettings())):
         found = parse_request(incoming(payload), guard)
         assert found is not None

@@ -1,4 +1,4 @@
-"""Which sources run after a reload."""
+"""Sources after a reload."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Refused:
         await asyncio.Event().wait()
 
 
-async def test_a_source_that_paused_is_tried_again_after_a_while_and_reported_once(
+async def test_paused_source_is_retried_and_reported_once(
     table: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(sources_module, "PAUSE_S", 0.05)
@@ -50,12 +50,12 @@ async def test_a_source_that_paused_is_tried_again_after_a_while_and_reported_on
                 await asyncio.sleep(0.01)
         (closed,) = events
         assert isinstance(closed, SourceClosed)
-        assert "add the user to group dialout (tried again" in closed.text
+        assert "add the user to group dialout (retrying" in closed.text
         assert caplog.text == ""  # the core reports it, on the log too
         await sources.stop()
 
 
-async def test_a_source_that_stopped_is_tried_again_at_a_reload(table: dict[str, Any]) -> None:
+async def test_paused_source_is_retried_at_a_reload(table: dict[str, Any]) -> None:
     driver: Any = type("Port", (Refused,), {})
     source = parse_rig(table).sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
     events: list[Event] = []

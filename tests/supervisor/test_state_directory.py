@@ -1,4 +1,4 @@
-"""The state directory: one daemon at a time, private files, checked before it is needed."""
+"""The state directory: lock, private files, and check for write access."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def mode(path: Path) -> int:
     return path.stat().st_mode & 0o777
 
 
-def test_a_second_lock_names_the_process_that_holds_the_first(tmp_path: Path) -> None:
+def test_second_lock_names_the_process_of_the_first(tmp_path: Path) -> None:
     held = lock_state(tmp_path / "state")
     assert held is not None
     with pytest.raises(StateDirectoryInUseError, match=f"process {os.getpid()}.*STATE_DIRECTORY"):

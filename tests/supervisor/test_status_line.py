@@ -1,4 +1,4 @@
-"""What systemd is told at the start, and the line that an operator reads first."""
+"""Readiness and the status line of the service."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import pytest
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.supervisor._source_tasks import SourceTasks
-from jointfit_daemon.supervisor._status_line import Pace, Seen, phase_of, status_line
+from jointfit_daemon.supervisor._status_line import (
+    FrameRateCounter,
+    ServiceStatus,
+    phase_of,
+    status_line,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
@@ -28,36 +33,38 @@ NAN = float("nan")
     ("seen", "line"),
     [
         (
-            Seen({"S1", "S2", "mocap"}, "calibrated", 49.98, True),
+            ServiceStatus({"S1", "S2", "mocap"}, "calibrated", 49.98, True),
             "2 of 2 IMUs, cameras, calibrated, 50 poses/s",
         ),
         (
-            Seen({"S1"}, "uncalibrated", NAN, False),
+            ServiceStatus({"S1"}, "uncalibrated", NAN, False),
             "1 of 2 IMUs, missing S2, no cameras, uncalibrated, no broker",
         ),
         (
-            Seen({"S2", "mocap"}, "functional", 0.0, True),
+            ServiceStatus({"S2", "mocap"}, "functional", 0.0, True),
             "1 of 2 IMUs, missing S1, cameras, calibration: functional, 0 poses/s",
         ),
     ],
 )
-def test_the_status_counts_what_is_well_and_names_what_is_not(seen: Seen, line: str) -> None:
+def test_status_line_counts_sensors_and_names_missing_ones(seen: ServiceStatus, line: str) -> None:
     assert status_line(RIG, seen) == line
 
 
-def test_a_rig_without_cameras_is_not_told_that_it_lacks_them() -> None:
-    assert "cameras" not in status_line(RIG[:2], Seen({"S1", "S2"}, "calibrated", NAN, True))
+def test_status_line_of_a_rig_without_cameras_omits_them() -> None:
+    assert "cameras" not in status_line(
+        RIG[:2], ServiceStatus({"S1", "S2"}, "calibrated", NAN, True)
+    )
 
 
-def test_the_pace_is_that_since_the_last_look() -> None:
-    pace = Pace()
-    assert pace.since(7, 100.0) != pace.since(7, 100.0)  # NaN: nothing to compare with, no time
-    assert pace.since(507, 110.0) == 50.0
-    assert pace.since(507, 120.0) == 0.0
+def test_frame_rate_is_that_since_the_last_call() -> None:
+    pace = FrameRateCounter()
+    assert pace.rate_hz(7, 100.0) != pace.rate_hz(7, 100.0)  # NaN: nothing to compare with, no time
+    assert pace.rate_hz(507, 110.0) == 50.0
+    assert pace.rate_hz(507, 120.0) == 0.0
 
 
 @pytest.mark.parametrize("health", [{}, {"calibration": {}}, {"calibration": None}])
-def test_what_is_not_told_is_not_calibrated(health: dict[str, object]) -> None:
+def test_missing_phase_is_uncalibrated(health: dict[str, object]) -> None:
     assert phase_of(health) == "uncalibrated"
     assert phase_of({"calibration": {"phase": "aligned"}}) == "aligned"
 
@@ -93,7 +100,7 @@ async def sources() -> Any:
         await made.stop()
 
 
-async def test_inputs_are_known_when_each_was_heard_lost_or_found_wrong(
+async def test_sources_are_known_once_each_sent_a_chunk_or_failed(
     sources: SourceTasks,
 ) -> None:
     waiting = asyncio.create_task(sources.known(10.0))
@@ -105,7 +112,7 @@ async def test_inputs_are_known_when_each_was_heard_lost_or_found_wrong(
         await waiting
 
 
-async def test_a_source_that_stays_silent_is_taken_for_absent(sources: SourceTasks) -> None:
+async def test_silent_source_is_awaited_for_a_limited_time(sources: SourceTasks) -> None:
     GO["well"].set()
     loop = asyncio.get_running_loop()
     began = loop.time()

@@ -1,4 +1,4 @@
-"""Stores and workers as the shell uses them: a bad file costs a calibration, not the run."""
+"""Stored calibrations and the worker process: faults in files are reported."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.config import Rig, parse_rig
-from jointfit_daemon.supervisor import _stored_calibrations
+from jointfit_daemon.supervisor import _calibration_store
 from jointfit_daemon.supervisor.worker import HEADER
 from tests.limb_model.plain_calibration import plain_calibration
 
@@ -26,39 +26,39 @@ def rig(table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     return parse_rig(table | {"calibration": {"store": "subject-07"}})
 
 
-def test_an_empty_store_is_no_trouble(rig: Rig) -> None:
-    assert _stored_calibrations.stored(rig) == (None, None, ())
+def test_empty_store_has_no_calibration(rig: Rig) -> None:
+    assert _calibration_store.load_latest(rig) == (None, None, ())
 
 
-def test_what_was_saved_is_found_with_its_version_and_date(rig: Rig) -> None:
-    assert _stored_calibrations.save(rig, plain_calibration(rig.chain)) == 1
-    assert _stored_calibrations.save(rig, plain_calibration(rig.chain)) == 2
-    found = _stored_calibrations.stored(rig)
+def test_saved_calibration_is_loaded_with_version_and_date(rig: Rig) -> None:
+    assert _calibration_store.save(rig, plain_calibration(rig.chain)) == 1
+    assert _calibration_store.save(rig, plain_calibration(rig.chain)) == 2
+    found = _calibration_store.load_latest(rig)
     assert found.version == 2
     assert found.calibration is not None
     assert found.calibration.created_utc.endswith("+00:00")
-    assert found.complaints == ()
+    assert found.warnings == ()
 
 
 def test_a_calibration_of_another_limb_is_not_used(rig: Rig) -> None:
-    _stored_calibrations.save(
+    _calibration_store.save(
         rig, plain_calibration(rig.chain, joints=("shoulder", "elbow", "wrist"))
     )
-    found = _stored_calibrations.stored(rig)
+    found = _calibration_store.load_latest(rig)
     assert found.calibration is None
-    assert "of another limb" in found.complaints[0]
+    assert "belongs to another limb" in found.warnings[0]
 
 
-def test_a_damaged_store_is_told_and_survived(rig: Rig, tmp_path: Path) -> None:
-    _stored_calibrations.save(rig, plain_calibration(rig.chain))
-    _stored_calibrations.store_of(rig).path(1).write_text("{")
-    found = _stored_calibrations.stored(rig)
+def test_damaged_store_is_reported(rig: Rig, tmp_path: Path) -> None:
+    _calibration_store.save(rig, plain_calibration(rig.chain))
+    _calibration_store.store_of(rig).path(1).write_text("{")
+    found = _calibration_store.load_latest(rig)
     assert found.calibration is None
-    assert "cannot be used" in found.complaints[0]
-    assert "renamed to 0001.json.bad" in found.complaints[0]
+    assert "cannot be used" in found.warnings[0]
+    assert "renamed to 0001.json.bad" in found.warnings[0]
 
 
-async def test_a_worker_dies_with_its_parent(tmp_path: Path) -> None:
+async def test_worker_ends_with_its_parent(tmp_path: Path) -> None:
     """The parent below starts a worker on an endless job and is then killed outright."""
     parent = (
         "import subprocess, sys, time\n"

@@ -55,7 +55,7 @@ prot = 1883
 [recodring]
 """
 SAID = (
-    ("rig.name", "must not hold /"),
+    ("rig.name", "must not contain /"),
     ("rig.output_rate_hz", "greater than"),
     ("chain.joints", "expected 3 joints, one more than segments"),
     ("imu[S1].segment", "did you mean 'thigh'?"),
@@ -118,4 +118,4 @@ def test_two_sensors_with_one_can_identifier_are_refused_before_anything_opens(
     ended = start(tmp_path, TWINS)
     assert ended.returncode == 2
     assert "imu[S2].ids.sample_time" in ended.stderr
-    assert "0x105 on this bus is taken by S1 (sample_time)" in ended.stderr
+    assert "0x105 on this bus belongs to S1 (sample_time)" in ended.stderr

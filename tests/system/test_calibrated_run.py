@@ -173,7 +173,7 @@ def test_the_log_has_one_line_for_each_phase_and_none_of_the_worker(run: Calibra
         "calibration calibrated: calibrated", "stored as version 1 (version 1 in ",
     ):  # fmt: skip
         assert run.log.count(line) == 1, (line, run.log)
-    assert "the worker said" not in run.log  # fits print nothing
+    assert "output of the worker" not in run.log  # fits print nothing
 
 
 def test_the_event_log_replays_to_the_published_limb_states_byte_for_byte(

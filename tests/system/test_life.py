@@ -114,7 +114,9 @@ async def broken_reload(station: Station, listener: Any, daemon: Any) -> None:
     station.rig.write_text(before.replace("[rig]", "[rgi]"), encoding="utf-8")
     hang_up(daemon)
     await listener.until(
-        lambda: listener.said("demo", "refused, the running rig stays", "did you mean 'rig'?")
+        lambda: listener.said(
+            "demo", "refused, the running configuration stays in force", "did you mean 'rig'?"
+        )
     )
     poses = await listener.more_poses(50)
     seqs = [pose["seq"] for pose in poses]

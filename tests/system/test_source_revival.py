@@ -112,7 +112,7 @@ async def test_the_right_device_on_the_port_of_a_wrong_one_is_used(
             await listener.connected({"S1"}, 4)
         child.check()
         log = (tmp_path / "daemon.log").read_text("utf-8")
-        assert log.count("tried again with another device on the port") == 1
+        assert log.count("retrying with another device on the port") == 1
 
 
 @pytest.mark.timeout(60)

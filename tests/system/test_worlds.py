@@ -120,7 +120,7 @@ async def test_worlds_a_right_angle_apart_are_aligned_or_the_assumption_is_said(
     async with played(tmp_path, broker.port) as simulator:
         station.write_rig()
         await calibrated_twice(station, simulator)
-    assert "the worker said" not in station.log  # fits print nothing
+    assert "output of the worker" not in station.log  # fits print nothing
     assert "Traceback" not in station.log
 
 

@@ -1,9 +1,14 @@
-"""The program's log: journal fields, rate limits, and warnings on an MQTT topic."""
+"""The log of the daemon: journal fields, rate limits, and warnings on an MQTT topic."""
 
-from jointfit_daemon.outputs.log._journal import JournalHandler, LevelFormatter, about, is_journal
+from jointfit_daemon.outputs.log._journal import (
+    JournalHandler,
+    LevelFormatter,
+    is_journal,
+    journal_fields,
+)
 from jointfit_daemon.outputs.log._mqtt_handler import MqttLogHandler
 from jointfit_daemon.outputs.log._printable_text import PrintableRecord, printable, printable_data
-from jointfit_daemon.outputs.log._rate_limit import RateLimitedHandler, TokenBucket
+from jointfit_daemon.outputs.log._rate_limit import RateLimitedHandler
 
 __all__ = [
     "JournalHandler",
@@ -11,9 +16,8 @@ __all__ = [
     "MqttLogHandler",
     "PrintableRecord",
     "RateLimitedHandler",
-    "TokenBucket",
-    "about",
     "is_journal",
+    "journal_fields",
     "printable",
     "printable_data",
 ]

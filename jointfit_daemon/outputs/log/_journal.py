@@ -1,8 +1,8 @@
-"""The log as systemd's journal takes it: with fields, so that it can be asked for one sensor.
+"""Log handler for the systemd journal: each entry has fields, so that it can be filtered by sensor.
 
-Law: fields name what a line is about and repeat nothing secret; whatever the journal does not take
-goes to standard error instead, with its level. Protocol: datagrams of fields to journald's socket,
-https://systemd.io/JOURNAL_NATIVE_PROTOCOL.
+Invariant: an entry that journald does not accept is written to standard error with its level.
+
+Source: https://systemd.io/JOURNAL_NATIVE_PROTOCOL.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 from typing_extensions import override
 
 from jointfit_daemon.outputs.log._printable_text import printable
-from jointfit_daemon.outputs.log._rate_limit import BURST, RATE_HZ, RateLimitedHandler, TokenBucket
+from jointfit_daemon.outputs.log._rate_limit import BURST, RATE_HZ, RateLimitedHandler
+from jointfit_daemon.outputs.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -27,26 +28,27 @@ if TYPE_CHECKING:
 
 SOCKET = "/run/systemd/journal/socket"
 FIELDS = "journal"
-"""Name of a log record's extra mapping of fields: ``extra={FIELDS: about(...)}``."""
+"""Attribute of a log record that holds its additional journal fields."""
 _LEVELS = {"CRITICAL": 2, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7}
+"""Syslog priorities of the levels of Python."""
 _INFO = 6
 
 
-def about(kind: str, name: str) -> dict[str, dict[str, str]]:
-    """Return the ``extra`` of a log line on something of the rig.
+def journal_fields(kind: str, name: str) -> dict[str, dict[str, str]]:
+    """Return the ``extra`` argument of a log call, with the journal fields of one object.
 
     Parameters
     ----------
     kind
-        What it is about, as in ``bridge/event``: ``device``, ``calibration`` …
+        Kind of the object, as in ``bridge/event``: ``device``, ``calibration`` …
     name
-        Id of the device, or what else it is about.
+        Id of the object.
     """
     return {FIELDS: {"JOINTFIT_KIND": printable(kind), "JOINTFIT_ID": printable(name)}}
 
 
 def is_journal(stream: TextIO) -> bool:
-    """Return whether systemd connected `stream` to the journal: $JOURNAL_STREAM names its inode."""
+    """Return whether `stream` is connected to the journal: $JOURNAL_STREAM holds its inode."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
     try:
         found = os.fstat(stream.fileno())
@@ -56,7 +58,7 @@ def is_journal(stream: TextIO) -> bool:
 
 
 def datagram(fields: Mapping[str, str]) -> bytes:
-    """Return `fields` as journald reads them: with its length where a value has line ends."""
+    """Return `fields` in the native protocol: values with line ends have a length prefix."""
     parts = []
     for name, value in fields.items():
         data = value.encode(errors="replace")
@@ -68,30 +70,30 @@ def datagram(fields: Mapping[str, str]) -> bytes:
 
 
 class LevelFormatter(logging.Formatter):
-    """Prefixes every line with its level, as sd-daemon(3) has it; the journal has the time."""
+    """Prefixes every line with its level as in sd-daemon(3); the journal adds the time."""
 
     def __init__(self) -> None:
         super().__init__("%(name)s: %(message)s")
 
     def format(self, record: logging.LogRecord) -> str:  # type: ignore[explicit-override]  # Python 3.12's
-        """Return the record as the journal reads it from standard error."""
+        """Return the record with the level prefix on each line."""
         level = _LEVELS.get(record.levelname, _INFO)
         return "\n".join(f"<{level}>{line}" for line in super().format(record).splitlines())
 
 
 class JournalHandler(RateLimitedHandler):
-    """Writes to the journal, at a bounded rate.
+    """Writes log records to the journal at a limited rate.
 
     Parameters
     ----------
     rig
-        Its name is a field of every line.
+        Name of the rig: a field of every entry.
     limited
-        Whether a flood is cut.
+        Whether the rate is limited.
     address
-        Where journald listens.
+        Path of journald's socket.
     stream, clock
-        As ``RateLimitedHandler`` has them.
+        As in `RateLimitedHandler`.
     """
 
     def __init__(
@@ -109,19 +111,19 @@ class JournalHandler(RateLimitedHandler):
         self._plain = logging.Formatter("%(name)s: %(message)s")
         self._rig, self._address = rig, address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-        self._socket.setblocking(False)  # a journal that hangs must not stop the loop
+        self._socket.setblocking(False)  # a blocked journal must not block the event loop
 
     @override
     def put(self, record: logging.LogRecord) -> None:
-        """Hand one record to journald, or to standard error where it takes none."""
+        """Send one record to journald, or to standard error if journald does not accept it."""
         try:
             self._socket.sendto(datagram(self._fields(record)), self._address)
-        except OSError:  # away, full, or the line is longer than a datagram
+        except OSError:  # no journald, a full socket, or an entry longer than a datagram
             super().put(record)
 
     @override
     def close(self) -> None:
-        """Release the socket."""
+        """Close the socket."""
         self._socket.close()
         super().close()
 

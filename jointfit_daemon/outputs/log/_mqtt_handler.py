@@ -1,4 +1,4 @@
-"""Warnings and errors of the log, on ``bridge/log``. Law: five a second, the rest is counted."""
+"""Log handler that passes warnings and errors to ``bridge/log``, at most five per second."""
 
 from __future__ import annotations
 
@@ -7,42 +7,43 @@ import logging
 import threading
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.outputs.log._rate_limit import TokenBucket
+from jointfit_daemon.outputs.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 RATE_HZ = 5.0
+"""Permitted rate, and burst, of messages on ``bridge/log``, 1/s."""
 
 
 class MqttLogHandler(logging.Handler):
-    """Hands warnings and errors to `tell`, on the loop's thread, at a bounded rate.
+    """Passes warnings and errors to `publish`, on the thread of the event loop.
 
     Parameters
     ----------
-    tell
-        Called with level, logger, text and how many lines were suppressed since the last.
+    publish
+        Called with level, logger, text, and the number of lines suppressed since the last call.
     """
 
-    def __init__(self, tell: Callable[[str, str, str, int], None]) -> None:
+    def __init__(self, publish: Callable[[str, str, str, int], None]) -> None:
         super().__init__(logging.WARNING)
-        self._tell = tell
+        self._publish = publish
         self._loop = asyncio.get_running_loop()
         self._thread = threading.get_ident()
-        self._allowance = TokenBucket(RATE_HZ, RATE_HZ, self._loop.time())
+        self._bucket = TokenBucket(RATE_HZ, RATE_HZ, self._loop.time())
         self._suppressed = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
-        """Take one record, from any thread."""
+        """Accept one record from any thread."""
         line = record.levelname.lower(), record.name, record.getMessage()
         if threading.get_ident() == self._thread:
-            self._take(*line)
+            self._pass_on(*line)
         elif not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._take, *line)
+            self._loop.call_soon_threadsafe(self._pass_on, *line)
 
-    def _take(self, level: str, name: str, text: str) -> None:
-        if not self._allowance.take(self._loop.time()):
+    def _pass_on(self, level: str, name: str, text: str) -> None:
+        if not self._bucket.take(self._loop.time()):
             self._suppressed += 1
             return
         suppressed, self._suppressed = self._suppressed, 0
-        self._tell(level, name, text, suppressed)
+        self._publish(level, name, text, suppressed)

@@ -1,6 +1,6 @@
-"""Text that devices, servers, adapters and clients send, made fit for a log, an event or a field.
+"""Text from devices, servers, adapters and clients, made safe for the log, events and topics.
 
-Invariant: what ``printable`` returns is one line without control characters and of bounded length.
+Invariant: `printable` returns one line of limited length without control characters.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from typing import Any
 from typing_extensions import override
 
 LONGEST = 2000
-"""Characters of a text; the longest message of ours has about 600."""
+"""Longest text, characters; the longest message of the daemon has about 600."""
 _DEEPEST = 4
+"""Deepest nesting of data; a deeper value is converted to text."""
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
@@ -23,7 +24,7 @@ def printable(text: str, longest: int = LONGEST) -> str:
     """
     if len(text) > longest:
         text = text[: longest - 1] + "…"
-    if text.isprintable():  # as nearly always
+    if text.isprintable():
         return text
     return "".join(
         each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
@@ -31,11 +32,12 @@ def printable(text: str, longest: int = LONGEST) -> str:
 
 
 def printable_data(data: Any, depth: int = 0) -> Any:
-    """Return `data` with every text in it printable; what is nested too deeply as text."""
+    """Return `data` with `printable` applied to each text in it, keys included."""
     if isinstance(data, str):
         return printable(data)
     if isinstance(data, Mapping | list | tuple) and depth >= _DEEPEST:
         return printable(repr(data))
+
     if isinstance(data, Mapping):
         return {
             printable(key) if isinstance(key, str) else key: printable_data(value, depth + 1)
@@ -47,13 +49,13 @@ def printable_data(data: Any, depth: int = 0) -> Any:
 
 
 class PrintableRecord(logging.LogRecord):
-    """A record whose message cannot pass for several: further lines are indented behind a bar.
+    """A log record whose further lines are indented behind a bar, so that no text forges an entry.
 
-    Installed by ``logging.setLogRecordFactory``, so that it holds for every handler.
+    Installed by ``logging.setLogRecordFactory``: it applies to every handler.
     """
 
     @override
     def getMessage(self) -> str:
-        """Return the message, its lines printable."""
+        """Return the message with printable lines."""
         lines = super().getMessage().splitlines()
         return "\n  | ".join(map(printable, lines))

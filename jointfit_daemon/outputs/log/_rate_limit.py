@@ -1,7 +1,7 @@
-"""What may be said in a second. Law: a flood of lines fills no disk, and its size is told.
+"""Log handler with a limited rate.
 
-systemd limits services, too, but at 10 000 lines in 30 s: a gateway that chatters at half of that
-writes gigabytes a day and wears its memory card out.
+Invariant: errors are always written, and the number of omitted lines is logged. systemd limits
+services at 10 000 lines in 30 s. Half of that rate writes gigabytes per day to a memory card.
 """
 
 from __future__ import annotations
@@ -10,77 +10,57 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.outputs.token_bucket import TokenBucket
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import TextIO
 
-RATE_HZ, BURST = 5.0, 50.0
-
-
-class TokenBucket:
-    """A bucket that fills at `rate_hz` up to `burst`; whoever takes from it may speak.
-
-    Parameters
-    ----------
-    rate_hz
-        Lines a second, on average.
-    burst
-        Lines at once, after a quiet time.
-    now_s
-        Any clock's time that does not go back; full at the start.
-    """
-
-    def __init__(self, rate_hz: float, burst: float, now_s: float) -> None:
-        self._rate_hz, self._burst = rate_hz, burst
-        self._left, self._at_s = burst, now_s
-
-    def take(self, now_s: float) -> bool:
-        """Return whether one more line may be said."""
-        self._left = min(self._burst, self._left + self._rate_hz * (now_s - self._at_s))
-        self._at_s = now_s
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
+RATE_HZ = 5.0
+"""Permitted mean rate, lines per second: enough for every state change of a rig."""
+BURST = 50.0
+"""Permitted lines at once: a start or a reload logs about twenty."""
 
 
 class RateLimitedHandler(logging.StreamHandler["TextIO"]):
-    """Writes lines at a bounded rate; errors always pass.
+    """Writes log lines to a stream at a limited rate; errors are exempt.
 
     Parameters
     ----------
     stream
-        Where to.
+        Destination.
     clock
-        Tells the time, s.
-    allowance
-        How much may be said.
+        Returns monotonic time, s.
+    bucket
+        Rate limit; default: `RATE_HZ` and `BURST`.
     """
 
     def __init__(
         self,
         stream: TextIO,
         clock: Callable[[], float] = time.monotonic,
-        allowance: TokenBucket | None = None,
+        bucket: TokenBucket | None = None,
     ) -> None:
         super().__init__(stream)
         self._clock = clock
-        self._allowance = allowance or TokenBucket(RATE_HZ, BURST, clock())
-        self._left_out = 0
+        self._bucket = bucket or TokenBucket(RATE_HZ, BURST, clock())
+        self._omitted = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
-        """Write `record`, and how many before it were not written."""
-        if not self._allowance.take(self._clock()) and record.levelno < logging.ERROR:
-            self._left_out += 1
+        """Write `record`, preceded by the number of lines omitted before it."""
+        if not self._bucket.take(self._clock()) and record.levelno < logging.ERROR:
+            self._omitted += 1
             return
-        if self._left_out:
-            count, self._left_out = self._left_out, 0
+
+        if self._omitted:
+            count, self._omitted = self._omitted, 0
             text = (
-                f"{count} line{'s' if count > 1 else ''} left out: more than {RATE_HZ:g} a second"
+                f"{count} line{'s' if count > 1 else ''} omitted: "
+                f"more than {RATE_HZ:g} lines per second"
             )
             self.put(logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None))
         self.put(record)
 
     def put(self, record: logging.LogRecord) -> None:
-        """Write one record, whatever was said before."""
+        """Write one record without a limit."""
         super().emit(record)

@@ -2,13 +2,12 @@
 
 from jointfit_daemon.outputs.mqtt._client import MqttClient, NoAnswerError
 from jointfit_daemon.outputs.mqtt._connection import (
-    PAYLOAD_VERSION,
     BrokerLostError,
     DisconnectErrorFilter,
     Incoming,
 )
 from jointfit_daemon.outputs.mqtt._outbox import Outbox
-from jointfit_daemon.outputs.mqtt._publisher import OFFLINE, ONLINE, MqttPublisher, command_of
+from jointfit_daemon.outputs.mqtt._publisher import MqttPublisher
 from jointfit_daemon.outputs.mqtt._secret_files import RequestKeyError, request_key_of
 from jointfit_daemon.outputs.mqtt._signature import (
     SIGNATURE_LIFETIME_US,
@@ -19,9 +18,6 @@ from jointfit_daemon.outputs.mqtt._signature import (
 )
 
 __all__ = [
-    "OFFLINE",
-    "ONLINE",
-    "PAYLOAD_VERSION",
     "SIGNATURE_LIFETIME_US",
     "SIGNING_KEYS",
     "BrokerLostError",
@@ -33,7 +29,6 @@ __all__ = [
     "Outbox",
     "RequestKeyError",
     "SignatureRejectedError",
-    "command_of",
     "request_key_of",
     "signed",
     "verify",

@@ -1,6 +1,6 @@
-"""A small client for tools: watch a daemon over MQTT and send it requests.
+"""MQTT client of the command-line tools: receives the topics of a daemon and sends requests.
 
-Law: no reconnecting; a tool that loses its broker says so and ends.
+The client does not reconnect: a tool that loses its broker reports it and ends.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import orjson
 
+from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.mqtt._connection import (
     BrokerLostError,
     Incoming,
@@ -27,10 +28,12 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import MqttSettings
 
-_UNREAD = 2000  # messages kept for a slow reader
+_UNREAD_CAPACITY = 2000
+"""Messages kept for a slow reader: some ten seconds of poses."""
 _LONGEST_BYTES = 1024 * 1024
-"""Limit of incoming packets: the qualities of a calibration fill a tenth of it."""
-_EXPIRY_S = 30  # a request nobody took for so long must not run
+"""Largest incoming packet, bytes: the quality of a calibration takes a tenth of it."""
+_EXPIRY_S = 30
+"""Time after which the broker drops an undelivered request, s: a late request must not run."""
 
 
 class NoAnswerError(Exception):
@@ -38,27 +41,27 @@ class NoAnswerError(Exception):
 
 
 class MqttClient:
-    """A connection to the broker of a rig, for as long as the ``async with`` block lasts.
+    """A connection to the broker of a rig, open for the duration of the ``async with`` block.
 
     Parameters
     ----------
     settings
-        ``[mqtt]`` of the rig: ``settings.base`` is the daemon to talk to.
+        ``[mqtt]`` of the rig: ``settings.base`` selects the daemon.
 
     Raises
     ------
     BrokerLostError
-        On entering, from any method, and from iterating: the broker is not there or went away.
+        On entering, from any method, and from iterating: the broker is absent or disconnected.
     """
 
     def __init__(self, settings: MqttSettings) -> None:
         self.base = settings.base
         self.dropped = 0
-        """Messages that came faster than they were read."""
+        """Messages dropped because the reader was too slow."""
         self._settings = settings
         self._connection = MqttConnection(settings, longest_bytes=_LONGEST_BYTES)
         self._own = uuid.uuid4().hex
-        """Last level of the topics on which this client wants its answers (MQTT 5)."""
+        """Last level of the response topics of this client (MQTT 5)."""
         self._unread: deque[Incoming] = deque()
         self._arrived = asyncio.Event()
         self._lost: BrokerLostError | None = None
@@ -67,7 +70,7 @@ class MqttClient:
     async def __aenter__(self) -> Self:
         await self._connection.__aenter__()
         self._reader = asyncio.create_task(self._read(), name="mqtt client")
-        answers = f"{self.base}/bridge/response/+"
+        answers = topics.RESPONSE.name(self.base, "+")
         await self._connection.subscribe([answers, f"{answers}/{self._own}"])
         return self
 
@@ -81,12 +84,12 @@ class MqttClient:
         await asyncio.wait([self._reader])
         await self._connection.__aexit__(None, None, None)
 
-    async def subscribe(self, *topics: str) -> None:
-        """Subscribe to `topics` below the base, as ``pose`` or ``device/+/availability``."""
-        await self._connection.subscribe([f"{self.base}/{topic}" for topic in topics])
+    async def subscribe(self, *names: str) -> None:
+        """Subscribe to topics below the base, as ``pose`` or ``device/+/availability``."""
+        await self._connection.subscribe([f"{self.base}/{name}" for name in names])
 
     async def messages(self) -> AsyncIterator[tuple[str, Any]]:
-        """Yield topic below the base, and decoded payload, of every message but responses."""
+        """Yield topic below the base, and decoded payload, of every message except responses."""
         while True:
             while self._unread:
                 message = self._unread.popleft()
@@ -101,17 +104,17 @@ class MqttClient:
     ) -> dict[str, Any]:
         """Send a request and return its answer: ``status``, ``data`` and, on refusal, ``error``.
 
-        It is signed if the rig names a key.
+        The request is signed if the rig configures a key.
 
         Raises
         ------
         NoAnswerError
-            Nobody answered within `timeout_s`, or the key to sign with cannot be read.
+            No answer arrived within `timeout_s`, or the key to sign with cannot be read.
         """
         transaction = uuid.uuid4().hex
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
         self._waiting[transaction] = answer
-        topic = f"{self.base}/bridge/request/{command}"
+        topic = topics.REQUEST.name(self.base, command)
         try:
             payload = self._payload(topic, {**arguments, "transaction": transaction})
             if self._lost is not None:
@@ -122,15 +125,15 @@ class MqttClient:
                     payload,
                     1,
                     expiry_s=_EXPIRY_S,
-                    response_topic=f"{self.base}/bridge/response/{command}/{self._own}",
+                    response_topic=f"{topics.RESPONSE.name(self.base, command)}/{self._own}",
                 )
             )
             async with asyncio.timeout(timeout_s):
                 return await answer
         except TimeoutError as error:
             text = (
-                f"no daemon answers on {topic}: is jointfitd running, with this base? It ignores "
-                "requests beyond ten a second: is somebody else sending many?"
+                f"no daemon answers on {topic}: check that jointfitd is running with this base, and"
+                " that no other client sends more than ten requests per second (they are ignored)"
             )
             raise NoAnswerError(text) from error
         finally:
@@ -147,7 +150,7 @@ class MqttClient:
     async def _read(self) -> None:
         try:
             async for message in self._connection.messages():
-                self._take(message)
+                self._receive(message)
         except BrokerLostError as error:
             self._lost = error
             for answer in self._waiting.values():
@@ -155,15 +158,16 @@ class MqttClient:
                     answer.set_exception(error)
             self._arrived.set()
 
-    def _take(self, message: Incoming) -> None:
-        if message.topic.startswith(f"{self.base}/bridge/response/"):
+    def _receive(self, message: Incoming) -> None:
+        if message.topic.startswith(topics.RESPONSE.name(self.base)):
             reply = _decoded(message.payload)
             key = reply.get("transaction") if isinstance(reply, dict) else None
             answer = self._waiting.get(key) if isinstance(key, str) else None
             if answer is not None and not answer.done():
                 answer.set_result(reply)
             return
-        if len(self._unread) >= _UNREAD:
+
+        if len(self._unread) >= _UNREAD_CAPACITY:
             self._unread.popleft()
             self.dropped += 1
         self._unread.append(message)
@@ -171,7 +175,7 @@ class MqttClient:
 
 
 def _decoded(payload: bytes) -> Any:
-    """Return the JSON value of `payload`; None where it is none."""
+    """Return the JSON value of `payload`; None if it is not JSON."""
     try:
         return orjson.loads(payload)
     except orjson.JSONDecodeError:

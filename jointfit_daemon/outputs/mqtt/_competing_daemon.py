@@ -1,8 +1,8 @@
-"""Another daemon with the same client id: detected by short connections, watched until it ends.
+"""Detection of another daemon with the same client id, and the wait for its end.
 
-A broker ends the older of two connections with one client id. So two daemons with one base take the
-connection from each other, for ever. The daemon whose connection was the shorter gives way: it
-connects under another id, which disturbs nobody, and waits until the other is gone.
+A broker ends the older of two connections with one client id, so two daemons with the same base
+topic would take the connection from each other without end. The daemon whose connection lasted
+shorter gives way: it connects with another client id and waits until the other daemon is gone.
 """
 
 from __future__ import annotations
@@ -10,38 +10,39 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 SHORT_S = 5.0
-"""A connection that ended sooner is the newcomer's; longer than any daemon needs to reconnect."""
+"""Shorter connections belong to the newcomer, s; longer than any daemon needs to reconnect."""
 UNEXPLAINED = 3
-"""Short connections in a row, without a reason from the broker, before another daemon is suspected.
-MQTT 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
+"""Short connections in a row, without a reason from the broker, that raise the suspicion: MQTT
+3.1.1 has no reasons, and some MQTT 5 brokers send none."""
 GLANCE_S = 2.0
-"""Time to look for poses of a suspected daemon."""
+"""Time to wait for a pose of a suspected daemon, s."""
 SETTLED_S = 5.0
-"""`offline` may be the will of our own ended connection; it counts if no message follows so long.
-"""
+"""Time without a message after ``offline`` that confirms it, s: ``offline`` may be the will of our
+own last connection."""
 
 
 class TakeoverDetector:
-    """Counts the short connections that may have been ended by another daemon."""
+    """Counts short connections that another daemon may have ended."""
 
     def __init__(self) -> None:
         self._unexplained = 0
 
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
-        """Return whether the connection that just ended should be left to another daemon.
+        """Return whether another daemon probably ended the last connection.
 
         Parameters
         ----------
         lasted_s
-            How long it was established, s.
+            Duration of the connection, s.
         taken_over
-            Whether the broker gave "session taken over" as reason.
+            Whether the broker gave the reason "session taken over".
         """
         short = 0.0 < lasted_s < SHORT_S
         self._unexplained = self._unexplained + 1 if short else 0
@@ -49,18 +50,18 @@ class TakeoverDetector:
 
 
 async def is_publishing(settings: MqttSettings, within_s: float) -> bool:
-    """Return whether poses arrive below the base, while this daemon is not connected.
+    """Return whether a pose arrives below the base while this daemon is disconnected.
 
     Raises
     ------
     BrokerLostError
-        The broker went away.
+        The connection failed.
     """
-    async with MqttConnection(settings) as watch:
-        await watch.subscribe([f"{settings.base}/pose"])
+    async with MqttConnection(settings) as observer:
+        await observer.subscribe([topics.POSE.name(settings.base)])
         try:
             async with asyncio.timeout(within_s):
-                await anext(watch.messages())
+                await anext(observer.messages())
         except TimeoutError:
             return False
     return True
@@ -69,24 +70,24 @@ async def is_publishing(settings: MqttSettings, within_s: float) -> bool:
 async def await_departure(settings: MqttSettings, offline: bytes) -> None:
     """Return when the other daemon is offline or silent.
 
-    Silent means no pose and no health for more than two of its health intervals, taken from our
-    own settings.
+    Silent means no pose and no health for more than two health intervals of this configuration.
 
     Raises
     ------
     BrokerLostError
-        The broker went away.
+        The connection failed.
     """
-    life, health = f"{settings.base}/bridge/state", f"{settings.base}/bridge/health"
+    base = settings.base
+    state, health = topics.BRIDGE_STATE.name(base), topics.BRIDGE_HEALTH.name(base)
     loop = asyncio.get_running_loop()
     silence_s = 2 * settings.health_s + SETTLED_S
-    async with MqttConnection(settings) as watch:
-        await watch.subscribe([f"{settings.base}/pose", health, life])
-        stored = {health, life}  # the first of a retained topic may be old
+    async with MqttConnection(settings) as observer:
+        await observer.subscribe([topics.POSE.name(base), health, state])
+        stored = {health, state}  # the first message of a retained topic may be old
         try:
             async with asyncio.timeout(silence_s) as patience:
-                async for message in watch.messages():
-                    if message.topic == life and message.payload == offline:
+                async for message in observer.messages():
+                    if message.topic == state and message.payload == offline:
                         patience.reschedule(loop.time() + SETTLED_S)
                     elif message.topic in stored:
                         stored.discard(message.topic)

@@ -1,8 +1,7 @@
-"""One connection to an MQTT broker. Law: the only module of the daemon that knows aiomqtt and paho.
+"""One connection to an MQTT broker.
 
-Nothing of theirs leaves it: whatever goes wrong with a broker is ``BrokerLostError``. A
-connection is
-used once; whoever wants another makes another.
+Invariant: no other module of the daemon imports aiomqtt or paho, and every fault of a broker is
+raised as `BrokerLostError`. A connection object is used once.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from jointfit_daemon.outputs.mqtt._error_messages import broker_fault, session_f
 from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
 from jointfit_daemon.outputs.mqtt._secret_files import password_of
 from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_remedy
+from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -30,36 +30,41 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import MqttSettings
 
-PAYLOAD_VERSION = 1
-"""Raised when a key is removed or renamed or changes its unit or meaning."""
-
-KEEPALIVE_S = 5  # a frozen broker is noticed in half as much again
-ANSWER_S = 3.0  # a broker that takes longer over one packet is no use
+KEEPALIVE_S = 5
+"""Keep-alive interval, s: an unresponsive broker is detected within 1.5 intervals."""
+ANSWER_S = 3.0
+"""Limit of one exchange with the broker, s."""
 SUBSCRIBED_S = 30.0
-"""Limit of a subscription: a broker may send thousands of stored messages before it confirms."""
-GOODBYE_S = 1.0  # leaving is worth that much
-_Properties: Any = (
-    Properties  # its constructor is not annotated, its attributes are made at run time
-)
+"""Limit of a subscription, s: a broker may send thousands of stored messages before it confirms."""
+GOODBYE_S = 1.0
+"""Limit of an orderly disconnect, s."""
+_Properties: Any = Properties  # the constructor is not annotated, its attributes are dynamic
 
-_INCOMING = 64  # requests are rare; a flood of them must not grow
-_REFUSED = 0x80  # MQTT reason codes from here on are refusals
-_TAKEN_OVER = 0x8E  # reason code "session taken over"
+_INCOMING_CAPACITY = 64
+"""Unread messages kept; requests are rare."""
+_REFUSED = 0x80
+"""Lowest MQTT reason code of a refusal."""
+_TAKEN_OVER = 0x8E
+"""MQTT 5 reason code "session taken over"."""
 _CLOSED_EARLY = "the broker closed the connection during the handshake"
 _NOT_STORED = 2
-"""MQTT 5 retain handling: the broker sends no stored message at a subscription."""
+"""MQTT 5 retain handling: the broker sends no stored messages for a subscription."""
 LONGEST_PACKET_BYTES = 32 * 1024
-"""Limit of incoming packets where none is given: a request, or a pose of seventy segments."""
+"""Default limit of incoming packets, bytes: a request, or a pose of seventy segments."""
 
 _SOCKET_OPTIONS = (
-    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # else stalls of 40 ms
+    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # Nagle's algorithm delays by 40 ms
     (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * KEEPALIVE_S),
-    (socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024),  # what hides in the kernel is lost unseen
+    (
+        socket.SOL_SOCKET,
+        socket.SO_SNDBUF,
+        16 * 1024,
+    ),  # messages in the kernel's buffer are lost without being counted
 )
 
 
 class BrokerLostError(Exception):
-    """The broker is absent, refuses, fell silent or went away: worth another try."""
+    """The broker is absent, refuses the connection, is silent or disconnected; a retry may help."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +76,7 @@ class Outgoing:
     qos: int = 0
     retain: bool = False
     expiry_s: int | None = None
-    """The broker drops it, undelivered, after this long."""
+    """Time after which the broker drops the undelivered message, s."""
     response_topic: str | None = None
     correlation: bytes | None = None
 
@@ -88,10 +93,10 @@ class Incoming:
 
 
 def stop_if_cancelled() -> None:
-    """Raise the cancellation that Python 3.11's ``wait_for``, inside aiomqtt, may have lost.
+    """Raise a cancellation that ``wait_for`` of Python 3.11, inside aiomqtt, may have suppressed.
 
-    It prefers a result that comes in the same instant. To be called in leaf tasks only: a task
-    that held a failed TaskGroup may look cancelled for ever.
+    ``wait_for`` prefers a result that arrives at the same instant. Call this in leaf tasks only: a
+    task that contained a failed TaskGroup may appear cancelled from then on.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():
@@ -99,29 +104,29 @@ def stop_if_cancelled() -> None:
 
 
 class MqttConnection:
-    """A connection for as long as the ``async with`` block lasts.
+    """A connection that is open for the duration of the ``async with`` block.
 
-    Leaving by cancellation publishes `farewell` and disconnects in order; leaving by any other
-    error closes the socket at once, so that the broker publishes `will`.
+    Leaving the block by cancellation publishes `farewell` and disconnects. Any other exception
+    closes the socket at once, so that the broker publishes `will`.
 
     Parameters
     ----------
     settings
-        Where, as whom, with which version.
+        Address, user and MQTT version.
     identifier
-        Client id; a fixed one lets a new connection take over from its own dead predecessor.
+        Client id; a fixed one replaces a dead connection of an earlier process.
     will, farewell
-        Published by the broker when we vanish, and by us when we leave.
+        Published by the broker if the connection breaks, and by the client before it disconnects.
     longest_bytes
-        Limit of incoming packets: announced to the broker with MQTT 5, and enforced here.
+        Largest incoming packet, bytes: announced to the broker with MQTT 5, and enforced here.
     admit
         Called with topic and retain flag of each incoming message before it is decoded, which
-        costs 100 µs; False drops it. Only for subscriptions with `live`.
+        takes 100 µs; False drops it. Only for subscriptions with `live`.
 
     Raises
     ------
     BrokerLostError
-        From any method: the message says what was tried.
+        From any method; the message names the broker and the operation.
     """
 
     def __init__(
@@ -139,20 +144,20 @@ class MqttConnection:
         self._longest_bytes, self._admit = longest_bytes, admit
         self._modern = settings.version == "5"
         self._cached: dict[int | None, Any] = {}
-        self._troubles = _Troubles()
+        self._paho_log = _PahoLog()
 
     async def __aenter__(self) -> Self:
         self._client = await self._new_client()
         task = asyncio.current_task()
-        asked_before = task.cancelling() if task else 0  # by others, of tasks that go on
+        asked_before = task.cancelling() if task else 0  # earlier requests, of tasks that continue
         try:
             await self._client.__aenter__()
             if task and task.cancelling() > asked_before:
                 stop_if_cancelled()
         except aiomqtt.MqttError as error:
             self._client.abandon()
-            why = f"{broker_fault(error)}{self._hint(error)}"
-            raise BrokerLostError(f"{self._place()}: {why}") from error
+            why = f"{broker_fault(error)}{self._remedy(error)}"
+            raise BrokerLostError(f"{self._address()}: {why}") from error
         except BaseException:
             self._client.abandon()
             raise
@@ -160,7 +165,7 @@ class MqttConnection:
 
     @property
     def taken_over(self) -> bool:
-        """Whether the broker ended it because another client connected with the same id."""
+        """Whether the broker ended the connection because another client uses the same id."""
         return self._client.taken_over
 
     async def __aexit__(
@@ -176,7 +181,7 @@ class MqttConnection:
             self._client.abandon()
 
     async def _leave(self) -> None:
-        """Say farewell and disconnect, each bounded; a clean disconnect takes the will back."""
+        """Publish the farewell and disconnect, each with a time limit; this cancels the will."""
         self._client.timeout = GOODBYE_S
         with contextlib.suppress(aiomqtt.MqttError, OSError):
             if self._farewell is not None:
@@ -185,24 +190,23 @@ class MqttConnection:
 
     @property
     def oversized(self) -> int:
-        """Incoming packets that were dropped because they were over the limit."""
+        """Number of incoming packets dropped because of their size."""
         return self._client.oversized
 
     async def publish(self, message: Outgoing) -> str | None:
-        """Publish; at QoS 1 returns when the broker has it, at QoS 0 when the kernel has it.
+        """Publish; return once the broker (QoS 1) or the kernel (QoS 0) has accepted the message.
 
         Returns
         -------
         str or None
-            The broker's reason for refusing the message, as far as it gives one: with MQTT 5 and
-            at QoS 1.
+            The broker's reason for refusing the message; only with MQTT 5 and at QoS 1.
         """
         self._client.refusal = None
         try:
             await self._publish(message)
         except (aiomqtt.MqttError, ValueError) as error:
             why = session_fault(error)
-            raise BrokerLostError(f"{self._place()}: {message.topic}: {why}") from error
+            raise BrokerLostError(f"{self._address()}: {message.topic}: {why}") from error
         stop_if_cancelled()
         return self._client.refusal
 
@@ -218,15 +222,14 @@ class MqttConnection:
     async def subscribe(self, topics: Sequence[str], *, live: bool = False) -> list[str]:
         """Subscribe and return the topics that the broker refused.
 
-        With MQTT 5 a message that its sender wants retained arrives marked so, even fresh.
+        With MQTT 5 a message sent with the retain flag arrives with it, even when new.
 
         Parameters
         ----------
         topics
             Topics or patterns.
         live
-            At QoS 0 and, with MQTT 5, without the messages that the broker has stored; else at
-            QoS 1 and with them.
+            True: QoS 0 and, with MQTT 5, no stored messages. False: QoS 1 with stored messages.
         """
         qos = 0 if live else 1
         handling = _NOT_STORED if live else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
@@ -236,7 +239,7 @@ class MqttConnection:
             codes = await self._client.subscribe(asked, timeout=SUBSCRIBED_S)
         except aiomqtt.MqttError as error:
             why = session_fault(error)
-            raise BrokerLostError(f"{self._place()}: cannot subscribe: {why}") from error
+            raise BrokerLostError(f"{self._address()}: cannot subscribe: {why}") from error
         stop_if_cancelled()
         values = [code if isinstance(code, int) else int(code.value) for code in codes]
         return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
@@ -247,20 +250,20 @@ class MqttConnection:
             await self._client.unsubscribe(topic)
         except aiomqtt.MqttError as error:
             why = session_fault(error)
-            raise BrokerLostError(f"{self._place()}: cannot unsubscribe: {why}") from error
+            raise BrokerLostError(f"{self._address()}: cannot unsubscribe: {why}") from error
         stop_if_cancelled()
 
     async def messages(self) -> AsyncIterator[Incoming]:
-        """Yield what arrives; beyond 64 unread messages the newest are discarded."""
+        """Yield incoming messages; beyond 64 unread messages the newest are dropped."""
         arriving = self._client.messages
         while True:
             try:
                 message = await anext(arriving)
             except aiomqtt.MqttError as error:
                 why = broker_fault(error.__cause__ or error)
-                raise BrokerLostError(f"{self._place()}: {why}") from error
+                raise BrokerLostError(f"{self._address()}: {why}") from error
             except OSError as error:  # what the reader met
-                raise BrokerLostError(f"{self._place()}: {broker_fault(error)}") from error
+                raise BrokerLostError(f"{self._address()}: {broker_fault(error)}") from error
             stop_if_cancelled()
             yield Incoming(
                 message.topic.value,
@@ -279,7 +282,7 @@ class MqttConnection:
             try:  # in a thread: reading the system's certificates takes tens of milliseconds
                 context = await asyncio.to_thread(tls_context, settings.tls)
             except TlsFilesError as fault:
-                raise BrokerLostError(f"{self._place()}: [mqtt.tls]: {fault}") from fault
+                raise BrokerLostError(f"{self._address()}: [mqtt.tls]: {fault}") from fault
 
         limit: Any = None
         if self._modern:
@@ -299,32 +302,32 @@ class MqttConnection:
             clean_session=None if self._modern else True,
             timeout=ANSWER_S,
             keepalive=KEEPALIVE_S,
-            max_queued_incoming_messages=_INCOMING,
+            max_queued_incoming_messages=_INCOMING_CAPACITY,
             tls_context=context,
-            logger=self._troubles,
+            logger=self._paho_log,
             properties=limit,
             longest_bytes=self._longest_bytes,
             admit=self._admit,
         )
 
-    def _place(self) -> str:
+    def _address(self) -> str:
         return f"broker {self._settings.host}:{self._settings.tcp_port}"
 
-    def _hint(self, error: Exception) -> str:
-        met = self._troubles.last or error.__cause__ or error.__context__
-        if remedy := tls_remedy(met, self._settings, established=self._client.opened):
+    def _remedy(self, error: Exception) -> str:
+        cause = self._paho_log.last or error.__cause__ or error.__context__
+        if remedy := tls_remedy(cause, self._settings, established=self._client.opened):
             return remedy
         if self._modern and ("timed out" in str(error) or _CLOSED_EARLY in str(error)):
             return (
-                " (no answer to MQTT 5; if this broker is older or keeps MQTT 5 on another port, "
-                'set version = "3.1.1" in [mqtt], or that port)'
+                " (no answer to MQTT 5; if the broker is older or serves MQTT 5 on another port, "
+                'set version = "3.1.1" or that port in [mqtt])'
             )
         return ""
 
     def _properties(self, message: Outgoing) -> Any:
         plain = message.response_topic is None and message.correlation is None
         if plain and (cached := self._cached.get(message.expiry_s)) is not None:
-            return cached  # building one costs 40 us
+            return cached  # building one takes 40 µs
         made: Any = _Properties(PacketTypes.PUBLISH)
         made.ContentType = "application/json"
         made.UserProperty = ("v", str(PAYLOAD_VERSION))
@@ -339,11 +342,11 @@ class MqttConnection:
         return made
 
 
-class _Troubles(logging.Logger):
-    """Takes what paho would log, and keeps the last exception of a socket.
+class _PahoLog(logging.Logger):
+    """Logger of paho that stores the last exception of a socket instead of logging it.
 
-    A broker that does not accept our certificate says so after the handshake (TLS 1.3), where paho
-    logs the alert and aiomqtt only sees that time passes.
+    With TLS 1.3 a broker rejects the client's certificate after the handshake. paho logs that
+    alert, and aiomqtt reports a timeout only.
     """
 
     def __init__(self) -> None:
@@ -351,19 +354,19 @@ class _Troubles(logging.Logger):
         self.last: OSError | None = None
 
     def handle(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
-        """Keep the exception of `record`, if it has one."""
+        """Store the exception of `record`, if there is one."""
         for value in record.args if isinstance(record.args, tuple) else ():
             if isinstance(value, OSError):
                 self.last = value
-        if record.exc_info:  # a callback of ours failed: a bug
+        if record.exc_info:  # a callback of the daemon failed: a bug
             logging.getLogger(__name__).handle(record)
 
 
 class _Client(aiomqtt.Client):
-    """aiomqtt's client with a limit on incoming packets and faster notice of failures.
+    """aiomqtt's client with a limit on incoming packets and immediate detection of failures.
 
-    It can be dropped in the middle of connecting, fails at once if the connection breaks during
-    the handshake, and keeps the reason for which the broker refused a message.
+    It can be abandoned while it connects, fails at once if the connection breaks during the
+    handshake, and stores the reason for which the broker refused a message.
     """
 
     _abandoned = False
@@ -378,25 +381,25 @@ class _Client(aiomqtt.Client):
     ) -> None:
         super().__init__(*arguments, **options)
         self.refusal: str | None = None
-        """Why the broker refused the last message; one is under way at a time."""
+        """Reason for which the broker refused the last message; one is sent at a time."""
         self._longest_bytes, self._admit = longest_bytes, admit
         self._limited: PacketLimitSocket | None = None
         self._disconnected.add_done_callback(self._fail_handshake)
 
     @property
     def opened(self) -> bool:
-        """Whether a socket was opened, and its TLS handshake, if any, completed."""
+        """Whether a socket was opened and its TLS handshake, if any, completed."""
         return self._limited is not None
 
     @property
     def oversized(self) -> int:
-        """Incoming packets that were over the limit."""
+        """Number of incoming packets above the size limit."""
         return 0 if self._limited is None else self._limited.oversized
 
     async def __aenter__(self) -> Self:  # type: ignore[explicit-override]  # Python 3.12's
-        """Connect; a connection that ended with its acceptance is no connection.
+        """Connect; fail if the connection ended at the moment of its acceptance.
 
-        aiomqtt forgets such an end, and would wait for messages for ever.
+        aiomqtt ignores such an end, and would wait for messages without limit.
         """
         ended = self._disconnected
         await super().__aenter__()
@@ -405,7 +408,7 @@ class _Client(aiomqtt.Client):
         return self
 
     def abandon(self) -> None:
-        """Close whatever is open, without a word; else a failed connect keeps it for seconds."""
+        """Close the socket at once; otherwise a failed attempt keeps it open for seconds."""
         self._abandoned = True
         if self._misc_task is not None:
             self._misc_task.cancel()
@@ -418,23 +421,23 @@ class _Client(aiomqtt.Client):
     def _on_socket_open(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, sock: Any
     ) -> None:
-        """Run in the thread that connects, perhaps after the connection was given up."""
+        """Wrap the new socket; runs in the connecting thread, possibly after `abandon`."""
         if self._abandoned:
             sock.close()
             return
         if isinstance(sock, socket.socket):
-            for option in _SOCKET_OPTIONS:  # aiomqtt sets them on plain sockets only
+            for option in _SOCKET_OPTIONS:  # aiomqtt sets options on plain sockets only
                 sock.setsockopt(*option)
         self._limited = PacketLimitSocket(sock, self._longest_bytes, self._admit)
-        client._sock = self._limited  # noqa: SLF001 - paho has no other way in
+        client._sock = self._limited  # noqa: SLF001 - paho has no public setter
         super()._on_socket_open(client, userdata, sock)
 
     def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
     ) -> None:
-        """Remember the reason: of several tasks that fail, the first may know none.
+        """Store the reason, which the first of several failing tasks may not contain.
 
-        A connection that ends before its acceptance fails now; aiomqtt would wait for a timeout.
+        A connection that ends before its acceptance fails at once, without aiomqtt's timeout.
         """
         self.taken_over |= getattr(reason_code, "value", None) == _TAKEN_OVER
         self._fail_handshake()
@@ -442,7 +445,7 @@ class _Client(aiomqtt.Client):
 
     def _fail_handshake(self, ended: asyncio.Future[None] | None = None) -> None:
         if ended is not None and not ended.cancelled():
-            ended.exception()  # seen: aiomqtt reads it only where messages are awaited
+            ended.exception()  # mark as retrieved: aiomqtt reads it only while awaiting messages
         if not self._connected.done():
             self._connected.set_exception(aiomqtt.MqttError(_CLOSED_EARLY))
 
@@ -455,17 +458,18 @@ class _Client(aiomqtt.Client):
 
 
 class DisconnectErrorFilter:
-    """Loop exception handler that drops the two complaints aiomqtt causes at a disconnect.
+    """Exception handler of the event loop that drops two harmless errors of aiomqtt.
 
-    They are an ``MqttError`` in a future that nobody awaits any more, and a bad file descriptor in
-    a callback on a socket just closed. They are counted; everything else is told as always.
+    At a disconnect aiomqtt leaves an ``MqttError`` in a future that is no longer awaited, and a
+    callback on a closed socket fails with a bad file descriptor. Both are counted; all other
+    errors are handled as usual.
     """
 
     def __init__(self) -> None:
         self.dropped = 0
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Judge one complaint of the loop."""
+        """Count or report one error of the event loop."""
         error, message = context.get("exception"), str(context.get("message", ""))
         late = isinstance(error, aiomqtt.MqttError) and "never retrieved" in message
         closed = isinstance(error, OSError) and error.errno == 9 and _is_mqtt(context)  # noqa: PLR2004 - EBADF
@@ -476,7 +480,7 @@ class DisconnectErrorFilter:
 
 
 def _is_mqtt(context: dict[str, Any]) -> bool:
-    """Return whether a function of aiomqtt is called, or passed on, by the handle of `context`."""
+    """Return whether the callback of `context`, or one of its arguments, belongs to aiomqtt."""
     handle = context.get("handle")
     functions = (getattr(handle, "_callback", None), *(getattr(handle, "_args", None) or ()))
     return any(str(getattr(f, "__module__", "")).startswith("aiomqtt") for f in functions)

@@ -1,6 +1,6 @@
-"""What is wrong with a broker, in words with a remedy, from the errors of sockets and of MQTT.
+"""Messages for errors of sockets and of MQTT: the cause, and what to do.
 
-Invariant: no text of a library or number of an error leaves it where the fault is known.
+Invariant: for a known error the message contains no error number and no text of a library.
 """
 
 from __future__ import annotations
@@ -11,22 +11,27 @@ import re
 _ERRNO = re.compile(r"\[Errno (-?\d+)\]")
 _CODE = re.compile(r"\[code:(\d+)\]")
 
-_OF_THE_SYSTEM = {
+_SYSTEM_ERRORS = {
     errno.ECONNREFUSED: (
-        "connection refused: nothing listens there; start the broker, or correct host and port in"
-        " [mqtt]"
+        "connection refused: no server listens on this port; start the broker, or correct host and"
+        " port in [mqtt]"
     ),
     errno.ECONNRESET: (
-        "the broker closed the connection: does it speak MQTT on this port, with or without TLS as"
-        " [mqtt] says?"
+        "the broker closed the connection: check that this port serves MQTT, with or without TLS"
+        " as configured in [mqtt]"
     ),
     errno.EHOSTUNREACH: "no route to the host: check host in [mqtt], and the network",
-    errno.ENETUNREACH: "no network reaches the host: check host in [mqtt], and the network",
+    errno.ENETUNREACH: "network unreachable: check host in [mqtt], and the network",
     errno.ETIMEDOUT: "the host does not answer: check host in [mqtt], the network and firewalls",
-    -2: "the name of the host is unknown: correct host in [mqtt], or write its address",
-    -3: "the name of the host cannot be looked up now: check the network, or write its address",
+    -2: "unknown host name: correct host in [mqtt], or use an address",
+    -3: "the host name cannot be resolved at present: check the network, or use an address",
 }
-"""By errno; the negative numbers are those of name lookup."""
+"""Messages by errno; negative numbers are errors of name resolution."""
+_VERSION = (
+    'the broker does not support this version of MQTT: set version = "3.1.1" or "5" in [mqtt]'
+)
+_IDENTIFIER = "the broker refuses the client id: check that no other program uses it"
+_UNAVAILABLE = "the broker is not available: check its log"
 _CREDENTIALS = (
     "the broker refuses user name or password: correct username and password_file in [mqtt]"
 )
@@ -34,47 +39,47 @@ _RIGHTS = (  # mosquitto answers so to a wrong password, too
     "the broker does not authorize this user: correct username and password_file in [mqtt], or the"
     " broker's ACL"
 )
-_CONNECTION = "the connection was lost: is the broker running, and the network up?"
-_OF_MQTT = {
-    1: 'the broker does not speak this version of MQTT: set version = "3.1.1" or "5" in [mqtt]',
-    2: "the broker refuses the client id: is another program connected with it?",
-    3: "the broker is not available: look into its log",
+_CONNECTION = "the connection was lost: check that the broker runs, and the network"
+_MQTT_ERRORS = {
+    1: _VERSION,
+    2: _IDENTIFIER,
+    3: _UNAVAILABLE,
     4: _CREDENTIALS,
     5: _RIGHTS,
     7: _CONNECTION,
     128: _CONNECTION,
-    132: 'the broker does not speak this version of MQTT: set version = "3.1.1" or "5" in [mqtt]',
-    133: "the broker refuses the client id: is another program connected with it?",
+    132: _VERSION,
+    133: _IDENTIFIER,
     134: _CREDENTIALS,
     135: _RIGHTS,
-    136: "the broker is not available: look into its log",
-    138: "the broker has banned this client: look into its log",
-    151: "the broker's quota for this client is used up: look into its configuration",
-    159: "the broker limits the rate of connections: wait, or look into its configuration",
+    136: _UNAVAILABLE,
+    138: "the broker has banned this client: check its log",
+    151: "the broker's quota for this client is used up: check its configuration",
+    159: "the broker limits the rate of connections: wait, or check its configuration",
 }
-"""By the reason code of MQTT 3.1.1 (below 128) or MQTT 5."""
+"""Messages by the reason code of MQTT 3.1.1 (below 128) or MQTT 5."""
 _SESSION_LOST = (4, 7, 128)
-"""Numbers of paho for "not connected" and "connection lost", and its reason for want of one."""
+"""Numbers of paho for "not connected" and "connection lost", and its default reason code."""
 
 
 def broker_fault(error: BaseException) -> str:
-    """Return the fault and its remedy; the text of `error` where it is not known."""
+    """Return cause and remedy of a failed connection; the text of an unknown `error`."""
     text = str(error)
     if found := _ERRNO.search(text):
-        return _OF_THE_SYSTEM.get(int(found[1]), text)
+        return _SYSTEM_ERRORS.get(int(found[1]), text)
     if found := _CODE.search(text):
-        return _OF_MQTT.get(int(found[1]), text)
+        return _MQTT_ERRORS.get(int(found[1]), text)
     return text
 
 
 def session_fault(error: BaseException) -> str:
-    """Return the fault of an operation on an established connection, and its remedy.
+    """Return cause and remedy of a failed operation on an established connection.
 
-    The numbers are those of paho there, of which 4 is "not connected" and not a wrong password.
+    There the numbers are those of paho: 4 means "not connected", not "wrong password".
     """
     text = str(error)
     if text == "Operation timed out":
-        return "the broker does not answer in time: look into its log, and at the network"
+        return "the broker does not answer in time: check its log, and the network"
     if (found := _CODE.search(text)) and int(found[1]) in _SESSION_LOST:
         return _CONNECTION
     return text

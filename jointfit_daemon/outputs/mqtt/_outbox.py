@@ -1,7 +1,10 @@
-"""What waits to be published. Law: bounded, the oldest goes first, what goes is counted.
+"""Messages waiting for publication.
 
-Three kinds wait apart: state (retained; the last value wins, and all of it is sent again on every
-connection), events (each matters), and streams (late is worthless).
+Invariant: the size is limited, the oldest message is dropped first, and drops are counted.
+
+Three kinds wait separately. State is retained: the last value of a topic replaces earlier ones, and
+all state is sent again on every connection. Events are sent once, in order. Stream messages are
+worthless when late.
 """
 
 from __future__ import annotations
@@ -16,26 +19,30 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 STREAM_EXPIRY_S = 2
+"""Time after which the broker drops an undelivered stream message, s."""
 RESPONSE_EXPIRY_S = 30
+"""Time after which the broker drops an undelivered event or response, s."""
 
-_STREAMS = 200  # a second or two of poses and what goes beside them
-_EVENTS = 256
+_STREAM_CAPACITY = 200
+"""Stream messages that may wait: one to two seconds of poses and other streams."""
+_EVENT_CAPACITY = 256
+"""Events that may wait: several minutes of a rig with faults."""
 
 
 class Outbox:
-    """Messages for one broker, filled from anywhere on the loop, emptied by one writer.
+    """Messages for one broker, filled by any code on the event loop, emptied by one writer.
 
     Parameters
     ----------
-    life
-        Topic of the bridge's own state: of all retained messages it is sent last, for it vouches
-        for the others.
+    state_topic
+        Topic of the daemon's own state. On a new connection it is sent after all other retained
+        messages, so that a subscriber of it can rely on them.
     """
 
-    def __init__(self, life: str) -> None:
-        self.life = life
+    def __init__(self, state_topic: str) -> None:
+        self.state_topic = state_topic
         self.dropped = 0
-        """Messages that went without having been sent."""
+        """Messages dropped without having been sent."""
         self._state: dict[str, bytes] = {}
         self._unsent: dict[str, None] = {}
         self._events: deque[Outgoing] = deque()
@@ -44,12 +51,12 @@ class Outbox:
 
     @property
     def queued(self) -> int:
-        """Messages waiting."""
+        """Number of waiting messages."""
         return len(self._unsent) + len(self._events) + len(self._streams)
 
     @property
-    def unsaid(self) -> bool:
-        """Whether state or an event waits, or is on its way."""
+    def has_unsent(self) -> bool:
+        """Whether state or an event is waiting, or is being sent."""
         return bool(self._unsent or self._events)
 
     @property
@@ -65,13 +72,14 @@ class Outbox:
             self._wake.set()
 
     def event(self, topic: str, payload: bytes, *, correlation: bytes | None = None) -> None:
-        """Send once, at QoS 1."""
+        """Queue a message that is sent once, at QoS 1."""
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S, None, correlation)
-        self._push(self._events, _EVENTS, message)
+        self._push(self._events, _EVENT_CAPACITY, message)
 
     def stream(self, topic: str, payload: bytes) -> None:
-        """Send at QoS 0, or never."""
-        self._push(self._streams, _STREAMS, Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S))
+        """Queue a message that is sent at most once, at QoS 0."""
+        message = Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S)
+        self._push(self._streams, _STREAM_CAPACITY, message)
 
     def _push(self, queue: deque[Outgoing], limit: int, message: Outgoing) -> None:
         if len(queue) >= limit:
@@ -81,20 +89,20 @@ class Outbox:
         self._wake.set()
 
     def reconnected(self) -> None:
-        """Send all state again, for the broker may have forgotten it; drop what is late."""
-        self._unsent = dict.fromkeys(sorted(self._state, key=self.life.__eq__))
+        """Queue all state again, since the broker may have lost it; drop waiting streams."""
+        self._unsent = dict.fromkeys(sorted(self._state, key=self.state_topic.__eq__))
         self.dropped += len(self._streams)
         self._streams.clear()
         self._wake.set()
 
     async def next(self) -> tuple[Outgoing, Callable[[], None]]:
-        """Wait for the next message; call what comes with it once it is sent."""
+        """Wait for the next message; return it with a callback for the moment it was sent."""
         while True:
             if self._unsent:
                 return self._next_state()
             for queue in (self._events, self._streams):
                 if queue:
-                    return queue.popleft(), _done
+                    return queue.popleft(), _ignore
             self._wake.clear()
             await self._wake.wait()
 
@@ -103,7 +111,7 @@ class Outbox:
         payload = self._state[topic]
 
         def sent() -> None:
-            if self._state.get(topic) is payload:  # else it changed meanwhile: once more
+            if self._state.get(topic) is payload:  # otherwise a newer value waits
                 self._unsent.pop(topic, None)
                 if not payload:
                     del self._state[topic]
@@ -111,5 +119,5 @@ class Outbox:
         return Outgoing(topic, payload, 1, True), sent
 
 
-def _done() -> None:
+def _ignore() -> None:
     pass

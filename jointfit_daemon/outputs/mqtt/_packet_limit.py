@@ -1,9 +1,8 @@
-"""A socket that drops incoming MQTT packets over a size limit, and messages that are not admitted.
+"""A socket that drops incoming MQTT packets above a size limit, and messages that are not admitted.
 
-Invariant: a packet over the limit costs time, no memory, and a message that is not admitted is
-dropped before it is decoded. paho stores a packet whole before it decodes it, and asks the kernel
-for all of it at once. MQTT 5 lets a client announce a maximum packet size; MQTT 3.1.1 does not, and
-not every broker respects the announcement.
+Invariant: a packet above the limit occupies no memory, and a message that is not admitted is
+dropped before it is decoded. paho buffers a whole packet before it decodes it. MQTT 5 lets a client
+announce a maximum packet size; MQTT 3.1.1 does not, and some brokers ignore the announcement.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _DISCARDED_BYTES = 64 * 1024
-"""Read and discarded in one turn of the event loop: other tasks run in between."""
+"""Bytes read and discarded in one iteration of the event loop, so that other tasks run."""
 _DROPPED_AT_ONCE = 16
-"""Packets dropped in one turn of the event loop, at 10 µs each."""
+"""Packets dropped in one iteration of the event loop; each takes 10 µs."""
 _MORE = 0x80
-"""Bit of a length byte: another one follows."""
+"""Bit of a length byte: another length byte follows."""
 _SHORTEST_HEADER, _LONGEST_HEADER = 2, 5
-"""Bytes: packet type and up to four bytes of remaining length (MQTT 5.0, section 2.1.4)."""
+"""Lengths of a fixed header, bytes: packet type and one to four length bytes (MQTT 5.0, 2.1.4)."""
 _TYPE, _PUBLISH, _RETAIN = 0xF0, 0x30, 0x01
 """Bits of the first byte: packet type, its value for a message, and the retain flag."""
 _TOPIC_LENGTH_BYTES = 2
@@ -29,19 +28,19 @@ _TOPIC_LENGTH_BYTES = 2
 class PacketLimitSocket:
     """Wraps a connected, non-blocking socket.
 
-    Everything but ``recv`` is the socket's own. Bytes of the packets behind the current one are not
-    buffered, so the readiness of the socket stays the readiness of this object.
+    Only ``recv`` differs from the wrapped socket. No bytes beyond the current packet are buffered,
+    so the readiness of the wrapped socket is the readiness of this object.
 
     Parameters
     ----------
     wrapped
         A ``socket.socket`` or ``ssl.SSLSocket``.
     longest_bytes
-        Greatest remaining length of a packet that is passed on.
+        Largest remaining length of a packet that is passed on, bytes.
     admit
-        Called with the topic of each message within the limit, and whether it is marked as
-        retained; the message is dropped if it returns False. A dropped message is not
-        acknowledged: only for subscriptions at QoS 0.
+        Called with topic and retain flag of each message within the limit; the message is dropped
+        if it returns False. A dropped message is not acknowledged: only for subscriptions at
+        QoS 0.
     """
 
     def __init__(
@@ -51,26 +50,26 @@ class PacketLimitSocket:
         admit: Callable[[str, bool], bool] | None = None,
     ) -> None:
         self.oversized = 0
-        """Packets that were over the limit."""
+        """Number of packets above the limit."""
         self._wrapped, self._longest_bytes, self._admit = wrapped, longest_bytes, admit
         self._header = b""
-        """Of the packet being read; complete before any of it is passed on."""
+        """Header of the packet being read; complete before any byte of it is passed on."""
         self._start = b""
-        """What was read behind the header to know the topic."""
+        """Bytes read after the header to find the topic."""
         self._ready = b""
-        """What is left to pass on of a header and what was read with it."""
+        """Header, and bytes read with it, that are still to be passed on."""
         self._body_bytes = self._excess_bytes = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._wrapped, name)
 
     def recv(self, size: int) -> bytes:
-        """Return up to `size` bytes of packets that are passed on; empty: the peer closed.
+        """Return up to `size` bytes of admitted packets; empty if the peer closed the connection.
 
         Raises
         ------
         BlockingIOError
-            Nothing to pass on yet.
+            No byte is available yet.
         """
         if not self._ready and not self._body_bytes and not self._find_packet():
             return b""
@@ -82,7 +81,7 @@ class PacketLimitSocket:
         return data
 
     def _find_packet(self) -> bool:
-        """Read up to a packet that is passed on; return False if the peer closed."""
+        """Read up to the next admitted packet; return False if the peer closed."""
         for _ in range(_DROPPED_AT_ONCE):
             if self._excess_bytes and not self._discard():
                 return False
@@ -94,6 +93,7 @@ class PacketLimitSocket:
                 self._header, self._excess_bytes = b"", length
                 continue
 
+            # A message is admitted by its topic, at the start of the packet.
             asks = self._admit is not None and self._header[0] & _TYPE == _PUBLISH
             if asks and not self._read_topic(length):
                 return False
@@ -102,6 +102,7 @@ class PacketLimitSocket:
             if asks and not self._is_admitted(header, start):
                 self._excess_bytes = length - len(start)
                 continue
+
             self._ready, self._body_bytes = header + start, length - len(start)
             return True
         raise BlockingIOError
@@ -118,12 +119,12 @@ class PacketLimitSocket:
         return True
 
     def _read_topic(self, length: int) -> bool:
-        """Read up to the end of the topic or more of the packet; return False if the peer closed.
+        """Read at least up to the end of the topic; return False if the peer closed.
 
         Parameters
         ----------
         length
-            Remaining length of the packet; a topic that is longer is malformed, and cut off.
+            Remaining length of the packet; a longer topic is malformed, and truncated.
         """
         while len(self._start) < min(length, _topic_end(self._start)):
             data: bytes = self._wrapped.recv(length - len(self._start))
@@ -137,12 +138,12 @@ class PacketLimitSocket:
         return self._admit is None or self._admit(topic, bool(header[0] & _RETAIN))
 
     def _discard(self) -> bool:
-        """Read what is left of a dropped packet; return False if the peer closed.
+        """Read the rest of a dropped packet; return False if the peer closed.
 
         Raises
         ------
         BlockingIOError
-            More of it is left than is read in one turn.
+            More than `_DISCARDED_BYTES` of it are left.
         """
         data = self._wrapped.recv(min(self._excess_bytes, _DISCARDED_BYTES))
         self._excess_bytes -= len(data)
@@ -152,5 +153,5 @@ class PacketLimitSocket:
 
 
 def _topic_end(start: bytes) -> int:
-    """Return where the topic ends in the body of a PUBLISH packet, as far as `start` shows it."""
+    """Return the end of the topic in the body of a PUBLISH packet that begins with `start`."""
     return _TOPIC_LENGTH_BYTES + int.from_bytes(start[:_TOPIC_LENGTH_BYTES], "big")

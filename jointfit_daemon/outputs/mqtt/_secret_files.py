@@ -1,7 +1,7 @@
-"""Password and request key. Law: they come from files, and go nowhere but to who needs them.
+"""Password and request key, read from files or systemd credentials.
 
-Not into rig.toml, a log, an error, an argument, an event or a topic. systemd hands them over as
-credentials, which no other service can read.
+Invariant: secrets appear in no configuration file, log line, error, argument, event or topic. No
+other service can read a systemd credential.
 """
 
 from __future__ import annotations
@@ -18,21 +18,24 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CREDENTIAL = "jointfitd.mqtt-password"
+"""Name of the systemd credential that holds the password."""
 LEAST_KEY_BYTES = 16
+"""Shortest request key, bytes: 128 bit resist guessing."""
 _OTHERS = stat.S_IROTH | stat.S_IWOTH
 
 
 class RequestKeyError(Exception):
-    """Requests must be signed, and the key to check them with cannot be had."""
+    """Requests must be signed, and the key to verify them is missing or too short."""
 
 
 def password_of(settings: MqttSettings) -> str | None:
-    """Return the password in the file that rig.toml or systemd names; None if there is none."""
+    """Return the password from `password_file` or the systemd credential; None without either."""
     path = settings.password_file
     if path is None and (credential := _credential(CREDENTIAL)) is not None:
         path = str(credential)
     if path is None:
         return None
+
     try:
         return Path(path).read_text(encoding="utf-8").rstrip("\r\n") or None
     except OSError as error:
@@ -41,17 +44,18 @@ def password_of(settings: MqttSettings) -> str | None:
 
 
 def request_key_of(settings: MqttSettings) -> bytes | None:
-    """Return the key that requests are signed with; None if they need not be.
+    """Return the key that signs requests; None if requests need no signature.
 
-    A systemd credential of the file's name is taken rather than the file.
+    A systemd credential with the name of the file takes precedence over the file.
 
     Raises
     ------
     RequestKeyError
-        There ought to be one, and it is missing or too short.
+        The file is configured, and is missing or too short.
     """
     if settings.request_key_file is None:
         return None
+
     named = Path(settings.request_key_file)
     credential = _credential(named.name)
     path = credential if credential is not None and credential.is_file() else named
@@ -61,28 +65,31 @@ def request_key_of(settings: MqttSettings) -> bytes | None:
         raise RequestKeyError(f"request_key_file = {named}: {error.strerror}") from error
     if len(key) < LEAST_KEY_BYTES:
         raise RequestKeyError(
-            f"request_key_file = {named}: shorter than {LEAST_KEY_BYTES} bytes; make one with: "
+            f"request_key_file = {named}: shorter than {LEAST_KEY_BYTES} bytes; create one with: "
             "openssl rand -hex 32"
         )
     return key
 
 
 def security_warnings(settings: MqttSettings) -> list[str]:
-    """Return what is open to others than it should be, a line each; empty when nothing is."""
+    """Return one line for each weakness of the configuration: plain MQTT, readable secrets."""
     found = []
     if settings.insecure and not settings.is_local:
         found.append(
-            f"broker {settings.host} is on another machine and spoken to without TLS: whoever is "
-            "on the way can read and send everything, the password too"
+            f"broker {settings.host} is on another machine and the connection is without TLS: any "
+            "host on the network path can read and send all messages, the password included"
         )
+
     tls_key = settings.tls.key if settings.tls is not None else None
     for name, path in (
         ("password_file", settings.password_file),
         ("request_key_file", settings.request_key_file),
         ("tls.key", tls_key),
     ):
-        if path is not None and _open_to_others(Path(path)):
-            found.append(f"{name} = {path}: every user of this machine can read it: chmod o-rw")
+        if path is not None and _is_open_to_others(Path(path)):
+            found.append(
+                f"{name} = {path}: every user of this machine can read it: run chmod o-rw {path}"
+            )
     return found
 
 
@@ -91,7 +98,7 @@ def _credential(name: str) -> Path | None:
     return None if folder is None else Path(folder) / name
 
 
-def _open_to_others(path: Path) -> bool:
+def _is_open_to_others(path: Path) -> bool:
     try:
         return bool(path.stat().st_mode & _OTHERS)
     except OSError:

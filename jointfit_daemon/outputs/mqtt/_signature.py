@@ -1,14 +1,14 @@
-"""Signatures on requests. Law: pure; both sides use this file, and a shell can do the same.
+"""Signatures of requests. Client and daemon share this module; shell tools can do the same.
 
-A signed request has three more keys::
+A signed request has three additional keys::
 
     t_us        UNIX time of signing, microseconds
     nonce       16 to 64 letters, digits and dashes, new for every request
     signature   HMAC-SHA256, in hexadecimal, of topic, newline, and canonical text
 
 The canonical text is the JSON of the request without ``signature``: keys sorted, no blanks, UTF-8
-unescaped, as ``jq -cS`` prints it. The topic is whole, so that a request signed for one rig or
-command is none for another.
+without escapes, as ``jq -cS`` prints it. The full topic is signed, so a request for one rig or
+command is invalid for another.
 
 Source: RFC 2104 (HMAC), FIPS 180-4 (SHA-256).
 """
@@ -28,13 +28,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SIGNATURE_LIFETIME_US = 30_000_000
-"""A signature is good for this long, and may come from a clock that is ahead by as much."""
+"""Largest difference of a signature's time from the present, either way, microseconds."""
 SIGNING_KEYS = ("nonce", "signature", "t_us")
+"""Keys of a request that belong to its signature."""
 _NONCE = re.compile(r"[A-Za-z0-9-]{16,64}")
 
 
 class SignatureRejectedError(Exception):
-    """The request is not signed as it must be; the message says what is wrong with it."""
+    """The signature of a request is missing, wrong, expired or used; the message gives details."""
 
 
 def canonical(topic: str, request: Mapping[str, Any]) -> bytes:
@@ -44,43 +45,45 @@ def canonical(topic: str, request: Mapping[str, Any]) -> bytes:
 
 
 def signature_of(key: bytes, topic: str, request: Mapping[str, Any]) -> str:
-    """Return the signature of `request` as it has to be sent on `topic`."""
+    """Return the signature of `request` on `topic`."""
     return hmac.new(key, canonical(topic, request), hashlib.sha256).hexdigest()
 
 
 def signed(key: bytes, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `request`, stamped with the present time and signed."""
+    """Return `request` with the present time, a nonce and the signature."""
     stamped = {**request, "t_us": time.time_ns() // 1000, "nonce": secrets.token_hex(16)}
     return stamped | {"signature": signature_of(key, topic, stamped)}
 
 
 def verify(key: bytes, topic: str, request: Mapping[str, Any], now_us: int) -> tuple[str, int]:
-    """Return nonce and time of a request that `key` signed for `topic` just now.
+    """Return nonce and time of a request with a valid signature.
 
     Raises
     ------
     SignatureRejectedError
-        A key is missing or no such thing, the signature is another, or it is too old or too new.
+        A key is missing or malformed, the signature is wrong, or its time is too far from `now_us`.
     """
     if missing := [name for name in SIGNING_KEYS if name not in request]:
         raise SignatureRejectedError(
-            f"this rig takes signed requests only: {', '.join(missing)} missing"
+            f"this rig accepts signed requests only: {', '.join(missing)} missing"
         )
+
     nonce, signature, t_us = (request[name] for name in SIGNING_KEYS)
     if not isinstance(nonce, str) or not _NONCE.fullmatch(nonce):
         raise SignatureRejectedError("nonce: expected 16 to 64 letters, digits or dashes")
     if not isinstance(t_us, int) or isinstance(t_us, bool):
         raise SignatureRejectedError("t_us: expected UNIX time in whole microseconds")
+
     right = signature_of(key, topic, request).encode()
     if not hmac.compare_digest(str(signature).encode(errors="replace"), right):
         raise SignatureRejectedError(
-            "signature: made with another key, for another topic, or of other content"
+            "signature: made with another key, for another topic, or for other content"
         )
     if abs(off_us := now_us - t_us) > SIGNATURE_LIFETIME_US:
         where = "old" if off_us > 0 else "ahead"
         raise SignatureRejectedError(
             f"t_us: {abs(off_us) / 1e6:.0f} s {where}, at most "
-            f"{SIGNATURE_LIFETIME_US // 1_000_000} s are "
-            "allowed: sign it anew, and compare the clocks of both machines"
+            f"{SIGNATURE_LIFETIME_US // 1_000_000} s are allowed: sign the request again, and "
+            "compare the clocks of both machines"
         )
     return nonce, t_us

@@ -1,7 +1,7 @@
-"""What is written on the topics, as bytes. Law: pure; the contract is docs/mqtt.md.
+"""JSON of the payloads, as documented in docs/mqtt.md.
 
-Every number's key ends in its unit; unknown is null, never 0; NaN cannot get out (orjson writes
-null). UNIX time appears here and nowhere deeper.
+Invariant: the key of every quantity ends in its unit, unknown values are null and never 0, and no
+payload contains NaN (orjson writes null). UNIX time is used in outputs only.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon.kinematics.joint_angles import read_patent
-from jointfit_daemon.outputs.mqtt import PAYLOAD_VERSION
+from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_NON_STR_KEYS
 _NS_PER_US, _NS_PER_MS = 1_000, 1_000_000
 _HUNDREDTHS = 100.0 * 180.0 / pi
-"""Of a degree in a radian."""
+"""Hundredths of a degree in one radian."""
 _EXACT = 2**53 - 1
-"""Largest integer that every JSON reader takes exactly."""
+"""Largest integer that every JSON reader represents exactly."""
 _NO_ANGLES = (None, None, None)
 _NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
     ("alpha_deg", "beta_deg", "gamma_deg", "joint_deg", "gimbal")
@@ -34,13 +34,13 @@ _NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
 def encode(payload: Mapping[str, Any]) -> bytes:
     """Return `payload` as JSON.
 
-    An integer that a browser would round is written as null, and a lone surrogate as a question
-    mark. Both can come from a device or a file name, and neither may end the daemon.
+    An integer that a browser would round becomes null, and a lone surrogate a question mark:
+    devices and file names can contain both.
     """
     try:
-        return orjson.dumps(payload, _plain, _OPTIONS)
+        return orjson.dumps(payload, _to_json, _OPTIONS)
     except TypeError:
-        return orjson.dumps(_writable(payload), _plain, _OPTIONS)
+        return orjson.dumps(_sanitized(payload), _to_json, _OPTIONS)
 
 
 def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
@@ -51,9 +51,9 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
     state
         One frame.
     offset_ns
-        UNIX time minus CLOCK_MONOTONIC.
+        UNIX time minus CLOCK_MONOTONIC, ns.
     now_ns
-        Now, CLOCK_MONOTONIC: gives ``age_ms``.
+        Present CLOCK_MONOTONIC time, ns, for ``age_ms``.
     """
     return encode(
         {
@@ -73,16 +73,16 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
 
 
 def encode_joint(state: LimbState, number: int, t_us: int) -> bytes:
-    """Return the payload of ``joint/NAME``: scalars only, for plain dashboards.
+    """Return the payload of ``joint/NAME``: scalars only, for dashboards.
 
     Parameters
     ----------
     state
         One frame.
     number
-        Of the joint in it; one between two segments has angles even while they are unknown.
+        Index of the joint; joints between two segments have keys of angles, null if unknown.
     t_us
-        UNIX time of the frame.
+        UNIX time of the frame, µs.
     """
     scalars = _joint(state, number)
     position = scalars.pop("p_m") or (None, None, None)
@@ -109,7 +109,7 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
     }
     inner = 0 < number < len(state.joints) - 1
     if not inner and joint.angles is None:
-        return shown  # an end of the chain has no angles
+        return shown  # the ends of the chain have no angles
     flexion, adduction, rotation = joint.angles or _NO_ANGLES
     rates = joint.rates or _NO_ANGLES
     return shown | {
@@ -126,7 +126,7 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
 
 
 def _patent(state: LimbState, number: int) -> dict[str, float | bool | None] | None:
-    """Return the patent's angles of a joint; None while one of its segments is not known."""
+    """Return the patent's angles of a joint; None if a segment orientation is unknown."""
     if number >= len(state.segments):
         return None
     above, below = (
@@ -146,10 +146,10 @@ def _patent(state: LimbState, number: int) -> dict[str, float | bool | None] | N
 
 
 def _degrees(angle: float | None) -> float | None:
-    """Return an angle in degrees, to a hundredth; None if it is no number.
+    """Return `angle`, rad, in degrees with two decimals; None if it is not finite.
 
-    A whole number over a power of ten is found in a third of the time that `round` takes for
-    digits, and a pose has forty of them.
+    Rounding to an integer and dividing takes a third of the time of ``round(x, 2)``; a pose has
+    forty such numbers.
     """
     if angle is None or not isfinite(whole := angle * _HUNDREDTHS):
         return None
@@ -163,21 +163,21 @@ def _rounded(values: Iterable[float] | None, digits: int) -> list[float | None] 
     return [round(whole) / scale if isfinite(whole := value * scale) else None for value in values]
 
 
-def _writable(value: object) -> object:
-    """Return `value` without the integers and characters that JSON cannot carry exactly."""
+def _sanitized(value: object) -> object:
+    """Return `value` with integers and characters replaced that JSON cannot represent."""
     if isinstance(value, int):
         return value if abs(value) <= _EXACT else None
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode("utf-8")
     if isinstance(value, list | tuple | set | frozenset):
-        return [_writable(item) for item in value]
+        return [_sanitized(item) for item in value]
     if hasattr(value, "items"):
-        return {_writable(key): _writable(item) for key, item in value.items()}
+        return {_sanitized(key): _sanitized(item) for key, item in value.items()}
     return value
 
 
-def _plain(value: object) -> object:
-    """Return what orjson cannot write as something it can."""
+def _to_json(value: object) -> object:
+    """Return a JSON-compatible value for an object that orjson does not support."""
     if isinstance(value, tuple | set | frozenset):  # named tuples among them
         return list(value)
     if isinstance(value, bytes):

@@ -1,7 +1,7 @@
-"""A calibration's figures as people read them. Law: pure; no figure leaves without its unit.
+"""Units of a calibration's quality on MQTT: degrees, milliseconds, and four digits.
 
-The core counts in radians and nanoseconds, and tables by method carry no unit. On a topic, angles
-are degrees, times milliseconds, and the key that a table hangs from names the unit of all in it.
+The core uses radians and nanoseconds, and its tables by method carry no unit. Invariant: on a topic
+every quantity has a unit, in its own key or in the key of the table that holds it.
 """
 
 from __future__ import annotations
@@ -10,44 +10,45 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-_SHOWN = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
+_CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
+"""Suffix of the core, suffix on MQTT, and factor."""
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
-"""The tables of ``holdout``: radians by segment or joint, and method."""
+"""Tables of ``holdout`` that hold radians by segment or joint, and method."""
 _DIGITS = 4
 
 
-def shown(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `quality` in the units of the MQTT contract, to four digits.
+def quality_payload(quality: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `quality` in the units of MQTT, rounded to four significant digits.
 
     Parameters
     ----------
     quality
-        As ``Calibration.quality``: nested mappings whose keys end in ``_rad``, ``_m``, ``_s``,
-        ``_ns``, or carry no unit. A unit counts for all that hangs from its key.
+        ``Calibration.quality``: nested mappings whose keys end in ``_rad``, ``_m``, ``_s`` or
+        ``_ns``, or have no unit. The unit of a key applies to all values below it.
     """
     found = dict(quality)
     if isinstance(holdout := found.get("holdout"), Mapping):
         found["holdout"] = {_TABLES.get(key, key): value for key, value in holdout.items()}
-    return _table(found, 1.0)
+    return _convert_table(found, 1.0)
 
 
-def _table(figures: Mapping[str, Any], factor: float) -> dict[str, Any]:
+def _convert_table(values: Mapping[str, Any], factor: float) -> dict[str, Any]:
     table = {}
-    for key, value in figures.items():
-        for unit, (wanted, scale) in _SHOWN.items():
+    for key, value in values.items():
+        for unit, (wanted, scale) in _CONVERTED.items():
             if key.endswith(unit):
-                table[key.removesuffix(unit) + wanted] = _figure(value, scale)
+                table[key.removesuffix(unit) + wanted] = _convert(value, scale)
                 break
         else:
-            table[key] = _figure(value, factor)
+            table[key] = _convert(value, factor)
     return table
 
 
-def _figure(value: Any, factor: float) -> Any:
+def _convert(value: Any, factor: float) -> Any:
     if isinstance(value, Mapping):
-        return _table(value, factor)
+        return _convert_table(value, factor)
     if isinstance(value, list | tuple):
-        return [_figure(item, factor) for item in value]
+        return [_convert(item, factor) for item in value]
     if isinstance(value, bool) or not isinstance(value, int | float):
         return value
     if isinstance(value, int) and factor == 1.0:

@@ -1,6 +1,6 @@
-"""Puts what the core says on its topics. Law: synchronous, and never waits for a broker.
+"""Writes the outputs of the core to the MQTT topics, by way of the outbox.
 
-The topics, their rates and their retained flags are the contract of docs/mqtt.md.
+Invariant: no method waits for a broker. docs/mqtt.md documents topics, rates and retained flags.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import orjson
 
 from jointfit_daemon import __version__
 from jointfit_daemon.model import LimbState
+from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
-from jointfit_daemon.outputs.mqtt import OFFLINE, ONLINE, PAYLOAD_VERSION
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint, encode_pose
-from jointfit_daemon.outputs.payloads._quality_units import shown
-from jointfit_daemon.outputs.unix_clock import UnixClock
+from jointfit_daemon.outputs.payloads._quality_units import quality_payload
+from jointfit_daemon.outputs.topics import OFFLINE, ONLINE, PAYLOAD_VERSION
 from jointfit_daemon.pipeline.events import (
     CalibrationProgress,
     CalibrationStatus,
@@ -32,19 +32,21 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Outbox
-    from jointfit_daemon.pipeline.events import Output
+    from jointfit_daemon.outputs.topics import Topic
+    from jointfit_daemon.outputs.unix_clock import UnixClock
+    from jointfit_daemon.pipeline.events import Event, Output
 
 _NS_PER_S = 1_000_000_000
 
 
-class _Pace:
-    """Lets one through every period, on a grid of its own so that the mean rate is kept."""
+class _RateDivider:
+    """Selects frames at a lower rate; a fixed grid preserves the mean rate."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = round(_NS_PER_S / rate_hz)
         self._next_ns = 0
 
-    def due(self, now_ns: int) -> bool:
+    def is_due(self, now_ns: int) -> bool:
         if now_ns < self._next_ns:
             return False
         late = now_ns - self._next_ns > self._period_ns
@@ -53,104 +55,133 @@ class _Pace:
 
 
 class TopicWriter:
-    """Writes one rig's topics into an outbox.
+    """Writes the topics of one rig into an outbox; a `Sink` of the core.
 
     Parameters
     ----------
     rig
-        Gives names, base topic and rates.
+        Provides names, base topic and rates.
     outbox
-        Takes the messages.
+        Receives the messages.
+    clock
+        Converts stamps to UNIX time.
     """
 
-    def __init__(self, rig: Rig, outbox: Outbox) -> None:
-        self._base, self._outbox, self._clock = rig.mqtt.base, outbox, UnixClock()
-        self._pose_ui, self._joints = _Pace(rig.mqtt.pose_ui_hz), _Pace(rig.mqtt.joint_hz)
-        self._pose_topic = f"{self._base}/pose"
+    def __init__(self, rig: Rig, outbox: Outbox, clock: UnixClock) -> None:
+        self._base, self._outbox, self._clock = rig.mqtt.base, outbox, clock
+        self._pose_topic = topics.POSE.name(self._base)
+        self._pose_ui_topic = topics.POSE_UI.name(self._base)
         self._devices: tuple[str, ...] = ()
         self.configure(rig)
 
     def configure(self, rig: Rig) -> None:
-        """Tell the rig's layout; devices that are gone lose their retained topics."""
-        self._pose_ui, self._joints = _Pace(rig.mqtt.pose_ui_hz), _Pace(rig.mqtt.joint_hz)
-        devices = tuple(source.id for source in rig.sources)
-        for gone in set(self._devices) - set(devices):
-            for leaf in ("availability", "info"):
-                self._outbox.retain(f"{self._base}/device/{gone}/{leaf}", b"")
-        for new in set(devices) - set(self._devices):  # absent until heard
-            self._outbox.retain(f"{self._base}/device/{new}/availability", OFFLINE)
-        self._devices = devices
-        self._outbox.retain(f"{self._base}/bridge/info", encode(_info(rig)))
+        """Publish the layout of `rig`, and clear the retained topics of removed devices."""
+        self._pose_ui_rate = _RateDivider(rig.mqtt.pose_ui_hz)
+        self._joint_rate = _RateDivider(rig.mqtt.joint_hz)
 
-    def handle(self, output: Output) -> None:
-        """Publish one output of the core; those meant for others are ignored."""
+        devices = tuple(source.id for source in rig.sources)
+        for removed in set(self._devices) - set(devices):
+            for topic in (topics.DEVICE_AVAILABILITY, topics.DEVICE_INFO):
+                self._publish(topic, b"", removed)
+        for added in set(devices) - set(self._devices):  # offline until the first sample
+            self._publish(topics.DEVICE_AVAILABILITY, OFFLINE, added)
+        self._devices = devices
+
+        self._publish(topics.BRIDGE_INFO, encode(_info(rig)))
+
+    def event(self, event: Event) -> None:
+        """Ignore the inputs of the core."""
+
+    def output(self, output: Output) -> None:
+        """Publish one output of the core; ignore jobs and calibrations to be stored."""
         match output:
             case LimbState():
-                self._limb_state(output)
+                self._publish_limb_state(output)
             case Notice():
-                self.event(output)
+                self.publish_notice(output)
             case DeviceStatus(name, online):
-                topic = f"{self._base}/device/{name}/availability"
-                self._outbox.retain(topic, ONLINE if online else OFFLINE)
+                self._publish(topics.DEVICE_AVAILABILITY, ONLINE if online else OFFLINE, name)
             case DeviceInfo(name, data):
-                info = self._stamped(printable_data(data), None)
-                self._outbox.retain(f"{self._base}/device/{name}/info", info)
+                self._publish(topics.DEVICE_INFO, self._stamped(printable_data(data), None), name)
             case CalibrationStatus():
-                self._calibration(output)
-            case CalibrationProgress():
-                self._progress(output)
-            case _:  # jobs and replies: the supervisor's
+                self._publish_calibration(output)
+            case CalibrationProgress(t_ns, phase, progress, text, data):
+                payload = {"phase": phase, "progress": progress, "text": text, "data": data}
+                self._publish(topics.CALIBRATION_PROGRESS, self._stamped(payload, t_ns))
+            case Reply():
+                self._publish_reply(output)
+            case _:
                 pass
 
-    def _limb_state(self, state: LimbState) -> None:
+    def _publish(self, topic: Topic, payload: bytes, value: str = "") -> None:
+        """Put a message into the queue of its topic; `value` replaces the placeholder."""
+        name = topic.name(self._base, value)
+        if topic.retained:
+            self._outbox.retain(name, payload)
+        elif topic.qos:
+            self._outbox.event(name, payload)
+        else:
+            self._outbox.stream(name, payload)
+
+    def _publish_limb_state(self, state: LimbState) -> None:
         offset_ns, now_ns = self._clock.offset_ns(), time.monotonic_ns()
         pose = encode_pose(state, offset_ns, now_ns)
         self._outbox.stream(self._pose_topic, pose)
-        if self._pose_ui.due(state.t_ns):
-            self._outbox.stream(f"{self._pose_topic}/ui", pose)
-        if self._joints.due(state.t_ns):
+
+        if self._pose_ui_rate.is_due(state.t_ns):
+            self._outbox.stream(self._pose_ui_topic, pose)
+        if self._joint_rate.is_due(state.t_ns):
             t_us = (state.t_ns + offset_ns) // 1000
             for i, joint in enumerate(state.joints):
-                payload = encode_joint(state, i, t_us)
-                self._outbox.stream(f"{self._base}/joint/{joint.name}", payload)
+                self._publish(topics.JOINT, encode_joint(state, i, t_us), joint.name)
 
-    def event(self, notice: Notice, level: str | None = None) -> None:
-        """Publish one change of state on ``bridge/event``, at its own level or at `level`."""
-        said = {"kind": notice.kind, "id": notice.id, "level": level or notice.level}
-        said |= {"text": printable(notice.text), "data": printable_data(notice.data)}
-        payload = self._stamped(said, notice.t_ns)
-        self._outbox.event(f"{self._base}/bridge/event", payload)
+    def publish_notice(self, notice: Notice, level: str | None = None) -> None:
+        """Publish a notice on ``bridge/event``, with its own level or with `level`."""
+        payload = {
+            "kind": notice.kind,
+            "id": notice.id,
+            "level": level or notice.level,
+            "text": printable(notice.text),
+            "data": printable_data(notice.data),
+        }
+        self._publish(topics.BRIDGE_EVENT, self._stamped(payload, notice.t_ns))
 
-    def _calibration(self, status: CalibrationStatus) -> None:
-        said: dict[str, Any] = {"phase": status.phase, "text": status.text}
-        said |= {"version": status.version, "kept": status.kept, "quality": shown(status.quality)}
-        self._outbox.retain(f"{self._base}/calibration", self._stamped(said, status.t_ns))
+    def _publish_calibration(self, status: CalibrationStatus) -> None:
+        payload: dict[str, Any] = {
+            "phase": status.phase,
+            "text": status.text,
+            "version": status.version,
+            "kept": status.kept,
+            "quality": quality_payload(status.quality),
+        }
+        self._publish(topics.CALIBRATION, self._stamped(payload, status.t_ns))
+
         data = {"quality": status.refused} if status.refused else {}
-        event = Notice(status.t_ns, "calibration", status.phase, status.text, status.level, data)
-        self.event(event)
-
-    def _progress(self, progress: CalibrationProgress) -> None:
-        said = {"phase": progress.phase, "progress": progress.progress, "text": progress.text}
-        payload = self._stamped(said | {"data": progress.data}, progress.t_ns)
-        self._outbox.stream(f"{self._base}/calibration/progress", payload)
-
-    def reply(self, reply: Reply, response_topic: str | None, correlation: bytes | None) -> None:
-        """Answer one request, where it wants the answer or on ``bridge/response/COMMAND``."""
-        topic = response_topic or f"{self._base}/bridge/response/{reply.command}"
-        said = {"v": PAYLOAD_VERSION, "transaction": reply.transaction, "status": reply.status}
-        payload = encode(said | {"data": reply.data, "error": reply.error})
-        self._outbox.event(topic, payload, correlation=correlation)
-
-    def health(self, figures: Mapping[str, object]) -> None:
-        """Publish ``bridge/health``."""
-        self._outbox.retain(
-            f"{self._base}/bridge/health", self._stamped(figures, time.monotonic_ns())
+        self.publish_notice(
+            Notice(status.t_ns, "calibration", status.phase, status.text, status.level, data)
         )
 
-    def log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
-        """Publish one line of the log on ``bridge/log``."""
-        said = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
-        self._outbox.stream(f"{self._base}/bridge/log", self._stamped(said, time.monotonic_ns()))
+    def _publish_reply(self, reply: Reply) -> None:
+        """Publish on the topic that the client requested, or on ``bridge/response/COMMAND``."""
+        address = reply.reply_to
+        topic = address.topic or topics.RESPONSE.name(self._base, reply.command)
+        payload = {
+            "v": PAYLOAD_VERSION,
+            "transaction": reply.transaction,
+            "status": reply.status,
+            "data": reply.data,
+            "error": reply.error,
+        }
+        self._outbox.event(topic, encode(payload), correlation=address.correlation)
+
+    def publish_health(self, health: Mapping[str, object]) -> None:
+        """Publish ``bridge/health``."""
+        self._publish(topics.BRIDGE_HEALTH, self._stamped(health, time.monotonic_ns()))
+
+    def publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
+        """Publish one log line on ``bridge/log``."""
+        line = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
+        self._publish(topics.BRIDGE_LOG, self._stamped(line, time.monotonic_ns()))
 
     def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
         stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}
@@ -158,7 +189,12 @@ class TopicWriter:
 
 
 def _info(rig: Rig) -> dict[str, Any]:
+    """Return the payload of ``bridge/info``."""
     config = orjson.dumps(rig.table, str, orjson.OPT_SORT_KEYS)
+    if any(source.kind == "mocap" for source in rig.sources):
+        world = "z up; x, y and origin of the motion capture, once calibrated with it; metres"
+    else:
+        world = "z up; x east and y north, where the sensors know north; metres"
     return {
         "v": PAYLOAD_VERSION,
         "software": __version__,
@@ -174,13 +210,6 @@ def _info(rig: Rig) -> dict[str, Any]:
             for source in rig.sources
         },
         "quaternions": "Hamilton, scalar first, segment to world",
-        "world": _world(rig),
+        "world": world,
         "pose_bin": None,
     }
-
-
-def _world(rig: Rig) -> str:
-    """Return in words which axes positions and orientations refer to."""
-    if any(source.kind == "mocap" for source in rig.sources):
-        return "z up; x, y and origin of the motion capture, once calibrated with it; metres"
-    return "z up; x east and y north, where the sensors know north; metres"

@@ -1,4 +1,4 @@
-"""Recording of all core input events, and their decoding for a replay."""
+"""Recording of all inputs of the core, and their decoding for a replay."""
 
 from jointfit_daemon.outputs.recording._event_log import (
     EventLogWriter,

@@ -1,11 +1,11 @@
-"""A log of everything that went into the core: one JSON object a line, enough for a replay.
+"""Event log: all inputs of the core, one JSON object per line, sufficient for a replay.
 
-Law: a replay of the events gives the limb states of the live run byte for byte, so the states are
-logged beside them. A log with a hole in it would lie: where memory or disk give out, logging ends
-and says so; the daemon goes on.
+Invariant: a replay of the events reproduces the limb states of the live run byte for byte; the
+states are logged, too, for comparison. A log has no gaps: if memory or disk are exhausted, logging
+ends with an error message, and the daemon continues.
 
-Line kinds, by their first key: ``log`` (header), ``state`` (a limb state that came out), else
-``e`` names the event that went in.
+The first key of a line is ``log`` (header), ``state`` (a limb state, output of the core) or ``e``
+(name of an input event).
 """
 
 from __future__ import annotations
@@ -38,36 +38,38 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from jointfit_daemon.pipeline.events import Event
+    from jointfit_daemon.pipeline.events import Event, Output
 
 log = logging.getLogger(__name__)
 
 FORMAT = 1
+"""Version of the file format."""
 FLUSH_S = 0.5
+"""Interval between writes to the file, s."""
 PENDING_BYTES = 64 * 1024 * 1024
-"""What may wait for a slow disk: minutes of four IMUs and a mocap system."""
+"""Largest backlog of a slow disk, bytes: minutes of four IMUs and a motion capture system."""
 
 _STATE = b'{"state":'
 _NAMED = (LimbState, SegmentState, JointState)
-"""What is written with the names of its fields."""
+"""Named tuples that are written as objects with field names."""
 
 
 def encode_state(state: LimbState) -> bytes:
-    """Return `state` exactly, as JSON: floats round-trip, so equal bytes are equal states."""
-    return orjson.dumps(state, _exact)
+    """Return `state` as JSON. Floats round-trip, so equal bytes mean equal states."""
+    return orjson.dumps(state, _to_json)
 
 
 def encode_event(event: Event) -> bytes:
-    """Return one line, without its end, from which ``decode_event`` gives an equal event."""
+    """Return the line of `event` without its line end; `decode_event` is the inverse."""
     if isinstance(event, ChunkArrived):
         chunk = event.chunk
         return orjson.dumps(
             {"e": "chunk", "source": event.source, "t_ns": chunk.t_ns, "hex": chunk.data.hex()}
         )
-    return orjson.dumps(_described(event), _exact, orjson.OPT_SERIALIZE_NUMPY)
+    return orjson.dumps(_line(event), _to_json, orjson.OPT_SERIALIZE_NUMPY)
 
 
-def _described(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return a kind
+def _line(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return per event class
     match event:
         case Tick(t_ns):
             return {"e": "tick", "t_ns": t_ns}
@@ -93,7 +95,7 @@ def _described(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return a 
             return {"e": "stored", "t_ns": t_ns, "version": version}
         case UnixOffset(t_ns, offset_ns):
             return {"e": "unix", "t_ns": t_ns, "offset_ns": offset_ns}
-    raise TypeError(f"no such event: {event!r}")
+    raise TypeError(f"not an input event: {event!r}")
 
 
 def decode_event(line: dict[str, Any]) -> Event:
@@ -102,31 +104,33 @@ def decode_event(line: dict[str, Any]) -> Event:
     Raises
     ------
     ValueError
-        The line describes none.
+        The line describes no event.
     ConfigError
-        The rig it was recorded with does not load here (a driver is missing).
+        The rig of the recording cannot be loaded (a driver is missing).
     """
     try:
-        return _decoded(line)
+        return _event(line)
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"damaged event: {type(error).__name__}: {error}") from error
 
 
-def _decoded(line: dict[str, Any]) -> Event:
+def _event(line: dict[str, Any]) -> Event:
     given = dict(line)
     kind = given.pop("e", None)
     for key, expected in _FIELD_TYPES.items():
         if not isinstance(given.get(key, expected()), expected):
             raise TypeError(f"{key} is {given[key]!r}, expected {expected.__name__}")
+
     if kind == "chunk":
         return ChunkArrived(given["source"], Chunk(given["t_ns"], bytes.fromhex(given["hex"])))
     if kind == "configured":
         given["rig"] = parse_rig(given.pop("table"), source="event log")
         stored = given["calibration"]
         given["calibration"] = None if stored is None else Calibration.from_dict(stored)
-    if kind not in _KINDS:
-        raise ValueError(f"no such event: {kind!r}")
-    event: Event = _KINDS[kind](**given)
+
+    if kind not in _EVENTS:
+        raise ValueError(f"unknown event: {kind!r}")
+    event: Event = _EVENTS[kind](**given)
     return event
 
 
@@ -134,8 +138,8 @@ _FIELD_TYPES: dict[str, type[int | str]] = {
     "t_ns": int, "offset_ns": int, "source": str, "hex": str, "command": str, "transaction": str,
     "job": int, "reason": str, "text": str,
 }  # fmt: skip
-"""Types of the fields that every event of a kind has."""
-_KINDS: dict[str, Any] = {
+"""Expected types of the fields of events."""
+_EVENTS: dict[str, Any] = {
     "tick": Tick,
     "configured": Configured,
     "opened": SourceOpened,
@@ -147,26 +151,23 @@ _KINDS: dict[str, Any] = {
 }
 
 
-def _exact(value: object) -> object:
+def _to_json(value: object) -> object:
     if isinstance(value, _NAMED):
         return value._asdict()
-    if isinstance(value, tuple):  # named tuples; orjson writes only plain ones
+    if isinstance(value, tuple):  # orjson does not write named tuples
         return list(value)
     if hasattr(value, "items"):
         return dict(value.items())
     raise TypeError(f"not a value of the event log: {type(value).__name__}")
 
 
-# --- reading ----------------------------------------------------------------------------------
-
-
 def read_events(path: Path) -> Iterator[Event]:
-    """Yield the events of a log in order; a last line cut short by a crash is left out.
+    """Yield the events of a log in order; an incomplete last line (after a crash) is skipped.
 
     Raises
     ------
     ValueError
-        The file is no event log, of another format, or damaged before its end.
+        The file is not an event log, has another format version, or is damaged before its end.
     """
     for line in _lines(path):
         if not line.startswith(_STATE):
@@ -174,7 +175,7 @@ def read_events(path: Path) -> Iterator[Event]:
 
 
 def read_states(path: Path) -> Iterator[bytes]:
-    """Yield the limb states of a log as ``encode_state`` wrote them."""
+    """Yield the limb states of a log, as written by `encode_state`."""
     for line in _lines(path):
         if line.startswith(_STATE):
             yield line[len(_STATE) : -1]
@@ -188,29 +189,27 @@ def _lines(path: Path) -> Iterator[bytes]:
         except (orjson.JSONDecodeError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not an event log") from error
         if found != FORMAT:
-            raise ValueError(f"{path}: event log of format {found}, this program reads {FORMAT}")
+            raise ValueError(f"{path}: event log of format {found}, expected format {FORMAT}")
+
         for line in file:
             if line.endswith(b"\n"):
                 yield line[:-1]
 
 
-# --- writing ----------------------------------------------------------------------------------
-
-
 class EventLogWriter:
-    """Writes events and states to a new file in `directory`, at the latest half a second later.
+    """Writes events and limb states to a new file, within half a second; a `Sink` of the core.
 
     Parameters
     ----------
     directory
-        Made when absent.
+        Folder of the file; created if absent.
     name
-        Begins the file's name; the rest is the time.
+        Beginning of the file name; the time follows.
 
     Raises
     ------
     OSError
-        The file cannot be made.
+        The file cannot be created.
     """
 
     def __init__(self, directory: Path, name: str) -> None:
@@ -222,22 +221,22 @@ class EventLogWriter:
         self._bytes = 0
         self.written_bytes = 0
         self.failure: str | None = None
-        """Why logging ended early."""
+        """Reason for which logging ended early; None while it works."""
         header = {"log": FORMAT, "version": __version__, "unix_ns": time.time_ns()}
         self._add(orjson.dumps(header))
 
     def event(self, event: Event) -> None:
-        """Take one event."""
+        """Log one input event."""
         if self.failure is None:
             self._add(encode_event(event))
 
-    def state(self, state: LimbState) -> None:
-        """Take one state."""
-        if self.failure is None:
-            self._add(b"".join((_STATE, encode_state(state), b"}")))
+    def output(self, output: Output) -> None:
+        """Log one output if it is a limb state."""
+        if isinstance(output, LimbState) and self.failure is None:
+            self._add(b"".join((_STATE, encode_state(output), b"}")))
 
     def figures(self) -> dict[str, object]:
-        """Return the recording's part of the health message."""
+        """Return ``recording`` of ``bridge/health``."""
         return {
             "file": self.path.name,
             "written_bytes": self.written_bytes,
@@ -247,34 +246,34 @@ class EventLogWriter:
 
     def _add(self, line: bytes) -> None:
         if self._bytes > PENDING_BYTES:
-            self._fail(f"the disk is too slow: {self._bytes} bytes wait for it")
+            self._fail(f"the disk is too slow: backlog of {self._bytes} bytes")
             return
         self._pending.append(line)
         self._bytes += len(line) + 1
 
     async def run(self) -> None:
-        """Write what waits, twice a second, until cancelled; then write the rest and close."""
+        """Write pending lines twice per second until cancelled; then write the rest and close."""
         try:
             while self.failure is None:
                 await asyncio.sleep(FLUSH_S)
                 writing = asyncio.create_task(
-                    asyncio.to_thread(self._write, self._taken()), name="event log writer"
+                    asyncio.to_thread(self._write, self._take_pending()), name="recording writer"
                 )
                 try:
                     await asyncio.shield(writing)
-                finally:  # a thread cannot be cancelled; the rest must come after it
+                finally:  # a thread cannot be cancelled; later lines must follow it
                     await asyncio.wait([writing])
         finally:
             self.close()
 
     def close(self) -> None:
-        """Write what waits and close the file."""
+        """Write pending lines and close the file."""
         if not self._file.closed:
             if self.failure is None:
-                self._write(self._taken())
+                self._write(self._take_pending())
             self._file.close()
 
-    def _taken(self) -> bytes:
+    def _take_pending(self) -> bytes:
         lines, self._pending, self._bytes = self._pending, [], 0
         return b"".join([line + b"\n" for line in lines])
 
@@ -287,6 +286,6 @@ class EventLogWriter:
             self._fail(f"{self.path}: {error.strerror}")
         self.written_bytes += len(data) - len(view)
 
-    def _fail(self, why: str) -> None:
-        self.failure, self._pending, self._bytes = why, [], 0
-        log.error("event log ended early: %s", why)
+    def _fail(self, reason: str) -> None:
+        self.failure, self._pending, self._bytes = reason, [], 0
+        log.error("event log ended early: %s", reason)

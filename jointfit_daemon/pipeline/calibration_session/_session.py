@@ -37,7 +37,6 @@ from jointfit_daemon.pipeline.events import (
     CancelJob,
     FitJob,
     Notice,
-    Reply,
 )
 from jointfit_daemon.pipeline.online_learning import OnlineRefits
 
@@ -190,7 +189,7 @@ class CalibrationSession:
         if wanted == "abort":
             outputs = self.abort(request.t_ns, "abort requested")
             data = {"phase": self.phase}
-            return [*outputs, Reply(request.command, request.transaction, "ok", data)]
+            return [*outputs, request.reply("ok", data)]
 
         wanted_s = _seconds(request.arguments.get("seconds"))
         refusal = self._refusal(wanted)
@@ -199,12 +198,12 @@ class CalibrationSession:
         if refusal is not None:
             key, message = refusal
             error = {"key": key, "message": message}
-            return [Reply(request.command, request.transaction, "error", {}, error)]
+            return [request.reply("error", {}, error)]
 
         phase = CalibrationPhase(wanted)
         self._force = request.arguments.get("force") is True
         return [
-            Reply(request.command, request.transaction, "accepted", {"phase": wanted}),
+            request.reply("accepted", {"phase": wanted}),
             *self._start(request.t_ns, phase, wanted_s or self._default_s(phase)),
         ]
 
@@ -215,12 +214,12 @@ class CalibrationSession:
         if before is None or self._fit is not None:
             message = "no online learning since the daemon started: there is nothing to revert"
             error = {"key": "phase", "message": message}
-            return [Reply(request.command, request.transaction, "error", {}, error)]
+            return [request.reply("error", {}, error)]
 
         self.calibration, self.version = before, None
         text = "online learning reverted and paused until the next functional calibration"
         return [
-            Reply(request.command, request.transaction, "ok", {"phase": self.phase}),
+            request.reply("ok", {"phase": self.phase}),
             CalibrationReady(before),
             self._status(request.t_ns, self.phase, text),
         ]

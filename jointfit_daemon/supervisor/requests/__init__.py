@@ -1,10 +1,6 @@
 """Validation and authentication of MQTT requests."""
 
 from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
-from jointfit_daemon.supervisor.requests._validation import (
-    parse_request,
-    reply_correlation,
-    reply_topic,
-)
+from jointfit_daemon.supervisor.requests._validation import parse_request
 
-__all__ = ["RequestAuthenticator", "parse_request", "reply_correlation", "reply_topic"]
+__all__ = ["RequestAuthenticator", "parse_request"]

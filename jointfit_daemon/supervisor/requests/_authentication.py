@@ -1,6 +1,8 @@
-"""Who may ask: checks the signature of requests. Law: closed when in doubt, bounded memory.
+"""Authentication of requests by signature and nonce.
 
-Without ``[mqtt] request_key_file`` the broker's access list alone decides, and all pass here.
+Invariant: without a usable key every request is refused, each signed request passes once, and the
+memory of nonces is limited. Without ``[mqtt] request_key_file`` all requests pass: then the
+broker's access list decides.
 """
 
 from __future__ import annotations
@@ -24,26 +26,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 NONCE_CAPACITY = 4096
-"""Requests within a minute; only those of who has the key count, so nobody else can fill it."""
-_KEPT_NS = 2 * SIGNATURE_LIFETIME_US * 1000
+"""Largest number of signed requests per minute; only owners of the key can fill it."""
+_NONCE_LIFETIME_NS = 2 * SIGNATURE_LIFETIME_US * 1000
+"""Time for which a nonce is stored, ns: a signature is valid that long at most."""
 
 
 class RequestAuthenticator:
-    """Lets signed requests pass, each once.
+    """Verifies the signature of requests, and accepts each request once.
 
-    What was signed before the guard was made is refused: it could have run under its predecessor,
-    whose memory of nonces is gone.
+    Requests signed before the authenticator was created are refused: an earlier process, whose
+    nonces are lost, may have accepted them.
 
     Parameters
     ----------
     settings
-        ``[mqtt]``; the key is read once, now.
+        ``[mqtt]``; the key is read once, at creation.
     """
 
     def __init__(self, settings: MqttSettings) -> None:
         self._key: bytes | None = None
         self.fault = ""
-        """Why no request can be let pass; empty: they can."""
+        """Reason for which every request is refused; empty if there is none."""
         try:
             self._key = request_key_of(settings)
         except RequestKeyError as missing:
@@ -52,29 +55,32 @@ class RequestAuthenticator:
         self._used: OrderedDict[str, int] = OrderedDict()
 
     def check(self, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `request` without what only the guard needs.
+        """Return `request` without the keys of its signature.
 
         Raises
         ------
         SignatureRejectedError
-            It must be signed, and is not as it should be.
+            A valid signature is required, and missing or wrong.
         """
         if self.fault:
             raise SignatureRejectedError(
-                "the daemon has no key to check requests with; its log says why"
+                "the daemon has no key to check signatures with: see its log for the reason"
             )
         if self._key is not None:
             nonce, t_us = verify(self._key, topic, request, time.time_ns() // 1000)
             if t_us < self._since_us:
-                raise SignatureRejectedError("t_us: from before the daemon started: sign it anew")
+                raise SignatureRejectedError(
+                    "t_us: from before the daemon started: sign the request again"
+                )
             self._use_up(nonce, time.monotonic_ns())
         return {name: value for name, value in request.items() if name not in SIGNING_KEYS}
 
     def _use_up(self, nonce: str, now_ns: int) -> None:
-        while self._used and now_ns - next(iter(self._used.values())) > _KEPT_NS:
+        while self._used and now_ns - next(iter(self._used.values())) > _NONCE_LIFETIME_NS:
             self._used.popitem(last=False)
+
         if nonce in self._used:
             raise SignatureRejectedError("nonce: used already: every request needs a new one")
         if len(self._used) >= NONCE_CAPACITY:
-            raise SignatureRejectedError("too many requests within a minute")
+            raise SignatureRejectedError(f"more than {NONCE_CAPACITY} requests within a minute")
         self._used[nonce] = now_ns

@@ -1,7 +1,7 @@
-"""Requests as they come over MQTT, checked.
+"""Validation of MQTT requests.
 
 Invariant: no payload, topic or property raises an exception or costs more than linear time. Size
-and nesting are bounded before the payload is parsed, and answers before they are written.
+and nesting are checked before the payload is parsed, and replies have a limited size.
 """
 
 from __future__ import annotations
@@ -15,106 +15,108 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jointfit_daemon.config import Fault, faults_of
 from jointfit_daemon.nearest_name import nearest_name
-from jointfit_daemon.outputs.mqtt import SignatureRejectedError, command_of
-from jointfit_daemon.pipeline.events import Reply, Request
+from jointfit_daemon.outputs.mqtt import SignatureRejectedError
+from jointfit_daemon.pipeline.events import Reply, ReplyAddress, Request
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
 
 LONGEST_BYTES = 4096
-"""Limit of a payload; a signed request with a long transaction takes a quarter of it."""
+"""Largest payload, bytes; a signed request with a long transaction takes a quarter of it."""
 MOST_KEYS = 16
-"""Limit of the keys in a request; `calibrate` knows seven, those of the signature included."""
+"""Largest number of keys; `calibrate` has seven, those of the signature included."""
 LONGEST_TEXT = 256
-"""Limit in characters of `transaction` and of the response topic."""
+"""Longest `transaction` and response topic, characters."""
 LONGEST_CORRELATION_BYTES = 256
-"""Limit of the correlation data."""
+"""Longest correlation data, bytes."""
 _MOST_BRACKETS = 64
-"""Limit of opening brackets: a request is flat, and has one outside of its texts."""
+"""Largest number of opening brackets: a request is flat, and has one outside of its texts."""
 _MOST_FAULTS = 8
-"""Faults listed in an answer; the others are counted."""
+"""Faults listed in a reply; further ones are counted."""
 _LONGEST_KEY, _LONGEST_MESSAGE = 80, 400
-"""Limits of the texts in an answer, in characters."""
+"""Longest texts in a reply, characters."""
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
-"""What may be a command: another name is not repeated on a topic."""
+"""Permitted command names: other names are not repeated on a topic."""
 _RESPONSE_LEVELS = re.compile(r"[\w.:~-]{1,64}(/[\w.:~-]{1,64}){0,3}", re.ASCII)
-"""Levels below ``bridge/response/`` that a caller may ask for."""
+"""Levels below ``bridge/response/`` that a client may request."""
 
 
 class _Arguments(BaseModel):
-    """Base of every request: unknown keys are refused, text is no number."""
+    """Base of every request: unknown keys are refused, and types are not converted."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    transaction: str = Field("", max_length=256, description="the caller's mark, sent back")
+    transaction: str = Field("", max_length=256, description="text of the client, sent back")
 
 
 class CalibrateArguments(_Arguments):
     """``bridge/request/calibrate``."""
 
     phase: Literal["align", "static", "functional", "abort", "revert"] = Field(
-        description="the phase to begin, or `abort`; `revert` takes back what was learned online"
+        description="phase to start, or `abort`; `revert` reverts online learning"
     )
     seconds: float | None = Field(
-        None, gt=0, le=600, description="length of the phase, s; default: as in rig.toml"
+        None, gt=0, le=600, description="duration of the phase, s; default: as in rig.toml"
     )
-    force: bool = Field(False, description="store the result even if it is worse than the last")
+    force: bool = Field(
+        False, description="store the result even if it is worse than the calibration in force"
+    )
 
 
 COMMANDS: dict[str, type[_Arguments]] = {"calibrate": CalibrateArguments}
+"""Model of the arguments of every command."""
 
 
 def parse_request(
-    message: Incoming, guard: RequestAuthenticator | None = None
+    message: Incoming, authenticator: RequestAuthenticator | None = None
 ) -> Request | Reply | None:
-    """Return the request in `message`, or the reply that says all that is wrong with it.
+    """Return the request in `message`, or a reply that lists all its faults.
 
     Parameters
     ----------
     message
-        As it came.
-    guard
-        Judges who may ask, before anything else is looked at; None: the broker did.
+        The received message.
+    authenticator
+        Checks the signature before the arguments are read; None: all signatures are accepted.
 
     Returns
     -------
     Request, Reply or None
-        None where no answer is due: the last level of the topic cannot be a command.
+        None if no reply is due: the last level of the topic cannot be a command.
     """
-    command = command_of(message)
+    command = message.topic.rpartition("/")[2]
     if not _COMMAND.fullmatch(command):
         return None
-    table, fault = _table(message.payload)
+
+    table, fault = _parse_table(message.payload)
     fault = fault or _property_fault(message)
-    if guard is not None and fault is None:
+    if authenticator is not None and fault is None:
         try:
-            table = guard.check(message.topic, table)
+            table = authenticator.check(message.topic, table)
         except SignatureRejectedError as refused:
             fault = Fault("signature", str(refused))
-    transaction = _transaction(table)
+
+    given = table.get("transaction")
+    transaction = given if isinstance(given, str) and len(given) <= LONGEST_TEXT else ""
+    reply_to = _reply_address(message)
     if fault is not None:
-        return _refusal(command, transaction, [fault])
+        return _refusal(command, transaction, [fault], reply_to)
 
     model = COMMANDS.get(command)
     if model is None:
-        known = f"no such request; known: {', '.join(COMMANDS)}"
+        known = f"unknown request; known: {', '.join(COMMANDS)}"
         fault = Fault("command", known, command, nearest_name(command, COMMANDS))
-        return _refusal(command, transaction, [fault])
+        return _refusal(command, transaction, [fault], reply_to)
     try:
         arguments = model.model_validate(table)
     except ValidationError as error:
-        return _refusal(command, transaction, faults_of(error, model, command))
+        return _refusal(command, transaction, faults_of(error, model, command), reply_to)
     values = arguments.model_dump(exclude={"transaction"}, exclude_none=True)
-    return Request(time.monotonic_ns(), command, transaction, values)
+    return Request(time.monotonic_ns(), command, transaction, values, reply_to)
 
 
-def _transaction(table: dict[str, Any]) -> str:
-    given = table.get("transaction")
-    return given if isinstance(given, str) and len(given) <= LONGEST_TEXT else ""
-
-
-def _table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
+def _parse_table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
     """Return the flat JSON object in `payload`, or an empty one and the fault."""
     if len(payload) > LONGEST_BYTES:
         text = f"has {len(payload)} bytes, expected at most {LONGEST_BYTES}"
@@ -122,6 +124,7 @@ def _table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
     if payload.count(b"[") + payload.count(b"{") > _MOST_BRACKETS:
         text = f"has more than {_MOST_BRACKETS} brackets, expected a flat JSON object"
         return {}, Fault("payload", text)
+
     try:
         table = orjson.loads(payload or b"{}")
     except orjson.JSONDecodeError as error:
@@ -134,14 +137,15 @@ def _table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
 
 
 def _property_fault(message: Incoming) -> Fault | None:
-    """Return what is wrong with where and how the answer is wanted."""
-    if message.response_topic is not None and reply_topic(message) is None:
+    """Return the fault of the response topic or of the correlation data."""
+    address = _reply_address(message)
+    if message.response_topic is not None and address.topic is None:
         text = (
             f"the response topic must begin with {_response_root(message)}, followed by one to "
             "four levels of at most 64 letters, digits, _ . : ~ -"
         )
         return Fault("response_topic", text, message.response_topic)
-    if message.correlation is not None and len(message.correlation) > LONGEST_CORRELATION_BYTES:
+    if message.correlation is not None and address.correlation is None:
         text = (
             f"the correlation data has {len(message.correlation)} bytes, expected at most "
             f"{LONGEST_CORRELATION_BYTES}"
@@ -150,31 +154,33 @@ def _property_fault(message: Incoming) -> Fault | None:
     return None
 
 
-def reply_topic(message: Incoming) -> str | None:
-    """Return where the caller wants its answer; None: on the usual topic.
+def _reply_address(message: Incoming) -> ReplyAddress:
+    """Return the requested topic and correlation data, each None if it is not permitted.
 
-    Only topics below ``bridge/response/`` are granted: else a caller could write on `pose`.
+    Only topics below ``bridge/response/`` are permitted: otherwise a client could write to `pose`.
     """
     topic = message.response_topic
-    if topic is None or len(topic) > LONGEST_TEXT:
-        return None
-    root = _response_root(message)
-    granted = topic.startswith(root) and _RESPONSE_LEVELS.fullmatch(topic, len(root))
-    return topic if granted else None
+    if topic is not None:
+        root = _response_root(message)
+        permitted = (
+            len(topic) <= LONGEST_TEXT
+            and topic.startswith(root)
+            and _RESPONSE_LEVELS.fullmatch(topic, len(root))
+        )
+        topic = topic if permitted else None
+
+    data = message.correlation
+    if data is not None and len(data) > LONGEST_CORRELATION_BYTES:
+        data = None
+    return ReplyAddress(topic, data)
 
 
 def _response_root(message: Incoming) -> str:
     return f"{message.topic.rpartition('/bridge/request/')[0]}/bridge/response/"
 
 
-def reply_correlation(message: Incoming) -> bytes | None:
-    """Return the correlation data to send back, if it is within the limit."""
-    data = message.correlation
-    return data if data is not None and len(data) <= LONGEST_CORRELATION_BYTES else None
-
-
-def _refusal(command: str, transaction: str, faults: list[Fault]) -> Reply:
-    """Return a bounded answer that lists `faults`."""
+def _refusal(command: str, transaction: str, faults: list[Fault], reply_to: ReplyAddress) -> Reply:
+    """Return a reply of limited size that lists `faults`."""
     lines = [
         {"key": _cut(fault.key, _LONGEST_KEY), "message": _cut(fault.text(), _LONGEST_MESSAGE)}
         for fault in faults[:_MOST_FAULTS]
@@ -185,7 +191,7 @@ def _refusal(command: str, transaction: str, faults: list[Fault]) -> Reply:
         "faults": lines,
         "more": len(faults) - len(lines),
     }
-    return Reply(command, transaction, "error", {}, error)
+    return Reply(command, transaction, "error", {}, error, reply_to)
 
 
 def _cut(text: str, longest: int) -> str:

@@ -16,7 +16,7 @@ from jointfit_daemon.calibration.phases import StaticPose, fit_static, run_job
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
 from jointfit_daemon.calibration.phases._functional import _refined
 from jointfit_daemon.limb_model import Calibration, cluster_record
-from jointfit_daemon.outputs.payloads._quality_units import shown
+from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from jointfit_daemon.tools.calibrate import report
 from tests.calibration.synthetic_limb import (
     CHAIN,
@@ -184,7 +184,7 @@ def test_the_worker_stores_and_tells_what_refining_did() -> None:
     stored = Calibration.from_dict(result["calibration"])
     assert stored.quality["markers"] == result["quality"]["markers"]
     assert stored.clusters["thigh"] == cluster_record(refined().clusters["thigh"])
-    lines = report(shown(stored.quality))
+    lines = report(quality_payload(stored.quality))
     assert any(line.startswith("thigh: markers ") and "refined" in line for line in lines)
     assert any(line.startswith(f"{KNOCKED}: ") and "knocked off?" in line for line in lines)
 

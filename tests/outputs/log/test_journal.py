@@ -1,4 +1,4 @@
-"""The journal gets fields, through a socket read by an independent parser; else stderr gets all."""
+"""Journal handler: entries have fields, and other lines go to standard error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.outputs.log import JournalHandler, about, is_journal
+from jointfit_daemon.outputs.log import JournalHandler, is_journal, journal_fields
 from jointfit_daemon.outputs.log._journal import datagram
 from jointfit_daemon.outputs.log._rate_limit import BURST
 
@@ -65,10 +65,10 @@ def logger_to(handler: logging.Handler) -> logging.Logger:
     return made
 
 
-def test_a_line_on_a_device_carries_rig_kind_and_id(
+def test_entry_on_a_device_has_fields_of_rig_kind_and_id(
     handler: JournalHandler, journald: socket.socket, stream: io.StringIO
 ) -> None:
-    logger_to(handler).warning("%s: gone", "S2", extra=about("device", "S2"))
+    logger_to(handler).warning("%s: gone", "S2", extra=journal_fields("device", "S2"))
     fields = parsed(journald.recv(65536))
     assert fields["MESSAGE"] == "jointfit_daemon.test: S2: gone"
     assert fields["PRIORITY"] == "4"
@@ -88,7 +88,7 @@ def test_a_traceback_is_one_entry(handler: JournalHandler, journald: socket.sock
     assert message.endswith("ValueError: invalid literal for int() with base 10: 'x'")
 
 
-def test_without_journald_every_line_goes_to_standard_error_with_its_level(
+def test_without_journald_lines_go_to_standard_error_with_level(
     handler: JournalHandler, journald: socket.socket, stream: io.StringIO
 ) -> None:
     os.unlink(journald.getsockname())  # noqa: PTH108 - a socket's address
@@ -96,14 +96,14 @@ def test_without_journald_every_line_goes_to_standard_error_with_its_level(
     assert stream.getvalue() == "<3>jointfit_daemon.test: first\n<3>second\n"
 
 
-def test_a_line_that_no_datagram_holds_goes_to_standard_error(
+def test_line_longer_than_a_datagram_goes_to_standard_error(
     handler: JournalHandler, stream: io.StringIO
 ) -> None:
     logger_to(handler).info("x" * 10_000_000)
     assert len(stream.getvalue()) > 10_000_000
 
 
-def test_a_flood_is_cut_unless_all_is_asked_for(journald: socket.socket) -> None:
+def test_rate_limit_is_optional(journald: socket.socket) -> None:
     for limited in (True, False):
         stream = io.StringIO()
         handler = JournalHandler("bench", limited=limited, address="nowhere", stream=stream)
@@ -120,11 +120,11 @@ def test_a_flood_is_cut_unless_all_is_asked_for(journald: socket.socket) -> None
         st.text(st.characters(exclude_categories=["Cs"])),
     )
 )
-def test_any_text_arrives_as_it_was(fields: dict[str, str]) -> None:
+def test_any_text_arrives_unchanged(fields: dict[str, str]) -> None:
     assert parsed(datagram(fields)) == fields
 
 
-def test_only_the_stream_that_systemd_names_is_the_journal(
+def test_journal_stream_is_recognized_by_its_inode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with (tmp_path / "log").open("w") as log:

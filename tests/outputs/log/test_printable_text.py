@@ -1,4 +1,4 @@
-"""What devices and servers send cannot forge lines of the log or escapes on a terminal."""
+"""Text of devices and servers cannot forge log lines or terminal escapes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from jointfit_daemon.config import parse_rig
 from jointfit_daemon.outputs.log import (
     LevelFormatter,
     PrintableRecord,
-    about,
+    journal_fields,
     printable,
     printable_data,
 )
 from jointfit_daemon.outputs.log._printable_text import LONGEST
 from jointfit_daemon.outputs.payloads import TopicWriter
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import DeviceInfo, Notice
 
 if TYPE_CHECKING:
@@ -57,13 +58,13 @@ def printable_records() -> Iterator[None]:
 @pytest.mark.parametrize(
     "formatter", [logging.Formatter("%(levelname)s %(message)s"), LevelFormatter()]
 )
-def test_a_name_of_a_device_makes_no_line_of_the_log(formatter: logging.Formatter) -> None:
+def test_device_name_cannot_forge_a_log_line(formatter: logging.Formatter) -> None:
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
     handler.setFormatter(formatter)
     log = logging.Logger("device")  # noqa: LOG001 - one of its own
     log.addHandler(handler)
-    log.warning("S1: %s", FORGED, extra=about("device", FORGED))
+    log.warning("S1: %s", FORGED, extra=journal_fields("device", FORGED))
     lines = stream.getvalue().splitlines()
     assert all(
         line.lstrip("<4>").startswith(("WARNING S1", "device: S1", "  | ")) for line in lines
@@ -83,12 +84,12 @@ class _Outbox:
     event = retain
 
 
-def test_events_and_device_info_hold_no_control_characters(table: dict[str, Any]) -> None:
+def test_events_and_device_info_contain_no_control_characters(table: dict[str, Any]) -> None:
     outbox: Any = _Outbox()
-    reporter = TopicWriter(parse_rig(table), outbox)
+    reporter = TopicWriter(parse_rig(table), outbox, UnixClock())
     outbox.payloads.clear()
-    reporter.handle(Notice(1, "device", "S1", FORGED, "warning", {"name": [FORGED]}))
-    reporter.handle(DeviceInfo("S1", {"model": FORGED}))
+    reporter.output(Notice(1, "device", "S1", FORGED, "warning", {"name": [FORGED]}))
+    reporter.output(DeviceInfo("S1", {"model": FORGED}))
     event, info = map(orjson.loads, outbox.payloads)
     assert all(
         text.isprintable() for text in (event["text"], *event["data"]["name"], info["model"])

@@ -1,4 +1,4 @@
-"""A flood of log lines is bounded and counted."""
+"""Log lines are limited in rate, and omitted lines are counted."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import logging
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.outputs.log import RateLimitedHandler, TokenBucket
+from jointfit_daemon.outputs.log import RateLimitedHandler
 from jointfit_daemon.outputs.log._rate_limit import BURST, RATE_HZ
+from jointfit_daemon.outputs.token_bucket import TokenBucket
 
 
 def said(handler: RateLimitedHandler, count: int, level: int = logging.WARNING) -> None:
@@ -18,7 +19,7 @@ def said(handler: RateLimitedHandler, count: int, level: int = logging.WARNING) 
 
 
 @given(st.lists(st.floats(0, 3), min_size=1, max_size=300))
-def test_no_stretch_of_time_has_more_than_its_share(gaps_s: list[float]) -> None:
+def test_rate_never_exceeds_the_limit(gaps_s: list[float]) -> None:
     allowance, now_s, taken = TokenBucket(RATE_HZ, BURST, 0.0), 0.0, 0
     for gap_s in gaps_s:
         now_s += gap_s
@@ -26,7 +27,7 @@ def test_no_stretch_of_time_has_more_than_its_share(gaps_s: list[float]) -> None
     assert taken <= BURST + RATE_HZ * now_s + 1e-6
 
 
-def test_a_flood_is_cut_and_its_size_told() -> None:
+def test_omitted_lines_are_counted() -> None:
     now_s = [0.0]
     stream = io.StringIO()
     handler = RateLimitedHandler(stream, lambda: now_s[0])
@@ -35,17 +36,17 @@ def test_a_flood_is_cut_and_its_size_told() -> None:
     now_s[0] = 1.0
     said(handler, 1)
     lines = stream.getvalue().splitlines()
-    assert lines[-2] == "950 lines left out: more than 5 a second"
+    assert lines[-2] == "950 lines omitted: more than 5 lines per second"
     assert lines[-1] == "line 0"
 
 
-def test_errors_always_pass() -> None:
+def test_errors_are_exempt_from_the_rate_limit() -> None:
     stream = io.StringIO()
     said(RateLimitedHandler(stream), 200, logging.ERROR)
     assert stream.getvalue().count("line ") == 200
 
 
-def test_few_lines_are_left_alone() -> None:
+def test_few_lines_are_all_written() -> None:
     stream = io.StringIO()
     said(RateLimitedHandler(stream), 20)
     assert stream.getvalue().count("\n") == 20

@@ -1,4 +1,4 @@
-"""The link to a real broker: what users of such daemons complain about, tried."""
+"""Connection to a real broker: losses, restarts, access rights, retained requests."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt import (
-    OFFLINE,
-    ONLINE,
     BrokerLostError,
     DisconnectErrorFilter,
     Incoming,
     MqttClient,
     MqttPublisher,
+    NoAnswerError,
     Outbox,
 )
-from jointfit_daemon.outputs.mqtt._client import NoAnswerError
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.outputs.mqtt._error_messages import broker_fault, session_fault
+from jointfit_daemon.outputs.topics import OFFLINE, ONLINE
 from tests.broker_fixture import free_port
 
 if TYPE_CHECKING:
@@ -87,15 +86,13 @@ async def test_a_socket_closed_before_its_turn_leaves_no_traceback_in_the_log(
         (aiomqtt.MqttError("something else"), "something else"),
     ],
 )
-def test_the_end_of_a_session_is_named_without_the_numbers_of_a_library(
-    error: aiomqtt.MqttError, fault: str
-) -> None:
+def test_session_fault_contains_no_library_code(error: aiomqtt.MqttError, fault: str) -> None:
     assert fault in session_fault(error)
     assert "code:" not in session_fault(error)
 
 
 @pytest.mark.parametrize("code", [5, 135])
-def test_a_wrong_password_that_mosquitto_calls_not_authorized_is_hinted_at(code: int) -> None:
+def test_not_authorized_suggests_the_password_file(code: int) -> None:
     assert "password_file" in broker_fault(aiomqtt.MqttCodeError(code))
 
 
@@ -104,7 +101,7 @@ def test_a_connection_that_ended_without_a_reason_is_reported_as_lost() -> None:
     assert "connection was lost" in broker_fault(ended)
 
 
-async def test_a_stop_that_comes_with_the_brokers_first_word_is_not_lost(
+async def test_stop_at_the_connack_is_not_lost(
     broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     connect = aiomqtt.Client.__aenter__
@@ -140,7 +137,7 @@ async def retained(port: int, wanted: int) -> dict[str, bytes]:
     return found
 
 
-async def test_retained_state_comes_back_after_a_broker_forgot_it(
+async def test_retained_state_is_restored_after_a_broker_restart(
     broker: Broker,
 ) -> None:
     link = Link(broker.port)
@@ -159,7 +156,7 @@ async def test_retained_state_comes_back_after_a_broker_forgot_it(
     assert back_s < 3  # the promise is 1 s; the machine may be busy
 
 
-async def test_no_broker_at_boot_is_waited_for(broker: Broker) -> None:
+async def test_absent_broker_at_start_is_awaited(broker: Broker) -> None:
     broker.stop()
     link = Link(broker.port)
     async with running(link):
@@ -170,22 +167,22 @@ async def test_no_broker_at_boot_is_waited_for(broker: Broker) -> None:
         assert await retained(broker.port, 1) == {LIFE: ONLINE}
 
 
-async def test_an_absent_broker_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_absent_broker_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         async with running(Link(free_port())):
             await asyncio.sleep(1.5)
-    said = [record.getMessage() for record in caplog.records if "trying again" in record.message]
+    said = [record.getMessage() for record in caplog.records if "retrying" in record.message]
     assert len(said) == 1
     assert "broker 127.0.0.1:" in said[0]
 
 
-async def test_a_stop_in_the_instant_of_a_loss_is_a_stop() -> None:
+async def test_stop_during_a_connection_loss_ends_the_publisher() -> None:
     for n in range(60):  # the connection is refused within these milliseconds
         async with asyncio.timeout(2), running(Link(free_port())):
             await asyncio.sleep(0.0002 * n)
 
 
-async def test_online_is_the_last_to_be_said(broker: Broker) -> None:
+async def test_online_is_published_last(broker: Broker) -> None:
     link = Link(broker.port)
     order: list[str] = []
     for n in range(5):
@@ -200,7 +197,7 @@ async def test_online_is_the_last_to_be_said(broker: Broker) -> None:
     assert order[-1] == LIFE
 
 
-async def test_a_vanished_daemon_is_offline_by_its_will(broker: Broker) -> None:
+async def test_will_reports_a_dead_daemon_offline(broker: Broker) -> None:
     will = Outgoing(LIFE, OFFLINE, 1, retain=True)
 
     async def vanish() -> None:
@@ -214,13 +211,13 @@ async def test_a_vanished_daemon_is_offline_by_its_will(broker: Broker) -> None:
     assert await retained(broker.port, 1) == {LIFE: OFFLINE}
 
 
-async def test_a_daemon_that_leaves_says_offline(broker: Broker) -> None:
+async def test_stopped_daemon_publishes_offline(broker: Broker) -> None:
     async with running(Link(broker.port)) as link:
         await until(lambda: link.publisher.sent > 0)
     assert await retained(broker.port, 1) == {LIFE: OFFLINE}
 
 
-async def test_a_predecessors_late_will_does_not_stay(broker: Broker) -> None:
+async def test_late_will_of_an_earlier_process_is_overwritten(broker: Broker) -> None:
     async with running(Link(broker.port)) as link:
         await until(lambda: bool(link.publisher.figures()["confirmed"]))
         async with MqttConnection(settings(broker.port)) as other:
@@ -230,7 +227,7 @@ async def test_a_predecessors_late_will_does_not_stay(broker: Broker) -> None:
                 await asyncio.sleep(0.05)
 
 
-async def test_a_retained_command_is_never_run(
+async def test_retained_request_is_never_executed(
     broker: Broker, caplog: pytest.LogCaptureFixture
 ) -> None:
     topic = f"{BASE}/bridge/request/calibrate"
@@ -245,7 +242,7 @@ async def test_a_retained_command_is_never_run(
     assert "it is retained" in caplog.text
 
 
-async def test_with_mqtt_5_a_stored_command_is_not_even_sent(mosquitto: Broker) -> None:
+async def test_with_mqtt_5_stored_requests_are_not_sent(mosquitto: Broker) -> None:
     topic = f"{BASE}/bridge/request/calibrate"
     async with MqttConnection(settings(mosquitto.port)) as operator:
         await operator.publish(Outgoing(topic, b'{"phase":"abort"}', 1, retain=True))
@@ -257,7 +254,7 @@ async def test_with_mqtt_5_a_stored_command_is_not_even_sent(mosquitto: Broker) 
     assert link.publisher.ignored_requests == 0
 
 
-async def test_with_mqtt_5_even_a_fresh_command_marked_retained_is_not_run(
+async def test_with_mqtt_5_new_retained_request_is_not_executed(
     mosquitto: Broker,
 ) -> None:  # "retain as published", which the embedded broker lacks
     async with running(Link(mosquitto.port)) as link:
@@ -269,7 +266,7 @@ async def test_with_mqtt_5_even_a_fresh_command_marked_retained_is_not_run(
     assert link.requests == []
 
 
-async def test_a_frozen_broker_is_noticed_and_the_queue_stays_bounded(
+async def test_unresponsive_broker_is_detected_and_the_queue_stays_limited(
     broker: Broker,
 ) -> None:
     async with running(Link(broker.port)) as link:
@@ -306,7 +303,7 @@ async def test_it_stops_under_load_thirty_times_of_thirty(broker: Broker) -> Non
         assert len(done) == 2, f"stop {number} hangs"
 
 
-async def test_a_broker_without_mqtt_5_gets_a_hint_and_no_silent_fallback(
+async def test_broker_without_mqtt_5_is_reported_without_fallback(
     embedded_broker: Broker,
 ) -> None:
     with pytest.raises(BrokerLostError, match=r'version = "3\.1\.1"'):
@@ -331,7 +328,7 @@ async def test_the_embedded_broker_serves_both_versions(
     assert message.payload == b"{}"
 
 
-async def test_a_forbidden_topic_is_noticed_by_the_self_test(
+async def test_forbidden_topic_is_detected_by_the_echo(
     tmp_path: Path,
     start_mosquitto: Callable[[str], Broker],
     monkeypatch: pytest.MonkeyPatch,
@@ -348,7 +345,7 @@ async def test_a_forbidden_topic_is_noticed_by_the_self_test(
     assert "check its ACL" in caplog.text
 
 
-async def test_a_wrong_password_says_so(
+async def test_wrong_password_is_reported(
     tmp_path: Path, start_mosquitto: Callable[[str], Broker]
 ) -> None:
     passwords = tmp_path / "passwords"
@@ -363,7 +360,7 @@ async def test_a_wrong_password_says_so(
             pass
 
 
-async def test_messages_of_ours_carry_expiry_content_type_and_version(
+async def test_messages_have_expiry_content_type_and_version(
     broker: Broker,
 ) -> None:
     async with (
@@ -380,7 +377,7 @@ async def test_messages_of_ours_carry_expiry_content_type_and_version(
     assert found["MessageExpiryInterval"] <= 2
 
 
-async def test_a_client_gets_the_answer_to_its_own_request(broker: Broker) -> None:
+async def test_client_receives_the_answer_to_its_request(broker: Broker) -> None:
     link = Link(broker.port)
 
     def answer(message: Incoming) -> None:
@@ -400,20 +397,20 @@ async def test_a_client_gets_the_answer_to_its_own_request(broker: Broker) -> No
             assert await anext(client.messages()) == ("bridge/state", {"v": 1, "state": "online"})
 
 
-async def test_a_client_that_nobody_answers_says_so(broker: Broker) -> None:
+async def test_client_without_answer_raises_no_answer_error(broker: Broker) -> None:
     async with MqttClient(settings(broker.port)) as client:
-        with pytest.raises(NoAnswerError, match="is jointfitd running"):
+        with pytest.raises(NoAnswerError, match="check that jointfitd is running"):
             await client.request("calibrate", {}, timeout_s=0.2)
 
 
-async def test_a_client_whose_broker_goes_says_so(broker: Broker) -> None:
+async def test_client_raises_broker_lost_error(broker: Broker) -> None:
     async with MqttClient(settings(broker.port)) as client:
         broker.stop()
         with pytest.raises(BrokerLostError):
             await anext(client.messages())
 
 
-async def test_connecting_can_be_given_up_at_any_moment(broker: Broker) -> None:
+async def test_connecting_can_be_cancelled_at_any_moment(broker: Broker) -> None:
     broker.freeze()  # connects, never answers
     connecting = asyncio.create_task(MqttConnection(settings(broker.port)).__aenter__())
     await asyncio.sleep(0.2)

@@ -1,4 +1,4 @@
-"""What waits for the broker is bounded, coalesced and counted."""
+"""The outbox is limited, coalesces state, and counts drops."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ async def test_a_value_that_changes_while_it_is_sent_is_sent_again() -> None:
     assert await drain(outbox) == [("a", b"2", True)]
 
 
-async def test_after_a_reconnect_all_state_goes_again_and_life_goes_last() -> None:
+async def test_reconnect_sends_all_state_again_and_bridge_state_last() -> None:
     outbox = Outbox(LIFE)
     for topic in ("z", LIFE, "a"):
         outbox.retain(topic, b"1")
@@ -65,7 +65,7 @@ async def test_streams_drop_the_oldest_and_count() -> None:
     assert [int(payload) for _, payload, _ in sent] == list(range(1000 - len(sent), 1000))
 
 
-async def test_a_flood_of_poses_pushes_no_event_out() -> None:
+async def test_poses_do_not_displace_events() -> None:
     outbox = Outbox(LIFE)
     outbox.event("bridge/response/calibrate", b"answer")
     for _ in range(1000):
@@ -73,7 +73,7 @@ async def test_a_flood_of_poses_pushes_no_event_out() -> None:
     assert (await drain(outbox))[0][1] == b"answer"
 
 
-async def test_what_was_late_before_a_reconnect_is_dropped_and_counted() -> None:
+async def test_reconnect_drops_and_counts_waiting_streams() -> None:
     outbox = Outbox(LIFE)
     outbox.stream("pose", b"old")
     outbox.event("event", b"kept")
@@ -82,7 +82,7 @@ async def test_what_was_late_before_a_reconnect_is_dropped_and_counted() -> None
     assert outbox.dropped == 1
 
 
-async def test_a_cleared_topic_is_sent_empty_once_and_forgotten() -> None:
+async def test_cleared_topic_is_sent_empty_once() -> None:
     outbox = Outbox(LIFE)
     outbox.retain("device/S1/info", b"x")
     await drain(outbox)
@@ -93,7 +93,7 @@ async def test_a_cleared_topic_is_sent_empty_once_and_forgotten() -> None:
 
 
 @given(actions)
-async def test_every_message_is_sent_or_waits_or_is_counted(
+async def test_every_message_is_sent_waiting_or_counted_as_dropped(
     script: list[tuple[str, str, bytes]],
 ) -> None:
     outbox, given_out, sent, wanted = Outbox(LIFE), 0, 0, {}

@@ -1,4 +1,4 @@
-"""What a broker and its clients can send is bounded in memory, time and consequences."""
+"""Input from a broker and its clients is limited in memory and time."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ async def test_a_message_over_the_limit_is_dropped_and_the_next_one_read(
         assert link.publisher.connects == 1
 
 
-async def test_mosquitto_is_asked_not_to_send_large_packets(mosquitto: Broker) -> None:
+async def test_packet_limit_is_announced_to_mosquitto(mosquitto: Broker) -> None:
     async with running(Link(mosquitto.port)) as link:
         await until(lambda: bool(link.publisher.figures()["confirmed"]))
         async with MqttConnection(settings(mosquitto.port)) as attacker:
@@ -126,7 +126,7 @@ async def test_mosquitto_is_asked_not_to_send_large_packets(mosquitto: Broker) -
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
 @pytest.mark.timeout(120)
-async def test_ten_thousand_stored_messages_do_not_keep_it_from_connecting(
+async def test_ten_thousand_stored_messages_do_not_prevent_connecting(
     mosquitto: Broker, version: str
 ) -> None:
     async with aiomqtt.Client("127.0.0.1", mosquitto.port) as attacker:
@@ -141,7 +141,7 @@ async def test_ten_thousand_stored_messages_do_not_keep_it_from_connecting(
     assert link.requests == []
 
 
-async def test_requests_are_handed_on_at_a_bounded_rate(
+async def test_requests_are_passed_on_at_a_limited_rate(
     broker: Broker, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with running(Link(broker.port)) as link:
@@ -183,7 +183,7 @@ async def test_requests_beyond_the_rate_are_dropped_before_they_are_decoded(
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
-async def test_a_denied_pose_is_noticed_and_reported(
+async def test_denied_pose_is_reported(
     tmp_path: Path,
     start_mosquitto: Callable[[str], Broker],
     version: str,
@@ -267,7 +267,7 @@ async def broken_broker(answer: bytes, *, reset: bool) -> AsyncIterator[tuple[in
 
 @pytest.mark.parametrize("reset", [True, False])
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
-async def test_a_broker_that_closes_in_the_handshake_is_tried_again_at_once(
+async def test_broker_that_closes_during_the_handshake_is_retried_at_once(
     version: str, *, reset: bool
 ) -> None:
     async with broken_broker(b"", reset=reset) as (port, tries):
@@ -288,7 +288,7 @@ async def read_all(port: int) -> None:
 
 
 @given(answer=st.binary(max_size=40) | (st.binary(max_size=40) | publishes).map(ACCEPTED.__add__))
-async def test_any_bytes_from_a_broker_are_a_lost_broker(answer: bytes) -> None:
+async def test_invalid_bytes_from_a_broker_raise_broker_lost_error(answer: bytes) -> None:
     async with broken_broker(answer, reset=False) as (port, _):
         with pytest.raises(BrokerLostError):
             await asyncio.wait_for(read_all(port), 2.5)

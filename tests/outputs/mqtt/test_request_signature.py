@@ -1,4 +1,4 @@
-"""Signed requests: what passes, what does not, and that a shell can sign."""
+"""Signed requests: verification, refusals, and signing in a shell."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def now_us() -> int:
 
 
 @given(requests)
-def test_what_was_signed_is_verified(request: dict[str, Any]) -> None:
+def test_signed_request_is_verified(request: dict[str, Any]) -> None:
     sent = orjson.loads(orjson.dumps(signed(KEY, TOPIC, request)))
     nonce, t_us = verify(KEY, TOPIC, sent, now_us())
     assert (nonce, t_us) == (sent["nonce"], sent["t_us"])
@@ -115,14 +115,14 @@ def test_an_old_or_future_request_is_refused(off_us: int, told: str) -> None:
         verify(KEY, TOPIC, sent, sent["t_us"] + off_us)
 
 
-def test_a_request_runs_once(guard: RequestAuthenticator) -> None:
+def test_signed_request_is_accepted_once(guard: RequestAuthenticator) -> None:
     sent = signed(KEY, TOPIC, ASKED)
     assert guard.check(TOPIC, sent) == ASKED
     with pytest.raises(SignatureRejectedError, match="used already"):
         guard.check(TOPIC, sent)
 
 
-def test_what_was_signed_before_the_daemon_started_is_refused(tmp_path: Path) -> None:
+def test_request_signed_before_the_start_is_refused(tmp_path: Path) -> None:
     (tmp_path / "key").write_bytes(KEY)
     sent = signed(KEY, TOPIC, ASKED)
     time.sleep(0.001)
@@ -131,15 +131,15 @@ def test_what_was_signed_before_the_daemon_started_is_refused(tmp_path: Path) ->
         late.check(TOPIC, sent)
 
 
-def test_the_memory_of_nonces_is_bounded_and_forgets(
+def test_nonce_memory_is_limited_and_expires(
     guard: RequestAuthenticator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication.NONCE_CAPACITY", 3)
     for _ in range(3):
         guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
-    with pytest.raises(SignatureRejectedError, match="too many"):
+    with pytest.raises(SignatureRejectedError, match="more than 3 requests"):
         guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
-    monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication._KEPT_NS", 0)
+    monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication._NONCE_LIFETIME_NS", 0)
     guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
 
 
@@ -150,7 +150,7 @@ def test_without_a_key_in_the_rig_signatures_are_not_needed() -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"short"])
-def test_a_key_that_cannot_be_had_closes_the_door(tmp_path: Path, content: bytes | None) -> None:
+def test_missing_key_refuses_all_requests(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "key"
     if content is not None:
         path.write_bytes(content)
@@ -161,7 +161,7 @@ def test_a_key_that_cannot_be_had_closes_the_door(tmp_path: Path, content: bytes
             guard.check(TOPIC, request)
 
 
-def test_a_credential_of_the_same_name_is_taken_first(
+def test_credential_takes_precedence_over_the_key_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "key").write_bytes(KEY[::-1])
@@ -176,7 +176,7 @@ def asked(guard: RequestAuthenticator, request: dict[str, Any]) -> Request | Rep
     return parse_request(Incoming(TOPIC, orjson.dumps(request), retained=False), guard)
 
 
-def test_the_daemon_takes_signed_requests_and_answers_the_others(
+def test_daemon_accepts_signed_requests_and_refuses_others(
     guard: RequestAuthenticator,
 ) -> None:
     good = asked(guard, signed(KEY, TOPIC, ASKED))
@@ -189,7 +189,7 @@ def test_the_daemon_takes_signed_requests_and_answers_the_others(
     assert refused.error["key"] == "signature"
 
 
-def test_the_page_shows_a_true_example() -> None:
+def test_documented_signature_example_is_valid() -> None:
     text = PAGE.read_text(encoding="utf-8")
     key = re.search(r"^\| key \| `(.+)` \|$", text, re.MULTILINE)
     topic = re.search(r"^\| topic \| `(.+)` \|$", text, re.MULTILINE)
@@ -204,7 +204,7 @@ def test_the_page_shows_a_true_example() -> None:
     assert signature_of(key[1].encode(), topic[1], table) == signature[1]
 
 
-def test_the_shell_example_of_the_page_signs(tmp_path: Path) -> None:
+def test_documented_shell_example_signs(tmp_path: Path) -> None:
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed (Debian: apt install openssl)")
     script = next(

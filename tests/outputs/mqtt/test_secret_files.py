@@ -1,4 +1,4 @@
-"""No secret leaves its file: the places where one could turn up are searched."""
+"""Secrets appear in no argument, environment, log, topic or recording."""
 
 from __future__ import annotations
 
@@ -139,18 +139,18 @@ async def test_no_secret_is_in_arguments_environment_log_topics_or_recording(
         assert KEY.encode() not in place
 
 
-def test_a_secret_in_the_rig_is_refused_and_not_repeated(table: dict[str, Any]) -> None:
+def test_secret_in_the_rig_is_refused_and_not_shown(table: dict[str, Any]) -> None:
     table["mqtt"] = {"password": PASSWORD, "request_key": KEY}
     with pytest.raises(ConfigError) as told:
         parse_rig(table)
     text = str(told.value)
-    assert "mqtt.password: no place for a secret" in text
+    assert "mqtt.password: a secret does not belong here" in text
     assert "password_file" in text
     assert PASSWORD not in text
     assert KEY not in text
 
 
-def test_a_file_that_all_can_read_is_told(tmp_path: Path) -> None:
+def test_world_readable_secret_is_reported(tmp_path: Path) -> None:
     secret = tmp_path / "secret"
     secret.write_text(PASSWORD)
     settings = [
@@ -165,7 +165,7 @@ def test_a_file_that_all_can_read_is_told(tmp_path: Path) -> None:
     assert security_warnings(MqttSettings(password_file=str(tmp_path / "nowhere"))) == []
 
 
-async def test_plain_mqtt_to_another_machine_is_told_at_every_start(
+async def test_plain_mqtt_to_another_machine_is_logged_at_every_start(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     assert security_warnings(MqttSettings(insecure=True)) == []  # on this machine nobody listens in

@@ -1,4 +1,4 @@
-"""TLS to a real mosquitto, with certificates made here: who is trusted, and what refusals say."""
+"""TLS to a real mosquitto with generated certificates: verification and messages."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ async def said(settings: MqttSettings) -> str:
     return str(lost.value)
 
 
-async def test_a_broker_of_our_own_authority_is_trusted(broker: Broker, pki: Path) -> None:
+async def test_broker_of_the_configured_authority_is_trusted(broker: Broker, pki: Path) -> None:
     for host in ("127.0.0.1", "localhost"):
         async with MqttConnection(settings(broker, host, ca=str(pki / "ours.crt"))) as connection:
             assert await connection.subscribe(["jointfit/t/bridge/state"]) == []
@@ -97,7 +97,7 @@ async def test_a_broker_of_our_own_authority_is_trusted(broker: Broker, pki: Pat
 async def test_an_unknown_authority_is_refused(broker: Broker, pki: Path) -> None:
     for ca in (str(pki / "theirs.crt"), None):
         told = await said(settings(broker, ca=ca))
-        assert "not signed by what" in told
+        assert "not signed by an authority in" in told
         assert "[mqtt.tls] ca" in told
 
 
@@ -115,13 +115,13 @@ async def test_a_certificate_of_another_host_is_refused(
     assert f"for another name than {host}" in told
 
 
-async def test_a_listener_without_tls_is_told(mosquitto: Broker, pki: Path) -> None:
+async def test_listener_without_tls_is_reported(mosquitto: Broker, pki: Path) -> None:
     told = await said(settings(mosquitto, ca=str(pki / "ours.crt")))
     assert "does not answer to TLS" in told
 
 
 @pytest.mark.parametrize("broker", [("broker", "require_certificate true")], indirect=True)
-async def test_a_broker_that_asks_for_a_certificate_takes_ours_and_no_strangers(
+async def test_broker_accepts_the_configured_client_certificate_only(
     broker: Broker, pki: Path
 ) -> None:
     ca = str(pki / "ours.crt")
@@ -162,7 +162,7 @@ def test_verification_is_on_and_tls_is_1_2_at_least() -> None:
 
 
 @pytest.mark.parametrize("host", ["broker.lab", "192.168.1.4", "example.org", "2001:db8::1"])
-def test_a_broker_on_another_machine_needs_tls_or_a_word(host: str) -> None:
+def test_remote_broker_requires_tls_or_insecure(host: str) -> None:
     with pytest.raises(ValidationError, match="insecure = true"):
         MqttSettings(host=host)
     assert MqttSettings(host=host, tls=TlsSettings()).tcp_port == 8883
@@ -170,7 +170,7 @@ def test_a_broker_on_another_machine_needs_tls_or_a_word(host: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "127.9.9.9", "::1"])
-def test_a_broker_on_this_machine_needs_neither(host: str) -> None:
+def test_local_broker_requires_neither_tls_nor_insecure(host: str) -> None:
     assert MqttSettings(host=host).is_local
 
 
@@ -183,4 +183,4 @@ def test_tls_remedy_names_the_certificate_if_the_handshake_was_completed() -> No
     secure = MqttSettings(host="127.0.0.1", base="jointfit/t", tls=TlsSettings())
     reset = ConnectionResetError()
     assert "does not answer to TLS" in tls_remedy(reset, secure)
-    assert "asks for a certificate of ours" in tls_remedy(reset, secure, established=True)
+    assert "requires a client certificate" in tls_remedy(reset, secure, established=True)

@@ -1,9 +1,10 @@
-"""The payloads of docs/mqtt.md, to the letter, and what may never be in one."""
+"""Payloads equal docs/mqtt.md."""
 
 from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from jointfit_daemon.model import JointAngles, JointState, LimbState, SegmentSta
 from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter, encode_pose
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
+from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
     CalibrationProgress,
@@ -26,6 +28,7 @@ from jointfit_daemon.pipeline.events import (
     DeviceStatus,
     Notice,
     Reply,
+    ReplyAddress,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +71,7 @@ def bent(alpha_deg: float, beta_deg: float, gamma_deg: float) -> LimbState:
     return STATE._replace(segments=segments)
 
 
-def test_a_pose_is_this_text() -> None:
+def test_pose_payload_is_exact() -> None:
     pose = encode_pose(STATE, 1_795_250_055_351_700_000, 5_007_523_000)
     assert json.loads(pose) == {
         "v": 1,
@@ -104,7 +107,7 @@ def test_a_pose_is_this_text() -> None:
     }
 
 
-def test_a_joint_is_scalars_only() -> None:
+def test_joint_payload_contains_scalars_only() -> None:
     assert json.loads(encode_joint(bent(-30.0, 0.0, 0.0), 1, 7)) == {
         "v": 1, "t_us": 7, "x_m": 0.021, "y_m": 0.104, "z_m": 0.481, "sd_m": 0.0051,
         "flexion_deg": 28.31, "adduction_deg": -1.92, "rotation_deg": 3.4, "inner_deg": 151.7,
@@ -114,7 +117,7 @@ def test_a_joint_is_scalars_only() -> None:
     }  # fmt: skip
 
 
-def test_a_joint_keeps_its_keys_while_its_angles_are_unknown() -> None:
+def test_joint_payload_has_all_keys_while_angles_are_unknown() -> None:
     known = json.loads(encode_joint(bent(-30.0, 0.0, 0.0), 1, 7))
     unknown = json.loads(encode_joint(STATE, 1, 7))
     assert list(known) == list(unknown)
@@ -124,7 +127,7 @@ def test_a_joint_keeps_its_keys_while_its_angles_are_unknown() -> None:
     ]  # fmt: skip
 
 
-def test_the_patents_angles_stand_beside_ours() -> None:
+def test_patent_angles_are_published_beside_anatomical_angles() -> None:
     joints = json.loads(encode_pose(bent(-50.0, 12.0, 7.0), 0, 0))["joints"]
     assert joints["knee"]["patent"] == {
         "alpha_deg": -50.0, "beta_deg": 12.0, "gamma_deg": 7.0, "joint_deg": 130.0, "gimbal": False,
@@ -133,14 +136,14 @@ def test_the_patents_angles_stand_beside_ours() -> None:
     assert "patent" not in joints["ankle"]
 
 
-def test_where_the_patents_outer_angles_lock_alpha_takes_all_and_the_block_says_so() -> None:
+def test_patent_gimbal_lock_is_flagged() -> None:
     found = json.loads(encode_pose(bent(-20.0, 90.0, 15.0), 0, 0))["joints"]["knee"]["patent"]
     assert found == {
         "alpha_deg": -35.0, "beta_deg": 90.0, "gamma_deg": 0.0, "joint_deg": 145.0, "gimbal": True,
     }  # fmt: skip
 
 
-def test_an_unknown_joint_is_null_not_zero() -> None:
+def test_unknown_joint_is_null() -> None:
     assert json.loads(encode_joint(STATE, 2, 7)) == {
         "v": 1, "t_us": 7, "x_m": None, "y_m": None, "z_m": None, "sd_m": None,
     }  # fmt: skip
@@ -148,13 +151,13 @@ def test_an_unknown_joint_is_null_not_zero() -> None:
 
 @example(1.797693134862316e304)  # finite, and not in hundredths of a degree
 @given(st.floats(allow_nan=True, allow_infinity=True))
-def test_no_number_json_does_not_know_gets_out(value: float) -> None:
+def test_payload_contains_no_nan_or_infinity(value: float) -> None:
     joint = JointState("knee", (value, value, value), value, JointAngles(value, value, value))
     pose = encode_pose(STATE.__class__(1, 0, 0, "imu", "locked", (), (), (joint,)), 0, 0)
     json.loads(pose, parse_constant=lambda word: pytest.fail(f"{word} in a pose"))
 
 
-def test_integers_a_browser_would_round_and_surrogates_end_nothing() -> None:
+def test_large_integers_and_surrogates_are_encoded() -> None:
     payload = {"t_ns": 2**53 + 1, "data": {"name": "a\udcff", "ticks": (-(2**60), 5, True)}}
     assert orjson.loads(encode(payload)) == {
         "t_ns": None,
@@ -162,7 +165,7 @@ def test_integers_a_browser_would_round_and_surrogates_end_nothing() -> None:
     }
 
 
-def test_numpy_and_named_tuples_are_written_as_they_are() -> None:
+def test_numpy_values_and_named_tuples_are_encoded() -> None:
     payload = encode({"a": np.float64(0.5), "b": np.arange(2), "c": JointAngles(1, 2, 3)})
     assert payload == b'{"a":0.5,"b":[0,1],"c":[1,2,3]}'
 
@@ -197,15 +200,15 @@ def numbers(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-async def test_ten_seconds_of_poses_are_decimated_as_promised(
+async def test_pose_ui_and_joint_rates_are_as_documented(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox, UnixClock())
     await sent(outbox)
     counts: dict[str, int] = {}
     for number in range(1000):
         t_ns = 3_000_000_000 + number * 10_000_000
-        reporter.handle(
+        reporter.output(
             LimbState(number, t_ns, t_ns, "imu", "locked", (), STATE.segments, STATE.joints)
         )
         for topic, payloads in (await sent(outbox)).items():
@@ -215,12 +218,12 @@ async def test_ten_seconds_of_poses_are_decimated_as_promised(
     }  # fmt: skip
 
 
-async def test_devices_are_absent_until_heard_and_cleared_when_gone(
+async def test_device_topics_start_offline_and_are_cleared_on_removal(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
-    reporter.handle(DeviceStatus("S1", online=True))
-    reporter.handle(DeviceInfo("S2", {"model": "fake"}))
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox, UnixClock())
+    reporter.output(DeviceStatus("S1", online=True))
+    reporter.output(DeviceInfo("S2", {"model": "fake"}))
     found = await sent(outbox)
     assert found["device/S1/availability"] == [{"v": 1, "state": "online"}]
     assert found["device/S2/availability"] == [{"v": 1, "state": "offline"}]
@@ -233,17 +236,15 @@ async def test_devices_are_absent_until_heard_and_cleared_when_gone(
     assert "device/S1/availability" not in found
 
 
-async def test_changes_of_state_go_where_the_contract_says(
-    table: dict[str, Any], outbox: Outbox
-) -> None:
-    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
-    reporter.handle(Notice(0, "device", "S1", "streaming"))
-    reporter.handle(CalibrationStatus(0, CalibrationPhase.CALIBRATED, "done", 3, {"rms_m": 0.004}))
-    reporter.handle(
+async def test_outputs_are_published_on_their_topics(table: dict[str, Any], outbox: Outbox) -> None:
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox, UnixClock())
+    reporter.output(Notice(0, "device", "S1", "streaming"))
+    reporter.output(CalibrationStatus(0, CalibrationPhase.CALIBRATED, "done", 3, {"rms_m": 0.004}))
+    reporter.output(
         CalibrationProgress(0, CalibrationPhase.FUNCTIONAL, 0.5, "keep moving", {"arc_deg": 40.0})
     )
-    reporter.health({"devices": {}, "process": {"cpu_pct": 3.0}})
-    reporter.log_line("warning", "x", "hot", 2)
+    reporter.publish_health({"devices": {}, "process": {"cpu_pct": 3.0}})
+    reporter.publish_log_line("warning", "x", "hot", 2)
     found = await sent(outbox)
     device, calibration = found["bridge/event"]
     assert (device["kind"], device["id"], device["text"]) == ("device", "S1", "streaming")
@@ -260,14 +261,14 @@ async def test_changes_of_state_go_where_the_contract_says(
                 assert key.rpartition("_")[2] in UNITS | {"progress"}, key
 
 
-async def test_an_answer_goes_where_the_caller_wants_it(
+async def test_reply_is_published_on_the_requested_topic(
     table: dict[str, Any], outbox: Outbox
 ) -> None:
-    reporter = TopicWriter(parse_rig(rig_table(table)), outbox)
+    reporter = TopicWriter(parse_rig(rig_table(table)), outbox, UnixClock())
     await sent(outbox)
     reply = Reply("calibrate", "7", "accepted", {"phase": "static"})
-    reporter.reply(reply, None, None)
-    reporter.reply(reply, "my/answers", b"9")
+    reporter.output(reply)
+    reporter.output(replace(reply, reply_to=ReplyAddress("my/answers", b"9")))
     usual, _ = await outbox.next()
     own, _ = await outbox.next()
     assert usual.topic == "b/bridge/response/calibrate"

@@ -1,4 +1,4 @@
-"""Figures on the wire: every one with its unit, in degrees and milliseconds, or null."""
+"""Units of the calibration quality on MQTT."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import pytest
 
 from jointfit_daemon.model import JointState, LimbState
 from jointfit_daemon.outputs.payloads import encode_pose
-from jointfit_daemon.outputs.payloads._quality_units import shown
+from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 
 
-def test_radians_are_told_in_degrees_and_nanoseconds_in_milliseconds() -> None:
-    told = shown({"alignment": {"S1": {"error_rad": math.pi / 2, "lag_ns": -5_527_259}}})
+def test_radians_become_degrees_and_nanoseconds_milliseconds() -> None:
+    told = quality_payload({"alignment": {"S1": {"error_rad": math.pi / 2, "lag_ns": -5_527_259}}})
     assert told == {"alignment": {"S1": {"error_deg": 90.0, "lag_ms": -5.527}}}
 
 
-def test_a_unit_counts_for_the_whole_table_that_hangs_from_it() -> None:
-    told = shown({"static": {"spread_rad": {"S1": 0.01, "S2": None}, "still_s": 5.15021}})
+def test_unit_of_a_key_applies_to_its_table() -> None:
+    told = quality_payload({"static": {"spread_rad": {"S1": 0.01, "S2": None}, "still_s": 5.15021}})
     assert told["static"]["spread_deg"] == {"S1": pytest.approx(0.573, abs=1e-3), "S2": None}
     assert told["static"]["still_s"] == 5.15
 
 
-def test_the_tables_of_the_holdout_get_the_unit_they_lack() -> None:
+def test_holdout_tables_get_a_unit() -> None:
     holdout = {
         "method": "anchored",
         "frames": 697,
@@ -32,7 +32,7 @@ def test_the_tables_of_the_holdout_get_the_unit_they_lack() -> None:
         "segments": {"thigh": {"anchored": math.radians(2.5), "sensors": {"S1": math.radians(5)}}},
         "flexion": {"knee": {"mean": np.float64(math.radians(3))}},
     }
-    assert shown({"holdout": holdout})["holdout"] == {
+    assert quality_payload({"holdout": holdout})["holdout"] == {
         "method": "anchored",
         "frames": 697,
         "share": 0.4,
@@ -41,12 +41,12 @@ def test_the_tables_of_the_holdout_get_the_unit_they_lack() -> None:
     }
 
 
-def test_words_flags_lists_and_what_is_unknown_pass_unchanged() -> None:
+def test_texts_flags_lists_and_nulls_pass_unchanged() -> None:
     told = {"alignment": None, "body_parts": ["foot", "shank"], "joints": {"fit": True}}
-    assert shown(told) == told
+    assert quality_payload(told) == told
 
 
-def test_a_knee_that_is_unknown_keeps_its_keys_and_a_hip_has_none() -> None:
+def test_unknown_knee_has_keys_and_hip_has_none() -> None:
     lost = [JointState(name, None, None) for name in ("hip", "knee", "ankle")]
     state = LimbState(1, 1, 1, "uncalibrated", "settling", (), (), tuple(lost))
     joints = orjson.loads(encode_pose(state, 0, 1))["joints"]

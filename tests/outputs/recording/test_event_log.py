@@ -1,4 +1,4 @@
-"""The log of events gives back what was put in, whatever happened to its end."""
+"""The event log round-trips, even with an incomplete end."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ states = st.builds(
 
 
 @given(events)
-def test_every_event_comes_back_equal(event: Event) -> None:
+def test_every_event_round_trips(event: Event) -> None:
     assert decode_event(orjson.loads(encode_event(event))) == event
 
 
-def test_a_configuration_comes_back_with_its_rig(table: dict[str, Any]) -> None:
+def test_configuration_round_trips_with_its_rig(table: dict[str, Any]) -> None:
     event = Configured(5, parse_rig(table), None, None, 7.5)
     assert decode_event(orjson.loads(encode_event(event))) == event
 
@@ -86,14 +86,14 @@ def test_states_are_equal_exactly_when_their_bytes_are(one: LimbState, other: Li
     assert (encode_state(one) == encode_state(other)) == (repr(one) == repr(other))
 
 
-async def test_a_log_gives_back_events_and_states_in_order(tmp_path: Path) -> None:
+async def test_log_returns_events_and_states_in_order(tmp_path: Path) -> None:
     log = EventLogWriter(tmp_path / "logs", "rig")
     writing = asyncio.create_task(log.run(), name="log")
     state = LimbState(1, 2, 3, "imu", "locked", (), (), ())
     given_events = [Tick(n) for n in range(1000)]
     for event in given_events:
         log.event(event)
-        log.state(state)
+        log.output(state)
     await asyncio.sleep(2 * _event_log.FLUSH_S)
     assert log.figures()["backlog_bytes"] == 0
     log.event(Tick(1000))
@@ -103,7 +103,7 @@ async def test_a_log_gives_back_events_and_states_in_order(tmp_path: Path) -> No
     assert list(read_states(log.path)) == [encode_state(state)] * 1000
 
 
-async def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
+async def test_incomplete_last_line_is_skipped(tmp_path: Path) -> None:
     log = EventLogWriter(tmp_path, "rig")
     log.event(Tick(1))
     log.event(Tick(2))
@@ -113,7 +113,7 @@ async def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"hello\n", b'{"log":99}\n', b"[]\n"])
-def test_what_is_no_event_log_says_so(tmp_path: Path, content: bytes) -> None:
+def test_other_file_is_reported_as_no_event_log(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.jsonl"
     path.write_bytes(content)
     with pytest.raises(ValueError, match="event log"):
@@ -134,9 +134,7 @@ async def test_a_full_disk_ends_the_log_and_not_the_daemon(
     assert "ended early" in caplog.text
 
 
-async def test_a_disk_too_slow_ends_the_log_before_memory_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_slow_disk_ends_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jointfit_daemon.outputs.recording._event_log.PENDING_BYTES", 1000)
     log = EventLogWriter(tmp_path, "rig")
     for n in range(200):

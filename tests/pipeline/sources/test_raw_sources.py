@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from jointfit_daemon.config import headings, parse_rig
+from jointfit_daemon.config import heading_warning, parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, Notice, SourceOpened
@@ -41,7 +41,7 @@ def message(k: int) -> bytes:
 
 @pytest.mark.parametrize("alike", [(True, True), (False, False), (True,), (False,), ()])
 def test_equal_heading_references_give_no_warning(alike: tuple[bool, ...]) -> None:
-    assert headings(rig(*alike).sources) is None
+    assert heading_warning(rig(*alike).sources) is None
 
 
 def test_mixed_heading_references_give_a_warning_at_the_start() -> None:

@@ -1,0 +1,31 @@
+"""A token bucket: limits the mean rate of log lines and of requests, and permits short bursts."""
+
+from __future__ import annotations
+
+
+class TokenBucket:
+    """A bucket that fills with `rate_hz` tokens per second and holds at most `burst`.
+
+    Parameters
+    ----------
+    rate_hz
+        Permitted mean rate, 1/s.
+    burst
+        Capacity: tokens available at once after a pause. The bucket is full at the start.
+    now_s
+        Present time of any monotonic clock, s.
+    """
+
+    def __init__(self, rate_hz: float, burst: float, now_s: float) -> None:
+        self._rate_hz, self._burst = rate_hz, burst
+        self._left, self._at_s = burst, now_s
+
+    def take(self, now_s: float) -> bool:
+        """Take one token and return True; return False if the bucket is empty."""
+        self._left = min(self._burst, self._left + self._rate_hz * (now_s - self._at_s))
+        self._at_s = now_s
+
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True

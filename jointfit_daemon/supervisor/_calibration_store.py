@@ -1,0 +1,177 @@
+"""Stored calibrations of the running rig: loading, and writing in the background.
+
+Invariant: an unreadable file costs the stored calibration, not the run. The calibration that the
+core uses and the one that a reload finds are the same, even while a write is pending or has failed.
+A calibration that could not be written is written again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import datetime
+import time
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
+from jointfit_daemon.pipeline.events import CalibrationStored
+from jointfit_daemon.supervisor.state_directory import state_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.pipeline.events import Event
+
+RETRY_S = 10.0
+"""Interval between attempts to write a calibration after a failure, s."""
+
+
+class LoadedCalibration(NamedTuple):
+    """The stored calibration of a rig."""
+
+    calibration: Calibration | None
+    """None if the store has none that can be used."""
+    version: int | None
+    """Its number in the store."""
+    warnings: tuple[str, ...]
+    """Faults of the stored files, for the log and ``bridge/event``."""
+
+
+def store_of(rig: Rig) -> CalibrationStore:
+    """Return the calibration store of the rig."""
+    return CalibrationStore(state_directory() / "calibrations", rig.calibration_store)
+
+
+def load_latest(rig: Rig) -> LoadedCalibration:
+    """Return the newest calibration for the chain and sensors of the rig; report faults in it."""
+    try:
+        latest = store_of(rig).latest()
+    except (CalibrationFileError, OSError) as error:
+        text = f"no stored calibration can be read: {error}"
+        return LoadedCalibration(None, None, (text,))
+
+    if latest is None:
+        return LoadedCalibration(None, None, ())
+    if not latest.calibration.fits(rig.chain):
+        text = (
+            f"version {latest.version} in store {rig.calibration_store!r} belongs to another limb "
+            "or other sensors than rig.toml: calibrate again, or set another [calibration] store"
+        )
+        return LoadedCalibration(None, None, (*latest.notes, text))
+    return LoadedCalibration(latest.calibration, latest.version, latest.notes)
+
+
+def calibration_age_s(calibration: Calibration, now: datetime.datetime | None = None) -> float:
+    """Return the time since a calibration was stored, s; 0 if unknown or in the future."""
+    try:
+        then = datetime.datetime.fromisoformat(calibration.created_utc)
+        elapsed = (now or datetime.datetime.now(datetime.UTC)) - then
+    except (ValueError, TypeError):  # no date, or a date without time zone
+        return 0.0
+    return max(0.0, elapsed.total_seconds())
+
+
+def save(rig: Rig, calibration: Calibration) -> int:
+    """Write a new version with the present date, and return its number.
+
+    Raises
+    ------
+    OSError
+        The medium is full, read-only or absent.
+    """
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return store_of(rig).save(dataclasses.replace(calibration, created_utc=now))
+
+
+class CalibrationWriter:
+    """Writes calibrations in a thread, one after another, and delivers `CalibrationStored`.
+
+    Parameters
+    ----------
+    tasks : asyncio.TaskGroup
+        Owner of the task of every write.
+    deliver : callable
+        Feeds one event to the core.
+    report : callable
+        Reports a failure to write; called once per reason.
+    """
+
+    def __init__(
+        self,
+        tasks: asyncio.TaskGroup,
+        deliver: Callable[[Event], None],
+        report: Callable[[str], None],
+    ) -> None:
+        self._tasks, self._deliver, self._report = tasks, deliver, report
+        self._lock = asyncio.Lock()
+        self._writing: set[asyncio.Task[None]] = set()
+        self._unwritten: tuple[Rig, Calibration] | None = None
+        self._next_try: asyncio.TimerHandle | None = None
+        self._store = ""
+        self.fault: str | None = None
+        """Reason for which the calibration in force is not stored; None if there is none."""
+
+    def start(self, rig: Rig, calibration: Calibration) -> None:
+        """Write a new version to the store of the rig."""
+        self._unwritten, self._store = (rig, calibration), rig.calibration_store
+        self._begin(rig, calibration)
+
+    def retry(self) -> None:
+        """Write a calibration that could not be written before, if any, at once."""
+        if self._next_try is not None:
+            self._next_try.cancel()
+            self._next_try = None
+        if self._unwritten is not None and not self._writing:
+            self._begin(*self._unwritten)
+
+    def _begin(self, rig: Rig, calibration: Calibration) -> None:
+        task = self._tasks.create_task(self._write(rig, calibration), name="store")
+        self._writing.add(task)
+        task.add_done_callback(self._writing.discard)
+
+    def stop(self) -> None:
+        """Cancel further attempts; a write in progress is completed."""
+        self._unwritten = None
+        if self._next_try is not None:
+            self._next_try.cancel()
+
+    async def _write(self, rig: Rig, calibration: Calibration) -> None:
+        async with self._lock:
+            try:
+                version = await asyncio.to_thread(save, rig, calibration)
+            except OSError as error:
+                self._schedule_retry(str(error))
+                return
+            if self._unwritten is None or self._unwritten[1] is calibration:
+                self._unwritten = self.fault = None
+
+        if rig.calibration_store == self._store:  # otherwise a reload selected another store
+            self._deliver(CalibrationStored(time.monotonic_ns(), version))
+
+    def _schedule_retry(self, fault: str) -> None:
+        if fault != self.fault:
+            self.fault = fault
+            self._report(f"in force but not stored: {fault}; retrying every {RETRY_S:g} s")
+        if self._next_try is None:
+            self._next_try = asyncio.get_running_loop().call_later(RETRY_S, self.retry)
+
+    async def settle(self) -> None:
+        """Wait until no write is in progress."""
+        while self._writing:
+            await asyncio.wait(set(self._writing))
+
+    def load(self, rig: Rig) -> LoadedCalibration:
+        """Return the calibration to use: the newest in the store, or an unwritten newer one."""
+        self._store = rig.calibration_store
+        if self._unwritten is not None:
+            asked, calibration = self._unwritten
+            same_store = asked.calibration_store == rig.calibration_store
+            if same_store and calibration.fits(rig.chain):
+                text = (
+                    "the calibration in force is still used, but it is not stored: a restart would "
+                    "lose it"
+                )
+                return LoadedCalibration(calibration, None, (text,))
+        return load_latest(rig)
