@@ -241,7 +241,7 @@ def test_damaged_calibrations_are_set_aside_and_the_newest_good_one_used(process
         _, said = daemon.communicate(timeout=15)
     assert daemon.returncode == 0
     assert "renamed to 0003.json.bad" in said
-    assert "is no unit quaternion" in said
+    assert "is not a unit quaternion" in said
     assert sorted(path.name for path in folder.iterdir()) == [
         "0001.json", "0002.json.bad", "0003.json.bad",
     ]  # fmt: skip

@@ -61,7 +61,7 @@ SAID = (
     ("imu[S1].segment", "did you mean 'thigh'?"),
     ("imu[S1].driver", "did you mean 'xbus'?"),
     ("imu[S2].can", "no table [can.can1]", "can0"),
-    ("imu[S4].ids.quaternion", "0x121", "taken by S3 (quaternion)"),
+    ("imu[S4].ids.quaternion", "0x121", "belongs to S3 (quaternion)"),
     ("mocap.markers.thigh", "at least three different markers"),
     ("mocap.markers.shank", "is a marker of 'thigh' already"),
     ("mqtt.prot", "did you mean 'port'?"),
