@@ -15,7 +15,7 @@ from tests.broker_fixture import CHOICE, EmbeddedBroker, MosquittoBroker, chosen
 if TYPE_CHECKING:
     from tests.broker_fixture import Broker
 
-PROJECT = Path(__file__).resolve().parents[2]
+PROJECT = Path(__file__).resolve().parents[1]
 
 LEAKS = {
     "descriptors left open": "import os\ndef test_leak(): os.open('/dev/null', os.O_RDONLY)\n",

@@ -1,4 +1,4 @@
-"""What a rig.toml means, in SI. Law: frozen; two equal sources may share one running driver."""
+"""The contents of a rig.toml in SI: frozen, so that equal sources can share a running driver."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The worker process: one fit, started as ``python -m jointfit_daemon.supervisor.worker``.
 
-Law: a pickled (kind, payload) comes on standard input, one JSON object goes to standard output:
+The worker reads a pickled (kind, payload) from standard input and writes one JSON object:
 ``{"result": …}`` or ``{"error": text}``; both ends are this program. What the fit prints goes to
 standard error. The parent keeps its end of the input open: when that closes, the worker dies.
 """

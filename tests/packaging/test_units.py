@@ -53,11 +53,11 @@ def test_a_wrong_rig_is_not_tried_again_and_all_else_is() -> None:
 def test_the_shipped_times_are_the_documented_ones() -> None:
     assert setting("Type") == "notify"
     assert setting("RestartSec") == "2"
-    assert "| restart | 2 s after any end but exit codes 2 and 3, for ever |" in GUIDE
+    assert "| restart | 2 s after any exit except with codes 2 and 3, without limit |" in GUIDE
     assert setting("WatchdogSec") == "10"
     assert "| watchdog | 10 s (`WatchdogSec=`)" in GUIDE
     assert setting("TimeoutStopSec") == "15"
-    assert f"After {STOP_S:g} s it leaves whatever hangs; systemd would kill it after 15 s" in GUIDE
+    assert f"abandoned after {STOP_S:g} s; systemd kills the process after 15 s" in GUIDE
     assert setting("MemoryMax") == "512M"
     assert "at most 512 MB" in GUIDE
 

@@ -16,13 +16,13 @@ import pytest
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import Configured, JobFinished, SourceClosed, SourceOpened
-from tests.broker_fixture import chosen_broker
 from tests.system.station import SENSORS, Listener, Station, hang_up, running, stopped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
+    from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -48,20 +48,6 @@ class CalibratedRun:
     recording: Path
     keys: dict[str, set[str]]
     """Keys of all payloads, by topic."""
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> CalibratedRun:
-    chosen = chosen_broker()
-    if (reason := chosen.missing()) is not None:
-        pytest.skip(reason)
-    folder = tmp_path_factory.mktemp("calibrated-run")
-    broker = chosen(folder)
-    broker.start()
-    try:
-        return asyncio.run(calibrated_run(folder, broker.port))
-    finally:
-        broker.stop()
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
@@ -151,9 +137,19 @@ def keys_of_examples() -> set[str]:
     return set(re.findall(r'"(\w+)":', " ".join(examples))) - NAMES
 
 
-def test_every_key_on_the_wire_is_documented_and_every_documented_key_is_published(
-    run: CalibratedRun,
+async def test_payloads_log_and_replay_of_a_calibrated_run(
+    tmp_path: Path, broker: Broker, subtests: pytest.Subtests
 ) -> None:
+    run = await calibrated_run(tmp_path, broker.port)
+    with subtests.test("every key on the wire is documented and every documented key is published"):
+        compare_keys_with_the_page(run)
+    with subtests.test("the log has one line for each phase and none of the worker"):
+        count_phases_in_the_log(run)
+    with subtests.test("the event log replays to the limb states byte for byte"):
+        replay_the_recording(run)
+
+
+def compare_keys_with_the_page(run: CalibratedRun) -> None:
     documented = documented_words()
     unknown = {
         topic: missing
@@ -167,7 +163,7 @@ def test_every_key_on_the_wire_is_documented_and_every_documented_key_is_publish
     assert keys_of_examples() - used == set()
 
 
-def test_the_log_has_one_line_for_each_phase_and_none_of_the_worker(run: CalibratedRun) -> None:
+def count_phases_in_the_log(run: CalibratedRun) -> None:
     for line in (
         "calibration align: ", "calibration aligned: ", "calibration posed: ",
         "calibration calibrated: calibrated", "stored as version 1 (version 1 in ",
@@ -176,9 +172,7 @@ def test_the_log_has_one_line_for_each_phase_and_none_of_the_worker(run: Calibra
     assert "output of the worker" not in run.log  # fits print nothing
 
 
-def test_the_event_log_replays_to_the_published_limb_states_byte_for_byte(
-    run: CalibratedRun,
-) -> None:
+def replay_the_recording(run: CalibratedRun) -> None:
     events = list(read_events(run.recording))
     assert len([e for e in events if isinstance(e, Configured)]) == 2
     assert len([e for e in events if isinstance(e, JobFinished)]) == 3

@@ -44,7 +44,7 @@ def run_job(kind: str, payload: Mapping[str, Any]) -> dict[str, Any]:
     -------
     dict
         ``quality`` and what the kind gives: ``alignment``, ``calibration`` (dicts), ``worse`` (why
-        the stored calibration is better), ``notes`` (how sensors were put on anew);
+        the stored calibration is better), ``notes`` (how sensors were re-donned);
         or ``refused`` with the reason alone.
     """
     try:

@@ -185,8 +185,8 @@ def test_the_worker_stores_and_tells_what_refining_did() -> None:
     assert stored.quality["markers"] == result["quality"]["markers"]
     assert stored.clusters["thigh"] == cluster_record(refined().clusters["thigh"])
     lines = report(quality_payload(stored.quality))
-    assert any(line.startswith("thigh: markers ") and "refined" in line for line in lines)
-    assert any(line.startswith(f"{KNOCKED}: ") and "knocked off?" in line for line in lines)
+    assert any(line.startswith("thigh: RMS marker error ") and "refined" in line for line in lines)
+    assert any(line.startswith(f"{KNOCKED}: ") and "check the marker" in line for line in lines)
 
 
 def test_turned_off_it_leaves_markers_and_tracks_as_they_were() -> None:

@@ -101,7 +101,7 @@ def test_predicted_error_with_soft_tissue_artefact_matches_actual_error() -> Non
 
 def test_refusal_for_soft_tissue_artefact_names_more_than_a_longer_arc() -> None:
     told = [found.refused for seed in range(24) if (found := fit_sphere(on_skin(seed))).refused]
-    assert any("where skin slides least" in why for why in told)
+    assert any("where the skin slides least" in why for why in told)
     clean = watched(np.random.default_rng(1), ball_turns(np.random.default_rng(1), 9.0))
     why = fit_sphere(clean.points).refused
     assert why is None or "skin" not in why
