@@ -35,6 +35,22 @@ _REMEDIES = {
     errno.ELOOP: "the path contains a loop of symbolic links: check the path",
 }
 
+ON_DEMAND_ERRORS = (
+    (EXIT_MISUSE, "jointfit_daemon.config", "ConfigError"),
+    (EXIT_MISUSE, "jointfit_daemon.calibration._errors", "CalibrationError"),
+    (EXIT_MISUSE, "jointfit_daemon.files.mocap._c3d", "MissingPackageError"),
+    (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlottingUnavailableError"),
+    (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriverError"),
+    (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "BrokerLostError"),
+    (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "NoAnswerError"),
+    (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "PhaseAbortedError"),
+    (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "RequestRefusedError"),
+    (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessExitedError"),
+    (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "DemoTimeoutError"),
+    (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
+)
+"""Exit code, module and class of errors whose modules are imported on demand."""
+
 
 class CommandGroup(TyperGroup):
     """Runs a command and converts errors that a user can correct into a message."""
@@ -85,20 +101,7 @@ def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
 
     A module that is not loaded cannot have raised the error.
     """
-    for code, module, name in (
-        (EXIT_MISUSE, "jointfit_daemon.config", "ConfigError"),
-        (EXIT_MISUSE, "jointfit_daemon.calibration._errors", "CalibrationError"),
-        (EXIT_MISUSE, "jointfit_daemon.files.mocap._c3d", "MissingPackageError"),
-        (EXIT_MISUSE, "jointfit_daemon.tools.plotting", "PlottingUnavailableError"),
-        (EXIT_MISUSE, "jointfit_daemon.driver", "UnknownDriverError"),
-        (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "BrokerLostError"),
-        (EXIT_FAILED, "jointfit_daemon.outputs.mqtt", "NoAnswerError"),
-        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "PhaseAbortedError"),
-        (EXIT_FAILED, "jointfit_daemon.tools.calibrate", "RequestRefusedError"),
-        (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessExitedError"),
-        (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "DemoTimeoutError"),
-        (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
-    ):
+    for code, module, name in ON_DEMAND_ERRORS:
         loaded = sys.modules.get(module)
         if loaded is not None and isinstance(error, getattr(loaded, name)):
             return code, str(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import orjson
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 
 from jointfit_daemon import __version__
 from jointfit_daemon.tools.__main__ import app
+from jointfit_daemon.tools.command_group import ON_DEMAND_ERRORS
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "knee.toml"
 run = CliRunner().invoke
@@ -24,6 +26,13 @@ def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])
     assert result.exit_code == 0
     assert "Usage" in result.stdout
+
+
+@pytest.mark.parametrize(("module", "name"), [row[1:] for row in ON_DEMAND_ERRORS])
+def test_every_error_that_commands_report_exists_where_they_look_for_it(
+    module: str, name: str
+) -> None:
+    assert issubclass(getattr(importlib.import_module(module), name), Exception)
 
 
 def test_the_example_rig_is_right_and_its_sources_are_listed() -> None:
