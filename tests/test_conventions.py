@@ -1,4 +1,4 @@
-"""What CONTRIBUTING.md says of the house and no linter checks."""
+"""Rules of CONTRIBUTING.md that no linter checks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PACKAGES = (
     "simulators/jointfit_simulators",
 )
 SHIPPED = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-TOOLING = [path for room in ("bench", ".ci") for path in sorted((ROOT / room).rglob("*.py"))]
+TOOLING = [path for folder in ("bench", ".ci") for path in sorted((ROOT / folder).rglob("*.py"))]
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 MOST_LINES = 400
 MOST_LINES_OF_A_FUNCTION = 50
@@ -43,7 +43,7 @@ def project() -> dict[str, dict[str, dict[str, str]]]:
     return found
 
 
-def test_no_file_is_two_rooms() -> None:
+def test_no_file_exceeds_the_limit_of_code_lines() -> None:
     counted = {name_of(path): len(code_lines(path)) for path in SHIPPED + TOOLING}
     assert {name: lines for name, lines in counted.items() if lines > MOST_LINES} == {}
 
@@ -73,7 +73,7 @@ def lines_of(path: Path, function: Function) -> int:
     return len(code_lines(path) & set(range(function.lineno, (function.end_lineno or 0) + 1)))
 
 
-def test_no_function_is_a_paragraph_without_full_stops() -> None:
+def test_no_function_exceeds_the_limit_of_code_lines() -> None:
     counted = {
         f"{name_of(path)}:{node.name}": lines_of(path, node)
         for path in SHIPPED + TOOLING
@@ -84,13 +84,13 @@ def test_no_function_is_a_paragraph_without_full_stops() -> None:
     assert too_long == {}
 
 
-def test_every_module_says_what_it_is_for() -> None:
+def test_every_module_has_a_docstring() -> None:
     assert [
         name_of(path) for path in SHIPPED + TOOLING if not ast.get_docstring(tree_of(path))
     ] == []
 
 
-def test_no_name_says_nothing() -> None:
+def test_no_module_has_a_vague_name() -> None:
     vague = [name_of(path) for path in SHIPPED if VAGUE & set(path.stem.split("_"))]
     assert vague == []
 
@@ -106,7 +106,7 @@ def imported_modules(path: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("family", ["jointfit_drivers", "jointfit_protocols"])
+@pytest.mark.parametrize("family", [Path(package).name for package in PACKAGES])
 def test_private_modules_are_imported_within_their_package_only(family: str) -> None:
     """`jointfit_drivers.xbus._decoder` is for `jointfit_drivers/xbus` alone."""
     crossing = [
@@ -146,15 +146,15 @@ def test_every_silenced_rule_has_its_reason(rule: re.Pattern[str], paths: list[P
 
 
 @pytest.mark.parametrize("folder", ["drivers", "protocols", "simulators", "tests", "bench"])
-def test_a_folder_is_no_package(folder: str) -> None:
+def test_top_level_folders_are_not_packages(folder: str) -> None:
     assert not list((ROOT / folder).glob("__init__.py"))
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_every_package_says_that_it_is_typed(package: str) -> None:
+def test_every_package_is_marked_as_typed(package: str) -> None:
     assert (ROOT / package / "py.typed").is_file()
 
 
-def test_test_files_have_names_of_their_own() -> None:
+def test_names_of_test_files_are_unique() -> None:
     names = [path.name for path in TESTS if path.name.startswith("test_")]
     assert sorted(names) == sorted(set(names))
