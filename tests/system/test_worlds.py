@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tests.broker_fixture import Broker
     from tests.system.station import Listener
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.experiment]
 
 SETTLE_S = 1.7
 SETTINGS = (
