@@ -32,12 +32,12 @@ def test_an_error_told_of_a_real_joint_is_not_far_too_small(tmp_path: Path) -> N
         f["name"]: float(f["value"])
         for f in json.loads((tmp_path / "a.json").read_text())[0]["results"]
     }
-    joints = {name.split(":")[0] for name in figures if "refused" not in name}
+    joints = {name.split(":")[0] for name in figures if "rejected" not in name}
     assert any("knee, sphere" in joint for joint in joints)
     for joint in joints:
-        told = figures[f"{joint}: error it tells across the axis"]
+        told = figures[f"{joint}: stated error across the axis"]
         # the model's own center moves 4 to 18 mm under the markers
-        assert figures[f"{joint}: across the axis"] < 2.0 * told + 18.0
+        assert figures[f"{joint}: distance to the model across the axis"] < 2.0 * told + 18.0
         assert (
-            figures[f"{joint}: from the model"] < 2.0 * figures[f"{joint}: error it tells"] + 18.0
+            figures[f"{joint}: distance to the model"] < 2.0 * figures[f"{joint}: stated error"] + 18.0
         )
