@@ -54,7 +54,7 @@ def test_installing_gives_a_rig_to_edit_and_starts_nothing() -> None:
     assert Path("/usr/share/jointfitd/examples/knee.toml").is_file()
     assert run("systemctl", "is-enabled", UNIT, check=False) == "disabled"
     assert run("jointfitd", "--version").startswith("jointfitd ")
-    assert "is right" in run("jointfit", "check", "/usr/share/jointfitd/examples/knee.toml")
+    assert "is valid" in run("jointfit", "check", "/usr/share/jointfitd/examples/knee.toml")
 
 
 def outcome(phase: str, wanted: str, **arguments: object) -> dict[str, Any]:
