@@ -35,9 +35,9 @@ def test_an_error_told_of_a_real_joint_is_not_far_too_small(tmp_path: Path) -> N
     joints = {name.split(":")[0] for name in figures if "rejected" not in name}
     assert any("knee, sphere" in joint for joint in joints)
     for joint in joints:
-        told = figures[f"{joint}: stated error across the axis"]
+        stated = figures[f"{joint}: stated error"]
+        stated_across = figures[f"{joint}: stated error across the axis"]
         # the model's own center moves 4 to 18 mm under the markers
-        assert figures[f"{joint}: distance to the model across the axis"] < 2.0 * told + 18.0
-        assert (
-            figures[f"{joint}: distance to the model"] < 2.0 * figures[f"{joint}: stated error"] + 18.0
-        )
+        across = figures[f"{joint}: distance to the model across the axis"]
+        assert across < 2.0 * stated_across + 18.0
+        assert figures[f"{joint}: distance to the model"] < 2.0 * stated + 18.0
