@@ -20,7 +20,11 @@ from pathlib import Path
 
 from numpy._core import _multiarray_umath as umath  # type: ignore[attr-defined]  # no stub
 
-TESTS = [f"tests/{name}" for name in ("timing", "kinematics", "calibration", "fusion", "pipeline")]
+CORE = (
+    "timing", "kinematics", "center_of_rotation", "limb_model", "fusion", "calibration",
+    "pipeline",
+)  # fmt: skip
+TESTS = [f"tests/{name}" for name in CORE]
 CORE_TYPES = {"Nehalem": "sse4_2", "Haswell": "avx2", "SkylakeX": "avx512f", "Zen": "avx2"}
 """Kernels of OpenBLAS, and the flag of /proc/cpuinfo that a processor needs for them."""
 
