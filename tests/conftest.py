@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 settings.register_profile("home", deadline=None)  # a loaded machine is no fault of the code
 settings.register_profile("ci", deadline=None, derandomize=True)
-settings.load_profile("ci" if os.environ.get("CI") else "home")
+settings.register_profile("few", deadline=None, derandomize=True, max_examples=20)
+settings.load_profile(
+    os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "home")
+)
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
 

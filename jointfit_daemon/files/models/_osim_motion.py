@@ -64,6 +64,12 @@ class JointMotion:
             axes = [_custom(axis) for axis in joint.spatial.iterfind("TransformAxis")]
         elif joint.kind in _TURNS:
             vectors = [*_padded(_TURNS[joint.kind]), *_padded(_SHIFTS.get(joint.kind, []))]
+            needed = sum(vector is not None for vector in vectors)
+            if len(self.names) != needed:
+                raise ValueError(
+                    f"joint {joint.name}: {len(self.names)} coordinates, expected {needed} for a "
+                    f"{joint.kind}"
+                )
             axes = _in_order(vectors, self.names)
         else:
             raise ValueError(f"joint {joint.name}: {joint.kind} is not supported")
