@@ -59,24 +59,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return bool(part == PARTS[2 * experiment + alone])
 
     config.hook.pytest_deselected(items=[item for item in items if not belongs(item)])
-    items[:] = _long_tests_first([item for item in items if belongs(item)])
-
-
-def _long_tests_first(items: list[pytest.Item]) -> list[pytest.Item]:
-    """Return the tests in an order in which each worker begins with its share of the long ones.
-
-    xdist gives each worker a contiguous share; a long test that begins late keeps one worker busy
-    while the others are idle.
-    """
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    long = [item for item in items if item.get_closest_marker("system") is not None]
-    short = [item for item in items if item.get_closest_marker("system") is None]
-    ordered: list[pytest.Item] = []
-    for worker in range(workers):
-        ordered += long[worker::workers]
-        end = (worker + 1) * len(items) // workers
-        ordered += [short.pop(0) for _ in range(min(len(short), end - len(ordered)))]
-    return ordered + short
+    items[:] = [item for item in items if belongs(item)]
 
 
 @pytest.fixture(scope="session")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tests.broker_fixture import Broker
     from tests.system.station import Listener
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.experiment]
 
 SENSORS = {
     "S1": "thigh", "S2": "thigh", "S5": "thigh", "S3": "shank", "S4": "shank", "S6": "foot",
