@@ -33,7 +33,7 @@ def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[by
     quaternion = mtdata2.real_id(mtdata2.Item.QUATERNION)
     return [
         xbus.encode(
-            xbus.MessageId.MT_DATA2,
+            xbus.XbusMessageId.MT_DATA2,
             mtdata2.encode_items(
                 [
                     (mtdata2.Item.PACKET_COUNTER, k & 0xFFFF),

@@ -60,7 +60,7 @@ def messages(felt: Sequence[Array]) -> list[bytes]:
     kinds = _KINDS[: len(felt)]
     return [
         xbus.encode(
-            xbus.MessageId.MT_DATA2,
+            xbus.XbusMessageId.MT_DATA2,
             mtdata2.encode_items(
                 [
                     (Item.PACKET_COUNTER, k & 0xFFFF),

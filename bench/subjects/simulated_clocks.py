@@ -198,7 +198,7 @@ def xbus_chunk(
     _name: str, number: int, ticks: int, due_ns: int, q: Quaternion
 ) -> tuple[int, bytes]:
     data = xbus.encode(
-        xbus.MessageId.MT_DATA2,
+        xbus.XbusMessageId.MT_DATA2,
         mtdata2.encode_items(
             [
                 (mtdata2.Item.PACKET_COUNTER, number & 0xFFFF),

@@ -15,7 +15,7 @@ from jointfit_drivers.ports._wall_clock import WallClock
 from jointfit_drivers.xbus import XbusDecoder
 from jointfit_protocols.can import CanFrame, frame_bits
 from jointfit_protocols.can.slcan import SlcanCodec, encode_frame
-from jointfit_protocols.xbus import MessageId, encode, mtdata2
+from jointfit_protocols.xbus import XbusMessageId, encode, mtdata2
 from jointfit_protocols.xbus.mtdata2 import Item
 
 S = 1_000_000_000
@@ -119,7 +119,7 @@ def xbus_wire(count: int) -> list[bytes]:
     quaternion = mtdata2.real_id(Item.QUATERNION)
     return [
         encode(
-            MessageId.MT_DATA2,
+            XbusMessageId.MT_DATA2,
             mtdata2.encode_items(
                 [
                     (Item.PACKET_COUNTER, k),

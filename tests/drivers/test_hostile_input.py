@@ -14,7 +14,7 @@ from jointfit_drivers.xbus._raw_orientation import RawOrientation
 from jointfit_drivers.xcdi import XcdiDecoder
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import XcdiIds
 
@@ -52,7 +52,7 @@ def xbus_messages(draw: st.DrawFn) -> bytes:
     if draw(st.booleans()):
         items.append((Item.RATE_OF_TURN, draw(st.tuples(FLOATS, FLOATS, FLOATS))))
         items.append((Item.ACCELERATION, draw(st.tuples(FLOATS, FLOATS, FLOATS))))
-    return encode(MessageId.MT_DATA2, encode_items(items)) * draw(st.sampled_from([1, 1, 15]))
+    return encode(XbusMessageId.MT_DATA2, encode_items(items)) * draw(st.sampled_from([1, 1, 15]))
 
 
 arrivals = st.lists(st.integers(0, 10**10), min_size=MOST_MESSAGES, max_size=MOST_MESSAGES)

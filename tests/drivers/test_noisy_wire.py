@@ -13,7 +13,7 @@ from jointfit_drivers.xbus import XbusDecoder
 from jointfit_drivers.xcdi import XcdiDecoder
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.can.slcan import SlcanCodec, encode_frame
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, XcdiIds, quaternion_counts
 from jointfit_protocols.xcdi import encode as xcdi_encode
@@ -46,7 +46,7 @@ def measurement(number: int) -> bytes:
         (Item.STATUS_WORD, 3),
         (Item.QUATERNION, orientation(number)),
     )
-    return encode(MessageId.MT_DATA2, encode_items(items))
+    return encode(XbusMessageId.MT_DATA2, encode_items(items))
 
 
 def outcome(decoder: Decoder, chunks: list[bytes]) -> Outcome:

@@ -21,7 +21,7 @@ from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_f
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
 from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet import HEADER, Bare, MessageId, decode
+from jointfit_protocols.natnet import HEADER, Bare, NatNetMessageId, decode
 from jointfit_protocols.natnet import encode as encode_natnet
 from jointfit_protocols.natnet._frame_encode import encode_frame
 from jointfit_protocols.xbus import XbusCodec, XbusMessage
@@ -258,7 +258,7 @@ def run_natnet_core(data: bytes) -> None:
 
 def _datagrams(data: bytes) -> list[bytes]:
     questions = OpenRequests()
-    questions.register(Bare(MessageId.REQUEST_MODELDEF), BEGIN_NS)
+    questions.register(Bare(NatNetMessageId.REQUEST_MODELDEF), BEGIN_NS)
     datagrams, at = [], 0
     while at + 3 <= len(data):
         kind, size = struct.unpack_from("<BH", data, at)

@@ -13,7 +13,7 @@ from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpen
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.natnet import BodyDescription, FrameOfData, ModelDefinition, ServerInfo
 from jointfit_protocols.natnet import encode as encode_natnet
-from jointfit_protocols.xbus import MessageId
+from jointfit_protocols.xbus import XbusMessageId
 from jointfit_protocols.xbus import encode as encode_xbus
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, quaternion_counts
@@ -80,7 +80,7 @@ def xbus_bytes(name: str, number: int) -> bytes:
         (Item.SAMPLE_TIME_FINE, number * 100),
         (Item.QUATERNION, orientation(name, number)),
     ]
-    return encode_xbus(MessageId.MT_DATA2, encode_items(items))
+    return encode_xbus(XbusMessageId.MT_DATA2, encode_items(items))
 
 
 def xcdi_bytes(name: str, number: int, t_ns: int) -> bytes:

@@ -16,7 +16,7 @@ from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Notice, SourceClosed, SourceOpened
 from jointfit_protocols.can import CanFrame, pack_frames
-from jointfit_protocols.xbus import MessageId
+from jointfit_protocols.xbus import XbusMessageId
 from jointfit_protocols.xbus import encode as encode_xbus
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, quaternion_counts
@@ -76,7 +76,7 @@ class Sent:
                 (Item.SAMPLE_TIME_FINE, ticks),
                 (Item.QUATERNION, q),
             ]
-            data = encode_xbus(MessageId.MT_DATA2, encode_items(items))
+            data = encode_xbus(XbusMessageId.MT_DATA2, encode_items(items))
         else:
             rows = zip(
                 IDS[self.name],

@@ -13,16 +13,16 @@ import pytest
 
 from jointfit_protocols.natnet import (
     Bare,
+    CommandRequest,
+    CommandResponse,
     Connect,
     Discovery,
     EchoRequest,
     EchoResponse,
     FrameOfData,
     Message,
-    MessageId,
     ModelDefinition,
-    Request,
-    Response,
+    NatNetMessageId,
     ServerInfo,
     decode,
     encode,
@@ -157,8 +157,10 @@ async def test_discovery_is_answered_but_makes_no_client() -> None:
 
 async def test_requests_are_answered_and_unknown_ones_named_so() -> None:
     async with calling(rate_hz=200.0) as (_, caller):
-        assert await caller.ask(Request("FrameRate")) == Response(b"\0\0HC")
-        assert await caller.ask(Request("Dance")) == Bare(MessageId.UNRECOGNIZED_REQUEST)
+        assert await caller.ask(CommandRequest("FrameRate")) == CommandResponse(b"\0\0HC")
+        assert await caller.ask(CommandRequest("Dance")) == Bare(
+            NatNetMessageId.UNRECOGNIZED_REQUEST
+        )
 
 
 async def test_the_echo_tells_a_clock_with_offset_and_skew() -> None:
@@ -179,7 +181,7 @@ async def test_no_frame_comes_before_the_model_was_answered() -> None:
     async with calling() as (server, caller):
         await caller.ask(Connect(0))
         server.push(0, PLACES, POSES)
-        assert isinstance(await caller.ask(Bare(MessageId.REQUEST_MODELDEF)), ModelDefinition)
+        assert isinstance(await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF)), ModelDefinition)
         server.push(0, PLACES, POSES)
         assert isinstance(await caller.hear(), FrameOfData)
         assert server.sent == 1
@@ -198,7 +200,7 @@ async def test_a_silent_client_is_dropped_and_told() -> None:
         await caller.ask(Connect(0))
         await asyncio.sleep(0.06)
         server.push(0, PLACES, POSES)
-        assert await caller.hear() == Bare(MessageId.DISCONNECTBYTIMEOUT)
+        assert await caller.hear() == Bare(NatNetMessageId.DISCONNECTBYTIMEOUT)
         assert server.clients == ()
 
 
@@ -208,7 +210,7 @@ async def test_what_is_hidden_looks_as_it_does_in_real_frames(
 ) -> None:
     async with calling(hiding=hiding) as (server, caller):
         await caller.ask(Connect(0))
-        await caller.ask(Bare(MessageId.REQUEST_MODELDEF))
+        await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
         places = {"T1": (1.0, 2.0, 3.0), "T2": (4.0, 5.0, 6.0), "T3": (0.0, 0.0, 1.0)}
         server.push(0, places, POSES)
         await caller.hear()
@@ -224,9 +226,9 @@ async def test_what_is_hidden_looks_as_it_does_in_real_frames(
 async def test_a_unicast_client_may_choose_its_bitstream_from_4_0_on() -> None:
     async with calling(bitstream=(4, 0)) as (server, caller):
         await caller.ask(Connect(0))
-        await caller.ask(Bare(MessageId.REQUEST_MODELDEF))
-        answer = await caller.ask(Request("Bitstream,4.1"))
-        assert isinstance(answer, Response)
+        await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
+        answer = await caller.ask(CommandRequest("Bitstream,4.1"))
+        assert isinstance(answer, CommandResponse)
         assert answer.text == "Bitstream,4.1"
         server.push(0, PLACES, POSES)
         caller.version = (4, 1)
@@ -239,7 +241,7 @@ async def test_a_unicast_client_may_choose_its_bitstream_from_4_0_on() -> None:
 async def test_the_network_can_be_as_bad_as_asked(knob: str) -> None:
     async with calling(**{knob: 0.5}) as (server, caller):
         await caller.ask(Connect(0))
-        await caller.ask(Bare(MessageId.REQUEST_MODELDEF))
+        await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
         for _ in range(60):
             server.push(0, PLACES, POSES)
         heard = [await caller.hear() for _ in range(server.sent)]

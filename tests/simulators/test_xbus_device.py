@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_protocols.xbus import MessageId, XbusCodec, XbusMessage, encode
+from jointfit_protocols.xbus import XbusCodec, XbusMessage, XbusMessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, decode_item, split
 from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
@@ -69,8 +69,8 @@ def streams(**options: Any) -> pytest.MarkDecorator:
 async def test_a_bad_output_list_is_error_21(host: Host) -> None:
     serve = asyncio.create_task(host.device.run())
     for outputs in ([(0x7777, 100)], [(0x2010, 401)]):
-        (reply,) = await host.ask(MessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(outputs))
-        assert (reply.mid, reply.data) == (MessageId.ERROR, b"\x21")
+        (reply,) = await host.ask(XbusMessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(outputs))
+        assert (reply.mid, reply.data) == (XbusMessageId.ERROR, b"\x21")
     assert host.device.flash_writes == 0
     serve.cancel()
     await asyncio.wait({serve})
@@ -82,7 +82,7 @@ async def test_the_acknowledgement_tells_the_rates_really_used(
 ) -> None:
     serve = asyncio.create_task(host.device.run())
     wanted = setup.encode_outputs([(0x1020, 100), (0x2010, asked)])
-    (reply,) = await host.ask(MessageId.OUTPUT_CONFIGURATION, wanted)
+    (reply,) = await host.ask(XbusMessageId.OUTPUT_CONFIGURATION, wanted)
     assert setup.decode_outputs(reply.data) == ((0x1020, 0xFFFF), (0x2010, used))
     assert host.device.flash_writes == 1
     serve.cancel()
@@ -93,7 +93,7 @@ async def test_the_acknowledgement_tells_the_rates_really_used(
 async def test_left_alone_after_waking_up_it_measures(host: Host) -> None:
     serve = asyncio.create_task(host.device.run())
     await asyncio.sleep(0.05)
-    assert [message.mid for message in host.hear()] == [MessageId.WAKE_UP]
+    assert [message.mid for message in host.hear()] == [XbusMessageId.WAKE_UP]
     before = host.device.streaming
     await asyncio.sleep(WAKE_UP_S)
     assert (before, host.device.streaming) == (False, True)
@@ -105,7 +105,7 @@ async def test_left_alone_after_waking_up_it_measures(host: Host) -> None:
 async def test_told_so_after_waking_up_it_stays_in_configuration(host: Host) -> None:
     serve = asyncio.create_task(host.device.run())
     await asyncio.sleep(0.05)
-    await host.ask(MessageId.WAKE_UP_ACK)
+    await host.ask(XbusMessageId.WAKE_UP_ACK)
     await asyncio.sleep(WAKE_UP_S)
     assert not host.device.streaming
     serve.cancel()

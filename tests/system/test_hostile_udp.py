@@ -15,11 +15,11 @@ import pytest
 
 from jointfit_daemon.tools.child_processes import daemon
 from jointfit_protocols.natnet import (
+    CommandResponse,
     EchoResponse,
     MarkerSetDescription,
-    MessageId,
     ModelDefinition,
-    Response,
+    NatNetMessageId,
     ServerInfo,
     encode,
 )
@@ -66,14 +66,14 @@ LARGEST = b"\x05\x00\xdf\xff" + b"\xff" * 65_503
 CONTROL: tuple[bytes, ...] = (
     encode(INFO),
     encode(INFO._replace(clock_hz=10_000_000)),
-    encode(Response(b"Bitstream,2.9\0")),
-    encode(Response(b"Bitstream,99.99\0")),
+    encode(CommandResponse(b"Bitstream,2.9\0")),
+    encode(CommandResponse(b"Bitstream,99.99\0")),
     encode(NAMES),
     LARGEST,
     b"",
     b"\x07",
     bytes(200),
-    *(bytes((kind, 0, 4, 0)) + b"\xff" * 4 for kind in MessageId),
+    *(bytes((kind, 0, 4, 0)) + b"\xff" * 4 for kind in NatNetMessageId),
 )
 """Messages that change, end or confuse a session that takes them for the server's."""
 

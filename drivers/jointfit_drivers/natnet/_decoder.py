@@ -24,12 +24,12 @@ from jointfit_protocols.natnet import (
     FRAME_BITSTREAM_CHANGED,
     FRAME_EDIT_MODE,
     FRAME_MODEL_CHANGED,
+    CommandResponse,
     EchoRequest,
     EchoResponse,
     FrameOfData,
-    MessageId,
     ModelDefinition,
-    Response,
+    NatNetMessageId,
     ServerInfo,
     is_versioned,
     supported,
@@ -52,7 +52,7 @@ _MOST_SECONDS = 2**63 // 10**9
 """Largest plausible stamp, s: its nanoseconds still fit 64 bits."""
 _MOST_LISTED = 200
 """Names of markers or bodies that an event lists; the count in its text is exact."""
-_FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
+_FRAME = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 _ANNOUNCED = {
     FRAME_MODEL_CHANGED: "the model list changed",
     FRAME_BITSTREAM_CHANGED: "the bitstream version changed",
@@ -98,7 +98,7 @@ class NatNetDecoder:
             ModelDefinition: self._model,
             EchoRequest: self._echo_request,
             EchoResponse: self._echo,
-            Response: self._response,
+            CommandResponse: self._response,
         }
 
     @property
@@ -188,7 +188,7 @@ class NatNetDecoder:
 
     def _response(self, _: Chunk, message: Message) -> list[Decoded]:
         """Process the answer to ``Bitstream,x.y``; other answers are ignored."""
-        version = bitstream_response(cast("Response", message).text)
+        version = bitstream_response(cast("CommandResponse", message).text)
         if version is not None:
             self._bitstream.confirm(version)
         return []

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import Chunk
 from jointfit_drivers.ports.udp_socket import UdpSocket
-from jointfit_protocols.natnet import MessageId, encode
+from jointfit_protocols.natnet import NatNetMessageId, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +31,7 @@ _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
 """Errors that concern one datagram and not the connection."""
 _FORGED_NS = 100_000_000
 """Interval, ns, after a datagram of the server in which an ICMP refusal is forged or stale."""
-_FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
+_FRAME = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
 class NatNetLink:

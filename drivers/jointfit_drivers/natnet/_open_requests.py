@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 from jointfit_protocols.natnet import (
     HEADER,
     Bare,
+    CommandRequest,
     Connect,
     EchoRequest,
     EchoResponse,
-    MessageId,
-    Request,
+    NatNetMessageId,
     decode,
 )
 
@@ -32,18 +32,21 @@ OPEN_ECHOES = 32
 """Stored echo requests without an answer; the burst at connection sends ten."""
 
 _REQUEST_OF_ANSWER = {
-    MessageId.SERVERINFO: MessageId.CONNECT,
-    MessageId.MODELDEF: MessageId.REQUEST_MODELDEF,
-    MessageId.RESPONSE: MessageId.REQUEST,
+    NatNetMessageId.SERVERINFO: NatNetMessageId.CONNECT,
+    NatNetMessageId.MODELDEF: NatNetMessageId.REQUEST_MODELDEF,
+    NatNetMessageId.RESPONSE: NatNetMessageId.REQUEST,
 }
-_REQUEST_IDS: dict[type, MessageId] = {Connect: MessageId.CONNECT, Request: MessageId.REQUEST}
+_REQUEST_IDS: dict[type, NatNetMessageId] = {
+    Connect: NatNetMessageId.CONNECT,
+    CommandRequest: NatNetMessageId.REQUEST,
+}
 
 
 class OpenRequests:
     """Requests to the server without an answer so far."""
 
     def __init__(self) -> None:
-        self._asked_ns: dict[MessageId, int] = {}
+        self._asked_ns: dict[NatNetMessageId, int] = {}
         self._echoes: dict[int, None] = {}
         self.unsolicited = 0
         """Messages dropped because they answered no open request."""
@@ -66,10 +69,10 @@ class OpenRequests:
         The first answer closes the request. If it is unusable, the caller sends another request.
         """
         kind = int.from_bytes(datagram[:2], "little") if len(datagram) >= HEADER.size else None
-        if kind == MessageId.ECHORESPONSE:
+        if kind == NatNetMessageId.ECHORESPONSE:
             accepted = self._accept_echo(datagram, now_ns)
         elif kind in _REQUEST_OF_ANSWER:
-            asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[MessageId(kind)], None)
+            asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[NatNetMessageId(kind)], None)
             accepted = asked_ns is not None and now_ns - asked_ns <= ANSWER_NS
         else:
             accepted = True  # has no effect; corrupt bytes are counted

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Quaternion, Vector
     from jointfit_drivers.natnet._binding import Binding, Key
-    from jointfit_protocols.natnet import Body, FrameOfData, Marker
+    from jointfit_protocols.natnet import Body, FrameOfData, LabeledMarker
 
 _HALF = math.sqrt(0.5)
 _NO_POSITION: Vector = (math.nan, math.nan, math.nan)
@@ -87,7 +87,7 @@ class PoseConverter:
         return seen
 
     def _labeled(
-        self, markers: tuple[Marker, ...], known: frozenset[Key], unknown: list[int]
+        self, markers: tuple[LabeledMarker, ...], known: frozenset[Key], unknown: list[int]
     ) -> dict[Key, Vector]:
         seen: dict[Key, Vector] = {}
         twice: set[int] = set()
@@ -153,7 +153,7 @@ class PoseConverter:
 _ABSENT = (_NO_POSITION, _NO_ORIENTATION)
 
 
-def _usable(marker: Marker) -> bool:
+def _usable(marker: LabeledMarker) -> bool:
     solved = marker.params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED
     return solved and _near(marker.x, marker.y, marker.z)
 

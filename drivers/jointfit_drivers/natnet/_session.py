@@ -40,14 +40,14 @@ from jointfit_protocols.natnet import (
     FRAME_MODEL_CHANGED,
     Bare,
     BodyDescription,
+    CommandRequest,
+    CommandResponse,
     Connect,
     EchoRequest,
     EchoResponse,
     FrameOfData,
-    MessageId,
     ModelDefinition,
-    Request,
-    Response,
+    NatNetMessageId,
     ServerInfo,
 )
 
@@ -77,7 +77,7 @@ _PARAMS = struct.Struct("<h")
 _PARAMS_FROM_END = 6
 """Place of the flags: they and the end tag close every frame, in every bitstream."""
 _SHORTEST_FRAME = 4 + 78
-_FRAME = int(MessageId.FRAMEOFDATA).to_bytes(2, "little")
+_FRAME = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
 class NatNetSession:
@@ -127,7 +127,7 @@ class NatNetSession:
                 with contextlib.suppress(
                     DeviceLostError
                 ):  # keep the exception that ended the connection
-                    link.send(Bare(MessageId.DISCONNECT))
+                    link.send(Bare(NatNetMessageId.DISCONNECT))
 
     # --- received messages --------------------------------------------------------------------
 
@@ -175,7 +175,7 @@ class NatNetSession:
                 self._model_wanted = False
             case EchoResponse(stamp, _):
                 self._echoed = stamp
-            case Response() as response:
+            case CommandResponse() as response:
                 version = bitstream_response(response.text)
                 if version is not None and version == self._settings.wanted_version:
                     self._bitstream.confirm(version)
@@ -226,7 +226,7 @@ class NatNetSession:
         """Request another bitstream than the server's own; continue without it if refused."""
         wanted = self._settings.wanted_version
         if wanted is not None:
-            asked = Request(f"Bitstream,{self._settings.bitstream}")
+            asked = CommandRequest(f"Bitstream,{self._settings.bitstream}")
             await self._request(asked, RETRY_S, lambda: self._confirmed)
 
     async def _first_echoes(self) -> None:
@@ -240,7 +240,7 @@ class NatNetSession:
         self._send(EchoRequest(time.monotonic_ns()))
 
     async def _request_model(self) -> None:
-        asked = Bare(MessageId.REQUEST_MODELDEF)
+        asked = Bare(NatNetMessageId.REQUEST_MODELDEF)
         await self._request(asked, MODEL_S, lambda: self._known is not None)
         if self._known is None:
             raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
@@ -257,7 +257,7 @@ class NatNetSession:
                 echo_at = now + random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
 
             if unicast and now >= alive_at:
-                self._link.send(Bare(MessageId.KEEPALIVE))
+                self._link.send(Bare(NatNetMessageId.KEEPALIVE))
                 alive_at = now + EVERY_S
 
             if now >= ask_at and (self._model_wanted or self._info_wanted):
@@ -272,7 +272,7 @@ class NatNetSession:
         if self._info_wanted:
             self._send(connect_request(self._settings))
         if self._model_wanted:
-            self._send(Bare(MessageId.REQUEST_MODELDEF))
+            self._send(Bare(NatNetMessageId.REQUEST_MODELDEF))
 
     def _check_alive(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
         """Raise DeviceLostError without decodable frames, or if another server answers."""

@@ -12,7 +12,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Chunk
-from jointfit_protocols.xbus import MASTER, MessageId, XbusCodec, XbusMessage, encode, mtdata2
+from jointfit_protocols.xbus import MASTER, XbusCodec, XbusMessage, XbusMessageId, encode, mtdata2
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -30,7 +30,7 @@ _MOST_REPLY_S = 8.0
 """Upper limit of the wait for a reply of a slow device, s."""
 _QUIET_S = 0.1
 """Pause, s, after which the rest of a message with a corrupt length is no longer expected."""
-_KNOWN = frozenset(map(int, MessageId))
+_KNOWN = frozenset(map(int, XbusMessageId))
 _OTHER_ADDRESS = 0x01
 """Bus address that a stand-alone device also uses in replies."""
 _KEPT = 8192
@@ -76,7 +76,7 @@ class XbusConversation:
         """Send a request until its reply, or an error, arrives; return None if neither does."""
         for _ in range(tries):
             await self.send(mid, data)
-            reply = await self.receive({mid + 1, MessageId.ERROR}, self.reply_s)
+            reply = await self.receive({mid + 1, XbusMessageId.ERROR}, self.reply_s)
 
             if reply is not None:
                 return reply
@@ -112,7 +112,7 @@ class XbusConversation:
         loop = asyncio.get_running_loop()
         began = asked = loop.time()
         sent = before = 0
-        wanted = {MessageId.GOTO_CONFIG_ACK, MessageId.WAKE_UP}
+        wanted = {XbusMessageId.GOTO_CONFIG_ACK, XbusMessageId.WAKE_UP}
         start = self.received
 
         while True:
@@ -124,15 +124,15 @@ class XbusConversation:
             waits = late_s > 0 and self.received > before and now < asked + OUTSTANDING_S
             if sent == 0 or (sent < tries and not waits):
                 asked, before, sent = now, self.received, sent + 1
-                await self.send(MessageId.GOTO_CONFIG)
+                await self.send(XbusMessageId.GOTO_CONFIG)
 
             reply = await self.receive(wanted, wait_s)
-            if reply is not None and reply.mid == MessageId.WAKE_UP:
+            if reply is not None and reply.mid == XbusMessageId.WAKE_UP:
                 await self.send(
-                    MessageId.WAKE_UP_ACK
+                    XbusMessageId.WAKE_UP_ACK
                 )  # the device has just started and waits for this answer
-                await self.send(MessageId.GOTO_CONFIG)
-                reply = await self.receive({MessageId.GOTO_CONFIG_ACK}, wait_s)
+                await self.send(XbusMessageId.GOTO_CONFIG)
+                reply = await self.receive({XbusMessageId.GOTO_CONFIG_ACK}, wait_s)
             if reply is not None:
                 took = loop.time() - began
                 if took > wait_s and late_s:  # the pending requests may still be answered, in order
@@ -169,7 +169,7 @@ class XbusConversation:
 
     def _start_emitting(self, message: XbusMessage) -> None:
         """Start emitting with the acknowledgement of configuration mode."""
-        if self._emitting or message.mid != MessageId.GOTO_CONFIG_ACK:
+        if self._emitting or message.mid != XbusMessageId.GOTO_CONFIG_ACK:
             return
 
         after = self._decoder.fed - message.end
@@ -182,4 +182,4 @@ def _is_certain(message: XbusMessage) -> bool:
     """Whether address, identifier and content identify an Xbus message, besides its checksum."""
     if message.bid not in {MASTER, _OTHER_ADDRESS} or message.mid not in _KNOWN:
         return False
-    return message.mid != MessageId.MT_DATA2 or bool(mtdata2.split(message.data))
+    return message.mid != XbusMessageId.MT_DATA2 or bool(mtdata2.split(message.data))

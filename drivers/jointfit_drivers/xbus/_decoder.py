@@ -16,7 +16,13 @@ from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
 from jointfit_drivers.xbus._raw_orientation import RAW, RawMessage
 from jointfit_drivers.xbus._sync_lines import describe_entry
 from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
-from jointfit_protocols.xbus import MAX_MESSAGE, MessageId, MTData2Layout, XbusCodec, XbusMessage
+from jointfit_protocols.xbus import (
+    MAX_MESSAGE,
+    MTData2Layout,
+    XbusCodec,
+    XbusMessage,
+    XbusMessageId,
+)
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Trigger, decode_item, split, world_of
 
@@ -127,7 +133,7 @@ class XbusDecoder:
         out: list[Decoded] = []
         for event in found:
             if isinstance(event, XbusMessage):
-                if event.mid == MessageId.MT_DATA2:
+                if event.mid == XbusMessageId.MT_DATA2:
                     out += self._decode_measurement(event)
                 else:
                     out += self._device_events(event)
@@ -285,15 +291,15 @@ class XbusDecoder:
     def _device_events(self, message: XbusMessage) -> list[Decoded]:
         """Return the events of a message other than a measurement."""
         mid, data = message.mid, message.data
-        if mid == MessageId.WAKE_UP:
+        if mid == XbusMessageId.WAKE_UP:
             return [] if data else self._wake_up_events()  # a corrupt measurement has data
 
-        if mid in {MessageId.ERROR, MessageId.WARNING}:
+        if mid in {XbusMessageId.ERROR, XbusMessageId.WARNING}:
             code = data[0] if data else 0
-            kind = "error" if mid == MessageId.ERROR else "warning"
+            kind = "error" if mid == XbusMessageId.ERROR else "warning"
             return [DeviceEvent(kind, setup.error_text(code), {"code": code})]
 
-        if mid == MessageId.PRODUCT_CODE:
+        if mid == XbusMessageId.PRODUCT_CODE:
             self._continuity.modulus = setup.fine_time_modulus(setup.decode_text(data))
 
         known = _device_property(mid, data)
@@ -324,7 +330,7 @@ def _gap(lost: int) -> list[Decoded]:
 
 def _device_property(mid: int, data: bytes) -> dict[str, object]:
     """Return the device property in a reply; empty for other and malformed messages."""
-    if mid == MessageId.ALIGNMENT_ROTATION_ACK:
+    if mid == XbusMessageId.ALIGNMENT_ROTATION_ACK:
         rotation = setup.decode_alignment(data)
         if rotation is None or rotation.frame >= len(_ALIGNED):
             return {}
@@ -353,10 +359,10 @@ def _sync(data: bytes) -> list[str] | None:
 
 
 _PROPERTIES: dict[int, tuple[str, Callable[[bytes], object]]] = {
-    MessageId.DEVICE_ID: ("serial", setup.decode_device_id),
-    MessageId.PRODUCT_CODE: ("model", setup.decode_text),
-    MessageId.FIRMWARE: ("firmware", _firmware),
-    MessageId.FILTER_PROFILE_ACK: ("filter_profile", setup.decode_filter_profile),
-    MessageId.OUTPUT_CONFIGURATION_ACK: ("outputs", _outputs),
-    MessageId.SYNC_SETTINGS_ACK: ("sync", _sync),
+    XbusMessageId.DEVICE_ID: ("serial", setup.decode_device_id),
+    XbusMessageId.PRODUCT_CODE: ("model", setup.decode_text),
+    XbusMessageId.FIRMWARE: ("firmware", _firmware),
+    XbusMessageId.FILTER_PROFILE_ACK: ("filter_profile", setup.decode_filter_profile),
+    XbusMessageId.OUTPUT_CONFIGURATION_ACK: ("outputs", _outputs),
+    XbusMessageId.SYNC_SETTINGS_ACK: ("sync", _sync),
 }

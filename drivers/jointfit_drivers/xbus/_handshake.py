@@ -15,7 +15,7 @@ from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.xbus import _sync_lines
 from jointfit_drivers.xbus._conversation import OUTSTANDING_S, XbusConversation
 from jointfit_drivers.xbus._required_outputs import ORIENTATION, message_bytes, required_outputs
-from jointfit_protocols.xbus import MessageId, XbusMessage
+from jointfit_protocols.xbus import XbusMessage, XbusMessageId
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, real_id
 
@@ -104,20 +104,24 @@ class XbusHandshake:
         if not self._settings.reset_if_stuck or not self._conversation.understood:
             return False
         log.warning("%s: streams but does not answer; resetting it", self._who)
-        await self._conversation.send(MessageId.RESET)
+        await self._conversation.send(XbusMessageId.RESET)
         return await self._conversation.enter_config(tries=_RESETS, wait_s=_RESET_WAIT_S)
 
     async def _read_identity(self) -> None:
         """Request the properties that the decoder reports; only the device id is required."""
-        await self._answer(MessageId.REQ_DEVICE_ID)
-        for mid in (MessageId.REQ_PRODUCT_CODE, MessageId.REQ_FIRMWARE, MessageId.FILTER_PROFILE):
+        await self._answer(XbusMessageId.REQ_DEVICE_ID)
+        for mid in (
+            XbusMessageId.REQ_PRODUCT_CODE,
+            XbusMessageId.REQ_FIRMWARE,
+            XbusMessageId.FILTER_PROFILE,
+        ):
             reply = await self._conversation.request(
                 mid
             )  # the reply is emitted; older devices refuse some
-            if reply is not None and reply.mid == MessageId.PRODUCT_CODE:
+            if reply is not None and reply.mid == XbusMessageId.PRODUCT_CODE:
                 self._product_code = setup.decode_text(reply.data)
         for frame in _FRAMES:
-            await self._conversation.request(MessageId.ALIGNMENT_ROTATION, bytes((frame,)))
+            await self._conversation.request(XbusMessageId.ALIGNMENT_ROTATION, bytes((frame,)))
 
     async def _answer(self, mid: int, data: bytes = b"") -> XbusMessage:
         """Return the reply to a request that the device must answer; it may be an error."""
@@ -129,7 +133,7 @@ class XbusHandshake:
     async def _ensure_outputs(self) -> None:
         """Configure the required outputs at the requested rate."""
         rate = int(self._settings.rate_hz)
-        reply = await self._answer(MessageId.OUTPUT_CONFIGURATION)
+        reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION)
         found = _outputs_of(reply)
         faults = output_differences(found, rate, self._triggers, self._needs)
         if not faults:
@@ -145,7 +149,7 @@ class XbusHandshake:
             *((item, setup.MAX_RATE) for item in self._triggers),
         )
 
-        reply = await self._answer(MessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(wanted))
+        reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(wanted))
 
         asked = ", ".join(need.many for need in self._needs)
         self._refuse_error(reply, f"refuses {asked} at {rate} Hz")
@@ -180,7 +184,9 @@ class XbusHandshake:
         self._refuse_to_write(faults)
         log.warning("%s: writing its sync settings: %s", self._who, "; ".join(faults))
 
-        reply = await self._answer(MessageId.SYNC_SETTINGS, setup.encode_sync(asked) or _NO_SYNC)
+        reply = await self._answer(
+            XbusMessageId.SYNC_SETTINGS, setup.encode_sync(asked) or _NO_SYNC
+        )
         self._refuse_error(reply, "refuses these sync settings", "`sync`")
 
         left = _sync_lines.sync_differences(await self._sync_stored(), asked)
@@ -190,19 +196,19 @@ class XbusHandshake:
             )
 
     async def _sync_stored(self) -> tuple[setup.SyncSetting, ...]:
-        reply = await self._answer(MessageId.SYNC_SETTINGS)
+        reply = await self._answer(XbusMessageId.SYNC_SETTINGS)
         self._refuse_error(reply, "has no sync settings", "`sync`: leave it out")
         entries = setup.decode_sync(reply.data) or ()
         return tuple(entry for entry in entries if entry.polarity)  # without entries that are off
 
     async def _start(self) -> None:
-        reply = await self._answer(MessageId.GOTO_MEASUREMENT)
+        reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
         self._refuse_error(reply, "refuses to start measuring")
 
     def _refuse_error(
         self, reply: XbusMessage, what: str, change: str = "`rate_hz` or `baud`"
     ) -> None:
-        if reply.mid == MessageId.ERROR:
+        if reply.mid == XbusMessageId.ERROR:
             code = reply.data[0] if reply.data else 0
             raise DeviceMisconfiguredError(
                 f"{self._who}: {what} ({setup.error_text(code)}): change {change}"
@@ -251,7 +257,7 @@ class XbusHandshake:
             except DeviceMisconfiguredError:  # the port does not support it
                 continue
             if answered:  # wait for the reply: closing the port discards unsent bytes
-                await self._conversation.request(MessageId.GOTO_MEASUREMENT)
+                await self._conversation.request(XbusMessageId.GOTO_MEASUREMENT)
             if answered or self._conversation.understood:
                 return baud
         return None
@@ -292,7 +298,7 @@ def output_differences(
 
 
 def _outputs_of(reply: XbusMessage) -> tuple[setup.Output, ...]:
-    return (setup.decode_outputs(reply.data) or ()) if reply.mid != MessageId.ERROR else ()
+    return (setup.decode_outputs(reply.data) or ()) if reply.mid != XbusMessageId.ERROR else ()
 
 
 def _hz(rate: int) -> str:

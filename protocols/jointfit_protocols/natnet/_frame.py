@@ -69,7 +69,7 @@ class Body(NamedTuple):
     """Bit 0 tracked; clear if the last valid pose is repeated."""
 
 
-class Marker(NamedTuple):
+class LabeledMarker(NamedTuple):
     """One labeled marker (26 bytes); id is ``model << 16 | member``, model 0 if it has none."""
 
     id: int
@@ -102,7 +102,7 @@ class Asset(NamedTuple):
 
     id: int
     bodies: tuple[Body, ...]
-    markers: tuple[Marker, ...]
+    markers: tuple[LabeledMarker, ...]
 
 
 class Analog(NamedTuple):
@@ -124,7 +124,7 @@ class FrameOfData(NamedTuple):
     transmit: int
     params: int = 0
     bodies: tuple[Body, ...] = ()
-    markers: tuple[Marker, ...] = ()
+    markers: tuple[LabeledMarker, ...] = ()
     marker_sets: tuple[MarkerSet, ...] = ()
     other_markers: tuple[Position, ...] = ()
     skeletons: tuple[Skeleton, ...] = ()
@@ -238,8 +238,8 @@ def _read_bodies(cursor: Cursor, n: int) -> tuple[Body, ...]:
     return tuple(map(Body._make, cursor.records(BODY_LAYOUT, n)))
 
 
-def _read_markers(cursor: Cursor, n: int) -> tuple[Marker, ...]:
-    return tuple(map(Marker._make, cursor.records(MARKER_LAYOUT, n)))
+def _read_markers(cursor: Cursor, n: int) -> tuple[LabeledMarker, ...]:
+    return tuple(map(LabeledMarker._make, cursor.records(MARKER_LAYOUT, n)))
 
 
 def _read_skeletons(cursor: Cursor, n: int) -> tuple[Skeleton, ...]:

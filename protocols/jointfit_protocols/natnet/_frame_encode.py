@@ -21,7 +21,7 @@ from jointfit_protocols.natnet._frame import (
     Asset,
     Body,
     FrameOfData,
-    Marker,
+    LabeledMarker,
     MarkerSet,
     Position,
     Skeleton,
@@ -101,7 +101,7 @@ def _put_body(body: Body) -> bytes:
     return BODY_LAYOUT.pack(*body)
 
 
-def _put_marker(marker: Marker) -> bytes:
+def _put_marker(marker: LabeledMarker) -> bytes:
     return MARKER_LAYOUT.pack(*marker)
 
 

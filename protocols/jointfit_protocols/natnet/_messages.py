@@ -40,7 +40,7 @@ _INFO = struct.Struct("<256s4B4B")
 _INFO_TAIL = struct.Struct("<QHB4B")
 
 
-class MessageId(IntEnum):
+class NatNetMessageId(IntEnum):
     """First field of the header."""
 
     CONNECT = 0
@@ -86,14 +86,14 @@ class Discovery(NamedTuple):
     connect: Connect
 
 
-class Request(NamedTuple):
+class CommandRequest(NamedTuple):
     """A command as text: ``FrameRate``, ``Bitstream,4.1`` and so on."""
 
     command: str
 
 
-class Response(NamedTuple):
-    """The answer to a `Request`: int32, float32 or text, depending on the request."""
+class CommandResponse(NamedTuple):
+    """The answer to a `CommandRequest`: int32, float32 or text, depending on the request."""
 
     data: bytes
 
@@ -125,15 +125,15 @@ class EchoResponse(NamedTuple):
 class Bare(NamedTuple):
     """A message that consists of its id; bytes after the header have no meaning."""
 
-    id: MessageId
+    id: NatNetMessageId
 
 
 Message = (
     Connect
     | Discovery
     | ServerInfo
-    | Request
-    | Response
+    | CommandRequest
+    | CommandResponse
     | ModelDefinition
     | FrameOfData
     | MessageString
@@ -169,7 +169,9 @@ def _decode_plain(datagram: bytes, number: int) -> Message | CorruptBytes:
 
     found = read(datagram[HEADER.size :])
     if found is None:
-        return CorruptBytes(len(datagram), f"{MessageId(number).name} of {len(datagram)} bytes")
+        return CorruptBytes(
+            len(datagram), f"{NatNetMessageId(number).name} of {len(datagram)} bytes"
+        )
     return found
 
 
@@ -224,34 +226,34 @@ def _read_echo(data: bytes) -> EchoResponse | None:
     return EchoResponse(*_ECHO.unpack(data)) if len(data) == _ECHO.size else None
 
 
-def _bare(number: MessageId) -> Callable[[bytes], Bare]:
+def _bare(number: NatNetMessageId) -> Callable[[bytes], Bare]:
     bare = Bare(number)
     return lambda _: bare
 
 
 _BARE = (
-    MessageId.REQUEST_MODELDEF,
-    MessageId.REQUEST_FRAMEOFDATA,
-    MessageId.DISCONNECT,
-    MessageId.KEEPALIVE,
-    MessageId.DISCONNECTBYTIMEOUT,
-    MessageId.UNRECOGNIZED_REQUEST,
+    NatNetMessageId.REQUEST_MODELDEF,
+    NatNetMessageId.REQUEST_FRAMEOFDATA,
+    NatNetMessageId.DISCONNECT,
+    NatNetMessageId.KEEPALIVE,
+    NatNetMessageId.DISCONNECTBYTIMEOUT,
+    NatNetMessageId.UNRECOGNIZED_REQUEST,
 )
 
 _VERSIONED: dict[int, Callable[[bytes, Version], FrameOfData | ModelDefinition | CorruptBytes]] = {
-    MessageId.FRAMEOFDATA: decode_frame,
-    MessageId.MODELDEF: decode_model,
+    NatNetMessageId.FRAMEOFDATA: decode_frame,
+    NatNetMessageId.MODELDEF: decode_model,
 }
 
 _READERS: dict[int, Callable[[bytes], Message | None]] = {
-    MessageId.CONNECT: decode_connect,
-    MessageId.DISCOVERY: _read_discovery,
-    MessageId.SERVERINFO: _read_info,
-    MessageId.REQUEST: lambda data: Request(fixed_text(data)),
-    MessageId.RESPONSE: Response,
-    MessageId.MESSAGESTRING: lambda data: MessageString(fixed_text(data)),
-    MessageId.ECHOREQUEST: _read_stamp,
-    MessageId.ECHORESPONSE: _read_echo,
+    NatNetMessageId.CONNECT: decode_connect,
+    NatNetMessageId.DISCOVERY: _read_discovery,
+    NatNetMessageId.SERVERINFO: _read_info,
+    NatNetMessageId.REQUEST: lambda data: CommandRequest(fixed_text(data)),
+    NatNetMessageId.RESPONSE: CommandResponse,
+    NatNetMessageId.MESSAGESTRING: lambda data: MessageString(fixed_text(data)),
+    NatNetMessageId.ECHOREQUEST: _read_stamp,
+    NatNetMessageId.ECHORESPONSE: _read_echo,
     **{number: _bare(number) for number in _BARE},
 }
 
@@ -259,28 +261,28 @@ _READERS: dict[int, Callable[[bytes], Message | None]] = {
 # --- writing ----------------------------------------------------------------------------------
 
 
-def _payload(message: Message, version: Version) -> tuple[MessageId, bytes]:  # noqa: C901, PLR0911 - one case a message
+def _payload(message: Message, version: Version) -> tuple[NatNetMessageId, bytes]:  # noqa: C901, PLR0911 - one case a message
     match message:
         case FrameOfData():
-            return MessageId.FRAMEOFDATA, encode_frame(message, version)
+            return NatNetMessageId.FRAMEOFDATA, encode_frame(message, version)
         case ModelDefinition():
-            return MessageId.MODELDEF, encode_model(message, version)
+            return NatNetMessageId.MODELDEF, encode_model(message, version)
         case ServerInfo():
-            return MessageId.SERVERINFO, _put_info(message)
+            return NatNetMessageId.SERVERINFO, _put_info(message)
         case Connect():
-            return MessageId.CONNECT, encode_connect(message)
+            return NatNetMessageId.CONNECT, encode_connect(message)
         case Discovery():
-            return MessageId.DISCOVERY, encode_connect(message.connect)
-        case Request():
-            return MessageId.REQUEST, message.command.encode() + b"\0"
-        case Response():
-            return MessageId.RESPONSE, message.data
+            return NatNetMessageId.DISCOVERY, encode_connect(message.connect)
+        case CommandRequest():
+            return NatNetMessageId.REQUEST, message.command.encode() + b"\0"
+        case CommandResponse():
+            return NatNetMessageId.RESPONSE, message.data
         case MessageString():
-            return MessageId.MESSAGESTRING, message.text.encode() + b"\0"
+            return NatNetMessageId.MESSAGESTRING, message.text.encode() + b"\0"
         case EchoRequest():
-            return MessageId.ECHOREQUEST, _STAMP.pack(message.stamp)
+            return NatNetMessageId.ECHOREQUEST, _STAMP.pack(message.stamp)
         case EchoResponse():
-            return MessageId.ECHORESPONSE, _ECHO.pack(*message)
+            return NatNetMessageId.ECHORESPONSE, _ECHO.pack(*message)
         case Bare():
             return message.id, b""
 

@@ -5,9 +5,9 @@ from jointfit_protocols.xbus._framing import (
     MAX_DATA,
     MAX_MESSAGE,
     PREAMBLE,
-    MessageId,
     XbusCodec,
     XbusMessage,
+    XbusMessageId,
     encode,
 )
 from jointfit_protocols.xbus._mtdata2_layout import MTData2Layout
@@ -18,8 +18,8 @@ __all__ = [
     "MAX_MESSAGE",
     "PREAMBLE",
     "MTData2Layout",
-    "MessageId",
     "XbusCodec",
     "XbusMessage",
+    "XbusMessageId",
     "encode",
 ]

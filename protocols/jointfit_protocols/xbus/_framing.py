@@ -31,7 +31,7 @@ _RUN = MAX_MESSAGE
 """Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
 
 
-class MessageId(IntEnum):
+class XbusMessageId(IntEnum):
     """Message identifiers; a reply is its request plus one."""
 
     REQ_DEVICE_ID = 0x00

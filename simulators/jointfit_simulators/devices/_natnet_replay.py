@@ -18,8 +18,8 @@ from jointfit_protocols.natnet import (
     EchoRequest,
     EchoResponse,
     FrameOfData,
-    MessageId,
     ModelDefinition,
+    NatNetMessageId,
     ServerInfo,
     decode,
     encode,
@@ -119,7 +119,7 @@ class NatNetReplay:
                 self._port.send(encode(own), address)
             case EchoRequest(stamp):
                 self._port.send(encode(EchoResponse(stamp, self._now_ticks())), address)
-            case Bare(MessageId.REQUEST_MODELDEF):
+            case Bare(NatNetMessageId.REQUEST_MODELDEF):
                 self._port.send(self._model, address)
                 self._client = address
                 self._ready.set()

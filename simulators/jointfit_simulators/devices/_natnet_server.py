@@ -20,14 +20,14 @@ from jointfit_protocols.natnet import (
     HEADER,
     SIZED,
     Bare,
+    CommandRequest,
+    CommandResponse,
     Connect,
     Discovery,
     EchoRequest,
     EchoResponse,
     Message,
-    MessageId,
-    Request,
-    Response,
+    NatNetMessageId,
     ServerInfo,
     Version,
     decode,
@@ -179,7 +179,7 @@ class NatNetServer:
         now_ns = time.monotonic_ns()
         for client in self.clients:
             if now_ns - client.heard_ns > self.options.keepalive_s * _NS:
-                self._send(Bare(MessageId.DISCONNECTBYTIMEOUT), client.address)
+                self._send(Bare(NatNetMessageId.DISCONNECTBYTIMEOUT), client.address)
                 self._forget(client)
             elif client.described or now_ns - client.since_ns > _PATIENCE_NS:
                 self._send_frame(client, frame)
@@ -244,11 +244,11 @@ class NatNetServer:
                 self._connect(message, address)
             case EchoRequest(stamp):
                 self._send(EchoResponse(stamp, self._ticks(time.monotonic_ns())), address)
-            case Request(command):
+            case CommandRequest(command):
                 self._send(self._answer(command, client), address)
-            case Bare(MessageId.REQUEST_MODELDEF):
+            case Bare(NatNetMessageId.REQUEST_MODELDEF):
                 self._describe(client or self._listeners, address)
-            case Bare(MessageId.DISCONNECT) if client is not None:
+            case Bare(NatNetMessageId.DISCONNECT) if client is not None:
                 self._forget(client)
             case _:
                 return
@@ -285,16 +285,16 @@ class NatNetServer:
     def _answer(self, command: str, client: Client | None) -> Message:
         word, _, rest = command.partition(",")
         if word == "FrameRate":
-            return Response(struct.pack("<f", self.options.rate_hz))
+            return CommandResponse(struct.pack("<f", self.options.rate_hz))
         if word == "UnitsToMillimeters":
-            return Response(struct.pack("<f", 1000.0))
+            return CommandResponse(struct.pack("<f", 1000.0))
         if word == "AnalogSamplesPerMocapFrame":
-            return Response(bytes(4))
+            return CommandResponse(bytes(4))
         version = _version(rest)
         if word == "Bitstream" and client is not None and version and self._selectable:
             client.version, client.changed = version, _ANNOUNCED_FRAMES
-            return Response(command.encode() + b"\0")
-        return Bare(MessageId.UNRECOGNIZED_REQUEST)
+            return CommandResponse(command.encode() + b"\0")
+        return Bare(NatNetMessageId.UNRECOGNIZED_REQUEST)
 
     def _describe(self, client: Client, address: Address) -> None:
         model = model_definition(self._stage.bodies, client.version)

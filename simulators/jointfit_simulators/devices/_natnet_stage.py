@@ -22,7 +22,7 @@ from jointfit_protocols.natnet import (
     Body,
     BodyDescription,
     FrameOfData,
-    Marker,
+    LabeledMarker,
     MarkerSet,
     MarkerSetDescription,
     ModelDefinition,
@@ -160,14 +160,16 @@ class Stage:
             ),
         )
 
-    def _labeled(self, body: StagedBody, markers: Markers) -> list[Marker]:
+    def _labeled(self, body: StagedBody, markers: Markers) -> list[LabeledMarker]:
         found = []
         for member, name in enumerate(body.markers, 1):
             seen = markers.get(name) is not None
             if seen or (self._hiding == "filled" and name in self._markers):
                 x, y, z = self._markers[name]
                 params = _SEEN if seen else _FILLED
-                found.append(Marker(body.id << 16 | member, x, y, z, _SIZE, params, _RESIDUAL))
+                found.append(
+                    LabeledMarker(body.id << 16 | member, x, y, z, _SIZE, params, _RESIDUAL)
+                )
         return found
 
 

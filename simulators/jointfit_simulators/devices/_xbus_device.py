@@ -14,7 +14,7 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.orientation import native_of
-from jointfit_protocols.xbus import MASTER, MessageId, XbusCodec, XbusMessage, encode, mtdata2
+from jointfit_protocols.xbus import MASTER, XbusCodec, XbusMessage, XbusMessageId, encode, mtdata2
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1
@@ -143,7 +143,7 @@ class XbusDevice:
     def line_ns(self) -> int:
         """How long a sample takes on a real line of the host's speed, ns."""
         baud = self._line.host_baud
-        size = len(encode(MessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
+        size = len(encode(XbusMessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
         return size * _BITS * 1_000_000_000 // baud if baud else 0
 
     @property
@@ -180,7 +180,7 @@ class XbusDevice:
         self._stuck, self._measuring = False, False
         self._epoch_ns, self._counter = self._last_ns, self._options.first_counter
         self._sync.forget()
-        self._send(MessageId.WAKE_UP)
+        self._send(XbusMessageId.WAKE_UP)
         self._waking = True
         self._after(WAKE_UP_S, self._measure_by_itself)
 
@@ -212,14 +212,14 @@ class XbusDevice:
                 self._answer(event)
 
     def _answer(self, message: XbusMessage) -> None:
-        if message.mid == MessageId.RESET:
-            self._send(MessageId.RESET_ACK)
+        if message.mid == XbusMessageId.RESET:
+            self._send(XbusMessageId.RESET_ACK)
             self.power_cycle()
         elif self._stuck:
             return
-        elif message.mid == MessageId.WAKE_UP_ACK and self._waking:
+        elif message.mid == XbusMessageId.WAKE_UP_ACK and self._waking:
             self._stop()
-        elif message.mid == MessageId.GOTO_CONFIG:
+        elif message.mid == XbusMessageId.GOTO_CONFIG:
             if self._measuring and self._options.config_delay_s:
                 self._after(self._options.config_delay_s, lambda: self._configure(message.bid))
             else:
@@ -230,7 +230,7 @@ class XbusDevice:
 
     def _configure(self, bid: int) -> None:
         self._stop()
-        self._send(MessageId.GOTO_CONFIG_ACK, b"", bid)
+        self._send(XbusMessageId.GOTO_CONFIG_ACK, b"", bid)
 
     def _stop(self) -> None:
         self._measuring = self._waking = False
@@ -241,24 +241,24 @@ class XbusDevice:
         self._waking, self._measuring = False, True
 
     def _go_to_measurement(self, _: bytes) -> tuple[int, bytes]:
-        self._send(MessageId.CONFIGURATION, bytes(118))  # a boot message may come first
+        self._send(XbusMessageId.CONFIGURATION, bytes(118))  # a boot message may come first
         self._measuring = True
-        return MessageId.GOTO_MEASUREMENT_ACK, b""
+        return XbusMessageId.GOTO_MEASUREMENT_ACK, b""
 
     def _device_id(self, _: bytes) -> tuple[int, bytes]:
-        return MessageId.DEVICE_ID, self._options.device_id
+        return XbusMessageId.DEVICE_ID, self._options.device_id
 
     def _product_code(self, _: bytes) -> tuple[int, bytes]:
-        return MessageId.PRODUCT_CODE, self._options.product_code.ljust(20).encode("ascii")
+        return XbusMessageId.PRODUCT_CODE, self._options.product_code.ljust(20).encode("ascii")
 
     def _firmware(self, _: bytes) -> tuple[int, bytes]:
         firmware = setup.Firmware(*self._options.firmware, build=74, scm=0)
-        return MessageId.FIRMWARE, setup.encode_firmware(firmware)
+        return XbusMessageId.FIRMWARE, setup.encode_firmware(firmware)
 
     def _filter_profile(self, data: bytes) -> tuple[int, bytes]:
         if data:
-            return MessageId.ERROR, _PARAMETER
-        return MessageId.FILTER_PROFILE_ACK, self._options.filter_profile
+            return XbusMessageId.ERROR, _PARAMETER
+        return XbusMessageId.FILTER_PROFILE_ACK, self._options.filter_profile
 
     def _alignment_rotation(self, data: bytes) -> tuple[int, bytes]:
         rotation = setup.decode_alignment(data)
@@ -267,38 +267,38 @@ class XbusDevice:
             self.flash_writes += 1
         frame = data[0] if data else 0
         if frame not in self._alignment:
-            return MessageId.ERROR, _PARAMETER
+            return XbusMessageId.ERROR, _PARAMETER
         rotation = setup.AlignmentRotation(frame, self._alignment[frame])
-        return MessageId.ALIGNMENT_ROTATION_ACK, setup.encode_alignment(rotation)
+        return XbusMessageId.ALIGNMENT_ROTATION_ACK, setup.encode_alignment(rotation)
 
     def _output_configuration(self, data: bytes) -> tuple[int, bytes]:
         wanted = setup.decode_outputs(data)
         if wanted is None or len(wanted) > _MOST_OUTPUTS:
-            return MessageId.ERROR, _INVALID
+            return XbusMessageId.ERROR, _INVALID
         if not all(map(_can_do, wanted)):
-            return MessageId.ERROR, _PARAMETER
+            return XbusMessageId.ERROR, _PARAMETER
         if wanted:
             self._outputs = tuple(map(_effective, wanted))
             self.flash_writes += 1
-        return MessageId.OUTPUT_CONFIGURATION_ACK, setup.encode_outputs(self._outputs)
+        return XbusMessageId.OUTPUT_CONFIGURATION_ACK, setup.encode_outputs(self._outputs)
 
     def _sync_settings(self, data: bytes) -> tuple[int, bytes]:
         if not data:
-            return MessageId.SYNC_SETTINGS_ACK, setup.encode_sync(self._sync.entries)
+            return XbusMessageId.SYNC_SETTINGS_ACK, setup.encode_sync(self._sync.entries)
         if not self._sync.store(data):
-            return MessageId.ERROR, _INVALID
+            return XbusMessageId.ERROR, _INVALID
         self.flash_writes += 1
-        return MessageId.SYNC_SETTINGS_ACK, b""
+        return XbusMessageId.SYNC_SETTINGS_ACK, b""
 
     _ANSWERS: dict[int, Callable[[XbusDevice, bytes], tuple[int, bytes]]] = {  # noqa: RUF012 - a table
-        MessageId.GOTO_MEASUREMENT: _go_to_measurement,
-        MessageId.REQ_DEVICE_ID: _device_id,
-        MessageId.REQ_PRODUCT_CODE: _product_code,
-        MessageId.REQ_FIRMWARE: _firmware,
-        MessageId.FILTER_PROFILE: _filter_profile,
-        MessageId.ALIGNMENT_ROTATION: _alignment_rotation,
-        MessageId.OUTPUT_CONFIGURATION: _output_configuration,
-        MessageId.SYNC_SETTINGS: _sync_settings,
+        XbusMessageId.GOTO_MEASUREMENT: _go_to_measurement,
+        XbusMessageId.REQ_DEVICE_ID: _device_id,
+        XbusMessageId.REQ_PRODUCT_CODE: _product_code,
+        XbusMessageId.REQ_FIRMWARE: _firmware,
+        XbusMessageId.FILTER_PROFILE: _filter_profile,
+        XbusMessageId.ALIGNMENT_ROTATION: _alignment_rotation,
+        XbusMessageId.OUTPUT_CONFIGURATION: _output_configuration,
+        XbusMessageId.SYNC_SETTINGS: _sync_settings,
     }
 
     # --- what it says -------------------------------------------------------------------------
@@ -331,7 +331,7 @@ class XbusDevice:
             return False
         edges = self._sync.next_triggers([data_id for data_id, _ in self._outputs])
         data = self._content(counter, ticks % self._modulus, q, edges)
-        return self._send(MessageId.MT_DATA2, data)
+        return self._send(XbusMessageId.MT_DATA2, data)
 
     def _content(
         self, counter: int, ticks: int, q: Quaternion | None, edges: Mapping[int, Trigger]

@@ -47,7 +47,7 @@ def xbus_bytes(samples: Iterable[tuple[int, Quaternion]]) -> bytes:
             (Item.STATUS_WORD, mtdata2.FILTER_VALID),
             (Item.QUATERNION, native_of(q)),
         ]
-        messages.append(xbus.encode(xbus.MessageId.MT_DATA2, mtdata2.encode_items(items)))
+        messages.append(xbus.encode(xbus.XbusMessageId.MT_DATA2, mtdata2.encode_items(items)))
     return b"".join(messages)
 
 

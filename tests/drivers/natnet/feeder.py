@@ -15,7 +15,7 @@ from jointfit_protocols.natnet import (
     Body,
     BodyDescription,
     FrameOfData,
-    Marker,
+    LabeledMarker,
     MarkerSetDescription,
     Message,
     ModelDefinition,
@@ -46,8 +46,8 @@ MODEL = ModelDefinition(
 )
 
 
-def marker(number: int, at: tuple[float, float, float], params: int = 10) -> Marker:
-    return Marker(number, *at, 0.5, params, 0.0)
+def marker(number: int, at: tuple[float, float, float], params: int = 10) -> LabeledMarker:
+    return LabeledMarker(number, *at, 0.5, params, 0.0)
 
 
 def body(number: int, q: tuple[float, float, float, float], params: int = 1) -> Body:

@@ -25,13 +25,13 @@ from jointfit_protocols.natnet import (
     FRAME_MODEL_CHANGED,
     Bare,
     Body,
+    CommandRequest,
+    CommandResponse,
     EchoRequest,
     EchoResponse,
     FrameOfData,
-    MessageId,
     ModelDefinition,
-    Request,
-    Response,
+    NatNetMessageId,
 )
 from tests.drivers.natnet.feeder import (
     INFO,
@@ -214,7 +214,7 @@ def test_a_changed_model_is_announced_once() -> None:
 
 def test_the_bitstream_follows_the_response_and_the_frames_stay_readable() -> None:
     feeder = ready()
-    assert feeder(Response(b"Bitstream,4.1\0")) == []
+    assert feeder(CommandResponse(b"Bitstream,4.1\0")) == []
     feeder.version = (4, 1)
     setting, first = feeder(frame(1))
     assert isinstance(setting, DeviceEvent)
@@ -239,7 +239,14 @@ def test_a_server_of_bitstream_2_is_refused_by_name() -> None:
 def test_what_a_client_says_has_no_effect() -> None:
     feeder = ready()
     before = feeder.decoder.messages
-    assert feeder(Bare(MessageId.KEEPALIVE), Request("FrameRate"), Bare(MessageId.DISCONNECT)) == []
+    assert (
+        feeder(
+            Bare(NatNetMessageId.KEEPALIVE),
+            CommandRequest("FrameRate"),
+            Bare(NatNetMessageId.DISCONNECT),
+        )
+        == []
+    )
     assert feeder.decoder.messages == before + 3
 
 

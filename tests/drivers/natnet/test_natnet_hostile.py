@@ -23,15 +23,15 @@ from jointfit_drivers.ports.udp_socket import UdpSocket
 from jointfit_protocols.natnet import (
     Bare,
     BodyDescription,
+    CommandRequest,
+    CommandResponse,
     Connect,
     EchoRequest,
     EchoResponse,
     MarkerSetDescription,
     Message,
-    MessageId,
     ModelDefinition,
-    Request,
-    Response,
+    NatNetMessageId,
     SkeletonDescription,
     encode,
 )
@@ -101,7 +101,7 @@ def test_frames_lost_in_a_long_silence_are_counted() -> None:
 @pytest.mark.parametrize("text", [b"Bitstream,2.9", b"Bitstream,4.1", b"Bitstream,99.99"])
 def test_a_bitstream_that_frames_do_not_have_is_not_adopted(text: bytes) -> None:
     feeder = ready()
-    assert feeder(Response(text + b"\0")) == []
+    assert feeder(CommandResponse(text + b"\0")) == []
     (found,) = feeder(frame(1))
     assert isinstance(found, MocapFrame)
 
@@ -148,8 +148,8 @@ def test_a_model_of_one_datagram_costs_no_second_and_bounded_columns(
     ("question", "answer"),
     [
         (Connect(), INFO),
-        (Bare(MessageId.REQUEST_MODELDEF), MODEL),
-        (Request("Bitstream,4.1"), Response(b"Bitstream,4.1\0")),
+        (Bare(NatNetMessageId.REQUEST_MODELDEF), MODEL),
+        (CommandRequest("Bitstream,4.1"), CommandResponse(b"Bitstream,4.1\0")),
         (EchoRequest(S), EchoResponse(S, 5)),
     ],
     ids=["info", "model", "response", "echo"],

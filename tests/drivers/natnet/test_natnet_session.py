@@ -18,7 +18,7 @@ from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.model import ClockEcho, MocapFrame
 from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _session
 from jointfit_drivers.ports.udp_socket import UdpSocket, local_address
-from jointfit_protocols.natnet import MessageId, ServerInfo, encode
+from jointfit_protocols.natnet import NatNetMessageId, ServerInfo, encode
 from jointfit_simulators.contract_scene import Listener
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
 from jointfit_simulators.devices._natnet_replay import NatNetReplay
@@ -78,7 +78,7 @@ async def test_the_real_capture_plays_through_socket_and_driver_frame_by_frame(
     got = heard.measurements
     assert server.sent == server.frames == len(got) == 518
     assert [frame.number for frame in got] == list(range(162734, 163252))
-    frames = [data for _, data in recorded if data[:1] == bytes([MessageId.FRAMEOFDATA])]
+    frames = [data for _, data in recorded if data[:1] == bytes([NatNetMessageId.FRAMEOFDATA])]
     assert [chunk.data for chunk in heard.chunks if len(chunk.data) == 336] == frames
     mean = np.mean([frame.body_positions[0] for frame in got], axis=0)
     assert mean == pytest.approx([0.1744416, 1.4471301, -0.7343158], abs=2e-6)

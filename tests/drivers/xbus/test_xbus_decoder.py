@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusDecoder
 from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 
@@ -34,7 +34,7 @@ def message(counter: int, ticks: int, q: tuple[float, ...] | None = IDENTITY) ->
     items: list[tuple[int, Any]] = [(Item.PACKET_COUNTER, counter), (Item.SAMPLE_TIME_FINE, ticks)]
     if q is not None:
         items.append((Item.QUATERNION, q))
-    return encode(MessageId.MT_DATA2, encode_items(items))
+    return encode(XbusMessageId.MT_DATA2, encode_items(items))
 
 
 def fed(events: XbusDecoder, *wires: bytes) -> list[Decoded]:
@@ -88,7 +88,7 @@ def test_any_bytes_give_events_and_every_lost_byte_is_counted(wires: list[bytes]
 
 @given(st.binary(max_size=80))
 def test_any_data_in_any_message_gives_events(data: bytes) -> None:
-    for mid in MessageId:
+    for mid in XbusMessageId:
         fed(decoder(), encode(mid, data))
 
 
@@ -154,7 +154,7 @@ def test_the_clock_wraps_where_the_model_says_or_where_it_is_seen(
     for turn in (2**32, 864_000_000) if modulus is None else (modulus,):
         events = decoder()
         if product is not None:
-            fed(events, encode(MessageId.PRODUCT_CODE, product.encode()))
+            fed(events, encode(XbusMessageId.PRODUCT_CODE, product.encode()))
             assert events.tick_clock.modulus == turn
         found = fed(events, message(1, turn - 150), message(2, turn - 50), message(3, 50))
         assert told(found) == []
@@ -186,7 +186,7 @@ def test_time_that_leaps_without_the_counter_is_a_restart() -> None:
 
 
 def test_waking_up_is_a_restart_once_it_has_measured() -> None:
-    wake = encode(MessageId.WAKE_UP)
+    wake = encode(XbusMessageId.WAKE_UP)
     assert told(fed(decoder(), wake, message(1, 100))) == []
     events = fed(decoder(), message(900, 90_000), wake, message(0, 100), message(1, 200))
     assert [kind for kind, _ in told(events)] == ["restart"]
@@ -275,7 +275,9 @@ def test_a_gap_of_hours_is_counted_whole() -> None:
 
 
 def test_a_wake_up_with_data_is_a_damaged_measurement() -> None:
-    events = fed(decoder(), message(1, 100), encode(MessageId.WAKE_UP, bytes(20)), message(2, 200))
+    events = fed(
+        decoder(), message(1, 100), encode(XbusMessageId.WAKE_UP, bytes(20)), message(2, 200)
+    )
     assert told(events) == []
 
 
@@ -309,14 +311,14 @@ def test_a_wrong_scale_is_said_once_with_the_norm_measured() -> None:
 
 def test_items_that_do_not_fill_the_message_make_it_corrupt() -> None:
     events = decoder()
-    wire = encode(MessageId.MT_DATA2, encode_items([(Item.PACKET_COUNTER, 1)]) + b"\x20\x10")
+    wire = encode(XbusMessageId.MT_DATA2, encode_items([(Item.PACKET_COUNTER, 1)]) + b"\x20\x10")
     (found,) = fed(events, wire)
     assert isinstance(found, Corrupt)
     assert found.discarded == len(wire) == events.discarded_bytes
 
 
 def test_a_quaternion_of_the_wrong_size_makes_it_corrupt() -> None:
-    wire = encode(MessageId.MT_DATA2, encode_items([(Item.QUATERNION, bytes(12))]))
+    wire = encode(XbusMessageId.MT_DATA2, encode_items([(Item.QUATERNION, bytes(12))]))
     (found,) = fed(decoder(), wire)
     assert isinstance(found, Corrupt)
 
@@ -331,13 +333,13 @@ def test_the_sign_never_jumps() -> None:
 def test_what_the_device_says_of_itself_is_information() -> None:
     found = fed(
         decoder(),
-        encode(MessageId.DEVICE_ID, bytes.fromhex("0360a1b2")),
-        encode(MessageId.PRODUCT_CODE, b"MTi-630-8A1G6   "),
-        encode(MessageId.FIRMWARE, setup.encode_firmware(setup.Firmware(1, 2, 3, 4, 5))),
-        encode(MessageId.FILTER_PROFILE_ACK, b"General/VRU"),
-        encode(MessageId.OUTPUT_CONFIGURATION_ACK, bytes.fromhex("20100064")),
+        encode(XbusMessageId.DEVICE_ID, bytes.fromhex("0360a1b2")),
+        encode(XbusMessageId.PRODUCT_CODE, b"MTi-630-8A1G6   "),
+        encode(XbusMessageId.FIRMWARE, setup.encode_firmware(setup.Firmware(1, 2, 3, 4, 5))),
+        encode(XbusMessageId.FILTER_PROFILE_ACK, b"General/VRU"),
+        encode(XbusMessageId.OUTPUT_CONFIGURATION_ACK, bytes.fromhex("20100064")),
         encode(
-            MessageId.ALIGNMENT_ROTATION_ACK,
+            XbusMessageId.ALIGNMENT_ROTATION_ACK,
             setup.encode_alignment(setup.AlignmentRotation(1, IDENTITY)),
         ),
     )
@@ -353,7 +355,7 @@ def test_what_the_device_says_of_itself_is_information() -> None:
 
 
 def test_an_error_of_the_device_is_an_event_in_words() -> None:
-    (event,) = fed(decoder(), encode(MessageId.ERROR, b"\x1e"))
+    (event,) = fed(decoder(), encode(XbusMessageId.ERROR, b"\x1e"))
     assert isinstance(event, DeviceEvent)
     assert (event.kind, dict(event.data)) == ("error", {"code": 0x1E})
     assert "baud" in event.text

@@ -15,7 +15,7 @@ from jointfit_daemon.model import Chunk, DeviceEvent, ImuSample
 from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_drivers.xbus._handshake import output_differences
 from jointfit_drivers.xbus._required_outputs import required_outputs
-from jointfit_protocols.xbus import MessageId, XbusCodec, XbusMessage
+from jointfit_protocols.xbus import XbusCodec, XbusMessage, XbusMessageId
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
 from jointfit_simulators.contract_scene import orientation
@@ -63,7 +63,7 @@ async def chunks_of(driver: XbusImu, samples: int = 5) -> list[Chunk]:
     task = asyncio.create_task(driver.run(chunks.append))
     try:
         async with asyncio.timeout(10):
-            while mids(chunks).count(MessageId.MT_DATA2) < samples:
+            while mids(chunks).count(XbusMessageId.MT_DATA2) < samples:
                 if task.done():
                     task.result()
                 await asyncio.sleep(0.005)
@@ -99,15 +99,15 @@ async def test_what_is_emitted_begins_with_the_acknowledgement_and_holds_all_rep
         await asyncio.sleep(0.05)
         chunks = await chunks_of(make(tmp_path), 20)
     found = mids(chunks)
-    assert found[0] == MessageId.GOTO_CONFIG_ACK
-    setup_ids = found[: found.index(MessageId.GOTO_MEASUREMENT_ACK)]
-    assert MessageId.MT_DATA2 not in setup_ids  # nothing of before
+    assert found[0] == XbusMessageId.GOTO_CONFIG_ACK
+    setup_ids = found[: found.index(XbusMessageId.GOTO_MEASUREMENT_ACK)]
+    assert XbusMessageId.MT_DATA2 not in setup_ids  # nothing of before
     assert {
-        MessageId.DEVICE_ID, MessageId.PRODUCT_CODE, MessageId.FIRMWARE,
-        MessageId.FILTER_PROFILE_ACK, MessageId.OUTPUT_CONFIGURATION_ACK,
+        XbusMessageId.DEVICE_ID, XbusMessageId.PRODUCT_CODE, XbusMessageId.FIRMWARE,
+        XbusMessageId.FILTER_PROFILE_ACK, XbusMessageId.OUTPUT_CONFIGURATION_ACK,
     } <= set(setup_ids)  # fmt: skip
-    assert setup_ids.count(MessageId.ALIGNMENT_ROTATION_ACK) == 2
-    assert set(found[len(setup_ids) + 1 :]) == {MessageId.MT_DATA2}
+    assert setup_ids.count(XbusMessageId.ALIGNMENT_ROTATION_ACK) == 2
+    assert set(found[len(setup_ids) + 1 :]) == {XbusMessageId.MT_DATA2}
 
 
 async def test_a_device_that_is_right_is_not_written_to(tmp_path: Path) -> None:
@@ -190,8 +190,10 @@ async def test_a_rate_the_device_rounds_is_named(tmp_path: Path) -> None:
 async def test_an_error_of_the_device_is_told_in_words(tmp_path: Path) -> None:
     class Refusing(XbusDevice):
         _ANSWERS = XbusDevice._ANSWERS | {
-            MessageId.OUTPUT_CONFIGURATION: lambda _, data: (
-                (MessageId.ERROR, b"\x21") if data else (MessageId.OUTPUT_CONFIGURATION_ACK, b"")
+            XbusMessageId.OUTPUT_CONFIGURATION: lambda _, data: (
+                (XbusMessageId.ERROR, b"\x21")
+                if data
+                else (XbusMessageId.OUTPUT_CONFIGURATION_ACK, b"")
             )
         }
 
@@ -230,8 +232,8 @@ class Queueing(XbusDevice):
     @override
     def _answer(self, message: XbusMessage) -> None:
         loop = asyncio.get_running_loop()
-        self.asked += message.mid == MessageId.GOTO_CONFIG
-        took_s = 1.5 if message.mid == MessageId.GOTO_CONFIG else 0.0
+        self.asked += message.mid == XbusMessageId.GOTO_CONFIG
+        took_s = 1.5 if message.mid == XbusMessageId.GOTO_CONFIG else 0.0
         self.free_s = max(self.free_s, loop.time()) + took_s
         loop.call_at(self.free_s, super()._answer, message)
 
@@ -286,14 +288,14 @@ async def test_a_stuck_device_is_reset_only_with_permission(tmp_path: Path) -> N
         said = await refusal(make(tmp_path), DeviceLostError)
         assert "reset_if_stuck" in said
         chunks = await chunks_of(make(tmp_path, reset_if_stuck=True))
-    assert MessageId.MT_DATA2 in mids(chunks)
+    assert XbusMessageId.MT_DATA2 in mids(chunks)
 
 
 async def test_a_device_that_just_woke_up_is_configured_at_once(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(wakes_up=True))
     async with powered(device, feeding=True):
         chunks = await chunks_of(make(tmp_path))
-    assert mids(chunks)[0] == MessageId.GOTO_CONFIG_ACK
+    assert mids(chunks)[0] == XbusMessageId.GOTO_CONFIG_ACK
 
 
 async def test_a_power_failure_while_streaming_is_one_restart(tmp_path: Path) -> None:
@@ -317,12 +319,14 @@ async def test_a_power_failure_while_streaming_is_one_restart(tmp_path: Path) ->
 
 async def test_the_acknowledgement_is_found_behind_a_broken_message(tmp_path: Path) -> None:
     def cut_off(data: bytes) -> bytes:
-        return b"\xfa\xff\x36\xff\x07\xd0" + data if data[2] == MessageId.GOTO_CONFIG_ACK else data
+        return (
+            b"\xfa\xff\x36\xff\x07\xd0" + data if data[2] == XbusMessageId.GOTO_CONFIG_ACK else data
+        )
 
     device = XbusDevice(tmp_path / "imu", wire_noise=cut_off)
     async with powered(device, feeding=True):
         chunks = await chunks_of(make(tmp_path))
-    assert mids(chunks)[0] == MessageId.GOTO_CONFIG_ACK
+    assert mids(chunks)[0] == XbusMessageId.GOTO_CONFIG_ACK
 
 
 async def test_more_than_the_line_carries_is_refused_before_anything_is_sent(

@@ -44,7 +44,7 @@ def setup(rate_hz: int = 100, **more: Any) -> XbusSettings:
 
 def message(counter: int, ticks: int, *items: tuple[int, Any]) -> bytes:
     head = [(Item.PACKET_COUNTER, counter & 0xFFFF), (Item.SAMPLE_TIME_FINE, ticks % 2**32)]
-    return xbus.encode(xbus.MessageId.MT_DATA2, mtdata2.encode_items([*head, *items]))
+    return xbus.encode(xbus.XbusMessageId.MT_DATA2, mtdata2.encode_items([*head, *items]))
 
 
 def decoded(messages: list[bytes], **more: Any) -> list[Decoded]:

@@ -20,7 +20,7 @@ from jointfit_drivers.xbus._sync_lines import (
     sync_differences,
     sync_entries,
 )
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.configuration import SyncSetting
 from jointfit_protocols.xbus.mtdata2 import Item
@@ -133,7 +133,7 @@ async def test_an_empty_list_turns_everything_off(tmp_path: Path) -> None:
 
 def test_a_request_is_what_the_vendor_would_send() -> None:
     asked = sync_entries([XbusSyncSettings(**CLOCKED)], "MTi-630-8A1G6")
-    wire = encode(MessageId.SYNC_SETTINGS, setup.encode_sync(asked))
+    wire = encode(XbusMessageId.SYNC_SETTINGS, setup.encode_sync(asked))
     assert wire.hex() == "faff2c0c0902010000000000000003e8d2"
 
 

@@ -10,7 +10,7 @@ from jointfit_daemon.config import heading_warning, parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, Notice, SourceOpened
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from tests.pipeline import core_feed
 
@@ -27,7 +27,7 @@ def rig(*magnetometers: bool) -> Any:
 
 def message(k: int) -> bytes:
     return encode(
-        MessageId.MT_DATA2,
+        XbusMessageId.MT_DATA2,
         encode_items(
             [
                 (Item.PACKET_COUNTER, k),

@@ -15,19 +15,19 @@ from jointfit_protocols.natnet import (
     Bare,
     Body,
     BodyDescription,
+    CommandRequest,
+    CommandResponse,
     Connect,
     Discovery,
     EchoRequest,
     EchoResponse,
     FrameOfData,
-    Marker,
+    LabeledMarker,
     MarkerSet,
     MarkerSetDescription,
     Message,
-    MessageId,
     ModelDefinition,
-    Request,
-    Response,
+    NatNetMessageId,
     ServerInfo,
     SkeletonDescription,
     decode,
@@ -66,7 +66,7 @@ def tuples(of: st.SearchStrategy[T], size: int = 3) -> st.SearchStrategy[tuple[T
 
 
 bodies = st.builds(Body, i32, *[f32] * 8, i16)
-markers = st.builds(Marker, i32, *[f32] * 4, i16, f32)
+markers = st.builds(LabeledMarker, i32, *[f32] * 4, i16, f32)
 analogs = st.builds(Analog, i32, tuples(tuples(f32)))
 
 
@@ -139,12 +139,12 @@ plain = st.one_of(
     st.just(Discovery(Connect(5, "Ping"))),
     st.builds(ServerInfo, names, u8x4, u8x4, u64, st.integers(0, 65535), st.booleans(), groups),
     st.just(ServerInfo("old", (1, 9, 0, 0), (2, 9, 0, 0), None)),
-    st.builds(Request, names),
-    st.builds(Response, st.binary(max_size=12)),
+    st.builds(CommandRequest, names),
+    st.builds(CommandResponse, st.binary(max_size=12)),
     st.builds(MessageString, names),
     st.builds(EchoRequest, u64),
     st.builds(EchoResponse, u64, u64),
-    st.sampled_from([Bare(MessageId.KEEPALIVE), Bare(MessageId.REQUEST_MODELDEF)]),
+    st.sampled_from([Bare(NatNetMessageId.KEEPALIVE), Bare(NatNetMessageId.REQUEST_MODELDEF)]),
 )
 messages = st.one_of(frames(), models(), plain.map(lambda message: (message, (3, 0))))
 
@@ -227,7 +227,7 @@ def test_a_bitstream_before_3_is_refused_by_name() -> None:
 
 
 def test_from_4_1_a_malformed_section_is_skipped_by_its_size() -> None:
-    marker = Marker(65537, 1.0, 2.0, 3.0, 0.5, 10, 0.0)
+    marker = LabeledMarker(65537, 1.0, 2.0, 3.0, 0.5, 10, 0.0)
     wire = bytearray(
         encode(
             FrameOfData(

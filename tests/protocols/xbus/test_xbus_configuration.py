@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_protocols.xbus import MessageId, encode
+from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 
 if TYPE_CHECKING:
@@ -78,24 +78,24 @@ def test_reading_text_never_raises(data: bytes) -> None:
     ("mid", "data", "wire"),
     [
         (
-            MessageId.OUTPUT_CONFIGURATION,
+            XbusMessageId.OUTPUT_CONFIGURATION,
             setup.encode_outputs(
                 [(0x1020, 0xFFFF), (0x1060, 0xFFFF), (0xE020, 0xFFFF), (0x2010, 100)]
             ),
             "faffc0101020ffff1060ffffe020ffff2010006403",
         ),
         (
-            MessageId.SYNC_SETTINGS,
+            XbusMessageId.SYNC_SETTINGS,
             setup.encode_sync([setup.SyncSetting(9, 2, 1, delay=1000)]),
             "faff2c0c0902010000000000000003e8d2",
         ),
         (
-            MessageId.CAN_CONFIG,
+            XbusMessageId.CAN_CONFIG,
             setup.encode_can_config(0x0C, enabled=True),
             "faffe6040000010c0a",
         ),
         (
-            MessageId.CAN_OUTPUT,
+            XbusMessageId.CAN_OUTPUT,
             setup.encode_can_outputs(
                 [
                     setup.CanOutput(0x05, False, 0x105, 0x7FF),

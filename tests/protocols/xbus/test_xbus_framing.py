@@ -136,7 +136,7 @@ def test_more_data_than_a_message_holds_is_a_bug_of_the_caller() -> None:
 
 
 def test_every_message_id_has_its_own_number_and_a_reply_follows_its_request() -> None:
-    ids = {item.name: item.value for item in xbus.MessageId}
+    ids = {item.name: item.value for item in xbus.XbusMessageId}
     for name, value in ids.items():
         if name.endswith("_ACK") and name != "WAKE_UP_ACK":
             assert ids[name.removesuffix("_ACK")] + 1 == value
