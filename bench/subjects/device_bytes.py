@@ -14,7 +14,12 @@ from jointfit_protocols.can import CanFrame, pack_frames, slcan
 from jointfit_protocols.natnet import ServerInfo, encode
 from jointfit_protocols.xbus import mtdata2
 from jointfit_simulators.body import CLUSTERS
-from jointfit_simulators.devices import Stage, StagedBody, Stamps, model_definition
+from jointfit_simulators.devices import (
+    FrameStamps,
+    NatNetFrameBuilder,
+    RigidBodyAsset,
+    model_definition,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -93,11 +98,11 @@ def natnet_opening() -> list[bytes]:
 
 def natnet_datagrams(count: int, period_ns: int) -> list[bytes]:
     """Frames of a leg: every marker seen, every body tracked."""
-    stage = Stage(_bodies(), "y", "missing")
+    stage = NatNetFrameBuilder(_bodies(), "y", "missing")
     found = []
     for k in range(count):
         ticks = k * period_ns // 100
-        stamps = Stamps(k, k * period_ns / NS, ticks, ticks + 46_000, ticks + 60_000, 0)
+        stamps = FrameStamps(k, k * period_ns / NS, ticks, ticks + 46_000, ticks + 60_000, 0)
         sway = 0.1 * math.sin(k / 20)
         markers = {
             name: (sway + 0.03 * i, 0.2 * i, 0.4 + sway)
@@ -109,8 +114,8 @@ def natnet_datagrams(count: int, period_ns: int) -> list[bytes]:
     return found
 
 
-def _bodies() -> tuple[StagedBody, ...]:
+def _bodies() -> tuple[RigidBodyAsset, ...]:
     return tuple(
-        StagedBody(part.capitalize(), names, number)
+        RigidBodyAsset(part.capitalize(), names, number)
         for number, (part, names) in enumerate(CLUSTERS.items(), 1)
     )

@@ -15,7 +15,7 @@ from bench.subjects.simulated_wearer import NS, bench_rig, phases
 from jointfit_daemon.calibration import CalibrationError
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.kinematics import rotation
-from jointfit_simulators.body import SENSORS, Rotation, Step, Wearer, from_wxyz, to_wxyz
+from jointfit_simulators.body import SENSORS, Rotation, SimulatedSubject, Step, from_wxyz, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
 
@@ -73,7 +73,7 @@ def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) ->
     knobs = Knobs(seed=seed)
     count = -(-int(seconds) // int(MOVE_S))
     steps = [Step(MOVES[k % len(MOVES)], MOVE_S) for k in range(count)]
-    wearer = Wearer(knobs, [Step("stand", begin_s), *steps])
+    wearer = SimulatedSubject(knobs, [Step("stand", begin_s), *steps])
     t_s = np.arange(begin_s, begin_s + seconds, 1 / rate_hz)
     seen = wearer.observe([t_s] * len(SENSORS), np.empty(0), t_s)
     world = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz).world

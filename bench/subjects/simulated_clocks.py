@@ -18,15 +18,15 @@ from jointfit_protocols import xbus, xcdi
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.natnet import EchoRequest, EchoResponse, ServerInfo, encode
 from jointfit_protocols.xbus import mtdata2
-from jointfit_simulators.body import CLUSTERS, SENSORS, Step, Wearer
+from jointfit_simulators.body import CLUSTERS, SENSORS, SimulatedSubject, Step
 from jointfit_simulators.devices import (
     CameraFrames,
     Cameras,
+    FrameStamps,
+    NatNetFrameBuilder,
     OrientationSensor,
-    Stage,
-    StagedBody,
-    Stamps,
-    Ticker,
+    RigidBodyAsset,
+    SampleTiming,
     model_definition,
 )
 from jointfit_simulators.settings import Knobs
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import Quaternion
     from jointfit_daemon.pipeline.events import Event
-    from jointfit_simulators.devices import Samples
+    from jointfit_simulators.devices import PlannedSamples
 
 NS = 1_000_000_000
 BEGIN_NS = 5_000 * NS
@@ -90,10 +90,10 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
         marker_soft_tissue_mm=0.0,
         orientation_white_deg=0.05,
     )
-    wearer = Wearer(knobs, [Step("walk", seconds)])
+    wearer = SimulatedSubject(knobs, [Step("walk", seconds)])
     cameras = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz)
     tickers = {
-        name: Ticker(knobs, name, latency_ms=_latency_ms(knobs, name), now_ns=BEGIN_NS)
+        name: SampleTiming(knobs, name, latency_ms=_latency_ms(knobs, name), now_ns=BEGIN_NS)
         for name in (*SENSORS, "mocap")
     }
     end_ns = BEGIN_NS + round(seconds * NS)
@@ -149,7 +149,7 @@ def _seconds(t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     return (t_ns - BEGIN_NS) / NS
 
 
-def _all(ticker: Ticker, name: str, end_ns: int, reboot_ns: int, knobs: Knobs) -> Track:
+def _all(ticker: SampleTiming, name: str, end_ns: int, reboot_ns: int, knobs: Knobs) -> Track:
     period_ns = NS / (knobs.mocap_hz if name == "mocap" else knobs.rate_hz)
     if name != REBOOTED:
         return _track([ticker.samples(BEGIN_NS, end_ns, period_ns)])
@@ -158,7 +158,7 @@ def _all(ticker: Ticker, name: str, end_ns: int, reboot_ns: int, knobs: Knobs) -
     return _track([before, ticker.samples(reboot_ns + DOWN_NS, end_ns, period_ns)])
 
 
-def _track(blocks: Sequence[Samples]) -> Track:
+def _track(blocks: Sequence[PlannedSamples]) -> Track:
     return (
         np.concatenate([block.host_ns for block in blocks]),
         np.concatenate([block.device_ns for block in blocks]),
@@ -226,20 +226,20 @@ def xcdi_chunk(name: str, number: int, ticks: int, due_ns: int, q: Quaternion) -
 
 def _cameras(made: _Made, cameras: Cameras, track: Track, frames: CameraFrames) -> None:
     bodies = tuple(
-        StagedBody(part.capitalize(), names, number)
+        RigidBodyAsset(part.capitalize(), names, number)
         for number, (part, names) in enumerate(CLUSTERS.items(), 1)
     )
     info = ServerInfo("Motive", (2, 3, 0, 0), (*VERSION, 0, 0), SERVER_HZ)
     for word in (info, model_definition(bodies, VERSION)):
         made.chunks.append((BEGIN_NS, "mocap", encode(word, VERSION)))
-    stage = Stage(bodies, "y", "missing")
+    stage = NatNetFrameBuilder(bodies, "y", "missing")
     places = frames.body_positions.tolist()
     turns = frames.body_orientations.tolist()
     for number, (host, device, due, dropped) in enumerate(_rows(track)):
         if dropped:
             continue
         exposure = device * SERVER_HZ // NS
-        stamps = Stamps(number, device / NS, exposure, exposure + 40_000, exposure + 50_000, 0)
+        stamps = FrameStamps(number, device / NS, exposure, exposure + 40_000, exposure + 50_000, 0)
         poses = {
             name: (tuple(at), tuple(q))
             for name, at, q in zip(cameras.bodies, places[number], turns[number], strict=True)
@@ -249,7 +249,7 @@ def _cameras(made: _Made, cameras: Cameras, track: Track, frames: CameraFrames) 
         made.chunks.append((due, "mocap", data))
 
 
-def _echoes(made: _Made, ticker: Ticker, end_ns: int, knobs: Knobs) -> None:
+def _echoes(made: _Made, ticker: SampleTiming, end_ns: int, knobs: Knobs) -> None:
     dice = knobs.random("echoes")
     at_ns, stamp = BEGIN_NS + NS // 10, 0
     while at_ns < end_ns:

@@ -16,7 +16,7 @@ import numpy as np
 from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTrack
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.config import parse_rig
-from jointfit_simulators.body import CLUSTERS, SENSORS, Step, Wearer
+from jointfit_simulators.body import CLUSTERS, SENSORS, SimulatedSubject, Step
 from jointfit_simulators.devices import CameraFrames, Cameras, OrientationSensor
 from jointfit_simulators.scene import RigOptions, rig_toml
 from jointfit_simulators.settings import Knobs
@@ -50,7 +50,7 @@ def phases(seed: int = 1, rate_hz: float = 100.0) -> Phases:
     knobs = Knobs(seed=seed, rate_hz=rate_hz)
     steps = [Step("plate", PLATE_S), Step("stand", STAND_S)]
     steps += [Step(name, FUNCTIONAL_S / len(MOVES)) for name in MOVES]
-    wearer = Wearer(knobs, steps)
+    wearer = SimulatedSubject(knobs, steps)
     end_s = PLATE_S + STAND_S + FUNCTIONAL_S
     imu_s = np.arange(0.0, end_s, 1 / rate_hz)
     camera_s = np.arange(0.0, end_s, 1 / knobs.mocap_hz)
@@ -130,6 +130,6 @@ def walking(sensor: str, rate_hz: float, seconds: float) -> list[Quaternion]:
     knobs = Knobs(rate_hz=rate_hz)
     t_s = np.arange(0.0, seconds, 1 / rate_hz)
     streams = [t_s if name == sensor else t_s[:0] for name in SENSORS]
-    seen = Wearer(knobs, [Step("walk", seconds)]).observe(streams, t_s[:1], t_s[:1])
+    seen = SimulatedSubject(knobs, [Step("walk", seconds)]).observe(streams, t_s[:1], t_s[:1])
     q = seen.sensors[list(SENSORS).index(sensor)]
     return [tuple(row) for row in OrientationSensor(knobs, sensor).report(t_s, q).tolist()]

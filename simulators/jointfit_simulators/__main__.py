@@ -30,16 +30,16 @@ import orjson
 from jointfit_simulators.body import (
     MOTIONS,
     SENSORS,
-    Replayed,
-    UnknownMotion,
-    Wearer,
-    parse_programme,
-    read_recording,
+    RecordedSubject,
+    SimulatedSubject,
+    UnknownMotionError,
+    parse_motion_script,
+    read_recorded_trial,
 )
 from jointfit_simulators.devices import ClockFault
 from jointfit_simulators.sample import write_sample
 from jointfit_simulators.scene import (
-    BadCommand,
+    InvalidCommandError,
     PhaseFollower,
     RigOptions,
     Scene,
@@ -51,7 +51,7 @@ from jointfit_simulators.settings import Knobs, knobs_from_toml, perfect, turn
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_simulators.body import Subject
+    from jointfit_simulators.body import InstrumentedSubject
     from jointfit_simulators.scene import PlayDirectory
 
 USAGE = 2
@@ -145,13 +145,15 @@ def _knobs(options: argparse.Namespace) -> Knobs:
     return turn(knobs, settings + options.settings)
 
 
-def _subject(options: argparse.Namespace, knobs: Knobs) -> Subject:
-    steps = parse_programme(options.programme or "stand")
+def _subject(options: argparse.Namespace, knobs: Knobs) -> InstrumentedSubject:
+    steps = parse_motion_script(options.programme or "stand")
     if options.trial:
-        recording = read_recording(options.trial)
-        return Replayed(recording, SENSORS, steps, transition_s=knobs.transition_s)
+        recording = read_recorded_trial(options.trial)
+        return RecordedSubject(recording, SENSORS, steps, transition_s=knobs.transition_s)
     files = dict(_pairs("--motion", options.motion))
-    return Wearer(knobs, steps, motion_files={name: Path(path) for name, path in files.items()})
+    return SimulatedSubject(
+        knobs, steps, motion_files={name: Path(path) for name, path in files.items()}
+    )
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
@@ -210,7 +212,7 @@ async def _obey(scene: Scene) -> None:
 def _answer(scene: Scene, line: str) -> None:
     try:
         answer = scene.command(line) if line else None
-    except BadCommand as error:
+    except InvalidCommandError as error:
         answer = {"error": str(error)}
     if answer is not None:
         _say(answer)
@@ -244,7 +246,7 @@ async def _play(options: argparse.Namespace) -> None:
 
 async def _run_scene(
     knobs: Knobs,
-    subject: Subject,
+    subject: InstrumentedSubject,
     hardware: SceneOptions,
     directory: PlayDirectory,
     *,
@@ -302,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             why = error.strerror or error
             print(f"jointfit-sim: {where}{why}: check the path", file=sys.stderr)
             return USAGE
-        except (ValueError, UnknownMotion) as error:
+        except (ValueError, UnknownMotionError) as error:
             print(f"jointfit-sim: {error}", file=sys.stderr)
             return USAGE
     return 0

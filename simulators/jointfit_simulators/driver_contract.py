@@ -41,17 +41,17 @@ from unittest import SkipTest
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, Settings, find_driver
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
-from jointfit_simulators.contract_scene import (
-    Listener,
-    Noise,
-    cancelled,
-    open_descriptors,
+from jointfit_simulators._contract_fixtures import (
+    DecodingReceiver,
+    SwitchableNoise,
+    cancel_and_wait,
+    content_of,
+    count_descriptors,
     orientation,
-    raises,
     require,
+    require_error,
     run_scene,
-    served,
-    without_arrival,
+    serve_device,
 )
 from jointfit_simulators.imu_device import clean_wire
 
@@ -155,12 +155,12 @@ class DriverContract(ABC):
                 "datagram": [[chunk.data for chunk in heard.chunks]],
             }
             for pieces in cuts[driver.wire]:
-                again = Listener(driver, self.measurement)
+                again = DecodingReceiver(driver, self.measurement)
                 for piece in pieces:
                     again.emit(Chunk(t_ns, piece))
-                same = list(map(without_arrival, again.measurements))
+                same = list(map(content_of, again.measurements))
                 require(
-                    same == list(map(without_arrival, heard.measurements)),
+                    same == list(map(content_of, heard.measurements)),
                     f"{len(pieces)} pieces give the same samples",
                 )
                 require(
@@ -177,7 +177,7 @@ class DriverContract(ABC):
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             async with self._streaming(device, driver) as (heard, first):
                 await self._send_all(device, heard, first, 20)
-            again = Listener(driver, self.measurement)
+            again = DecodingReceiver(driver, self.measurement)
             for chunk in heard.chunks:
                 again.emit(chunk)
             require(repr(again.events) == repr(heard.events), "the same events")
@@ -203,7 +203,7 @@ class DriverContract(ABC):
             raise SkipTest("this wire has its own error detection")
 
         async def scene() -> None:
-            noise = Noise()
+            noise = SwitchableNoise()
             device = self.make_device(tmp_path, noise)
             async with self._streaming(device, self.make_driver(tmp_path)) as (heard, first):
                 before = len(heard.measurements)
@@ -233,12 +233,12 @@ class DriverContract(ABC):
         async def scene() -> None:
             device = self.make_device(tmp_path, clean_wire)
             driver, heard = self.make_driver(tmp_path), None
-            async with served(device):
-                heard = Listener(driver, self.measurement)
+            async with serve_device(device):
+                heard = DecodingReceiver(driver, self.measurement)
                 task = asyncio.create_task(driver.run(heard.emit))
                 first = await self._first(device, heard, task)
                 await self._send_all(device, heard, first, 5)
-                await raises(DeviceLostError, task, self.lost_within_s)
+                await require_error(DeviceLostError, task, self.lost_within_s)
 
         run_scene(scene())
 
@@ -250,13 +250,13 @@ class DriverContract(ABC):
         async def scene() -> None:
             device = self.make_device(tmp_path, clean_wire)
             driver = self.make_driver(tmp_path)
-            async with served(device):
-                heard = Listener(driver, self.measurement)
+            async with serve_device(device):
+                heard = DecodingReceiver(driver, self.measurement)
                 task = asyncio.create_task(driver.run(heard.emit))
                 first = await self._first(device, heard, task)
                 device.unplug()
-                await raises(DeviceLostError, task, self.lost_within_s)
-                await raises(
+                await require_error(DeviceLostError, task, self.lost_within_s)
+                await require_error(
                     DeviceLostError,
                     asyncio.create_task(driver.run(heard.emit)),
                     self.starts_within_s,
@@ -276,7 +276,7 @@ class DriverContract(ABC):
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             device.unplug()
             task = asyncio.create_task(driver.run(lambda _: None))
-            await raises(DeviceLostError, task, self.starts_within_s)
+            await require_error(DeviceLostError, task, self.starts_within_s)
 
         run_scene(scene())
 
@@ -287,9 +287,9 @@ class DriverContract(ABC):
             raise SkipTest("a wrong device cannot be told apart on this wire")
 
         async def scene() -> None:
-            async with served(device):
+            async with serve_device(device):
                 task = asyncio.create_task(self.make_driver(tmp_path).run(lambda _: None))
-                await raises(DeviceMisconfiguredError, task, self.refused_within_s)
+                await require_error(DeviceMisconfiguredError, task, self.refused_within_s)
 
         run_scene(scene())
 
@@ -302,7 +302,7 @@ class DriverContract(ABC):
             def emit(_: Chunk) -> None:
                 raise ZeroDivisionError
 
-            async with served(device):
+            async with serve_device(device):
                 task = asyncio.create_task(self.make_driver(tmp_path).run(emit))
                 async with asyncio.timeout(self.starts_within_s):
                     number = 0
@@ -310,7 +310,7 @@ class DriverContract(ABC):
                         self.send(device, number)
                         number += 1
                         await asyncio.sleep(_PACE_S)
-                await raises(ZeroDivisionError, task, self.starts_within_s)
+                await require_error(ZeroDivisionError, task, self.starts_within_s)
 
         run_scene(scene())
 
@@ -319,44 +319,46 @@ class DriverContract(ABC):
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
-            async with served(device):
+            async with serve_device(device):
                 async with self._reading(device, driver, 0):
                     pass  # whatever is made once (executors, caches) is made now
-                before, tasks = open_descriptors(), asyncio.all_tasks()
+                before, tasks = count_descriptors(), asyncio.all_tasks()
                 for pause_s in (0.0, 0.001, 0.02):
                     task = asyncio.create_task(driver.run(lambda _: None))
                     await asyncio.sleep(pause_s)
-                    await cancelled(task)
+                    await cancel_and_wait(task)
                 for _ in range(2):
                     async with self._reading(device, driver, 0):
                         pass
                 require(asyncio.all_tasks() == tasks, "no task is left")
-                require(open_descriptors() == before, "no descriptor is left")
+                require(count_descriptors() == before, "no descriptor is left")
 
         run_scene(scene())
 
     # --- scenery ------------------------------------------------------------------------------
 
     @contextlib.asynccontextmanager
-    async def _streaming(self, device: Any, driver: Driver) -> AsyncIterator[tuple[Listener, int]]:
+    async def _streaming(
+        self, device: Any, driver: Driver
+    ) -> AsyncIterator[tuple[DecodingReceiver, int]]:
         """Device and driver at work; yields the listener and the next sample number."""
-        async with served(device), self._reading(device, driver, 0) as state:
+        async with serve_device(device), self._reading(device, driver, 0) as state:
             yield state
 
     @contextlib.asynccontextmanager
     async def _reading(
         self, device: Any, driver: Driver, number: int
-    ) -> AsyncIterator[tuple[Listener, int]]:
+    ) -> AsyncIterator[tuple[DecodingReceiver, int]]:
         """Driver at work on a device that runs; yields as ``_streaming``; cancels at the end."""
-        heard = Listener(driver, self.measurement)
+        heard = DecodingReceiver(driver, self.measurement)
         task = asyncio.create_task(driver.run(heard.emit))
         try:
             yield heard, await self._first(device, heard, task, number)
         finally:
-            await cancelled(task)
+            await cancel_and_wait(task)
 
     async def _first(
-        self, device: Any, heard: Listener, task: asyncio.Task[None], number: int = 0
+        self, device: Any, heard: DecodingReceiver, task: asyncio.Task[None], number: int = 0
     ) -> int:
         """Send until the first sample arrives, then let the rest arrive; return the next number."""
         async with asyncio.timeout(self.starts_within_s):
@@ -370,7 +372,9 @@ class DriverContract(ABC):
         await heard.settle()
         return number
 
-    async def _send_all(self, device: Any, heard: Listener, first: int, count: int) -> range:
+    async def _send_all(
+        self, device: Any, heard: DecodingReceiver, first: int, count: int
+    ) -> range:
         """Send `count` samples and wait for all of them."""
         before = len(heard.measurements)
         for number in range(first, first + count):

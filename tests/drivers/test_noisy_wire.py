@@ -17,7 +17,7 @@ from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus.mtdata2 import Item, encode_items
 from jointfit_protocols.xcdi import DataId, XcdiIds, quaternion_counts
 from jointfit_protocols.xcdi import encode as xcdi_encode
-from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators._contract_fixtures import orientation
 
 if TYPE_CHECKING:
     from collections.abc import Callable

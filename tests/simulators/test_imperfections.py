@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_simulators.body import CLUSTERS, SENSORS, Wearer, parse_programme
-from jointfit_simulators.body._random_signal import Wander
+from jointfit_simulators.body import CLUSTERS, SENSORS, SimulatedSubject, parse_motion_script
+from jointfit_simulators.body._random_signal import RandomSignal
 from jointfit_simulators.body._soft_tissue import SoftTissue
-from jointfit_simulators.devices import NS, CameraFrames, Cameras, OrientationSensor, Ticker
+from jointfit_simulators.devices import NS, CameraFrames, Cameras, OrientationSensor, SampleTiming
 from jointfit_simulators.settings import Knobs, perfect, turn
 from jointfit_simulators.wires import line_noise
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import Observation
 
 NOTHING = perfect(Knobs())
-WALK_AND_SQUATS = parse_programme("walk:60,squat:60")
+WALK_AND_SQUATS = parse_motion_script("walk:60,squat:60")
 T = np.arange(5.0, 120.0, 0.05)
 NONE = np.empty(0)
 
@@ -34,7 +34,7 @@ def rms(lengths: ArrayLike) -> float:
 
 def seen(knobs: Knobs, programme: str = "walk:60,squat:60", t: np.ndarray = T) -> list[Rotation]:
     """Return the true orientations of S1..S4 in their bone, mounts included."""
-    wearer = Wearer(knobs, parse_programme(programme))
+    wearer = SimulatedSubject(knobs, parse_motion_script(programme))
     found = wearer.observe([t] * 4, NONE, t)
     return [
         found.truth.orientations[SENSORS[name]].inv() * Rotation.from_quat(q, scalar_first=True)
@@ -62,7 +62,7 @@ def test_own_soft_tissue_is_each_sensors_own(seed: int) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.15, 0.5])
 def test_the_random_share_is_what_does_not_repeat_with_posture(share: float) -> None:
-    wearer = Wearer(NOTHING, WALK_AND_SQUATS)
+    wearer = SimulatedSubject(NOTHING, WALK_AND_SQUATS)
     coordinates = wearer._programme.coordinates(T)
     skins = [
         SoftTissue(
@@ -91,7 +91,7 @@ def test_skin_is_still_while_the_wearer_stands() -> None:
 
 
 def test_on_the_plate_nothing_moves_against_anything() -> None:
-    wearer = Wearer(Knobs(), parse_programme("plate"))
+    wearer = SimulatedSubject(Knobs(), parse_motion_script("plate"))
     t = np.arange(0.0, 20.0, 0.1)
     found = wearer.observe([t] * 4, t, t)
     plate = found.markers[:, -5:]
@@ -159,7 +159,7 @@ def test_a_tilted_world_is_a_fault_of_the_chosen_sensor_only() -> None:
 def test_clocks_are_offset_and_skewed_within_their_bounds() -> None:
     skews, now = [], 10**13
     for name in "abcdefghijkl":
-        ticker = Ticker(Knobs(), name, latency_ms=2.0, now_ns=now)
+        ticker = SampleTiming(Knobs(), name, latency_ms=2.0, now_ns=now)
         samples = ticker.samples(now, now + 100 * NS, NS / 100)
         gained = np.polyfit((samples.host_ns - now) / NS, (samples.device_ns - now) / NS, 1)[0] - 1
         assert gained == pytest.approx(ticker.clock.skew, abs=2e-7)
@@ -178,8 +178,8 @@ def test_clocks_are_offset_and_skewed_within_their_bounds() -> None:
 
 
 def test_blocks_share_no_sample_and_miss_none() -> None:
-    whole = Ticker(Knobs(), "a", latency_ms=0.0, now_ns=10**12)
-    blocks = Ticker(Knobs(), "a", latency_ms=0.0, now_ns=10**12)
+    whole = SampleTiming(Knobs(), "a", latency_ms=0.0, now_ns=10**12)
+    blocks = SampleTiming(Knobs(), "a", latency_ms=0.0, now_ns=10**12)
     edges = 10**12 + np.cumsum(np.r_[0, np.random.default_rng(1).integers(1, 10**8, 200)])
     parts = [blocks.samples(a, b, NS / 400).host_ns for a, b in pairwise(edges)]
     once = whole.samples(edges[0], edges[-1], NS / 400).host_ns
@@ -201,8 +201,8 @@ def test_markers_move_on_the_skin_by_their_rms(seed: int) -> None:
 
 def marker_errors_against(knobs: Knobs, base: Knobs) -> dict[str, np.ndarray]:
     t = np.arange(5.0, 120.0, 0.1)
-    there = Wearer(knobs, WALK_AND_SQUATS).observe([NONE] * 4, t, NONE).markers
-    still = Wearer(base, WALK_AND_SQUATS).observe([NONE] * 4, t, NONE).markers
+    there = SimulatedSubject(knobs, WALK_AND_SQUATS).observe([NONE] * 4, t, NONE).markers
+    still = SimulatedSubject(base, WALK_AND_SQUATS).observe([NONE] * 4, t, NONE).markers
     ends = np.cumsum([len(names) for names in CLUSTERS.values()])
     return dict(zip(CLUSTERS, np.split(there - still, ends[:-1], axis=1), strict=True))
 
@@ -210,7 +210,7 @@ def marker_errors_against(knobs: Knobs, base: Knobs) -> dict[str, np.ndarray]:
 def frames(
     knobs: Knobs, seconds: float = 60.0, programme: str = "walk"
 ) -> tuple[Cameras, CameraFrames, Observation]:
-    wearer = Wearer(knobs, parse_programme(programme))
+    wearer = SimulatedSubject(knobs, parse_motion_script(programme))
     cameras = Cameras(knobs, wearer, rate_hz=120.0)
     t = np.arange(0.0, seconds, 1 / 120)
     observation = wearer.observe([NONE] * 4, t, t)
@@ -276,7 +276,7 @@ def test_line_noise_flips_the_asked_share_of_bytes_and_adds_bursts() -> None:
 def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
     def run(seed: int) -> np.ndarray:
         knobs = dataclasses.replace(Knobs(), seed=seed)
-        wearer = Wearer(knobs, WALK_AND_SQUATS)
+        wearer = SimulatedSubject(knobs, WALK_AND_SQUATS)
         found = wearer.observe([T] * 4, T, T)
         said = [
             OrientationSensor(knobs, name).report(T, q)
@@ -296,7 +296,7 @@ def test_turning_one_knob_leaves_the_other_dice_as_they_fell() -> None:
 
 
 def test_wanders_can_be_read_in_any_order_and_stay_in_their_band() -> None:
-    wander = Wander(np.random.default_rng(1), 2, low_hz=0.5, high_hz=2.0, rms=3.0)
+    wander = RandomSignal(np.random.default_rng(1), 2, low_hz=0.5, high_hz=2.0, rms=3.0)
     t = np.arange(0, 400, 0.05)
     found = wander.at(t)
     np.testing.assert_allclose(wander.at(t[::-1])[::-1], found, atol=1e-9)

@@ -9,7 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_simulators.body import MOTIONS, LegGeometry, Step, UnknownMotion, parse_programme
+from jointfit_simulators.body import (
+    MOTIONS,
+    LegGeometry,
+    Step,
+    UnknownMotionError,
+    parse_motion_script,
+)
 from jointfit_simulators.body._limb import (
     ANKLE,
     COORDINATES,
@@ -22,14 +28,14 @@ from jointfit_simulators.body._limb import (
 )
 from jointfit_simulators.body._motion import motions_of
 from jointfit_simulators.body._motion_file import motion_from_file
-from jointfit_simulators.body._motion_script import Programme
-from jointfit_simulators.body._posture import person
+from jointfit_simulators.body._motion_script import MotionScript
+from jointfit_simulators.body._posture import draw_style
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 GEOMETRY = LegGeometry()
-STYLE = person(GEOMETRY, np.random.default_rng(5))
+STYLE = draw_style(GEOMETRY, np.random.default_rng(5))
 DOING = motions_of(STYLE)
 angle = st.floats(-1.2, 1.2)
 
@@ -148,7 +154,7 @@ def jerkiness(coordinates: np.ndarray, step: float) -> float:
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_every_motion_has_two_continuous_derivatives(name: str) -> None:
-    programme = Programme(DOING, [Step("stand", 2.0), Step(name, 4.0), Step("squat", 9.0)])
+    programme = MotionScript(DOING, [Step("stand", 2.0), Step(name, 4.0), Step("squat", 9.0)])
     jumps = []
     for step in (2e-3, 1e-3):  # a jump that is none shrinks with the step
         t = np.arange(1.0, 9.0, step)
@@ -162,8 +168,8 @@ def test_a_kink_would_be_found() -> None:
 
 
 def test_a_switch_bends_the_future_only() -> None:
-    steps = parse_programme("stand:5,walk")
-    programme, same = Programme(DOING, steps), Programme(DOING, steps)
+    steps = parse_motion_script("stand:5,walk")
+    programme, same = MotionScript(DOING, steps), MotionScript(DOING, steps)
     programme.play("squat", 3.0)
     past, future = np.arange(0, 3.0, 0.1), np.arange(4.6, 9, 0.1)
     np.testing.assert_array_equal(programme.coordinates(past), same.coordinates(past))
@@ -172,23 +178,23 @@ def test_a_switch_bends_the_future_only() -> None:
 
 
 def test_forgetting_changes_nothing_that_is_still_to_come() -> None:
-    steps = parse_programme("stand:3,walk:1,squat:3,turn")
-    whole, forgetful = Programme(DOING, steps), Programme(DOING, steps)
+    steps = parse_motion_script("stand:3,walk:1,squat:3,turn")
+    whole, forgetful = MotionScript(DOING, steps), MotionScript(DOING, steps)
     for begin in np.arange(0.0, 12.0, 0.2):
         t = begin + np.arange(0, 0.2, 0.01)
-        forgetful.forget_before(begin)
+        forgetful.discard_before(begin)
         np.testing.assert_allclose(forgetful.coordinates(t), whole.coordinates(t), atol=1e-15)
 
 
 @pytest.mark.parametrize("text", ["", "walk:0", "walk:-1", ":5", "walk:x"])
 def test_a_senseless_programme_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"expected|convert"):
-        parse_programme(text)
+        parse_motion_script(text)
 
 
 def test_an_unknown_motion_is_named_with_the_known_ones() -> None:
-    with pytest.raises(UnknownMotion, match=r"'hop'.*stand, walk"):
-        Programme(DOING, [Step("hop", 1.0)])
+    with pytest.raises(UnknownMotionError, match=r"'hop'.*stand, walk"):
+        MotionScript(DOING, [Step("hop", 1.0)])
 
 
 def test_a_motion_from_toml_goes_through_its_keys(tmp_path: Path) -> None:

@@ -27,13 +27,13 @@ from jointfit_protocols.natnet import (
     decode,
     encode,
 )
-from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-THIGH = StagedBody("Thigh", ("T1", "T2", "T3"), 7)
-SHANK = StagedBody("Shank", ("S1", "S2"), 8)
+THIGH = RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 7)
+SHANK = RigidBodyAsset("Shank", ("S1", "S2"), 8)
 HALF = 0.5**0.5
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 PLACES = {"T1": (1.0, 2.0, 3.0), "T2": None, "T3": (0.5, 0.25, 0.125), "S1": (0.0, 0.0, 1.0)}

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from jointfit_daemon.files.orientations import read_orientations_npz
 from jointfit_simulators.body import (
     SENSORS,
-    Replayed,
+    RecordedSubject,
     Step,
-    UnknownMotion,
-    parse_programme,
-    read_recording,
+    UnknownMotionError,
+    parse_motion_script,
+    read_recorded_trial,
 )
-from jointfit_simulators.body._recorded_trial import Track
+from jointfit_simulators.body._recorded_trial import InterpolatedTrack
 from jointfit_simulators.devices import Cameras
 from jointfit_simulators.scene._truth_log import TruthLog
 from jointfit_simulators.settings import Knobs, perfect
@@ -38,7 +38,9 @@ def squats(shared_data: Path) -> list[Path]:
 
 def test_sensors_bones_and_markers_are_those_of_the_files(squats: list[Path]) -> None:
     recorded = read_orientations_npz(squats[0])
-    subject = Replayed(read_recording(squats), SENSORS, [Step("trial", 1.0)], transition_s=1.5)
+    subject = RecordedSubject(
+        read_recorded_trial(squats), SENSORS, [Step("trial", 1.0)], transition_s=1.5
+    )
     t = recorded.t_s - recorded.t_s[0] + 1.5  # the trial begins when it has faded in
     found = subject.observe([t] * 4, t, t)
     for name, q in zip(SENSORS, found.sensors, strict=True):
@@ -61,7 +63,7 @@ def test_sensors_bones_and_markers_are_those_of_the_files(squats: list[Path]) ->
 
 def test_between_samples_the_recording_is_interpolated(squats: list[Path]) -> None:
     recorded = read_orientations_npz(squats[0])
-    track = Track(recorded.t_s, recorded.sensors["S3"], rotation=True)
+    track = InterpolatedTrack(recorded.t_s, recorded.sensors["S3"], rotation=True)
     middle = (recorded.t_s[:-1] + recorded.t_s[1:]) / 2
     said = Rotation.from_quat(track.at(middle), scalar_first=True)
     was = Rotation.from_quat(recorded.sensors["S3"], scalar_first=True)
@@ -70,7 +72,9 @@ def test_between_samples_the_recording_is_interpolated(squats: list[Path]) -> No
 
 
 def test_with_its_biases_the_static_pose_is_upright(squats: list[Path]) -> None:
-    subject = Replayed(read_recording(squats), SENSORS, parse_programme("stand:9,trial"))
+    subject = RecordedSubject(
+        read_recorded_trial(squats), SENSORS, parse_motion_script("stand:9,trial")
+    )
     t = np.arange(0.0, 5.0, 0.1)
     found = subject.observe([t] * 4, t, t)
     assert found.truth.orientations["thigh"].magnitude().max() < 1e-9
@@ -81,7 +85,9 @@ def test_with_its_biases_the_static_pose_is_upright(squats: list[Path]) -> None:
 
 
 def test_nothing_jumps_between_standing_and_the_trial(squats: list[Path]) -> None:
-    subject = Replayed(read_recording(squats), SENSORS, parse_programme("stand:2,trial:12,stand"))
+    subject = RecordedSubject(
+        read_recorded_trial(squats), SENSORS, parse_motion_script("stand:2,trial:12,stand")
+    )
     t = np.arange(0.0, 18.0, 0.005)
     found = subject.observe([t] * 4, t, t)
     for q in found.sensors:
@@ -93,7 +99,9 @@ def test_nothing_jumps_between_standing_and_the_trial(squats: list[Path]) -> Non
 def test_a_missing_marker_makes_a_missing_sample_not_a_made_up_one(shared_data: Path) -> None:
     walking = shared_data / "semireal_knee4imu/walking1.npz"
     recorded = read_orientations_npz(walking)
-    subject = Replayed(read_recording([walking]), SENSORS, [Step("trial", 1.0)], transition_s=1.0)
+    subject = RecordedSubject(
+        read_recorded_trial([walking]), SENSORS, [Step("trial", 1.0)], transition_s=1.0
+    )
     t = recorded.t_s - recorded.t_s[0] + 1.0
     found = subject.observe([t] * 4, NONE, NONE)
     missing = [int(np.isnan(q[:, 0]).sum()) for q in found.sensors]
@@ -102,7 +110,7 @@ def test_a_missing_marker_makes_a_missing_sample_not_a_made_up_one(shared_data: 
 
 
 def test_reference_bones_are_streamed_as_bodies(squats: list[Path]) -> None:
-    subject = Replayed(read_recording(squats), SENSORS, [Step("trial", 1.0)])
+    subject = RecordedSubject(read_recorded_trial(squats), SENSORS, [Step("trial", 1.0)])
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
     t = np.arange(2.0, 8.0, 0.1)
     observation = subject.observe([NONE] * 4, t, t)
@@ -115,17 +123,17 @@ def test_reference_bones_are_streamed_as_bodies(squats: list[Path]) -> None:
 
 def test_files_that_make_no_trial_are_refused(tmp_path: Path, squats: list[Path]) -> None:
     with pytest.raises(ValueError, match="got 0"):
-        read_recording(squats[1:])
+        read_recorded_trial(squats[1:])
     with pytest.raises(ValueError, match=r"'\.txt'"):
-        read_recording([tmp_path / "a.txt"])
-    with pytest.raises(UnknownMotion, match="a trial has: stand, trial, trial@FROM-TO"):
-        Replayed(read_recording(squats), SENSORS, [Step("walk", 1.0)])
+        read_recorded_trial([tmp_path / "a.txt"])
+    with pytest.raises(UnknownMotionError, match="a trial has: stand, trial, trial@FROM-TO"):
+        RecordedSubject(read_recorded_trial(squats), SENSORS, [Step("walk", 1.0)])
 
 
 def test_the_truth_log_tells_no_future_and_writes_unknown_as_null(
     tmp_path: Path, squats: list[Path]
 ) -> None:
-    subject = Replayed(read_recording(squats), SENSORS, [Step("trial", 1.0)])
+    subject = RecordedSubject(read_recorded_trial(squats), SENSORS, [Step("trial", 1.0)])
     t_ns = np.arange(0, 10**9, 10**7)
     truth = subject.observe([NONE] * 4, NONE, t_ns / 1e9).truth
     log = TruthLog(tmp_path / "truth.jsonl", {"lengths_m": {}})
@@ -143,21 +151,21 @@ def test_the_truth_log_tells_no_future_and_writes_unknown_as_null(
 
 def test_a_part_of_the_trial_is_played_at_its_place(squats: list[Path]) -> None:
     recorded = read_orientations_npz(squats[0])
-    steps = parse_programme("stand:2,trial@8.06-9:9")
-    subject = Replayed(read_recording(squats), SENSORS, steps, transition_s=1.0)
+    steps = parse_motion_script("stand:2,trial@8.06-9:9")
+    subject = RecordedSubject(read_recorded_trial(squats), SENSORS, steps, transition_s=1.0)
     t = 3.0 + np.arange(0.0, 0.95, 0.02)  # the blend is over at 3 s
     found = subject.observe([t] * 4, t, t)
     first = round(8.06 * 50)
     was = Rotation.from_quat(recorded.sensors["S2"][first : first + len(t)], scalar_first=True)
     said = Rotation.from_quat(found.sensors[1], scalar_first=True)
     assert np.degrees((said.inv() * was).magnitude()).max() < 1e-4
-    with pytest.raises(UnknownMotion, match=r"13\.44 s long"):
+    with pytest.raises(UnknownMotionError, match=r"13\.44 s long"):
         subject.play("trial@13.5-", 20.0)
 
 
 def test_cameras_see_bones_standing_and_recorded_but_never_made_up(squats: list[Path]) -> None:
-    steps = parse_programme("stand:2,trial@0-4:8,stand")
-    subject = Replayed(read_recording(squats), SENSORS, steps, transition_s=1.0)
+    steps = parse_motion_script("stand:2,trial@0-4:8,stand")
+    subject = RecordedSubject(read_recorded_trial(squats), SENSORS, steps, transition_s=1.0)
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
     t = np.array([1.0, 1.99, 2.01, 2.5, 2.99, 3.0, 5.0, 7.0, 7.01, 9.9, 10.5, 11.01])
     seen = cameras.see(subject.observe([NONE] * 4, t, t)).body_positions[:, :, 0]
@@ -169,7 +177,7 @@ def test_standing_the_shank_hangs_on_the_thigh_where_it_hung_in_the_trial(
     squats: list[Path],
 ) -> None:
     recorded = read_orientations_npz(squats[0])
-    subject = Replayed(read_recording(squats), SENSORS, parse_programme("stand"))
+    subject = RecordedSubject(read_recorded_trial(squats), SENSORS, parse_motion_script("stand"))
     t = np.array([1.0])
     found = subject.observe([NONE] * 4, t, t)
     (_, hip), (_, knee) = found.bones["thigh"], found.bones["shank"]

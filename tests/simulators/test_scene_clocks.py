@@ -10,9 +10,9 @@ from typing import Any
 import orjson
 import pytest
 
-from jointfit_simulators.body import Wearer, parse_programme
-from jointfit_simulators.devices import NS, ClockFault, Ticker
-from jointfit_simulators.scene import BadCommand, Scene, SceneOptions
+from jointfit_simulators.body import SimulatedSubject, parse_motion_script
+from jointfit_simulators.devices import NS, ClockFault, SampleTiming
+from jointfit_simulators.scene import InvalidCommandError, Scene, SceneOptions
 from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.settings import Knobs
 
@@ -21,7 +21,7 @@ NOW = 10**13
 
 
 def test_a_clock_runs_as_it_is_asked_to() -> None:
-    ticker = Ticker(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
+    ticker = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
     ticker.ask(ClockFault.parse("50,3600"), NOW)
     assert ticker.device_ns(NOW) == pytest.approx(3600 * NS * (1 + 50e-6), abs=1)
     hour_later = ticker.device_ns(NOW + 3600 * NS) - ticker.device_ns(NOW)
@@ -31,7 +31,7 @@ def test_a_clock_runs_as_it_is_asked_to() -> None:
 
 
 def test_a_skew_alone_leaves_the_start_to_the_dice() -> None:
-    ticker = Ticker(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
+    ticker = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
     boot_ns = ticker.clock.boot_ns
     ticker.ask(ClockFault.parse("-20"), NOW)
     assert ticker.clock.boot_ns == boot_ns
@@ -48,13 +48,13 @@ def test_the_log_tells_device_number_and_instant(tmp_path: Path) -> None:
 
 def scene(folder: Path, **options: Any) -> Scene:
     knobs = Knobs()
-    wearer = Wearer(knobs, parse_programme("stand"), motion_files={})
+    wearer = SimulatedSubject(knobs, parse_motion_script("stand"), motion_files={})
     now_ns = time.monotonic_ns()  # the script waits for instants after it
     return Scene(knobs, wearer, SceneOptions(folder, **options), now_ns=now_ns)
 
 
 def test_clocks_that_are_not_there_cannot_be_asked(tmp_path: Path) -> None:
-    with pytest.raises(BadCommand, match=r"S9.*there are: S1"):
+    with pytest.raises(InvalidCommandError, match=r"S9.*there are: S1"):
         scene(tmp_path, clocks={"S9": ClockFault(1.0)})
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_simulators.body._recorded_trial import Track
+from jointfit_simulators.body._recorded_trial import InterpolatedTrack
 from jointfit_simulators.devices import NS
 from jointfit_simulators.scene._streams import ImuStream
 from jointfit_simulators.settings import Knobs, perfect, turn
@@ -123,5 +123,7 @@ def test_a_track_of_either_sign_is_one_rotation() -> None:
     quaternions = turns.as_quat(scalar_first=True)
     flipped = quaternions * np.where(np.arange(40) % 3, 1.0, -1.0)[:, None]
     between = np.linspace(0.01, 0.99, 100)
-    one, other = (Track(t, q, rotation=True).at(between) for q in (quaternions, flipped))
+    one, other = (
+        InterpolatedTrack(t, q, rotation=True).at(between) for q in (quaternions, flipped)
+    )
     np.testing.assert_allclose(np.abs(np.sum(one * other, axis=1)), 1.0, atol=1e-12)

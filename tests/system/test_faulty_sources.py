@@ -20,7 +20,7 @@ from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.devices import (
     NatNetServer,
     NatNetServerOptions,
-    StagedBody,
+    RigidBodyAsset,
     XbusDevice,
     XbusDeviceOptions,
     XcdiDevice,
@@ -128,7 +128,7 @@ class Hardware:
             XcdiDevice(self.bus, XcdiDeviceOptions(SHARED, first_counter=n, first_tick=n))
             for n in (0, 31_000)
         ]
-        bodies = (StagedBody("Thigh", MARKERS[:3], 1), StagedBody("Shank", MARKERS[3:], 2))
+        bodies = (RigidBodyAsset("Thigh", MARKERS[:3], 1), RigidBodyAsset("Shank", MARKERS[3:], 2))
         self.server = NatNetServer(NatNetServerOptions(bodies=bodies))
         self.absent: XbusDevice | None = None
         self.pushed_us: list[int] = []

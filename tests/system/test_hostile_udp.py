@@ -23,7 +23,12 @@ from jointfit_protocols.natnet import (
     ServerInfo,
     encode,
 )
-from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody, XbusDevice
+from jointfit_simulators.devices import (
+    NatNetServer,
+    NatNetServerOptions,
+    RigidBodyAsset,
+    XbusDevice,
+)
 from tests.system.station import BASE, Listener, listening
 
 if TYPE_CHECKING:
@@ -83,7 +88,7 @@ class Cameras:
 
     def __init__(self, folder: Path) -> None:
         self.readable = True
-        body = StagedBody("Thigh", tuple(MARKERS), 1)
+        body = RigidBodyAsset("Thigh", tuple(MARKERS), 1)
         self.server = NatNetServer(NatNetServerOptions(bodies=(body,), wire_noise=self._noise))
         self.sensor = XbusDevice(folder / "S1")
 

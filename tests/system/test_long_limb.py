@@ -13,7 +13,7 @@ import pytest
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.tools.demo._truth import TruthReader
-from jointfit_simulators.body import Wearer, parse_programme
+from jointfit_simulators.body import SimulatedSubject, parse_motion_script
 from jointfit_simulators.scene import RigOptions, Scene, SceneOptions
 from jointfit_simulators.settings import Knobs, perfect, turn
 from tests.system.station import BASE, Station, in_this_process, listening, sensors_in
@@ -48,7 +48,7 @@ async def played(folder: Path, port: int) -> AsyncIterator[Scene]:
     knobs = turn(perfect(Knobs()), SETTINGS)
     rig = RigOptions(mqtt_port=port, mqtt_base=BASE, axes="static")  # the truth's axes
     options = SceneOptions(folder, wires=WIRES, rig=rig)
-    subject = Wearer(knobs, parse_programme("stand"), sensors=SENSORS)
+    subject = SimulatedSubject(knobs, parse_motion_script("stand"), sensors=SENSORS)
     scene = Scene(knobs, subject, options, now_ns=time.monotonic_ns())
     async with in_this_process(scene):
         yield scene

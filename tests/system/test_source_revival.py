@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.tools.child_processes import ChildProcess, daemon
-from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import XbusDevice
 from jointfit_simulators.wires import PtyLine
 from tests.system.station import BASE, Listener, listening

@@ -14,7 +14,7 @@ import pytest
 
 from jointfit_daemon.tools.demo._score import DemoScore
 from jointfit_daemon.tools.demo._truth import TruthReader
-from jointfit_simulators.body import Wearer, parse_programme
+from jointfit_simulators.body import SimulatedSubject, parse_motion_script
 from jointfit_simulators.scene import RigOptions, Scene, SceneOptions
 from jointfit_simulators.settings import Knobs, perfect, turn
 from tests.system.station import BASE, SENSORS, Station, in_this_process, listening
@@ -59,7 +59,7 @@ class SpoiledScene(Scene):
 async def played(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
     knobs = turn(perfect(Knobs()), SETTINGS)
     options = SceneOptions(folder, rig=RigOptions(mqtt_port=port, mqtt_base=BASE))
-    subject = Wearer(knobs, parse_programme("stand"))
+    subject = SimulatedSubject(knobs, parse_motion_script("stand"))
     scene = SpoiledScene(knobs, subject, options, now_ns=time.monotonic_ns())
     scene.spoil()
     async with in_this_process(scene):

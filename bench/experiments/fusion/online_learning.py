@@ -36,7 +36,7 @@ from jointfit_daemon.calibration.registration import sensor_at
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import Calibration
-from jointfit_simulators.body import SENSORS, Step, Wearer, to_wxyz
+from jointfit_simulators.body import SENSORS, SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
 
@@ -102,7 +102,7 @@ def _cut(track: OpticalTrack, rows: NDArray[np.bool_]) -> OpticalTrack:
 def person(seed: int) -> Person:
     """Return one person."""
     knobs = Knobs(seed=seed, rate_hz=RATE_HZ)
-    wearer = Wearer(knobs, list(PLAN))
+    wearer = SimulatedSubject(knobs, list(PLAN))
     end_s = sum(step.seconds for step in PLAN)
     t_s, camera_s = np.arange(0.0, end_s, 1 / RATE_HZ), np.arange(0.0, end_s, 1 / RATE_HZ)
     seen = wearer.observe([t_s] * len(SENSORS), camera_s, t_s)

@@ -26,7 +26,7 @@ from jointfit_daemon.calibration.phases import (
 )
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
-from jointfit_simulators.body import SENSORS, Step, Wearer, to_wxyz
+from jointfit_simulators.body import SENSORS, SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
 
@@ -80,8 +80,10 @@ class Errors:
 
 def wear_live(seed: int) -> Live:
     knobs = Knobs(seed=seed)
-    still = Wearer(knobs, [Step("stand", 9.0)]).observe([np.empty(0)] * 4, np.empty(0), _STILL_S)
-    wearer = Wearer(knobs, [Step("stand", BEGIN_S), *(Step(*motion) for motion in LIVE)])
+    still = SimulatedSubject(knobs, [Step("stand", 9.0)]).observe(
+        [np.empty(0)] * 4, np.empty(0), _STILL_S
+    )
+    wearer = SimulatedSubject(knobs, [Step("stand", BEGIN_S), *(Step(*motion) for motion in LIVE)])
     end_s = BEGIN_S + sum(seconds for _, seconds in LIVE)
     t_s = np.arange(BEGIN_S, end_s, 1 / RATE_HZ)
     seen = wearer.observe([t_s] * len(SENSORS), np.empty(0), t_s)

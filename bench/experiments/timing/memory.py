@@ -35,7 +35,7 @@ from jointfit_protocols.natnet import (
     encode,
 )
 from jointfit_simulators.body import SENSORS
-from jointfit_simulators.devices import DeviceClock
+from jointfit_simulators.devices import SimulatedClock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -93,7 +93,7 @@ class Hardware:
 
     def __init__(self) -> None:
         self._clocks = {
-            name: DeviceClock(BEGIN_NS - 100 * NS, skew) for name, skew in _SKEW.items()
+            name: SimulatedClock(BEGIN_NS - 100 * NS, skew) for name, skew in _SKEW.items()
         }
         self._numbers = dict.fromkeys(_SKEW, 0)
         self._dice = np.random.default_rng(11)
@@ -115,7 +115,7 @@ class Hardware:
             yield [ChunkArrived(name, Chunk(t_ns, data)) for t_ns, name, data in chunks]
 
     def _reboot(self, name: str, at_ns: int) -> None:
-        self._clocks[name] = DeviceClock(at_ns - NS, _SKEW[name])
+        self._clocks[name] = SimulatedClock(at_ns - NS, _SKEW[name])
         self._numbers[name] = 0
 
     def _taken(self, name: str, begin_ns: int) -> list[tuple[int, int, int]]:

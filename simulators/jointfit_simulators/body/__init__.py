@@ -2,33 +2,33 @@
 
 from jointfit_simulators.body._limb import PARTS, LegGeometry
 from jointfit_simulators.body._motion import MOTIONS
-from jointfit_simulators.body._motion_script import Step, UnknownMotion, parse_programme
+from jointfit_simulators.body._motion_script import Step, UnknownMotionError, parse_motion_script
 from jointfit_simulators.body._orientation import Rotation, from_wxyz, heading, to_wxyz
 from jointfit_simulators.body._placement import CLUSTERS
-from jointfit_simulators.body._random_signal import vector_wander
-from jointfit_simulators.body._recorded_subject import Replayed
-from jointfit_simulators.body._recorded_trial import read_recording
-from jointfit_simulators.body._simulated_subject import SENSORS, Wearer
-from jointfit_simulators.body._subject import Observation, Subject, Truth
+from jointfit_simulators.body._random_signal import random_vector_signal
+from jointfit_simulators.body._recorded_subject import RecordedSubject
+from jointfit_simulators.body._recorded_trial import read_recorded_trial
+from jointfit_simulators.body._simulated_subject import SENSORS, SimulatedSubject
+from jointfit_simulators.body._subject import GroundTruth, InstrumentedSubject, Observation
 
 __all__ = [
     "CLUSTERS",
     "MOTIONS",
     "PARTS",
     "SENSORS",
+    "GroundTruth",
+    "InstrumentedSubject",
     "LegGeometry",
     "Observation",
-    "Replayed",
+    "RecordedSubject",
     "Rotation",
+    "SimulatedSubject",
     "Step",
-    "Subject",
-    "Truth",
-    "UnknownMotion",
-    "Wearer",
+    "UnknownMotionError",
     "from_wxyz",
     "heading",
-    "parse_programme",
-    "read_recording",
+    "parse_motion_script",
+    "random_vector_signal",
+    "read_recorded_trial",
     "to_wxyz",
-    "vector_wander",
 ]

@@ -33,7 +33,7 @@ from jointfit_simulators.body._posture import (
     LIST,
     ROTATION,
     TILT,
-    Style,
+    MovementStyle,
     column,
     couple_knee,
     ground,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 Motion = Callable[["NDArray[np.float64]"], "NDArray[np.float64]"]
 """Seconds since the motion began, shape (n,), to coordinates, shape (n, COORDINATES)."""
-StyledMotion = Callable[[Style, "NDArray[np.float64]"], "NDArray[np.float64]"]
+StyledMotion = Callable[[MovementStyle, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """The same, as done by a person."""
 
 
@@ -71,7 +71,7 @@ _CHAIR_LEAN = _cycle((0, 6), (0.12, 12), (0.24, 38), (0.45, 2), (0.55, 2), (0.72
 _CHAIR_S = 5.0
 
 
-def stand(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stand upright, swaying by tenths of a degree."""
     coordinates = upright(style, t)
     coordinates[:, LEG_ANGLES] += style.sway.at(t)
@@ -81,7 +81,7 @@ def stand(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-def walk(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def walk(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Walk on a treadmill, facing ahead."""
     coordinates = upright(style, t)
     share = t / _STRIDE_S
@@ -103,7 +103,7 @@ def walk(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _sagittal(
-    style: Style,
+    style: MovementStyle,
     t: NDArray[np.float64],
     *,
     knee: NDArray[np.float64],
@@ -124,7 +124,7 @@ def _sagittal(
     return coordinates
 
 
-def squat(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def squat(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squat every 3 s, not always equally deep."""
     depth = (1 - np.cos(2 * np.pi * t / 3.0)) / 2 * (0.9 + 0.1 * np.cos(0.37 * t))
     return _sagittal(
@@ -136,7 +136,7 @@ def squat(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def sit_to_stand(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def sit_to_stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sit on a chair and stand up again, every 5 s."""
     share = (t / _CHAIR_S + 0.5) % 1.0  # begins standing
     return _sagittal(
@@ -144,7 +144,7 @@ def sit_to_stand(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def hip_circles(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def hip_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Swing the almost straight leg through a star of arcs in turning directions (star-arc)."""
     coordinates = upright(style, t)
     swing = np.sin(2 * np.pi * 0.5 * t)
@@ -161,7 +161,7 @@ def hip_circles(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-def knee_swings(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def knee_swings(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Swing the shank under a raised thigh, turning the foot in and out as the knee bends."""
     coordinates = upright(style, t)
     bend = np.radians(55 + 43 * np.sin(2 * np.pi * 0.55 * t))
@@ -177,7 +177,7 @@ def knee_swings(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-def ankle_circles(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def ankle_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Circle the lifted foot."""
     coordinates = upright(style, t)
     phase = 2 * np.pi * 0.7 * t
@@ -192,14 +192,14 @@ def ankle_circles(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-def turn(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Walk while turning the whole body by a right angle to either side, once in 16 s."""
     coordinates = walk(style, t)
     coordinates[:, column(PELVIS_TURN, HEADING)] += np.radians(90) * np.sin(2 * np.pi * t / 16.0)
     return coordinates
 
 
-def plate(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def plate(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stand and turn the plate that carries all sensors by hand, about every axis."""
     coordinates = stand(style, t)
     coordinates[:, ON_PLATE] = 1.0
@@ -221,7 +221,7 @@ _MIX_S = 4.0
 _MIX_BLEND_S = 1.0
 
 
-def functional(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def functional(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Go through walking, hip star, squats, knee swings and ankle circles, 4 s each, for ever."""
     coordinates = np.zeros((len(t), COORDINATES))
     place = (t / _MIX_S) % len(_MIX)
@@ -254,6 +254,6 @@ MOTIONS: Mapping[str, StyledMotion] = {
 """Every built-in motion by name."""
 
 
-def motions_of(style: Style) -> dict[str, Motion]:
+def motions_of(style: MovementStyle) -> dict[str, Motion]:
     """Return all built-in motions as `style` does them."""
     return {name: partial(motion, style) for name, motion in MOTIONS.items()}

@@ -27,7 +27,7 @@ from jointfit_daemon.files.orientations import read_sto
 from jointfit_daemon.files.text import read_toml
 from jointfit_simulators.body._limb import ANKLE, HIP, KNEE, PELVIS_POSITION, PELVIS_TURN
 from jointfit_simulators.body._orientation import Rotation
-from jointfit_simulators.body._posture import Style, upright
+from jointfit_simulators.body._posture import MovementStyle, upright
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -83,7 +83,7 @@ def _read_opensim(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np
 _READERS = {".toml": _read_toml, ".npz": _read_npz, ".mot": _read_opensim, ".sto": _read_opensim}
 
 
-def motion_from_file(path: Path, style: Style) -> Motion:
+def motion_from_file(path: Path, style: MovementStyle) -> Motion:
     """Return the motion a file describes; curves between its keys have two continuous derivatives.
 
     Raises

@@ -26,11 +26,11 @@ class Step(NamedTuple):
     seconds: float
 
 
-class UnknownMotion(LookupError):  # noqa: N818 - named for what happened
+class UnknownMotionError(LookupError):
     """Nobody taught the person that motion."""
 
 
-def parse_programme(text: str) -> tuple[Step, ...]:
+def parse_motion_script(text: str) -> tuple[Step, ...]:
     """Return the steps of ``"plate:20,stand:8,walk:60"``; the last one goes on for ever.
 
     Raises
@@ -51,7 +51,7 @@ def parse_programme(text: str) -> tuple[Step, ...]:
     return tuple(steps)
 
 
-class Programme:
+class MotionScript:
     """The motions of one run, layered: each newer one fades in over the older ones.
 
     Parameters
@@ -85,7 +85,7 @@ class Programme:
 
     def _known(self, name: str) -> str:
         if name not in self._motions:
-            raise UnknownMotion(f"no motion {name!r}; there are: {', '.join(self._motions)}")
+            raise UnknownMotionError(f"no motion {name!r}; there are: {', '.join(self._motions)}")
         return name
 
     def play(self, name: str, t_s: float) -> None:
@@ -99,7 +99,7 @@ class Programme:
         begun = [name for start, name in self._layers if start <= t_s]
         return begun[-1] if begun else self._layers[0][1]
 
-    def forget_before(self, t_s: float) -> None:
+    def discard_before(self, t_s: float) -> None:
         """Drop what can no longer be seen from `t_s` on."""
         covered = [
             i for i, (start, _) in enumerate(self._layers) if start + self._transition_s <= t_s

@@ -26,13 +26,13 @@ _PLACEMENT_M = 0.008
 """Nobody sticks a marker exactly where the drawing shows it."""
 
 
-def strapped(random: np.random.Generator, most_rad: float) -> Rotation:
+def random_misalignment(random: np.random.Generator, most_rad: float) -> Rotation:
     """Return how a sensor sits: turned by up to `most_rad` about a random axis."""
     axis = random.standard_normal(3)
     return Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0, most_rad))
 
 
-def skin_templates(
+def marker_templates(
     random: np.random.Generator, geometry: LegGeometry
 ) -> dict[str, NDArray[np.float64]]:
     """Return marker positions in the frame of each part, upright stance, shape (4, 3).

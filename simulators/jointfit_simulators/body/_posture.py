@@ -19,7 +19,7 @@ from jointfit_simulators.body._limb import (
     LegGeometry,
     leg_pose,
 )
-from jointfit_simulators.body._random_signal import Wander
+from jointfit_simulators.body._random_signal import RandomSignal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,26 +38,26 @@ def column(part: slice, axis: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Style:
+class MovementStyle:
     """How this person moves."""
 
     geometry: LegGeometry
-    sway: Wander
+    sway: RandomSignal
     """Slow sway of each joint angle in quiet stance, rad, 9 channels."""
-    variability: Wander
+    variability: RandomSignal
     """By how much each joint angle of a movement departs from its pattern, rad, 9 channels."""
 
 
-def person(geometry: LegGeometry, random: np.random.Generator) -> Style:
+def draw_style(geometry: LegGeometry, random: np.random.Generator) -> MovementStyle:
     """Return a person with habits drawn from `random`."""
-    return Style(
+    return MovementStyle(
         geometry,
-        sway=Wander(random, 9, low_hz=0.05, high_hz=0.3, rms=np.radians(0.08)),
-        variability=Wander(random, 9, low_hz=0.05, high_hz=0.7, rms=np.radians(1.5)),
+        sway=RandomSignal(random, 9, low_hz=0.05, high_hz=0.3, rms=np.radians(0.08)),
+        variability=RandomSignal(random, 9, low_hz=0.05, high_hz=0.7, rms=np.radians(1.5)),
     )
 
 
-def upright(style: Style, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return upright stance over the origin, plate on its table."""
     coordinates = np.zeros((len(t), COORDINATES))
     coordinates[:, PELVIS_POSITION] = style.geometry.standing_pelvis
@@ -77,14 +77,14 @@ def couple_knee(coordinates: NDArray[np.float64], rotation_rad: float = 0.0) -> 
     coordinates[:, column(KNEE, ROTATION)] += np.radians(11.0) * bend + rotation_rad * bend
 
 
-def vary(style: Style, t: NDArray[np.float64], coordinates: NDArray[np.float64]) -> None:
+def vary(style: MovementStyle, t: NDArray[np.float64], coordinates: NDArray[np.float64]) -> None:
     """Let the movement depart from its pattern, as a person's does."""
     departure = style.variability.at(t)
     departure[:, 4:6] *= 0.3  # the knee hardly tips or twists at will
     coordinates[:, LEG_ANGLES] += departure
 
 
-def ground(style: Style, coordinates: NDArray[np.float64]) -> None:
+def ground(style: MovementStyle, coordinates: NDArray[np.float64]) -> None:
     """Move the pelvis so that the ankle stays where it stands."""
     ankle = leg_pose(style.geometry, coordinates).origins["foot"]
     coordinates[:, PELVIS_POSITION] += np.array(style.geometry.standing_ankle) - ankle

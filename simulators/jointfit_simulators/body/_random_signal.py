@@ -17,7 +17,7 @@ LINES = 48
 """Sinusoids in one signal; with fewer it would visibly repeat and its RMS would swing."""
 
 
-class Wander:
+class RandomSignal:
     r"""A stationary, nearly Gaussian signal of several channels within a frequency band.
 
     .. math:: x_c(t) = \sum_k a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t
@@ -61,8 +61,8 @@ class Wander:
         return found
 
 
-def vector_wander(
+def random_vector_signal(
     random: np.random.Generator, vectors: int, *, low_hz: float, high_hz: float, rms: float
-) -> Wander:
+) -> RandomSignal:
     """Return a wander of 3-vectors whose *length* has the given RMS (isotropic)."""
-    return Wander(random, 3 * vectors, low_hz=low_hz, high_hz=high_hz, rms=rms / np.sqrt(3))
+    return RandomSignal(random, 3 * vectors, low_hz=low_hz, high_hz=high_hz, rms=rms / np.sqrt(3))

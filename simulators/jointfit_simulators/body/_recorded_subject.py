@@ -13,18 +13,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_simulators.body._limb import included_angle
-from jointfit_simulators.body._motion_script import Step, UnknownMotion
+from jointfit_simulators.body._motion_script import Step, UnknownMotionError
 from jointfit_simulators.body._orientation import Rotation, from_wxyz, to_wxyz
 from jointfit_simulators.body._posture import smootherstep
-from jointfit_simulators.body._recorded_trial import BONES, OPENCAP_CLUSTERS, Track, marker_track
-from jointfit_simulators.body._subject import Observation, Truth
+from jointfit_simulators.body._recorded_trial import (
+    BONES,
+    OPENCAP_CLUSTERS,
+    InterpolatedTrack,
+    interpolated_markers,
+)
+from jointfit_simulators.body._subject import GroundTruth, Observation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from jointfit_simulators.body._recorded_trial import Recording
+    from jointfit_simulators.body._recorded_trial import RecordedTrial
 
 _STAND = "stand"
 _MOTION = re.compile(r"stand|trial(@(?P<begin>[\d.]*)-(?P<end>[\d.]*))?")
@@ -39,7 +44,7 @@ class _Switch(NamedTuple):
     """Part of the recording."""
 
 
-class Replayed:
+class RecordedSubject:
     """The wearer of a recorded trial.
 
     Parameters
@@ -64,7 +69,7 @@ class Replayed:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: RecordedTrial,
         sensors: Mapping[str, str],
         steps: Iterable[Step],
         *,
@@ -80,19 +85,20 @@ class Replayed:
         self.sensors = sensors
         trial = recording.orientations
         self._tracks = {
-            name: Track(trial.t_s, trial.sensors[name], rotation=True) for name in sensors
+            name: InterpolatedTrack(trial.t_s, trial.sensors[name], rotation=True)
+            for name in sensors
         }
         self._bones = {
             BONES[name.split("_")[0]]: (
-                Track(trial.t_s, turn, rotation=True),
-                Track(trial.t_s, trial.origins[name], rotation=False),
+                InterpolatedTrack(trial.t_s, turn, rotation=True),
+                InterpolatedTrack(trial.t_s, trial.origins[name], rotation=False),
             )
             for name, turn in trial.bones.items()
             if name.split("_")[0] in BONES and name in trial.origins
         }
         self.visible_bones = tuple(self._bones)
         self._foothold = self._standing_origins()
-        self._markers = marker_track(recording.markers) if recording.markers else None
+        self._markers = interpolated_markers(recording.markers) if recording.markers else None
         self.clusters = self._known_clusters(clusters or OPENCAP_CLUSTERS)
         self._switches: list[_Switch] = []
         for step in steps:
@@ -136,11 +142,13 @@ class Replayed:
         """Stand, or begin the trial or a part of it anew; UnknownMotion for anything else."""
         part = _MOTION.fullmatch(name)
         if part is None:
-            raise UnknownMotion(f"no motion {name!r}; a trial has: stand, trial, trial@FROM-TO (s)")
+            raise UnknownMotionError(
+                f"no motion {name!r}; a trial has: stand, trial, trial@FROM-TO (s)"
+            )
         whole_s = self._recording.seconds
         begin_s, end_s = float(part["begin"] or 0.0), min(float(part["end"] or whole_s), whole_s)
         if not begin_s < end_s:
-            raise UnknownMotion(f"no motion {name!r}; the trial is {whole_s:g} s long")
+            raise UnknownMotionError(f"no motion {name!r}; the trial is {whole_s:g} s long")
         self._switches = [s for s in self._switches if s.start_s < t_s]
         self._switches.append(_Switch(t_s, name, begin_s, end_s))
 
@@ -148,7 +156,7 @@ class Replayed:
         """Return the name of the motion at an instant."""
         return self._switch(t_s).name
 
-    def forget_before(self, t_s: float) -> None:
+    def discard_before(self, t_s: float) -> None:
         """Nothing to forget: switches are few."""
 
     def _switch(self, t_s: float) -> _Switch:
@@ -220,7 +228,7 @@ class Replayed:
         return from_wxyz(self._faded(turns, still, t_s)), where
 
     def _faded(
-        self, track: Track, still: NDArray[np.float64], t_s: NDArray[np.float64]
+        self, track: InterpolatedTrack, still: NDArray[np.float64], t_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return a track blended with its still value along the shortest arc."""
         place, share = self._place(t_s)
@@ -232,7 +240,7 @@ class Replayed:
             moving[fading] = to_wxyz(rest * Rotation.from_rotvec(arc))
         return moving
 
-    def _truth(self, t_s: NDArray[np.float64]) -> Truth:
+    def _truth(self, t_s: NDArray[np.float64]) -> GroundTruth:
         bones = {name: self._bone(name, t_s) for name in self._bones}
         nothing = np.full((len(t_s), 3), np.nan)
         joints = {"hip": nothing, "knee": nothing, "ankle": nothing}
@@ -243,6 +251,6 @@ class Replayed:
         }
         turns = {name: turn for name, (turn, _) in bones.items()}
         if not {"thigh", "shank"} <= set(turns) or not len(t_s):
-            return Truth(turns, joints, nothing, nothing[:, 0])
+            return GroundTruth(turns, joints, nothing, nothing[:, 0])
         knee = (turns["thigh"].inv() * turns["shank"]).as_euler("XYZ") * [-1, 1, 1]
-        return Truth(turns, joints, knee, included_angle(turns["thigh"], turns["shank"]))
+        return GroundTruth(turns, joints, knee, included_angle(turns["thigh"], turns["shank"]))

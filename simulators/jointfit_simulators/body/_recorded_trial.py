@@ -45,7 +45,7 @@ OPENCAP_CLUSTERS = {
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedTrial:
     """All that was recorded of one trial, z up, on one time line that begins at 0."""
 
     orientations: OrientationTrial
@@ -59,7 +59,7 @@ class Recording:
         return float(self.orientations.t_s[-1])
 
 
-def read_recording(paths: Sequence[Path]) -> Recording:
+def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
     """Return the trial that several files describe together.
 
     Raises
@@ -85,7 +85,7 @@ def read_recording(paths: Sequence[Path]) -> Recording:
                 raise ValueError(f"{path}: no trial is read from {other!r} files")
     if len(orientations) != 1:
         raise ValueError(f"a trial needs one .npz or .sto with sensors, got {len(orientations)}")
-    return Recording(_from_zero(orientations[0]), markers, biases)
+    return RecordedTrial(_from_zero(orientations[0]), markers, biases)
 
 
 def _sensors_of_sto(path: Path) -> OrientationTrial:
@@ -100,7 +100,7 @@ def _from_zero(trial: OrientationTrial) -> OrientationTrial:
     return OrientationTrial(trial.t_s - trial.t_s[0], trial.sensors, trial.bones, trial.origins)
 
 
-class Track:
+class InterpolatedTrack:
     """Vectors or quaternions over time, read between their samples.
 
     Straight lines between neighbours; of unit quaternions, made continuous first, that is within
@@ -140,7 +140,7 @@ class Track:
         return found
 
 
-def marker_track(markers: MarkerTrajectories) -> Track:
+def interpolated_markers(markers: MarkerTrajectories) -> InterpolatedTrack:
     """Return all markers as one track, z up, flat: shape (n, 3 * markers)."""
     flat = vectors_z_up(markers.positions).reshape(len(markers.t_s), -1)
-    return Track(markers.t_s - markers.t_s[0], flat, rotation=False)
+    return InterpolatedTrack(markers.t_s - markers.t_s[0], flat, rotation=False)

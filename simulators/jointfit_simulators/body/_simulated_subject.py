@@ -22,12 +22,17 @@ from jointfit_simulators.body._limb import (
 )
 from jointfit_simulators.body._motion import motions_of
 from jointfit_simulators.body._motion_file import motion_from_file
-from jointfit_simulators.body._motion_script import Programme, Step
+from jointfit_simulators.body._motion_script import MotionScript, Step
 from jointfit_simulators.body._orientation import Rotation, to_wxyz
-from jointfit_simulators.body._placement import CLUSTERS, plate_template, skin_templates, strapped
-from jointfit_simulators.body._posture import person
+from jointfit_simulators.body._placement import (
+    CLUSTERS,
+    marker_templates,
+    plate_template,
+    random_misalignment,
+)
+from jointfit_simulators.body._posture import draw_style
 from jointfit_simulators.body._soft_tissue import SoftTissue
-from jointfit_simulators.body._subject import Observation, Truth
+from jointfit_simulators.body._subject import GroundTruth, Observation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -71,7 +76,7 @@ class _Person:
         )
 
 
-class Wearer:
+class SimulatedSubject:
     """A right leg that follows a programme.
 
     Parameters
@@ -104,11 +109,11 @@ class Wearer:
         self.geometry = geometry or LegGeometry()
         self.sensors = sensors or SENSORS
         self.clusters = CLUSTERS
-        style = person(self.geometry, knobs.random("style"))
+        style = draw_style(self.geometry, knobs.random("style"))
         motions = motions_of(style)
         for name, path in (motion_files or {}).items():
             motions[name] = motion_from_file(path, style)
-        self._programme = Programme(
+        self._programme = MotionScript(
             motions, steps, start_s=start_s, transition_s=knobs.transition_s
         )
         body = _Person(knobs, walking_and_squats(motions))
@@ -125,16 +130,20 @@ class Wearer:
             for sensor, part in self.sensors.items()
         }
         self._mounts = {
-            sensor: strapped(knobs.random(f"mount {sensor}"), np.radians(knobs.mount_deg))
+            sensor: random_misalignment(
+                knobs.random(f"mount {sensor}"), np.radians(knobs.mount_deg)
+            )
             for sensor in self.sensors
         }
         self._plate_mounts = {
-            sensor: strapped(knobs.random(f"plate mount {sensor}"), np.radians(knobs.mount_deg))
+            sensor: random_misalignment(
+                knobs.random(f"plate mount {sensor}"), np.radians(knobs.mount_deg)
+            )
             for sensor in self.sensors
         }
 
     def _place_markers(self, knobs: Knobs, body: _Person) -> None:
-        self._templates = skin_templates(knobs.random("markers"), self.geometry)
+        self._templates = marker_templates(knobs.random("markers"), self.geometry)
         self.templates = {**self._templates, "plate": plate_template()}
         self._marker_skin = {
             part: body.skin(
@@ -170,9 +179,9 @@ class Wearer:
         """Return the name of the motion at an instant."""
         return self._programme.name_at(t_s)
 
-    def forget_before(self, t_s: float) -> None:
+    def discard_before(self, t_s: float) -> None:
         """Promise never to ask about earlier instants again."""
-        self._programme.forget_before(t_s)
+        self._programme.discard_before(t_s)
 
     def observe(
         self,
@@ -250,10 +259,10 @@ def _cut(pose: LegPose, cut: slice) -> LegPose:
     )
 
 
-def _truth(coordinates: NDArray[np.float64], pose: LegPose) -> Truth:
+def _truth(coordinates: NDArray[np.float64], pose: LegPose) -> GroundTruth:
     thigh, shank = pose.orientations["thigh"], pose.orientations["shank"]
     joints = {"hip": pose.origins["thigh"], "knee": pose.origins["shank"]}
-    return Truth(
+    return GroundTruth(
         pose.orientations,
         {**joints, "ankle": pose.origins["foot"]},
         coordinates[:, KNEE],

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_simulators.body._limb import ANKLE, HIP, KNEE
-from jointfit_simulators.body._random_signal import Wander, vector_wander
+from jointfit_simulators.body._random_signal import RandomSignal, random_vector_signal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -158,5 +158,7 @@ class SoftTissue:
         return found
 
 
-def _wobble(random: np.random.Generator, vectors: int, rms: float) -> Wander:
-    return vector_wander(random, vectors, low_hz=_WOBBLE_HZ[0], high_hz=_WOBBLE_HZ[1], rms=rms)
+def _wobble(random: np.random.Generator, vectors: int, rms: float) -> RandomSignal:
+    return random_vector_signal(
+        random, vectors, low_hz=_WOBBLE_HZ[0], high_hz=_WOBBLE_HZ[1], rms=rms
+    )

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.body._orientation import Rotation
 
 
-class Truth(NamedTuple):
+class GroundTruth(NamedTuple):
     """The bones at n instants."""
 
     orientations: Mapping[str, Rotation]
@@ -35,10 +35,10 @@ class Observation(NamedTuple):
     """Marker positions on the skin, m, shape (m, markers, 3); NaN where never recorded."""
     bones: Mapping[str, tuple[Rotation, NDArray[np.float64]]]
     """Orientation and origin (m) of bones that the cameras can see as bodies; else empty."""
-    truth: Truth
+    truth: GroundTruth
 
 
-class Subject(Protocol):
+class InstrumentedSubject(Protocol):
     """Whoever wears the sensors."""
 
     @property
@@ -67,7 +67,7 @@ class Subject(Protocol):
     def motion_at(self, t_s: float) -> str:
         """Return the name of the motion at an instant."""
 
-    def forget_before(self, t_s: float) -> None:
+    def discard_before(self, t_s: float) -> None:
         """Promise never to ask about earlier instants again."""
 
     def observe(

@@ -1,22 +1,28 @@
 """Virtual IMUs and a virtual motion-capture server that behave like real devices."""
 
 from jointfit_simulators.devices._cameras import CameraFrames, Cameras
-from jointfit_simulators.devices._clocks import NS, ClockFault, DeviceClock, Samples, Ticker
-from jointfit_simulators.devices._natnet_options import NatNetServerOptions
-from jointfit_simulators.devices._natnet_port import LOOPBACK
-from jointfit_simulators.devices._natnet_server import NatNetServer
-from jointfit_simulators.devices._natnet_stage import (
+from jointfit_simulators.devices._clocks import (
+    NS,
+    ClockFault,
+    PlannedSamples,
+    SampleTiming,
+    SimulatedClock,
+)
+from jointfit_simulators.devices._natnet_frames import (
     Bodies,
+    FrameStamps,
     Markers,
+    NatNetFrameBuilder,
     Pose,
-    Stage,
-    StagedBody,
-    Stamps,
+    RigidBodyAsset,
     Vector,
     model_definition,
 )
+from jointfit_simulators.devices._natnet_options import NatNetServerOptions
+from jointfit_simulators.devices._natnet_port import LOOPBACK
+from jointfit_simulators.devices._natnet_server import NatNetServer
 from jointfit_simulators.devices._orientation_sensor import OrientationSensor
-from jointfit_simulators.devices._sensor_faults import Mishaps
+from jointfit_simulators.devices._sensor_faults import SensorFaults
 from jointfit_simulators.devices._xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.devices._xcdi_device import XcdiDevice, XcdiDeviceOptions
 
@@ -27,18 +33,18 @@ __all__ = [
     "CameraFrames",
     "Cameras",
     "ClockFault",
-    "DeviceClock",
+    "FrameStamps",
     "Markers",
-    "Mishaps",
+    "NatNetFrameBuilder",
     "NatNetServer",
     "NatNetServerOptions",
     "OrientationSensor",
+    "PlannedSamples",
     "Pose",
-    "Samples",
-    "Stage",
-    "StagedBody",
-    "Stamps",
-    "Ticker",
+    "RigidBodyAsset",
+    "SampleTiming",
+    "SensorFaults",
+    "SimulatedClock",
     "Vector",
     "XbusDevice",
     "XbusDeviceOptions",

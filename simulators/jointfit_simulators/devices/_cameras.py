@@ -17,7 +17,7 @@ from jointfit_simulators.body import Rotation, heading, to_wxyz
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from jointfit_simulators.body import Observation, Subject
+    from jointfit_simulators.body import InstrumentedSubject, Observation
     from jointfit_simulators.settings import Knobs
 
 _FIT = 3
@@ -52,7 +52,7 @@ class Cameras:
         Camera frames a second.
     """
 
-    def __init__(self, knobs: Knobs, subject: Subject, *, rate_hz: float) -> None:
+    def __init__(self, knobs: Knobs, subject: InstrumentedSubject, *, rate_hz: float) -> None:
         turned = knobs.random("optical world").uniform(-1, 1)
         self.heading_rad = float(np.radians(knobs.optical_heading_deg) * turned)
         self.world = heading(self.heading_rad)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 
 
-class DeviceClock:
+class SimulatedClock:
     """An oscillator that counts from power-up, slightly wrong.
 
     Parameters
@@ -62,7 +62,7 @@ class ClockFault(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class PlannedSamples:
     """The samples of one device in one block of time; arrays of shape (n,)."""
 
     host_ns: NDArray[np.int64]
@@ -75,7 +75,7 @@ class Samples:
     """Which are never sent."""
 
 
-class Ticker:
+class SampleTiming:
     """A device's sampling: instants, stamps, delays and losses, in blocks.
 
     Parameters
@@ -94,7 +94,7 @@ class Ticker:
         self._random = knobs.random(f"clock {name}")
         skew = self._random.uniform(-1, 1) * knobs.clock_skew_ppm * 1e-6
         up_ns = round(self._random.uniform(0.1, 1.0) * knobs.clock_offset_s * NS)
-        self.clock = DeviceClock(now_ns - up_ns, skew)
+        self.clock = SimulatedClock(now_ns - up_ns, skew)
         self._jitter_ns = knobs.clock_jitter_us * 1e3
         self._latency_ns = latency_ms * 1e6
         self._late_ns = knobs.latency_jitter_ms * 1e6
@@ -104,7 +104,7 @@ class Ticker:
     def ask(self, fault: ClockFault, now_ns: int) -> None:
         """Run as `fault` says, from `now_ns` (the beginning of the run) on."""
         up_ns = now_ns - self.clock.boot_ns if fault.up_s is None else round(fault.up_s * NS)
-        self.clock = DeviceClock(now_ns - up_ns, fault.skew_ppm * 1e-6)
+        self.clock = SimulatedClock(now_ns - up_ns, fault.skew_ppm * 1e-6)
 
     def device_ns(self, host_ns: int) -> int:
         """Return what the clock shows at a host instant, whatever became of it since the start."""
@@ -112,9 +112,9 @@ class Ticker:
 
     def reboot(self, host_ns: int) -> None:
         """Count from 0 again, from `host_ns` on."""
-        self.clock = DeviceClock(host_ns, self.clock.skew)
+        self.clock = SimulatedClock(host_ns, self.clock.skew)
 
-    def samples(self, begin_ns: int, end_ns: int, period_ns: float) -> Samples:
+    def samples(self, begin_ns: int, end_ns: int, period_ns: float) -> PlannedSamples:
         """Return all samples taken from host time `begin_ns` up to `end_ns`."""
         first, end = self.clock.device_ns(begin_ns), self.clock.device_ns(end_ns)
         ticks = np.arange(np.ceil(first / period_ns), np.ceil(end / period_ns))
@@ -127,4 +127,4 @@ class Ticker:
         delay = self._latency_ns + self._random.exponential(1.0, n) * self._late_ns
         due = np.maximum.accumulate(np.append(self._last_due_ns, host_ns + delay.astype(np.int64)))
         self._last_due_ns = int(due[-1])
-        return Samples(host_ns, stamps, due[1:], self._random.random(n) < self._dropout)
+        return PlannedSamples(host_ns, stamps, due[1:], self._random.random(n) < self._dropout)

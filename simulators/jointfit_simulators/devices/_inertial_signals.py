@@ -27,7 +27,7 @@ _TINY = 1e-12
 Vector = tuple[float, float, float]
 
 
-class Felt:
+class InertialSignals:
     """Follows one sensor."""
 
     def __init__(self) -> None:

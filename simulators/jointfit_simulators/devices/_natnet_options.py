@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_protocols.natnet import Version
-    from jointfit_simulators.devices._natnet_stage import Axis, Hiding, StagedBody
+    from jointfit_simulators.devices._natnet_frames import Axis, Hiding, RigidBodyAsset
 
 
 def same_clock(host_ns: int) -> int:
@@ -23,7 +23,7 @@ def same_clock(host_ns: int) -> int:
 class NatNetServerOptions:
     """Everything about a server that does not change while it runs."""
 
-    bodies: tuple[StagedBody, ...] = ()
+    bodies: tuple[RigidBodyAsset, ...] = ()
     application: str = "Motive"
     bitstream: Version = (3, 1)
     transport: Literal["unicast", "multicast"] = "unicast"

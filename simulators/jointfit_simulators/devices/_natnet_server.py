@@ -33,14 +33,18 @@ from jointfit_protocols.natnet import (
     decode,
     encode,
 )
+from jointfit_simulators.devices._natnet_frames import (
+    FrameStamps,
+    NatNetFrameBuilder,
+    model_definition,
+)
 from jointfit_simulators.devices._natnet_options import NatNetServerOptions
 from jointfit_simulators.devices._natnet_port import NatNetPort
-from jointfit_simulators.devices._natnet_stage import Stage, Stamps, model_definition
 
 if TYPE_CHECKING:
     from jointfit_protocols.natnet import FrameOfData
+    from jointfit_simulators.devices._natnet_frames import Bodies, Markers, RigidBodyAsset
     from jointfit_simulators.devices._natnet_port import Address
-    from jointfit_simulators.devices._natnet_stage import Bodies, Markers, StagedBody
 
 _NS = 10**9
 _PATIENCE_NS = 50_000_000
@@ -84,7 +88,9 @@ class NatNetServer:
     def __init__(self, options: NatNetServerOptions | None = None) -> None:
         self.options = options or NatNetServerOptions()
         self._port = NatNetPort(self.options.command_port, self.options.data_port)
-        self._stage = Stage(self.options.bodies, self.options.up_axis, self.options.hiding)
+        self._stage = NatNetFrameBuilder(
+            self.options.bodies, self.options.up_axis, self.options.hiding
+        )
         self._random = random.Random(self.options.seed)  # noqa: S311 - the same dice every time
         self._clients: dict[Address, Client] = {}
         group = (self.options.group, self._port.data_port)
@@ -144,9 +150,9 @@ class NatNetServer:
         self.plug()
         self.number = 0
 
-    def set_bodies(self, bodies: tuple[StagedBody, ...]) -> None:
+    def set_bodies(self, bodies: tuple[RigidBodyAsset, ...]) -> None:
         """Change the operator's project while running; the next frames announce it."""
-        self._stage = Stage(bodies, self.options.up_axis, self.options.hiding)
+        self._stage = NatNetFrameBuilder(bodies, self.options.up_axis, self.options.hiding)
         self._model_changed = _ANNOUNCED_FRAMES
 
     def set_bitstream(self, version: Version) -> None:
@@ -189,12 +195,12 @@ class NatNetServer:
     def _ticks(self, host_ns: int) -> int:
         return self.options.device_ns(host_ns) * self.options.clock_hz // _NS
 
-    def _stamps(self, exposure_ns: int) -> Stamps:
+    def _stamps(self, exposure_ns: int) -> FrameStamps:
         options = self.options
         received = exposure_ns + options.received_after_ns
         params = FRAME_MODEL_CHANGED if self._model_changed else 0
         params |= FRAME_EDIT_MODE if self.edit_mode else 0
-        return Stamps(
+        return FrameStamps(
             self.number,
             self.number / options.rate_hz,
             self._ticks(exposure_ns) if options.exposure_stamps else 0,

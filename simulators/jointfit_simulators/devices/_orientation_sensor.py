@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_simulators.body import Rotation, from_wxyz, heading, to_wxyz, vector_wander
+from jointfit_simulators.body import Rotation, from_wxyz, heading, random_vector_signal, to_wxyz
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class OrientationSensor:
         level = Rotation.from_rotvec([tilt * np.cos(about), tilt * np.sin(about), 0.0])
         self.world = level * heading(self.heading_rad)
         """Base world to the sensor's own world."""
-        self._slow = vector_wander(
+        self._slow = random_vector_signal(
             knobs.random(f"slow error {name}"),
             1,
             low_hz=_DRIFT_HZ[0],

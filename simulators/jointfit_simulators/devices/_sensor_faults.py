@@ -21,7 +21,7 @@ _ASKEW = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
 """Axis of a slip in the sensor frame, oblique to all sensor axes."""
 
 
-class Mishaps:
+class SensorFaults:
     """Faults of one sensor."""
 
     def __init__(self) -> None:

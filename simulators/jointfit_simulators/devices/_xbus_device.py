@@ -18,8 +18,8 @@ from jointfit_protocols.xbus import MASTER, XbusCodec, XbusMessage, XbusMessageI
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1
-from jointfit_simulators.devices._inertial_signals import Felt
-from jointfit_simulators.devices._xbus_sync_lines import SyncLines
+from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.devices._xbus_sync_inputs import SyncInputs
 from jointfit_simulators.imu_device import clean_wire
 from jointfit_simulators.wires import PtyLine
 
@@ -102,8 +102,8 @@ class XbusDevice:
         self._options = options = options or XbusDeviceOptions()
         self._line = PtyLine(link)
         self._noise = wire_noise
-        self._sync = SyncLines(options.sync)
-        self._felt = Felt()
+        self._sync = SyncInputs(options.sync)
+        self._felt = InertialSignals()
         self._decoder = XbusCodec()
         self._outputs = tuple(setup.Output(*output) for output in options.outputs)
         self._alignment = dict.fromkeys((0, 1), options.alignment)
@@ -346,7 +346,7 @@ class XbusDevice:
 
 
 def _value(
-    data_id: int, counter: int, ticks: int, q: Quaternion | None, felt: Felt
+    data_id: int, counter: int, ticks: int, q: Quaternion | None, felt: InertialSignals
 ) -> Value | None:
     """Return what an item of a message holds; None if the message does without it."""
     simple: dict[int, Value] = {

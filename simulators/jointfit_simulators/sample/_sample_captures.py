@@ -16,7 +16,12 @@ from jointfit_protocols.orientation import native_of
 from jointfit_protocols.xbus import mtdata2
 from jointfit_protocols.xbus.configuration import TICK_NS
 from jointfit_protocols.xbus.mtdata2 import Item
-from jointfit_simulators.devices import Stage, StagedBody, Stamps, model_definition
+from jointfit_simulators.devices import (
+    FrameStamps,
+    NatNetFrameBuilder,
+    RigidBodyAsset,
+    model_definition,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -81,10 +86,10 @@ def natnet_pcap(
         Frames per second.
     """
     bodies = tuple(
-        StagedBody(part.capitalize(), tuple(names), number)
+        RigidBodyAsset(part.capitalize(), tuple(names), number)
         for number, (part, names) in enumerate(clusters.items(), 1)
     )
-    stage = Stage(bodies, "y", "missing")
+    stage = NatNetFrameBuilder(bodies, "y", "missing")
     info = ServerInfo(
         "Motive", (3, 0, 0, 0), (*_BITSTREAM, 0, 0), _CLOCK_HZ, _DATA_PORT, False, "239.255.42.99"
     )
@@ -96,7 +101,7 @@ def natnet_pcap(
     for number, (exposure_ns, markers, poses) in enumerate(frames):
         ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // _NS  # not from 0, which means unknown
         received, transmitted = ticks + _CLOCK_HZ // 200, ticks + _CLOCK_HZ // 150
-        stamps = Stamps(number, number / rate_hz, ticks, received, transmitted, 0)
+        stamps = FrameStamps(number, number / rate_hz, ticks, received, transmitted, 0)
         frame = stage.frame(stamps, markers, poses)
         datagrams.append((exposure_ns + _NS // 100, encode_natnet(frame, _BITSTREAM)))
     return _pcap(datagrams)

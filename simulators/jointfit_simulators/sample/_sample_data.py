@@ -20,7 +20,7 @@ from jointfit_daemon.files.orientations import (
     write_orientations_sto,
 )
 from jointfit_protocols.xcdi import XcdiIds
-from jointfit_simulators.body import PARTS, Step, Wearer, to_wxyz
+from jointfit_simulators.body import PARTS, SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor, XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.sample._c3d_file import c3d_bytes
 from jointfit_simulators.sample._sample_captures import candump_text, natnet_pcap, xbus_bytes
@@ -129,8 +129,8 @@ def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[st
     )
 
 
-def _wearer(knobs: Knobs, motion: str, start_s: float) -> Wearer:
-    return Wearer(knobs, [Step(motion, 1.0)], start_s=start_s)
+def _wearer(knobs: Knobs, motion: str, start_s: float) -> SimulatedSubject:
+    return SimulatedSubject(knobs, [Step(motion, 1.0)], start_s=start_s)
 
 
 def _record(

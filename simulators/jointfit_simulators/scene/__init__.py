@@ -3,10 +3,10 @@
 from jointfit_simulators.scene._phase_follower import PhaseFollower
 from jointfit_simulators.scene._play_directory import PlayDirectory, play_directory
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
-from jointfit_simulators.scene._scene import BadCommand, Scene, SceneOptions
+from jointfit_simulators.scene._scene import InvalidCommandError, Scene, SceneOptions
 
 __all__ = [
-    "BadCommand",
+    "InvalidCommandError",
     "PhaseFollower",
     "PlayDirectory",
     "RigOptions",

@@ -18,7 +18,7 @@ from jointfit_simulators.devices import (
     NS,
     NatNetServer,
     NatNetServerOptions,
-    StagedBody,
+    RigidBodyAsset,
     XbusDevice,
     XbusDeviceOptions,
     XcdiDevice,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from jointfit_simulators.devices import Ticker
+    from jointfit_simulators.devices import SampleTiming
     from jointfit_simulators.settings import Knobs
 
 WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
@@ -48,7 +48,7 @@ _FIRST_BLOCK = 0x100
 
 
 @dataclass
-class Hardware:
+class SceneHardware:
     """Connected devices and their configuration tables."""
 
     streams: dict[str, ImuStream] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Hardware:
     """Port of each device or bus."""
 
 
-def wire_up(
+def create_hardware(
     knobs: Knobs,
     sensors: Mapping[str, str],
     directory: Path,
@@ -68,7 +68,7 @@ def wire_up(
     can: str,
     now_ns: int,
     sync_line: bool = False,
-) -> Hardware:
+) -> SceneHardware:
     """Create and power the devices of a scene.
 
     Parameters
@@ -88,7 +88,7 @@ def wire_up(
     sync_line
         Whether a sync line is connected; the Xbus devices are then configured to report its edges.
     """
-    hardware = Hardware()
+    hardware = SceneHardware()
     for number, (name, segment) in enumerate(sensors.items(), start=1):
         if wires[name] == "xbus":
             sync = _SYNC if sync_line else ()
@@ -101,7 +101,7 @@ def wire_up(
 
 
 def _on_uart(
-    hardware: Hardware,
+    hardware: SceneHardware,
     knobs: Knobs,
     name: str,
     segment: str,
@@ -132,7 +132,7 @@ def _on_uart(
     hardware.tables.append(_imu_table(knobs, name, segment, "xbus", where))
 
 
-def _bus(hardware: Hardware, knobs: Knobs, directory: Path, can: str) -> CanWire:
+def _bus(hardware: SceneHardware, knobs: Knobs, directory: Path, can: str) -> CanWire:
     interface, _, channel = can.partition(":")
     wire: CanWire
     if interface == "slcan":
@@ -152,7 +152,7 @@ def _bus(hardware: Hardware, knobs: Knobs, directory: Path, can: str) -> CanWire
 
 
 def _on_can(
-    hardware: Hardware, knobs: Knobs, name: str, segment: str, *, number: int, now_ns: int
+    hardware: SceneHardware, knobs: Knobs, name: str, segment: str, *, number: int, now_ns: int
 ) -> None:
     if hardware.bus is None:
         raise ValueError("no bus to put a CAN device on")
@@ -181,7 +181,7 @@ def optical_server(
     knobs: Knobs,
     clusters: Mapping[str, tuple[str, ...]],
     bodies: Sequence[str],
-    ticker: Ticker,
+    ticker: SampleTiming,
     *,
     ptp: bool = False,
     command_port: int = 0,
@@ -206,7 +206,7 @@ def optical_server(
     owned = {part.capitalize(): names for part, names in clusters.items()}
     owned |= {body: () for body in bodies if body not in owned}
     staged = tuple(
-        StagedBody(body, names, number) for number, (body, names) in enumerate(owned.items(), 1)
+        RigidBodyAsset(body, names, number) for number, (body, names) in enumerate(owned.items(), 1)
     )
     options = NatNetServerOptions(
         bodies=staged,

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_simulators.body import Observation
-    from jointfit_simulators.devices import CameraFrames, Cameras, Ticker
-    from jointfit_simulators.scene._streams import SampleTold
+    from jointfit_simulators.devices import CameraFrames, Cameras, SampleTiming
+    from jointfit_simulators.scene._streams import SampleCallback
     from jointfit_simulators.settings import Knobs
 
 Vector = tuple[float, float, float]
@@ -69,9 +69,9 @@ class OpticalStream:
         self,
         knobs: Knobs,
         cameras: Cameras,
-        ticker: Ticker,
+        ticker: SampleTiming,
         server: OpticalServer | None,
-        told: SampleTold | None = None,
+        told: SampleCallback | None = None,
     ) -> None:
         self.cameras = cameras
         self._told = told

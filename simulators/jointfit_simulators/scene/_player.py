@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_simulators.body import Subject
+    from jointfit_simulators.body import InstrumentedSubject
     from jointfit_simulators.scene._optical_stream import OpticalStream
     from jointfit_simulators.scene._streams import ImuStream
     from jointfit_simulators.scene._truth_log import TruthLog
@@ -33,7 +33,7 @@ TRUTH_NS = NS // 100
 _FLUSH_NS = NS // 10
 
 
-class Stream(Protocol):
+class PlannedStream(Protocol):
     """Stream with planned samples."""
 
     def emit(self, *, heard: bool) -> None:
@@ -43,7 +43,7 @@ class Stream(Protocol):
         """Drop all that are planned."""
 
 
-class Player:
+class ScenePlayer:
     """Scheduler of all streams of a scene.
 
     Parameters
@@ -64,7 +64,7 @@ class Player:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: InstrumentedSubject,
         imus: Mapping[str, ImuStream],
         optical: OpticalStream,
         truth: TruthLog,
@@ -75,7 +75,7 @@ class Player:
         self._sync_line = sync_line
         self._subject, self._optical, self._truth = subject, optical, truth
         self._imus = [imus[name] for name in subject.sensors]
-        self._streams: list[Stream] = [*self._imus, optical]
+        self._streams: list[PlannedStream] = [*self._imus, optical]
         self._origin_ns = origin_ns
         self._planned_ns = origin_ns
         self._due: list[tuple[int, int]] = []  # when, stream; a heap
@@ -144,7 +144,7 @@ class Player:
         motions = [self._subject.motion_at(t) for t in truth_s.tolist()]
         self._truth.add(truth_ns, motions, seen.truth, self._optical.cameras.world)
         self._planned_ns = end_ns
-        self._subject.forget_before((begin_ns - self._origin_ns) / NS)
+        self._subject.discard_before((begin_ns - self._origin_ns) / NS)
 
     def _schedule(self, stream: int, due_ns: list[int]) -> None:
         for due in due_ns:

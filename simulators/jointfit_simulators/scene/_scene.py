@@ -9,11 +9,11 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jointfit_simulators.body import UnknownMotion, to_wxyz
-from jointfit_simulators.devices import NS, Cameras, Ticker
-from jointfit_simulators.scene._hardware import WIRES, mocap_table, optical_server, wire_up
+from jointfit_simulators.body import UnknownMotionError, to_wxyz
+from jointfit_simulators.devices import NS, Cameras, SampleTiming
+from jointfit_simulators.scene._hardware import WIRES, create_hardware, mocap_table, optical_server
 from jointfit_simulators.scene._optical_stream import OpticalStream
-from jointfit_simulators.scene._player import Player
+from jointfit_simulators.scene._player import ScenePlayer
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
 from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.scene._truth_log import TruthLog
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from jointfit_simulators.body import Subject
+    from jointfit_simulators.body import InstrumentedSubject
     from jointfit_simulators.devices import ClockFault, NatNetServer
     from jointfit_simulators.scene._streams import ImuStream
     from jointfit_simulators.settings import Knobs
@@ -60,7 +60,7 @@ class SceneOptions:
     """Whether the true sampling time of each sample sent is logged."""
 
 
-class BadCommand(ValueError):  # noqa: N818 - named for what happened
+class InvalidCommandError(ValueError):
     """Invalid command; the message names the valid ones."""
 
 
@@ -80,12 +80,12 @@ class Scene:
     """
 
     def __init__(
-        self, knobs: Knobs, subject: Subject, options: SceneOptions, *, now_ns: int
+        self, knobs: Knobs, subject: InstrumentedSubject, options: SceneOptions, *, now_ns: int
     ) -> None:
         self._options, self._subject = options, subject
         _check_clocks(options.clocks, (*subject.sensors, OPTICAL))
         options.directory.mkdir(parents=True, exist_ok=True)
-        self._hardware = wire_up(
+        self._hardware = create_hardware(
             knobs,
             subject.sensors,
             options.directory,
@@ -98,7 +98,7 @@ class Scene:
         samples = options.directory / SAMPLES_FILE
         self._samples = SampleLog(samples) if options.sample_log else None
         told = None if self._samples is None else self._samples.add
-        ticker = Ticker(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
+        ticker = SampleTiming(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
         self._tickers = {n: s.ticker for n, s in self._hardware.streams.items()} | {OPTICAL: ticker}
         for name, fault in options.clocks.items():
             self._tickers[name].ask(fault, now_ns)
@@ -117,7 +117,7 @@ class Scene:
         self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
         self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
-        self._player = Player(
+        self._player = ScenePlayer(
             subject,
             self._hardware.streams,
             self._optical,
@@ -135,8 +135,8 @@ class Scene:
             "unplug": lambda name: self._plugs(name)[0](),
             "plug": lambda name: self._plugs(name)[1](),
             "reboot": self._reboot,
-            "stick": lambda name: self._stream(name).mishaps.stick(),
-            "free": lambda name: self._stream(name).mishaps.free(),
+            "stick": lambda name: self._stream(name).faults.stick(),
+            "free": lambda name: self._stream(name).faults.free(),
             "slip": self._slip,
             "drift": self._drift,
             "occlude": lambda word: setattr(cameras, "covered", _on(word)),
@@ -204,7 +204,7 @@ class Scene:
             await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / NS))
             try:
                 self.command(line)
-            except BadCommand as error:
+            except InvalidCommandError as error:
                 say({"error": str(error)})
 
     def stop(self) -> None:
@@ -256,11 +256,13 @@ class Scene:
         if verb == "status":
             return self.status()
         if verb not in self._verbs:
-            raise BadCommand(f"no command {verb!r}; there are: {', '.join(self._verbs)}, status")
+            raise InvalidCommandError(
+                f"no command {verb!r}; there are: {', '.join(self._verbs)}, status"
+            )
         try:
             self._verbs[verb](rest.strip())
-        except UnknownMotion as error:
-            raise BadCommand(str(error)) from error
+        except UnknownMotionError as error:
+            raise InvalidCommandError(str(error)) from error
         return None
 
     def _play(self, name: str) -> None:
@@ -274,11 +276,11 @@ class Scene:
 
     def _slip(self, words: str) -> None:
         stream, degrees = self._with_number(words, "slip S1 15 (degrees)")
-        stream.mishaps.slip(math.radians(degrees))
+        stream.faults.slip(math.radians(degrees))
 
     def _drift(self, words: str) -> None:
         stream, degrees = self._with_number(words, "drift S1 5 (degrees a minute)")
-        stream.mishaps.drift(math.radians(degrees) / 60.0)
+        stream.faults.drift(math.radians(degrees) / 60.0)
 
     def _with_number(self, words: str, example: str) -> tuple[ImuStream, float]:
         name, _, number = words.partition(" ")
@@ -288,7 +290,7 @@ class Scene:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise BadCommand(f"{words!r}: expected a sensor and a number, as in {example}")
+            raise InvalidCommandError(f"{words!r}: expected a sensor and a number, as in {example}")
         return stream, value
 
     def _mocap(self, word: str) -> None:
@@ -301,7 +303,7 @@ class Scene:
         """Close the server and reopen it after `DOWN_S`; reset its clock if `clock_anew`."""
         server = self._server
         if server is None:
-            raise BadCommand("there is no motion-capture server")
+            raise InvalidCommandError("there is no motion-capture server")
         server.unplug()
         if clock_anew:
             self._tickers[OPTICAL].reboot(time.monotonic_ns())
@@ -312,7 +314,7 @@ class Scene:
             return self._hardware.streams[name]
         except KeyError:
             known = ", ".join(self._hardware.streams)
-            raise BadCommand(f"no sensor {name!r}; there are: {known}") from None
+            raise InvalidCommandError(f"no sensor {name!r}; there are: {known}") from None
 
     def _plugs(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
         found = self._hardware.bus if name == "can0" and self._hardware.bus else self._stream(name)
@@ -342,11 +344,11 @@ class Scene:
 def _check_clocks(asked: Mapping[str, ClockFault], known: tuple[str, ...]) -> None:
     for name in asked:
         if name not in known:
-            raise BadCommand(f"no clock {name!r}; there are: {', '.join(known)}")
+            raise InvalidCommandError(f"no clock {name!r}; there are: {', '.join(known)}")
 
 
 def _on(word: str) -> bool:
     words = {"on": True, "start": True, "off": False, "stop": False}
     if word not in words:
-        raise BadCommand(f"{word!r}: expected {' or '.join(words)}")
+        raise InvalidCommandError(f"{word!r}: expected {' or '.join(words)}")
     return words[word]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from jointfit_simulators.devices import NS, Mishaps, OrientationSensor, Ticker
+from jointfit_simulators.devices import NS, OrientationSensor, SampleTiming, SensorFaults
 from jointfit_simulators.imu_device import ImuDevice
 
 if TYPE_CHECKING:
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 
-SampleTold = Callable[[str, int, int], None]
+SampleCallback = Callable[[str, int, int], None]
 """Callback for every sample sent: device, number on the wire, true host time in ns."""
 
 
 _EDGES = 4096
 
 
-class WornDevice(ImuDevice, Protocol):
+class SceneImuDevice(ImuDevice, Protocol):
     """Virtual IMU with the faults that a scene can trigger."""
 
     def edge(self, device_ns: int) -> None:
@@ -81,16 +81,16 @@ class ImuStream:
         self,
         knobs: Knobs,
         name: str,
-        device: WornDevice,
+        device: SceneImuDevice,
         *,
         latency_ms: float,
         shared_wire: bool,
         now_ns: int,
-        told: SampleTold | None = None,
+        told: SampleCallback | None = None,
     ) -> None:
         self.name, self.device, self.told = name, device, told
-        self.sensor, self.mishaps = OrientationSensor(knobs, name), Mishaps()
-        self.ticker = Ticker(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
+        self.sensor, self.faults = OrientationSensor(knobs, name), SensorFaults()
+        self.ticker = SampleTiming(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
         self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
         self._unplugged = False
         self._waiting: deque[tuple[int, int, Quaternion | None]] = deque()
@@ -114,7 +114,7 @@ class ImuStream:
 
     def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
         """Add orientations to the planned samples and return the transmission times, ns."""
-        said = self.mishaps.apply(t_s, self.sensor.report(t_s, q_base_sensor))
+        said = self.faults.apply(t_s, self.sensor.report(t_s, q_base_sensor))
         lost = self._taken.dropped | ~np.isfinite(said[:, 0])
         for true_ns, stamp, q, never in zip(
             self._taken.host_ns.tolist(), self._taken.device_ns.tolist(), said.tolist(),

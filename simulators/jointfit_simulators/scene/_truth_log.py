@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from jointfit_simulators.body import Rotation, Truth
+    from jointfit_simulators.body import GroundTruth, Rotation
 
 VERSION = 1
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
@@ -56,7 +56,7 @@ class TruthLog:
         self._waiting: deque[tuple[int, bytes]] = deque()
 
     def add(
-        self, t_ns: NDArray[np.int64], motions: list[str], truth: Truth, world: Rotation
+        self, t_ns: NDArray[np.int64], motions: list[str], truth: GroundTruth, world: Rotation
     ) -> None:
         """Queue the ground truth of a planned block.
 

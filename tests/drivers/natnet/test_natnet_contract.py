@@ -10,8 +10,8 @@ from typing_extensions import override
 
 from jointfit_daemon.model import MocapFrame
 from jointfit_drivers.natnet import NatNetMocap, NatNetSettings
-from jointfit_simulators.contract_scene import orientation
-from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
+from jointfit_simulators._contract_fixtures import orientation
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
 from jointfit_simulators.devices._natnet_port import NatNetPort
 from jointfit_simulators.driver_contract import DriverContract
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
-THIGH = StagedBody("Thigh", ("T1", "T2", "T3"), 1)
+THIGH = RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1)
 
 
 class Gossip:

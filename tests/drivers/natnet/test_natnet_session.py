@@ -19,16 +19,16 @@ from jointfit_daemon.model import ClockEcho, MocapFrame
 from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _session
 from jointfit_drivers.ports.udp_socket import UdpSocket, local_address
 from jointfit_protocols.natnet import NatNetMessageId, ServerInfo, encode
-from jointfit_simulators.contract_scene import Listener
-from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, StagedBody
+from jointfit_simulators._contract_fixtures import DecodingReceiver
+from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
 from jointfit_simulators.devices._natnet_replay import NatNetReplay
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-THIGH = StagedBody("Thigh", ("T1", "T2", "T3"), 1)
-SHANK = StagedBody("Shank", ("S1",), 2)
+THIGH = RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1)
+SHANK = RigidBodyAsset("Shank", ("S1",), 2)
 POSE = ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
 SCENE: tuple[dict[str, Any], dict[str, Any]] = ({"T1": (1.0, 2.0, 3.0)}, {"Thigh": POSE})
 
@@ -36,11 +36,11 @@ SCENE: tuple[dict[str, Any], dict[str, Any]] = ({"T1": (1.0, 2.0, 3.0)}, {"Thigh
 @contextlib.asynccontextmanager
 async def at_work(
     server: Any, **settings: Any
-) -> AsyncIterator[tuple[Listener, asyncio.Task[None]]]:
+) -> AsyncIterator[tuple[DecodingReceiver, asyncio.Task[None]]]:
     """Serve and drive; yields what is heard and the driver's task."""
     table = {"driver": "natnet", "server": "127.0.0.1", "command_port": server.command_port}
     driver = NatNetMocap(NatNetSettings.model_validate(table | settings))
-    heard = Listener(driver, MocapFrame)
+    heard = DecodingReceiver(driver, MocapFrame)
     tasks = [asyncio.create_task(server.run()), asyncio.create_task(driver.run(heard.emit))]
     try:
         yield heard, tasks[1]

@@ -11,9 +11,9 @@ from typing_extensions import override
 from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols.xbus.configuration import MAX_RATE
 from jointfit_protocols.xbus.mtdata2 import Item
-from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
-from jointfit_simulators.devices._inertial_signals import Felt
+from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.driver_contract import DriverContract
 from jointfit_simulators.wires import PtyLine
 
@@ -95,7 +95,7 @@ class TestXbusThatOnlyFeels(TestXbus):
     @override
     def matches(self, number: int, measurement: Any) -> bool:
         """By what it felt: the orientation remembers all that came before."""
-        felt = Felt()
+        felt = InertialSignals()
         felt.moved(0, orientation(number))
         force = felt.value(Item.ACCELERATION)
         return bool(measurement.acceleration == pytest.approx(force, abs=0.01))

@@ -18,7 +18,7 @@ from jointfit_drivers.xbus._required_outputs import required_outputs
 from jointfit_protocols.xbus import XbusCodec, XbusMessage, XbusMessageId
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
-from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.wires import PtyLine
 

@@ -21,7 +21,7 @@ from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols import xbus
 from jointfit_protocols.xbus import mtdata2
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
-from jointfit_simulators.devices._inertial_signals import Felt
+from jointfit_simulators.devices._inertial_signals import InertialSignals
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -344,7 +344,7 @@ def test_a_simulated_sensor_feels_the_turn_it_made(
 ) -> None:
     before = rotation.normalize(np.array(start))
     after = rotation.multiply(before, rotation.exp(np.array(turn)))
-    felt = Felt()
+    felt = InertialSignals()
     felt.moved(0, tuple(before.tolist()))
     felt.moved(10_000_000, tuple(after.tolist()))
     rate, force = felt.value(Item.RATE_OF_TURN), felt.value(Item.ACCELERATION)
@@ -355,7 +355,7 @@ def test_a_simulated_sensor_feels_the_turn_it_made(
 
 
 def test_simulated_readings_filtered_give_the_simulated_movement_back() -> None:
-    felt, wires, truth = Felt(), [], []
+    felt, wires, truth = InertialSignals(), [], []
     for k in range(1500):
         q = rotation.exp(np.array([0.6 * sin(0.02 * k), 0.3 * sin(0.013 * k), 0.4 * sin(0.01 * k)]))
         truth.append(q)

@@ -24,9 +24,9 @@ from jointfit_protocols.xbus import XbusMessageId, encode
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.configuration import SyncSetting
 from jointfit_protocols.xbus.mtdata2 import Item
-from jointfit_simulators.contract_scene import orientation
+from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
-from jointfit_simulators.devices._xbus_sync_lines import SyncLines
+from jointfit_simulators.devices._xbus_sync_inputs import SyncInputs
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -179,7 +179,7 @@ def test_order_matters_to_no_device(stored: list[SyncSetting], dice: Any) -> Non
 
 @given(st.integers(0, 20), st.integers(0, 20), st.integers(1, 200))
 def test_edges_are_skipped_as_configured(first: int, factor: int, edges: int) -> None:
-    lines = SyncLines([SyncSetting(3, 2, 1, 0, first, factor)])
+    lines = SyncInputs([SyncSetting(3, 2, 1, 0, first, factor)])
     told_at = []
     for number in range(edges):
         lines.edge(2, number)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_simulators.devices import Mishaps
+from jointfit_simulators.devices import SensorFaults
 from jointfit_simulators.devices._sensor_faults import SLIP_S
 
 T_S = np.arange(0.0, 4.0, 0.01)
@@ -15,7 +15,7 @@ SAID = Rotation.from_rotvec(
 ).as_quat(scalar_first=True)
 
 
-def blocks(mishaps: Mishaps, first: int, end: int, said: np.ndarray = SAID) -> np.ndarray:
+def blocks(mishaps: SensorFaults, first: int, end: int, said: np.ndarray = SAID) -> np.ndarray:
     """Return what is said instead, a fifth of a second at a time."""
     cuts = [slice(k, min(k + 20, end)) for k in range(first, end, 20)]
     return np.concatenate([mishaps.apply(T_S[cut], said[cut]) for cut in cuts])
@@ -26,11 +26,11 @@ def rotations(q: np.ndarray) -> Rotation:
 
 
 def test_without_a_mishap_nothing_is_touched() -> None:
-    assert np.array_equal(blocks(Mishaps(), 0, 400), SAID)
+    assert np.array_equal(blocks(SensorFaults(), 0, 400), SAID)
 
 
 def test_a_stuck_sensor_repeats_itself_to_the_bit_until_it_is_freed() -> None:
-    mishaps = Mishaps()
+    mishaps = SensorFaults()
     blocks(mishaps, 0, 100)
     mishaps.stick()
     assert np.all(blocks(mishaps, 100, 200) == SAID[100])
@@ -39,7 +39,7 @@ def test_a_stuck_sensor_repeats_itself_to_the_bit_until_it_is_freed() -> None:
 
 
 def test_slips_add_up_and_stay() -> None:
-    mishaps = Mishaps()
+    mishaps = SensorFaults()
     blocks(mishaps, 0, 100)
     mishaps.slip(0.2)
     first = rotations(SAID[100:200]).inv() * rotations(blocks(mishaps, 100, 200))
@@ -52,7 +52,7 @@ def test_slips_add_up_and_stay() -> None:
 
 
 def test_a_drift_turns_the_world_about_the_vertical_and_stops_where_it_is() -> None:
-    mishaps = Mishaps()
+    mishaps = SensorFaults()
     blocks(mishaps, 0, 100)
     mishaps.drift(0.5)
     blocks(mishaps, 100, 300)
@@ -64,7 +64,7 @@ def test_a_drift_turns_the_world_about_the_vertical_and_stops_where_it_is() -> N
 def test_what_was_never_said_stays_unsaid() -> None:
     holes = SAID.copy()
     holes[::7] = np.nan
-    mishaps = Mishaps()
+    mishaps = SensorFaults()
     mishaps.slip(0.3)
     mishaps.stick()
     said = blocks(mishaps, 0, 100, holes)

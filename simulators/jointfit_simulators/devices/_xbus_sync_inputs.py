@@ -17,7 +17,7 @@ _ITEMS = {IN1: Item.TRIGGER_IN1, IN2: Item.TRIGGER_IN2}
 _WAITING = 16
 
 
-class SyncLines:
+class SyncInputs:
     """What is stored for the lines, and the edges that are still to be told.
 
     Parameters

@@ -46,7 +46,7 @@ def orientation(number: int) -> Quaternion:
     )
 
 
-class Listener:
+class DecodingReceiver:
     """Stands where the daemon stands: takes chunks, decodes them at once, keeps both."""
 
     def __init__(self, driver: Driver, measurement: type) -> None:
@@ -80,7 +80,7 @@ class Listener:
         return [event for event in self.events if isinstance(event, self._measurement)]
 
 
-class Noise:
+class SwitchableNoise:
     """A wire that is clean until told otherwise: flips, cuts, repeats and adds bytes."""
 
     def __init__(self) -> None:
@@ -116,17 +116,17 @@ def run_scene(scene: Coroutine[Any, Any, None]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def served(device: ContractDevice) -> AsyncIterator[None]:
+async def serve_device(device: ContractDevice) -> AsyncIterator[None]:
     """Have the device serve; unplug it at the end."""
     task = asyncio.create_task(device.run())
     try:
         yield
     finally:
-        await cancelled(task)
+        await cancel_and_wait(task)
         device.unplug()
 
 
-async def cancelled(task: asyncio.Task[None]) -> None:
+async def cancel_and_wait(task: asyncio.Task[None]) -> None:
     """Cancel and see it end within a second."""
     task.cancel()
     _, late = await asyncio.wait({task}, timeout=1.0)
@@ -136,11 +136,11 @@ async def cancelled(task: asyncio.Task[None]) -> None:
         raise AssertionError("not so: a cancelled run raises CancelledError")
 
 
-async def raises(kind: type[Exception], task: asyncio.Task[None], within_s: float) -> None:
+async def require_error(kind: type[Exception], task: asyncio.Task[None], within_s: float) -> None:
     """See `task` end with exactly `kind`."""
     _, late = await asyncio.wait({task}, timeout=within_s)
     if late:
-        await cancelled(task)
+        await cancel_and_wait(task)
         raise AssertionError(f"not so: {kind.__name__} within {within_s:g} s")
     error = task.exception()
     if error is not None and type(error) is not kind:
@@ -151,12 +151,12 @@ async def raises(kind: type[Exception], task: asyncio.Task[None], within_s: floa
     )
 
 
-def open_descriptors() -> int:
+def count_descriptors() -> int:
     """Return how many descriptors this process has open."""
     return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - a count, not paths
 
 
-def without_arrival(measurement: Any) -> str:
+def content_of(measurement: Any) -> str:
     """Return everything of a measurement but when it arrived."""
     changed: Callable[..., Any] | None = getattr(measurement, "_replace", None)
     if changed is not None:

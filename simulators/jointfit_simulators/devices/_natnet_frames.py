@@ -47,7 +47,7 @@ _NOWHERE: Pose = (_ORIGIN, (1.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
-class StagedBody:
+class RigidBodyAsset:
     """One rigid body of the operator's project and the names of its markers."""
 
     name: str
@@ -59,7 +59,7 @@ class StagedBody:
 
 
 @dataclass(frozen=True, slots=True)
-class Stamps:
+class FrameStamps:
     """Frame number and server ticks of one frame."""
 
     number: int
@@ -70,7 +70,7 @@ class Stamps:
     params: int
 
 
-def model_definition(bodies: tuple[StagedBody, ...], version: Version) -> ModelDefinition:
+def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> ModelDefinition:
     """Return the descriptions of `bodies` as Motive orders them.
 
     Parameters
@@ -97,17 +97,17 @@ def model_definition(bodies: tuple[StagedBody, ...], version: Version) -> ModelD
     return ModelDefinition((*described, *sets, MarkerSetDescription("all", every)))
 
 
-class Stage:
+class NatNetFrameBuilder:
     """Makes frames; remembers where everything was last seen."""
 
-    def __init__(self, bodies: tuple[StagedBody, ...], up_axis: Axis, hiding: Hiding) -> None:
+    def __init__(self, bodies: tuple[RigidBodyAsset, ...], up_axis: Axis, hiding: Hiding) -> None:
         self.bodies = bodies
         self._hiding = hiding
         self._place, self._turn = _AXES[up_axis]
         self._poses: dict[str, Pose] = {}
         self._markers: dict[str, Vector] = {}
 
-    def frame(self, stamps: Stamps, markers: Markers, bodies: Bodies) -> FrameOfData:
+    def frame(self, stamps: FrameStamps, markers: Markers, bodies: Bodies) -> FrameOfData:
         """Return one frame.
 
         Parameters
@@ -143,12 +143,12 @@ class Stage:
     def _posed(self, pose: Pose) -> Pose:
         return self._place(*pose[0]), self._turn(*pose[1])
 
-    def _body(self, body: StagedBody, pose: Pose | None) -> Body:
+    def _body(self, body: RigidBodyAsset, pose: Pose | None) -> Body:
         (x, y, z), (w, i, j, k) = self._poses.get(body.name, _NOWHERE)
         params = 0 if pose is None else BODY_TRACKED
         return Body(body.id, x, y, z, i, j, k, w, _ERROR, params)
 
-    def _set(self, body: StagedBody, markers: Markers) -> MarkerSet:
+    def _set(self, body: RigidBodyAsset, markers: Markers) -> MarkerSet:
         filled = self._hiding == "filled"
         return MarkerSet(
             body.name,
@@ -160,7 +160,7 @@ class Stage:
             ),
         )
 
-    def _labeled(self, body: StagedBody, markers: Markers) -> list[LabeledMarker]:
+    def _labeled(self, body: RigidBodyAsset, markers: Markers) -> list[LabeledMarker]:
         found = []
         for member, name in enumerate(body.markers, 1):
             seen = markers.get(name) is not None
