@@ -7,7 +7,6 @@ import json
 import shutil
 import tempfile
 import time
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -153,6 +152,11 @@ def good_calibration() -> Calibration:
     return fit_static_only(pose, None, rig().chain)
 
 
+@cache
+def _good_content() -> str:
+    return json.dumps(good_calibration().to_dict())
+
+
 def use_calibration(calibration: Calibration) -> None:
     """Run the core with a calibration that was accepted, with samples of every sensor."""
     core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"), UnixClock())
@@ -179,7 +183,7 @@ def run_calibration(data: bytes) -> None:
 
 def run_calibration_content(data: bytes) -> None:
     """Change a good calibration as the input says, with a valid checksum, and load it."""
-    content = deepcopy(good_calibration().to_dict())
+    content = json.loads(_good_content())
     leaves = _leaves(content)
     for number in range(0, len(data) - 1, 2):
         parent, key = leaves[data[number] % len(leaves)]

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.inventory import REPRODUCERS, TARGETS, reproducers
+from tests.fuzz.mutation import mutate
 from tests.fuzz.target import LEAST_S, Target, UnaccountedError, run_case
 
 if TYPE_CHECKING:
@@ -26,22 +27,6 @@ STEEPEST = 8.0
 FAILED_ONCE = [path for name in TARGETS for path in reproducers(name)]
 
 
-def mutant(seed: bytes, dice: random.Random) -> bytes:
-    """Return `seed` with some bytes changed, a part repeated or the end cut off."""
-    data = bytearray(seed)
-    for _ in range(dice.randrange(6)):
-        if data:
-            data[dice.randrange(len(data))] = dice.randrange(256)
-    at = dice.randrange(len(data) + 1)
-    match dice.randrange(4):
-        case 0:
-            return bytes(data[:at])
-        case 1:
-            return bytes(data[:at] + data[: dice.randrange(at + 1)] + data[at:])
-        case _:
-            return bytes(data)
-
-
 @pytest.mark.parametrize("name", TARGETS)
 def test_valid_inputs_are_accepted_or_refused_as_documented(name: str) -> None:
     target = TARGETS[name]
@@ -53,8 +38,9 @@ def test_valid_inputs_are_accepted_or_refused_as_documented(name: str) -> None:
 def test_mutants_of_valid_inputs_keep_the_limits(name: str) -> None:
     target, dice = TARGETS[name], random.Random(name)
     seeds = target.seeds()
+    longest = max(target.longest, *map(len, seeds))
     for _ in range(MUTANTS):
-        data = mutant(dice.choice(seeds), dice)[: target.longest]
+        data = mutate(seeds, dice, longest)
         assert run_case(target, data).finding == "", data
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import struct
 from functools import cache
 from typing import TYPE_CHECKING
@@ -49,7 +48,12 @@ if TYPE_CHECKING:
 VERSIONS = ((3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
 ANSWERS = (0x01, 0x0D, 0x13, 0x1D, 0x2D, 0x3E, 0x42, 0x43, 0xC1, 0xED)
 """Xbus messages that a device sends unsolicited or as answers."""
+SIZES = (1, 2, 7, 40, 300, 4096)
+"""Lengths of the pieces that a stream arrives in, bytes."""
 _MS = 1_000_000
+_PAUSE_EVERY = 16
+_PAUSE_NS = 700 * _MS
+"""Pause after so many chunks, ns: longer than a source may be late."""
 
 
 # --- cutting inputs ---------------------------------------------------------------------------
@@ -57,10 +61,11 @@ _MS = 1_000_000
 
 def cut(data: bytes) -> Iterator[bytes]:
     """Cut a stream in pieces whose lengths follow from its content."""
-    dice = random.Random(len(data) * 256 + data[0] if data else 0)
-    at = 0
+    at, state = 0, len(data) * 256 + data[0] if data else 0
     while at < len(data):
-        size = dice.choice((1, 2, 7, 40, 300, 4096))
+        # A linear congruential generator: seeding `random.Random` would cost more than the case.
+        state = (1_103_515_245 * state + 12_345) % 2**31
+        size = SIZES[(state >> 16) % len(SIZES)]
         yield data[at : at + size]
         at += size
 
@@ -95,7 +100,7 @@ def feed_core(source: str, chunks: Iterable[bytes]) -> None:
             reporter.output(output)
 
     for number, data in enumerate(chunks):
-        t_ns += PERIOD_NS if number % 16 else 700 * _MS
+        t_ns += PERIOD_NS if (number + 1) % _PAUSE_EVERY else _PAUSE_NS
         for output in core.feed(ChunkArrived(source, Chunk(t_ns, data))):
             reporter.output(output)
 
@@ -114,7 +119,7 @@ def feed_source(source: str, chunks: Iterable[bytes]) -> None:
         if isinstance(event, ChunkArrived):
             state.feed(event.chunk)
     for number, data in enumerate(chunks):
-        t_ns += PERIOD_NS if number % 16 else 700 * _MS
+        t_ns += PERIOD_NS if (number + 1) % _PAUSE_EVERY else _PAUSE_NS
         for item in state.feed(Chunk(t_ns, data)):
             if isinstance(item, DeviceEvent):
                 encode_payload(item.data)
@@ -292,13 +297,13 @@ def seeds_natnet_core() -> list[bytes]:
 TARGETS = (
     Target("xbus-bytes", run_xbus_bytes, seeds_xbus, share=40),
     Target("xbus-source", run_xbus_source, seeds_xbus_records, share=4),
-    Target("xbus-core", run_xbus_core, seeds_xbus_records, share=0.4),
-    Target("serial-core", run_serial_core, seeds_xbus, share=0.4),
+    Target("xbus-core", run_xbus_core, seeds_xbus_records, share=1),
+    Target("serial-core", run_serial_core, seeds_xbus, share=1),
     Target("slcan-source", run_slcan, seeds_slcan, share=4),
     Target("can-records", run_can_records, seeds_can_records, share=3),
     Target("can-source", run_can_source, seeds_can_core, share=4),
-    Target("can-core", run_can_core, seeds_can_core, share=0.4),
+    Target("can-core", run_can_core, seeds_can_core, share=1),
     Target("natnet-codec", run_natnet_codec, seeds_natnet, share=30, longest=1500),
     Target("natnet-source", run_natnet_source, seeds_natnet_core, share=2, longest=1500),
-    Target("natnet-core", run_natnet_core, seeds_natnet_core, share=0.4, longest=1500),
+    Target("natnet-core", run_natnet_core, seeds_natnet_core, share=1, longest=1500),
 )
