@@ -84,7 +84,10 @@ class OrientationGate:
         refused = not self._low <= square <= self._high  # NaN compares false: refused
 
         if self._checked < _CHECKED:
-            self._record_norm(square, refused=refused)
+            self._checked += 1
+            self._rejected += refused
+            if isfinite(square):
+                self._norms.append(sqrt(square))
         if refused:
             return None
 
@@ -94,12 +97,6 @@ class OrientationGate:
             scale = -scale
         self._last = (scale * w, scale * x, scale * y, scale * z)
         return self._last
-
-    def _record_norm(self, square: float, *, refused: bool) -> None:
-        self._checked += 1
-        self._rejected += refused
-        if isfinite(square):
-            self._norms.append(sqrt(square))
 
     @property
     def judged(self) -> bool:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.files.captures import read_capture
+from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.mocap import read_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_model, read_osim
@@ -23,7 +24,6 @@ from jointfit_daemon.files.orientations import (
     read_orientations_sto,
     read_sto,
 )
-from jointfit_protocols.can._candump import parse_candump
 from jointfit_simulators.sample import write_sample
 from jointfit_simulators.sample._c3d_file import c3d_bytes
 from tests.fuzz.broker_targets import folder
@@ -119,7 +119,7 @@ def seeds_capture() -> list[bytes]:
 
 def run_candump(data: bytes) -> None:
     """Read the text of candump."""
-    list(parse_candump(data))
+    list(read_candump(data))
 
 
 _FILES = (ValueError, OSError)

@@ -19,8 +19,7 @@ from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.ports.can_bus import shared_bus
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu
 from jointfit_protocols.can import HOST_DROPPED, host_count
-from jointfit_protocols.xcdi import XcdiIds
-from jointfit_protocols.xcdi._messages import id_block
+from jointfit_protocols.xcdi import XcdiIds, id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.driver_contract import DriverContract
 from jointfit_simulators.wires import PythonCanWire

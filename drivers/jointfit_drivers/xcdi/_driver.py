@@ -18,7 +18,7 @@ from jointfit_drivers.xcdi._decoder import XcdiDecoder
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, unpack_frames
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.orientation import OrientationGate
-from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode
+from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode, id_block
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
@@ -73,25 +73,13 @@ class XcdiIdSettings(Settings):
     def resolved(self, *, extended: bool = False) -> XcdiIds:
         """Return all identifiers; those left out are derived from a block if there is one."""
         base = self.quaternion - DataId.QUATERNION
-        block = base >= 0 and (
-            self.sample_time - DataId.SAMPLE_TIME
-            == self.group_counter - DataId.GROUP_COUNTER
-            == base
+        is_block = (
+            base >= 0
+            and self.sample_time == base + DataId.SAMPLE_TIME
+            and self.group_counter == base + DataId.GROUP_COUNTER
         )
-
-        def default(data_id: DataId) -> int | None:
-            return base + data_id if block else None
-
-        return XcdiIds(
-            sample_time=self.sample_time,
-            group_counter=self.group_counter,
-            quaternion=self.quaternion,
-            status_word=default(DataId.STATUS_WORD)
-            if self.status_word is None
-            else self.status_word,
-            error=default(DataId.ERROR) if self.error is None else self.error,
-            extended=extended,
-        )
+        derived = id_block(base) if is_block else XcdiIds(status_word=None, error=None)
+        return derived._replace(**self.model_dump(exclude_none=True), extended=extended)
 
 
 class XcdiSettings(ImuSettings):

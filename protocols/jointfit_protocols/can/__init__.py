@@ -1,6 +1,5 @@
-"""CAN frames: records, error frames, candump logs and the SLCAN adapter protocol."""
+"""CAN frames: records, error frames and the SLCAN adapter protocol."""
 
-from jointfit_protocols.can._candump import parse_candump
 from jointfit_protocols.can._error_frame import describe_error
 from jointfit_protocols.can._frame import (
     EXTENDED_MAX,
@@ -30,6 +29,5 @@ __all__ = [
     "host_count",
     "host_dropped",
     "pack_frames",
-    "parse_candump",
     "unpack_frames",
 ]

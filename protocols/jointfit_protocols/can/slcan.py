@@ -32,7 +32,7 @@ BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000,
 """Bit rates of the commands S0 to S8, bit/s."""
 
 DONE, REFUSED = b"\r", b"\a"
-_CR, _BELL = 0x0D, 0x07
+_BELL = 0x07
 _LONGEST = 64
 """Characters of the longest line; some adapters have long version strings."""
 _WINDOW = 32
@@ -152,8 +152,13 @@ class SlcanCodec:
             after_ns -= (len(line) + 1) * self._character_ns or self._on_bus_ns(line)
             before -= len(line) + 1
 
-        self._pending = self._limit_length(rest, found)
-        self._previous_ns = t_ns
+        # An overlong line is cut to its end, in which a frame may have begun.
+        rest = self._split_bells(rest, found)
+        if len(rest) > _LONGEST:
+            self._endless = True
+            found.append(self._corrupt(len(rest) - _WINDOW, "line without end"))
+            rest = rest[-_WINDOW:]
+        self._pending, self._previous_ns = rest, t_ns
         return found
 
     def flush(self) -> list[CorruptBytes]:
@@ -169,15 +174,6 @@ class SlcanCodec:
         digit = line[9:10] if extended else line[4:5]
         size = int(digit) if digit.isdigit() and line[0] in b"tT" else 0
         return frame_bits(min(size, 8), extended) * self._bit_ns
-
-    def _limit_length(self, rest: bytes, found: list[CanFrame | SlcanLine | CorruptBytes]) -> bytes:
-        """Return the unfinished line; an overlong line is cut to its end."""
-        rest = self._split_bells(rest, found)
-        if len(rest) <= _LONGEST:
-            return rest
-        self._endless = True
-        found.append(self._corrupt(len(rest) - _WINDOW, "line without end"))
-        return rest[-_WINDOW:]  # a frame may have begun in it
 
     def _split_bells(self, line: bytes, found: list[CanFrame | SlcanLine | CorruptBytes]) -> bytes:
         """Return the rest of `line` after its last BELL, which is an answer without CR."""

@@ -19,7 +19,7 @@ from jointfit_protocols.natnet._frame import (
     decode_frame,
     supported,
 )
-from jointfit_protocols.natnet._frame_time import DECIDING, PrecisionTime, Timecode, timecode_of
+from jointfit_protocols.natnet._frame_time import DECIDING, PrecisionTime, timecode_of
 from jointfit_protocols.natnet._messages import (
     HEADER,
     Bare,
@@ -77,7 +77,6 @@ __all__ = [
     "PrecisionTime",
     "ServerInfo",
     "SkeletonDescription",
-    "Timecode",
     "Version",
     "decode",
     "decode_frame",

@@ -13,18 +13,19 @@ Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._cursor import BREAKS, XYZ, Cursor, MalformedError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Version = tuple[int, int]
 """Bitstream in use: major and minor."""
 
 Position = tuple[float, float, float]
+
+SectionReader = Callable[[Cursor, int], tuple[Any, ...]]
+"""Reads the items of one section; the number of items is the argument."""
 
 OLDEST: Version = (3, 0)
 SIZED: Version = (4, 1)
@@ -33,10 +34,7 @@ SIZED: Version = (4, 1)
 BODY_TRACKED = 0x01
 MARKER_OCCLUDED = 0x01
 MARKER_POINT_CLOUD_SOLVED = 0x02
-MARKER_MODEL_FILLED = 0x04
 MARKER_HAS_MODEL = 0x08
-MARKER_UNLABELED = 0x10
-FRAME_RECORDING = 0x01
 FRAME_MODEL_CHANGED = 0x02
 FRAME_EDIT_MODE = 0x04
 FRAME_BITSTREAM_CHANGED = 0x08
@@ -174,7 +172,7 @@ def _read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
     tail = STAMPS_LAYOUT.size + _LONG_TAIL
     while sized and cursor.left > tail:  # a section of a newer bitstream behind the known ones
         _, size = cursor.unpack(TWO_LAYOUT)
-        cursor.window(size, _nothing)
+        cursor.window(size, lambda: None)
         skipped.append("unknown")
 
     timecode, subframe, timestamp, exposure, received, transmit = cursor.unpack(STAMPS_LAYOUT)
@@ -196,7 +194,7 @@ def _read_section(
     cursor: Cursor,
     name: str,
     smallest: int,
-    read: Callable[[Cursor, int], tuple[Any, ...]],
+    read: SectionReader,
     skipped: list[str] | None,
 ) -> tuple[Any, ...]:
     """Read one section; with sizes (`skipped` given), skip one that does not fit its size."""
@@ -220,20 +218,6 @@ def _read_section(
     return found
 
 
-def _nothing() -> None:
-    """Read nothing of an unknown section."""
-
-
-def _read_sets(cursor: Cursor, n: int) -> tuple[MarkerSet, ...]:
-    return tuple(
-        MarkerSet(cursor.text(), tuple(cursor.records(XYZ, cursor.integer()))) for _ in range(n)
-    )
-
-
-def _read_positions(cursor: Cursor, n: int) -> tuple[Any, ...]:
-    return tuple(cursor.records(XYZ, n))
-
-
 def _read_bodies(cursor: Cursor, n: int) -> tuple[Body, ...]:
     return tuple(map(Body._make, cursor.records(BODY_LAYOUT, n)))
 
@@ -242,41 +226,28 @@ def _read_markers(cursor: Cursor, n: int) -> tuple[LabeledMarker, ...]:
     return tuple(map(LabeledMarker._make, cursor.records(MARKER_LAYOUT, n)))
 
 
-def _read_skeletons(cursor: Cursor, n: int) -> tuple[Skeleton, ...]:
-    return tuple(
-        Skeleton(cursor.integer(), _read_bodies(cursor, cursor.integer())) for _ in range(n)
-    )
+def _read_analog(cursor: Cursor) -> Analog:
+    number = cursor.integer()
+    channels = (cursor.records(FLOAT_LAYOUT, cursor.integer()) for _ in range(cursor.count(4)))
+    return Analog(number, tuple(tuple(value for (value,) in channel) for channel in channels))
 
 
-def _read_assets(cursor: Cursor, n: int) -> tuple[Asset, ...]:
-    return tuple(
-        Asset(
-            cursor.integer(),
-            _read_bodies(cursor, cursor.integer()),
-            _read_markers(cursor, cursor.integer()),
-        )
-        for _ in range(n)
-    )
+def _items(read: Callable[[Cursor], Any]) -> SectionReader:
+    """Return the reader of a section whose items differ in size."""
+    return lambda cursor, n: tuple(read(cursor) for _ in range(n))
 
 
-def _read_analog(cursor: Cursor, n: int) -> tuple[Analog, ...]:
-    return tuple(
-        Analog(cursor.integer(), tuple(_read_channel(cursor) for _ in range(cursor.count(4))))
-        for _ in range(n)
-    )
-
-
-def _read_channel(cursor: Cursor) -> tuple[float, ...]:
-    return tuple(value for (value,) in cursor.records(FLOAT_LAYOUT, cursor.integer()))
-
-
-_SECTIONS: tuple[tuple[str, int, Callable[[Cursor, int], tuple[Any, ...]]], ...] = (
-    ("marker_sets", 5, _read_sets),
-    ("other_markers", XYZ.size, _read_positions),
+# Name, smallest item (bytes), and reader of each section, in wire order.
+_SECTIONS: tuple[tuple[str, int, SectionReader], ...] = (
+    ("marker_sets", 5, _items(lambda c: MarkerSet(c.text(), tuple(c.records(XYZ, c.integer()))))),
+    ("other_markers", XYZ.size, lambda cursor, n: tuple(cursor.records(XYZ, n))),
     ("bodies", BODY_LAYOUT.size, _read_bodies),
-    ("skeletons", 8, _read_skeletons),
+    ("skeletons", 8, _items(lambda c: Skeleton(c.integer(), _read_bodies(c, c.integer())))),
     ("markers", MARKER_LAYOUT.size, _read_markers),
-    ("force_plates", 8, _read_analog),
-    ("devices", 8, _read_analog),
+    ("force_plates", 8, _items(_read_analog)),
+    ("devices", 8, _items(_read_analog)),
 )
-_SECTIONS_SIZED = (*_SECTIONS[:4], ("assets", 12, _read_assets), *_SECTIONS[4:])
+_ASSETS = _items(
+    lambda c: Asset(c.integer(), _read_bodies(c, c.integer()), _read_markers(c, c.integer()))
+)
+_SECTIONS_SIZED = (*_SECTIONS[:4], ("assets", 12, _ASSETS), *_SECTIONS[4:])

@@ -18,20 +18,14 @@ from jointfit_protocols.natnet._frame import (
     STAMPS_LAYOUT,
     TWO_LAYOUT,
     Analog,
-    Asset,
-    Body,
     FrameOfData,
-    LabeledMarker,
-    MarkerSet,
-    Position,
-    Skeleton,
     Version,
     supported,
 )
 
 if TYPE_CHECKING:
     import struct
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
 
 def encode_frame(frame: FrameOfData, version: Version) -> bytes:
@@ -53,65 +47,41 @@ def encode_frame(frame: FrameOfData, version: Version) -> bytes:
     if frame.precision is None and sized:
         frame = frame._replace(precision=(0, 0))
 
-    tail = b"" if frame.precision is None else PRECISION_LAYOUT.pack(*frame.precision)
-
-    sections: list[tuple[Iterable[Any], Callable[[Any], bytes]]] = [
-        (frame.marker_sets, _put_set),
-        (frame.other_markers, _put_position),
-        (frame.bodies, _put_body),
-        (frame.skeletons, _put_skeleton),
-        *([(frame.assets, _put_asset)] if sized else []),
-        (frame.markers, _put_marker),
-        (frame.force_plates, _put_analog),
-        (frame.devices, _put_analog),
+    sections = [
+        [put_text(one.name) + _put_items(one.positions, XYZ) for one in frame.marker_sets],
+        [XYZ.pack(*position) for position in frame.other_markers],
+        [BODY_LAYOUT.pack(*body) for body in frame.bodies],
+        [I32.pack(one.id) + _put_items(one.bones, BODY_LAYOUT) for one in frame.skeletons],
+        [MARKER_LAYOUT.pack(*marker) for marker in frame.markers],
+        [_put_analog(plate) for plate in frame.force_plates],
+        [_put_analog(device) for device in frame.devices],
     ]
+    if sized:
+        assets = [
+            I32.pack(one.id)
+            + _put_items(one.bodies, BODY_LAYOUT)
+            + _put_items(one.markers, MARKER_LAYOUT)
+            for one in frame.assets
+        ]
+        sections.insert(4, assets)
+
+    parts = [I32.pack(frame.number)]
+    for items in sections:
+        body = b"".join(items)
+        parts.append(TWO_LAYOUT.pack(len(items), len(body)) if sized else I32.pack(len(items)))
+        parts.append(body)
 
     stamps = (frame.timestamp, frame.exposure, frame.received, frame.transmit)
-    return b"".join(
-        (
-            I32.pack(frame.number),
-            *(_put_section([put(item) for item in items], sized) for items, put in sections),
-            STAMPS_LAYOUT.pack(frame.timecode, frame.subframe, *stamps),
-            tail,
-            END_LAYOUT.pack(frame.params, 0),
-        )
-    )
-
-
-def _put_section(items: list[bytes], sized: bool) -> bytes:
-    body = b"".join(items)
-    head = TWO_LAYOUT.pack(len(items), len(body)) if sized else I32.pack(len(items))
-    return head + body
+    parts.append(STAMPS_LAYOUT.pack(frame.timecode, frame.subframe, *stamps))
+    if frame.precision is not None:
+        parts.append(PRECISION_LAYOUT.pack(*frame.precision))
+    parts.append(END_LAYOUT.pack(frame.params, 0))
+    return b"".join(parts)
 
 
 def _put_items(items: Iterable[tuple[Any, ...]], layout: struct.Struct) -> bytes:
     packed = [layout.pack(*item) for item in items]
     return I32.pack(len(packed)) + b"".join(packed)
-
-
-def _put_set(marker_set: MarkerSet) -> bytes:
-    return put_text(marker_set.name) + _put_items(marker_set.positions, XYZ)
-
-
-def _put_position(position: Position) -> bytes:
-    return XYZ.pack(*position)
-
-
-def _put_body(body: Body) -> bytes:
-    return BODY_LAYOUT.pack(*body)
-
-
-def _put_marker(marker: LabeledMarker) -> bytes:
-    return MARKER_LAYOUT.pack(*marker)
-
-
-def _put_skeleton(skeleton: Skeleton) -> bytes:
-    return I32.pack(skeleton.id) + _put_items(skeleton.bones, BODY_LAYOUT)
-
-
-def _put_asset(asset: Asset) -> bytes:
-    bodies = _put_items(asset.bodies, BODY_LAYOUT)
-    return I32.pack(asset.id) + bodies + _put_items(asset.markers, MARKER_LAYOUT)
 
 
 def _put_analog(analog: Analog) -> bytes:

@@ -15,7 +15,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet._connect import Connect, decode_connect, encode_connect
+from jointfit_protocols.natnet._connect import Connect, Version4, decode_connect, encode_connect
 from jointfit_protocols.natnet._cursor import fixed_text, put_fixed_text
 from jointfit_protocols.natnet._frame import FrameOfData, Version, decode_frame
 from jointfit_protocols.natnet._frame_encode import encode_frame
@@ -27,11 +27,6 @@ if TYPE_CHECKING:
 
 MAX_DATAGRAM = 65_507
 """Largest payload of a UDP datagram over IPv4, bytes."""
-COMMAND_PORT = 1510
-DATA_PORT = 1511
-GROUP = "239.255.42.99"
-
-Version4 = tuple[int, int, int, int]
 
 HEADER = struct.Struct("<HH")
 _STAMP = struct.Struct("<Q")
@@ -70,9 +65,9 @@ class ServerInfo(NamedTuple):
     """Its first two numbers are the bitstream in use unless changed."""
     clock_hz: int | None
     """Ticks per second of the stamps in frames; None from a 2.x server."""
-    data_port: int = DATA_PORT
+    data_port: int = 1511
     multicast: bool = False
-    group: str = GROUP
+    group: str = "239.255.42.99"
 
     @property
     def bitstream(self) -> Version:
@@ -158,11 +153,7 @@ def decode(datagram: bytes, version: Version) -> Message | CorruptBytes:
     by_version = _VERSIONED.get(number)
     if by_version is not None:
         return by_version(datagram, version)
-    return _decode_plain(datagram, number)
 
-
-def _decode_plain(datagram: bytes, number: int) -> Message | CorruptBytes:
-    """Decode a message that is the same in every bitstream."""
     read = _READERS.get(number)
     if read is None:
         return CorruptBytes(len(datagram), f"no message has id {number}")
@@ -218,27 +209,16 @@ def _read_discovery(data: bytes) -> Discovery | None:
     return None if connect is None else Discovery(connect)
 
 
-def _read_stamp(data: bytes) -> EchoRequest | None:
-    return EchoRequest(*_STAMP.unpack(data)) if len(data) == _STAMP.size else None
+def _fixed(
+    kind: type[EchoRequest | EchoResponse], layout: struct.Struct
+) -> Callable[[bytes], Message | None]:
+    """Return the reader of a message that consists of one record."""
+    return lambda data: kind(*layout.unpack(data)) if len(data) == layout.size else None
 
 
-def _read_echo(data: bytes) -> EchoResponse | None:
-    return EchoResponse(*_ECHO.unpack(data)) if len(data) == _ECHO.size else None
+def _bare(number: NatNetMessageId) -> Callable[[bytes], Message | None]:
+    return lambda _: Bare(number)
 
-
-def _bare(number: NatNetMessageId) -> Callable[[bytes], Bare]:
-    bare = Bare(number)
-    return lambda _: bare
-
-
-_BARE = (
-    NatNetMessageId.REQUEST_MODELDEF,
-    NatNetMessageId.REQUEST_FRAMEOFDATA,
-    NatNetMessageId.DISCONNECT,
-    NatNetMessageId.KEEPALIVE,
-    NatNetMessageId.DISCONNECTBYTIMEOUT,
-    NatNetMessageId.UNRECOGNIZED_REQUEST,
-)
 
 _VERSIONED: dict[int, Callable[[bytes, Version], FrameOfData | ModelDefinition | CorruptBytes]] = {
     NatNetMessageId.FRAMEOFDATA: decode_frame,
@@ -252,9 +232,14 @@ _READERS: dict[int, Callable[[bytes], Message | None]] = {
     NatNetMessageId.REQUEST: lambda data: CommandRequest(fixed_text(data)),
     NatNetMessageId.RESPONSE: CommandResponse,
     NatNetMessageId.MESSAGESTRING: lambda data: MessageString(fixed_text(data)),
-    NatNetMessageId.ECHOREQUEST: _read_stamp,
-    NatNetMessageId.ECHORESPONSE: _read_echo,
-    **{number: _bare(number) for number in _BARE},
+    NatNetMessageId.ECHOREQUEST: _fixed(EchoRequest, _STAMP),
+    NatNetMessageId.ECHORESPONSE: _fixed(EchoResponse, _ECHO),
+    NatNetMessageId.REQUEST_MODELDEF: _bare(NatNetMessageId.REQUEST_MODELDEF),
+    NatNetMessageId.REQUEST_FRAMEOFDATA: _bare(NatNetMessageId.REQUEST_FRAMEOFDATA),
+    NatNetMessageId.DISCONNECT: _bare(NatNetMessageId.DISCONNECT),
+    NatNetMessageId.KEEPALIVE: _bare(NatNetMessageId.KEEPALIVE),
+    NatNetMessageId.DISCONNECTBYTIMEOUT: _bare(NatNetMessageId.DISCONNECTBYTIMEOUT),
+    NatNetMessageId.UNRECOGNIZED_REQUEST: _bare(NatNetMessageId.UNRECOGNIZED_REQUEST),
 }
 
 

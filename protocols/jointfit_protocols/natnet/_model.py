@@ -13,17 +13,26 @@ Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 from __future__ import annotations
 
 import struct
+from enum import IntEnum
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._cursor import BREAKS, I32, XYZ, Cursor, MalformedError
 from jointfit_protocols.natnet._frame import SIZED, Position, Version, supported
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
-MARKER_SET, RIGID_BODY, SKELETON, FORCE_PLATE, DEVICE, CAMERA, ASSET = range(7)
+class DescriptionType(IntEnum):
+    """First field of a description."""
+
+    MARKER_SET = 0
+    RIGID_BODY = 1
+    SKELETON = 2
+    FORCE_PLATE = 3
+    DEVICE = 4
+    CAMERA = 5
+    ASSET = 6
+
 
 QUATERNION_LAYOUT = struct.Struct("<4f")
 PLATE_LAYOUT = struct.Struct("<2f3f144f12f2i")
@@ -169,22 +178,16 @@ def _read_sized(cursor: Cursor, n: int, version: Version) -> ModelDefinition:
     for _ in range(n):
         kind, size = cursor.integer(), cursor.integer()
         at = cursor.at
-        description = _read_window(cursor, size, kind, version)
+        description: Description | None = None
+
+        # The size decides whether the 4.2 quaternion is present.
+        for rotated in (False, True):
+            if description is None:
+                cursor.at = at
+                reader = _Reader(cursor, version, rotated)
+                description = cursor.window(size, partial(reader.description, kind))
         found.append(description or UnknownDescription(kind, cursor.data[at : cursor.at]))
     return ModelDefinition(tuple(found))
-
-
-def _read_window(cursor: Cursor, size: int, kind: int, version: Version) -> Description | None:
-    """Read one description of `size` bytes, with or without the 4.2 quaternion."""
-    at = cursor.at
-    found: Description | None = None
-    for rotated in (False, True):
-        cursor.at = at
-        reader = _Reader(cursor, version, rotated)
-        found = cursor.window(size, partial(reader.description, kind))
-        if found is not None:
-            break
-    return found
 
 
 def _read(cursor: Cursor, n: int, version: Version) -> ModelDefinition:
@@ -205,23 +208,35 @@ class _Reader:
         self._cursor = cursor
         self._named = version >= NAMES_FROM
         self._rotated = rotated
-        self._readers: dict[int, Callable[[], Description]] = {
-            MARKER_SET: self._marker_set,
-            RIGID_BODY: self._body,
-            SKELETON: self._skeleton,
-            FORCE_PLATE: self._plate,
-            DEVICE: self._device,
-            CAMERA: self._camera,
-            ASSET: self._asset,
-        }
 
-    def description(self, kind: int) -> Description | None:
+    def description(self, kind: int) -> Description | None:  # noqa: PLR0911 - one case a type
         """Read a description of type `kind`; None if the type is unknown."""
-        read = self._readers.get(kind)
-        return None if read is None else read()
-
-    def _marker_set(self) -> MarkerSetDescription:
-        return MarkerSetDescription(self._cursor.text(), self._cursor.texts())
+        cursor = self._cursor
+        text, integer = cursor.text, cursor.integer
+        match kind:
+            case DescriptionType.MARKER_SET:
+                return MarkerSetDescription(text(), cursor.texts())
+            case DescriptionType.RIGID_BODY:
+                return self._body()
+            case DescriptionType.SKELETON:
+                return SkeletonDescription(text(), integer(), self._bodies())
+            case DescriptionType.FORCE_PLATE:
+                return PlateDescription(
+                    integer(), text(), cursor.unpack(PLATE_LAYOUT), cursor.texts()
+                )
+            case DescriptionType.DEVICE:
+                return DeviceDescription(
+                    integer(), text(), text(), integer(), integer(), cursor.texts()
+                )
+            case DescriptionType.CAMERA:
+                name, (x, y, z, *quaternion) = text(), cursor.unpack(CAMERA_LAYOUT)
+                return CameraDescription(name, (x, y, z), tuple(quaternion))
+            case DescriptionType.ASSET:
+                name, type_, number, bodies = text(), integer(), integer(), self._bodies()
+                n = cursor.count(1 + ASSET_MARKER_LAYOUT.size)
+                markers = tuple(self._marker() for _ in range(n))
+                return AssetDescription(name, type_, number, bodies, markers)
+        return None
 
     def _body(self) -> BodyDescription:
         cursor = self._cursor
@@ -237,53 +252,13 @@ class _Reader:
         names = tuple(cursor.text() for _ in range(n)) if self._named else ()
 
         x, y, z = offset
-        return BodyDescription(
-            name,
-            number,
-            parent,
-            (x, y, z),
-            positions,
-            labels,
-            names,
-            rotation,
-        )
-
-    def _skeleton(self) -> SkeletonDescription:
-        return SkeletonDescription(self._cursor.text(), self._cursor.integer(), self._bodies())
+        return BodyDescription(name, number, parent, (x, y, z), positions, labels, names, rotation)
 
     def _bodies(self) -> tuple[BodyDescription, ...]:
         smallest = 1 + BODY_HEAD_LAYOUT.size + I32.size
         return tuple(self._body() for _ in range(self._cursor.count(smallest)))
 
-    def _plate(self) -> PlateDescription:
-        cursor = self._cursor
-        number, serial = cursor.integer(), cursor.text()
-        return PlateDescription(number, serial, cursor.unpack(PLATE_LAYOUT), cursor.texts())
-
-    def _device(self) -> DeviceDescription:
-        cursor = self._cursor
-        return DeviceDescription(
-            cursor.integer(),
-            cursor.text(),
-            cursor.text(),
-            cursor.integer(),
-            cursor.integer(),
-            cursor.texts(),
-        )
-
-    def _camera(self) -> CameraDescription:
-        name = self._cursor.text()
-        x, y, z, qx, qy, qz, qw = self._cursor.unpack(CAMERA_LAYOUT)
-        return CameraDescription(name, (x, y, z), (qx, qy, qz, qw))
-
-    def _asset(self) -> AssetDescription:
-        cursor = self._cursor
-        name, kind, number = cursor.text(), cursor.integer(), cursor.integer()
-        bodies = self._bodies()
-        n = cursor.count(1 + ASSET_MARKER_LAYOUT.size)
-        return AssetDescription(name, kind, number, bodies, tuple(map(self._marker, range(n))))
-
-    def _marker(self, _: int) -> AssetMarkerDescription:
+    def _marker(self) -> AssetMarkerDescription:
         name = self._cursor.text()
         number, x, y, z, size, params = self._cursor.unpack(ASSET_MARKER_LAYOUT)
         return AssetMarkerDescription(name, number, (x, y, z), size, params)

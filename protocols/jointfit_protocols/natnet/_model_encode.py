@@ -5,36 +5,26 @@ Invariant: a model of a real server that `decode_model` has decoded is encoded b
 
 from __future__ import annotations
 
-import struct
-
 from jointfit_protocols.natnet._cursor import I32, XYZ, put_text, put_texts
-from jointfit_protocols.natnet._frame import SIZED, Version, supported
+from jointfit_protocols.natnet._frame import SIZED, TWO_LAYOUT, Version, supported
 from jointfit_protocols.natnet._model import (
-    ASSET,
     ASSET_MARKER_LAYOUT,
     BODY_HEAD_LAYOUT,
-    CAMERA,
     CAMERA_LAYOUT,
-    DEVICE,
-    FORCE_PLATE,
-    MARKER_SET,
     NAMES_FROM,
     PLATE_LAYOUT,
     QUATERNION_LAYOUT,
-    RIGID_BODY,
-    SKELETON,
     AssetDescription,
     BodyDescription,
     CameraDescription,
     Description,
+    DescriptionType,
     DeviceDescription,
     MarkerSetDescription,
     ModelDefinition,
     PlateDescription,
     SkeletonDescription,
 )
-
-_TWO = struct.Struct("<ii")
 
 
 def encode_model(model: ModelDefinition, version: Version) -> bytes:
@@ -50,7 +40,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
     parts = [I32.pack(len(model.descriptions))]
     for description in model.descriptions:
         kind, body = _put(description, version)
-        parts.append(_TWO.pack(kind, len(body)) if version >= SIZED else I32.pack(kind))
+        parts.append(TWO_LAYOUT.pack(kind, len(body)) if version >= SIZED else I32.pack(kind))
         parts.append(body)
     return b"".join(parts)
 
@@ -58,21 +48,36 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
 def _put(description: Description, version: Version) -> tuple[int, bytes]:  # noqa: PLR0911 - one case a type
     match description:
         case MarkerSetDescription():
-            return MARKER_SET, put_text(description.name) + put_texts(description.markers)
+            names = put_texts(description.markers)
+            return DescriptionType.MARKER_SET, put_text(description.name) + names
         case BodyDescription():
-            return RIGID_BODY, _put_body(description, version)
+            return DescriptionType.RIGID_BODY, _put_body(description, version)
         case SkeletonDescription():
             head = put_text(description.name) + I32.pack(description.id)
-            return SKELETON, head + _put_bodies(description.bones, version)
+            return DescriptionType.SKELETON, head + _put_bodies(description.bones, version)
         case PlateDescription():
-            return FORCE_PLATE, _put_plate(description)
+            head = I32.pack(description.id) + put_text(description.serial)
+            numbers = PLATE_LAYOUT.pack(*description.numbers)
+            return DescriptionType.FORCE_PLATE, head + numbers + put_texts(description.channels)
         case DeviceDescription():
-            return DEVICE, _put_device(description)
+            head = I32.pack(description.id) + put_text(description.name)
+            head += put_text(description.serial)
+            head += TWO_LAYOUT.pack(description.type, description.data_type)
+            return DescriptionType.DEVICE, head + put_texts(description.channels)
         case CameraDescription():
             place = CAMERA_LAYOUT.pack(*description.position, *description.quaternion)
-            return CAMERA, put_text(description.name) + place
+            return DescriptionType.CAMERA, put_text(description.name) + place
         case AssetDescription():
-            return ASSET, _put_asset(description, version)
+            if version < SIZED:
+                raise ValueError("assets exist from bitstream 4.1 on")
+            head = put_text(description.name) + TWO_LAYOUT.pack(description.type, description.id)
+            bodies = _put_bodies(description.bodies, version)
+            markers = [
+                put_text(m.name) + ASSET_MARKER_LAYOUT.pack(m.id, *m.position, m.size, m.params)
+                for m in description.markers
+            ]
+            count = I32.pack(len(markers))
+            return DescriptionType.ASSET, b"".join((head, bodies, count, *markers))
         case _:
             if version < SIZED:
                 raise ValueError("an unknown description has no size before 4.1")
@@ -93,26 +98,3 @@ def _put_body(body: BodyDescription, version: Version) -> bytes:
 
 def _put_bodies(bodies: tuple[BodyDescription, ...], version: Version) -> bytes:
     return I32.pack(len(bodies)) + b"".join(_put_body(body, version) for body in bodies)
-
-
-def _put_plate(plate: PlateDescription) -> bytes:
-    head = I32.pack(plate.id) + put_text(plate.serial)
-    return head + PLATE_LAYOUT.pack(*plate.numbers) + put_texts(plate.channels)
-
-
-def _put_device(device: DeviceDescription) -> bytes:
-    names = put_text(device.name) + put_text(device.serial)
-    kinds = _TWO.pack(device.type, device.data_type)
-    return I32.pack(device.id) + names + kinds + put_texts(device.channels)
-
-
-def _put_asset(asset: AssetDescription, version: Version) -> bytes:
-    if version < SIZED:
-        raise ValueError("assets exist from bitstream 4.1 on")
-    head = put_text(asset.name) + _TWO.pack(asset.type, asset.id)
-    markers = [
-        put_text(m.name) + ASSET_MARKER_LAYOUT.pack(m.id, *m.position, m.size, m.params)
-        for m in asset.markers
-    ]
-    bodies = _put_bodies(asset.bodies, version)
-    return head + bodies + I32.pack(len(markers)) + b"".join(markers)

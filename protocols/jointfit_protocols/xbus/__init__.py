@@ -2,9 +2,7 @@
 
 from jointfit_protocols.xbus._framing import (
     MASTER,
-    MAX_DATA,
     MAX_MESSAGE,
-    PREAMBLE,
     XbusCodec,
     XbusMessage,
     XbusMessageId,
@@ -14,9 +12,7 @@ from jointfit_protocols.xbus._mtdata2_layout import MTData2Layout
 
 __all__ = [
     "MASTER",
-    "MAX_DATA",
     "MAX_MESSAGE",
-    "PREAMBLE",
     "MTData2Layout",
     "XbusCodec",
     "XbusMessage",

@@ -152,7 +152,6 @@ class XbusCodec:
         found: list[XbusMessage | CorruptBytes] = []
 
         at, end = 0, len(buffer)
-
         while at < end:
             size = _size(buffer, at)
             if at + size > end and not final:
@@ -161,7 +160,9 @@ class XbusCodec:
             if not reason:
                 if self._run:
                     self._end_run(found)
-                found.append(_message(buffer, at, size, base + at + size))
+                head = at + (_HEAD if buffer[at + 3] != _EXTENDED else _HEAD + 2)
+                data = buffer[head : at + size - 1]
+                found.append(XbusMessage(buffer[at + 2], data, buffer[at + 1], base + at + size))
                 self.messages += 1
                 at += size
             elif reason == _NO_START:
@@ -215,12 +216,6 @@ def _size(buffer: bytes, at: int) -> int:
         return _HEAD + 2
     length = buffer[at + 4] << 8 | buffer[at + 5]
     return length + _HEAD + 3 if _EXTENDED <= length <= MAX_DATA else _HEAD + 2
-
-
-def _message(buffer: bytes, at: int, size: int, end: int) -> XbusMessage:
-    """Return the message found at `at`."""
-    head = _HEAD if buffer[at + 3] != _EXTENDED else _HEAD + 2
-    return XbusMessage(buffer[at + 2], buffer[at + head : at + size - 1], buffer[at + 1], end)
 
 
 def _fault(buffer: bytes, at: int, size: int) -> str:

@@ -12,21 +12,14 @@ import struct
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.xbus.mtdata2 import Item, Precision, reals_in
+from jointfit_protocols.xbus.mtdata2 import COUNT_BYTES, Item, Precision, reals_in
 
 if TYPE_CHECKING:
     from collections.abc import Container, Sequence
 
     from jointfit_protocols.xbus.mtdata2 import Value
 
-_COUNTS = {1: "B", 2: "H", 4: "I"}
-_COUNTED = {
-    Item.PACKET_COUNTER,
-    Item.SAMPLE_TIME_FINE,
-    Item.SAMPLE_TIME_COARSE,
-    Item.STATUS_BYTE,
-    Item.STATUS_WORD,
-}
+_COUNT_CODES = {1: "B", 2: "H", 4: "I"}
 _HEAD = 2
 """Values of an item's head: identifier and size."""
 
@@ -95,8 +88,8 @@ class MTData2Layout:
 
 def _form(data_id: int, raw: bytes) -> tuple[int, str]:
     """Return an item's number of values and their struct code; 0 if it has none."""
-    if data_id in _COUNTED:
-        return 1, _COUNTS[len(raw)]
+    if data_id in COUNT_BYTES:
+        return 1, _COUNT_CODES[len(raw)]
     count = reals_in(data_id)
     if count is None or data_id & 0x3 != Precision.FLOAT32:
         return 0, ""

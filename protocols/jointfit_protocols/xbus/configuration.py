@@ -5,9 +5,8 @@
                               | pulseWidth U2, 100 us | delay U2, 100 us, or period, ms |   N <= 10
     AlignmentRotation         | frame U1: 0 sensor, 1 local | w x y z float32 |
     FirmwareRev               | major | minor | revision | build U4 | scm U4 |
-    CanOutputConfig       N x | data id, 7 bit | 29 bit flag | identifier U4 | rate U2 |    N <= 16
 
-Source: MT0101P rev. 2020.A; CAN from the MTi-600 pages of the same vendor.
+Source: MT0101P rev. 2020.A.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ WRAP_32_BIT = 1 << 32
 """Ticks after which SampleTimeFine of most models wraps."""
 WRAP_DAY = 864_000_000
 """Ticks after which SampleTimeFine of the MTi-10 and MTi-100 series wraps, at midnight."""
-CAN_ENABLED = 1 << 8
 
 ERRORS = {
     0x03: "period out of range",
@@ -37,29 +35,11 @@ ERRORS = {
     0x21: "parameter invalid or out of range",
     0x28: "device error",
 }
-_BAUD_OF_CODE = {
-    0x0B: 4_800,
-    0x09: 9_600,
-    0x07: 19_200,
-    0x05: 38_400,
-    0x04: 57_600,
-    0x02: 115_200,
-    0x01: 230_400,
-    0x00: 460_800,
-    0x0A: 921_600,
-    0x80: 921_600,
-    0x0C: 2_000_000,
-    0x0E: 3_686_400,
-    0x0D: 4_000_000,
-}
-_CODE_OF_BAUD = {baud: code for code, baud in reversed(_BAUD_OF_CODE.items())}
-BAUD_RATES = tuple(sorted(_CODE_OF_BAUD))
 _DAY_WRAP_MODELS = {10, 20, 30, 100, 200, 300, 700, 710}
 """Models of the MTi-10 and MTi-100 series."""
 _OUTPUT = struct.Struct(">HH")
 _SYNC = struct.Struct(">BBBBHHHH")
 _FIRMWARE = struct.Struct(">BBBII")
-_CAN_OUTPUT = struct.Struct(">BBIH")
 _ROTATION = struct.Struct(">B4f")
 _FILTER_CODE_BYTES = 2
 
@@ -107,16 +87,6 @@ class AlignmentRotation(NamedTuple):
     q: tuple[float, float, float, float]
 
 
-class CanOutput(NamedTuple):
-    """One entry of the CAN output configuration."""
-
-    data_id: int
-    extended: bool
-    identifier: int
-    rate: int
-    """Hz; 0x7FF is the highest possible rate."""
-
-
 def encode_outputs(outputs: Iterable[tuple[int, int]]) -> bytes:
     """Return the data of SetOutputConfiguration."""
     return b"".join(_OUTPUT.pack(*output) for output in outputs)
@@ -139,26 +109,6 @@ def decode_sync(data: bytes) -> tuple[SyncSetting, ...] | None:
     if len(data) % _SYNC.size:
         return None
     return tuple(SyncSetting(*entry) for entry in _SYNC.iter_unpack(data))
-
-
-def encode_can_config(code: int, *, enabled: bool) -> bytes:
-    """Return the data of SetCanConfig with a bit rate code."""
-    return (code | (CAN_ENABLED if enabled else 0)).to_bytes(4, "big")
-
-
-def encode_can_outputs(outputs: Iterable[CanOutput]) -> bytes:
-    """Return the data of SetCanOutputConfig."""
-    return b"".join(_CAN_OUTPUT.pack(*output) for output in outputs)
-
-
-def decode_can_outputs(data: bytes) -> tuple[CanOutput, ...] | None:
-    """Return the entries of a CAN output configuration; None if they do not fill `data`."""
-    if len(data) % _CAN_OUTPUT.size:
-        return None
-    return tuple(
-        CanOutput(data_id & 0x7F, bool(flags & 1), identifier & 0x1FFFFFFF, rate & 0x7FF)
-        for data_id, flags, identifier, rate in _CAN_OUTPUT.iter_unpack(data)
-    )
 
 
 def encode_alignment(rotation: AlignmentRotation) -> bytes:
@@ -199,16 +149,6 @@ def decode_filter_profile(data: bytes) -> str:
     if len(data) == _FILTER_CODE_BYTES:
         return str(int.from_bytes(data, "big"))
     return decode_text(data)
-
-
-def baud_of_code(code: int) -> int | None:
-    """Return the speed for a code, bit/s; None for an unknown code."""
-    return _BAUD_OF_CODE.get(code)
-
-
-def code_of_baud(baud: int) -> int | None:
-    """Return the code for a speed; None if the device does not support it."""
-    return _CODE_OF_BAUD.get(baud)
 
 
 def error_text(code: int) -> str:

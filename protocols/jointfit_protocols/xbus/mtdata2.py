@@ -102,11 +102,7 @@ class Trigger(NamedTuple):
 Value = int | Reals | UtcTime | Trigger | bytes
 
 FILTER_VALID = 1 << 1
-GNSS_FIX = 1 << 2
-CLOCK_BIAS_ACTIVE = 1 << 6
 CLIPPING = 1 << 19
-SYNC_IN_SEEN = 1 << 21
-SYNC_OUT_ACTIVE = 1 << 22
 
 _WORLDS: dict[int, World] = {0x0: "ENU", 0x4: "NED", 0x8: "NWU"}
 _WORLD_BITS: dict[World, int] = {world: bits for bits, world in _WORLDS.items()}
@@ -121,13 +117,14 @@ _REALS: dict[int, int] = {
     Item.DELTA_Q: 4,
     Item.MAGNETIC_FIELD: 3,
 }
-_COUNTS: dict[int, int] = {
+COUNT_BYTES: dict[int, int] = {
     Item.PACKET_COUNTER: 2,
     Item.SAMPLE_TIME_FINE: 4,
     Item.SAMPLE_TIME_COARSE: 4,
     Item.STATUS_BYTE: 1,
     Item.STATUS_WORD: 4,
 }
+"""Bytes of the unsigned integer in an item."""
 _BYTES = (4, 4, 6, 8)
 """Bytes of one real, by precision."""
 _UTC = struct.Struct(">IHBBBBBB")
@@ -180,8 +177,8 @@ def decode_reals(data_id: int, raw: bytes, count: int) -> Reals | None:
 
 def decode_item(data_id: int, raw: bytes) -> Value | None:
     """Return the value of one item; None if the item is unknown or its size is wrong."""
-    if data_id in _COUNTS:
-        return int.from_bytes(raw, "big") if len(raw) == _COUNTS[data_id] else None
+    if data_id in COUNT_BYTES:
+        return int.from_bytes(raw, "big") if len(raw) == COUNT_BYTES[data_id] else None
     if data_id == Item.UTC_TIME:
         return UtcTime(*_UTC.unpack(raw)) if len(raw) == _UTC.size else None
     if data_id in _TRIGGERS:
@@ -232,7 +229,7 @@ def encode_item(data_id: int, value: Value) -> bytes:
     elif isinstance(value, Trigger):
         raw = _TRIGGER.pack(*value)
     elif isinstance(value, int):
-        raw = value.to_bytes(_COUNTS[data_id], "big")
+        raw = value.to_bytes(COUNT_BYTES[data_id], "big")
     else:
         raw = encode_reals(data_id, value)
     return struct.pack(">HB", data_id, len(raw)) + raw

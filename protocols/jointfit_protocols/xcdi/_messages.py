@@ -125,17 +125,10 @@ class XcdiIds(NamedTuple):
 
     def by_id(self) -> dict[tuple[int, bool], DataId]:
         """Return the content of each (identifier, is 29-bit)."""
-        named = {
-            DataId.SAMPLE_TIME: self.sample_time,
-            DataId.GROUP_COUNTER: self.group_counter,
-            DataId.QUATERNION: self.quaternion,
-            DataId.STATUS_WORD: self.status_word,
-            DataId.ERROR: self.error,
-        }
         return {
-            (number, self.extended or number > STANDARD_MAX): data_id
-            for data_id, number in named.items()
-            if number is not None
+            (number, self.extended or number > STANDARD_MAX): DataId[name.upper()]
+            for name, number in self._asdict().items()
+            if name != "extended" and number is not None
         }
 
 
@@ -225,7 +218,13 @@ class XcdiCodec:
         self.messages += 1
         counts = message.unpack(data)
         if data_id is _QUATERNION:
-            return self._complete(t_ns, counts)
+            if self._ticks is None:
+                self.ungrouped += 1
+                self._start_ns = t_ns
+            group = XcdiGroup(self._start_ns, self._ticks, self._counter, self._status, counts)
+            self._ticks = self._counter = self._status = None
+            return group
+
         if data_id is _SAMPLE_TIME:
             self._open(t_ns, counts[0])
         elif data_id is _GROUP_COUNTER:
@@ -247,12 +246,3 @@ class XcdiCodec:
             self.incomplete += 1
         self._start_ns, self._ticks = t_ns, ticks
         self._counter = self._status = None
-
-    def _complete(self, t_ns: int, quaternion: tuple[int, int, int, int]) -> XcdiGroup:
-
-        ticks, counter, status = self._ticks, self._counter, self._status
-        self._ticks = self._counter = self._status = None
-        if ticks is None:
-            self.ungrouped += 1
-            return XcdiGroup(t_ns, None, counter, status, quaternion)
-        return XcdiGroup(self._start_ns, ticks, counter, status, quaternion)

@@ -15,7 +15,7 @@ from jointfit_daemon.model import Chunk, Corrupt, ImuSample
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import CanFrame
 from jointfit_protocols.can.slcan import encode_frame
-from jointfit_protocols.xcdi._messages import id_block
+from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.wires import PtyLine, SlcanAdapter
 

@@ -17,7 +17,7 @@ from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_drivers.ports.can_bus import shared_bus
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import CanFrame, unpack_frames
-from jointfit_protocols.xcdi._messages import id_block
+from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.wires import PythonCanWire
 

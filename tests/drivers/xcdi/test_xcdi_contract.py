@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
-from jointfit_protocols.xcdi._messages import id_block
+from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.driver_contract import DriverContract
 from jointfit_simulators.wires import PtyLine, PythonCanWire, SlcanAdapter

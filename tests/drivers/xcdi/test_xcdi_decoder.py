@@ -16,8 +16,7 @@ from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.xcdi import XcdiDecoder, XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, host_corrupt, host_dropped, pack_frames
-from jointfit_protocols.xcdi import DataId, XcdiIds
-from jointfit_protocols.xcdi._messages import id_block
+from jointfit_protocols.xcdi import DataId, XcdiIds, id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.devices._xcdi_device import interleaved
 

@@ -14,8 +14,8 @@ from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.captures._capture import UnreadableCaptureError
 from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_protocols.can import host_count, unpack_frames
-from jointfit_protocols.can._candump import parse_candump
 from jointfit_protocols.corrupt import CorruptBytes
+from tests.protocols.can.candump_oracle import parse_candump
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,8 +16,8 @@ from jointfit_protocols.can import (
     pack_frames,
     unpack_frames,
 )
-from jointfit_protocols.can._candump import parse_candump
 from jointfit_protocols.corrupt import CorruptBytes
+from tests.protocols.can.candump_oracle import parse_candump
 
 stamps = st.integers(-(2**63), 2**63 - 1)
 payloads = st.binary(max_size=8)

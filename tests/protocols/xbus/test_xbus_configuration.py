@@ -29,19 +29,6 @@ PAIRS: list[tuple[Any, Any, Any]] = [
         ),
     ),
     (
-        setup.encode_can_outputs,
-        setup.decode_can_outputs,
-        st.lists(
-            st.builds(
-                setup.CanOutput,
-                st.integers(0, 0x7F),
-                st.booleans(),
-                st.integers(0, 0x1FFFFFFF),
-                st.integers(0, 0x7FF),
-            )
-        ).map(tuple),
-    ),
-    (
         setup.encode_firmware,
         setup.decode_firmware,
         st.builds(setup.Firmware, byte, byte, byte, long, long),
@@ -89,22 +76,6 @@ def test_reading_text_never_raises(data: bytes) -> None:
             setup.encode_sync([setup.SyncSetting(9, 2, 1, delay=1000)]),
             "faff2c0c0902010000000000000003e8d2",
         ),
-        (
-            XbusMessageId.CAN_CONFIG,
-            setup.encode_can_config(0x0C, enabled=True),
-            "faffe6040000010c0a",
-        ),
-        (
-            XbusMessageId.CAN_OUTPUT,
-            setup.encode_can_outputs(
-                [
-                    setup.CanOutput(0x05, False, 0x105, 0x7FF),
-                    setup.CanOutput(0x06, False, 0x106, 0x7FF),
-                    setup.CanOutput(0x21, False, 0x121, 100),
-                ]
-            ),
-            "faffe81805000000010507ff06000000010607ff210000000121006436",
-        ),
     ],
 )
 def test_documented_bytes(mid: int, data: bytes, wire: str) -> None:
@@ -114,17 +85,6 @@ def test_documented_bytes(mid: int, data: bytes, wire: str) -> None:
 def test_both_forms_of_the_device_id_read_as_on_the_label() -> None:
     assert setup.decode_device_id(bytes.fromhex("0360a1b2")) == "0360A1B2"
     assert setup.decode_device_id(bytes.fromhex("000000000080c3d4")) == "0080C3D4"
-
-
-def test_every_speed_has_one_code_and_comes_back() -> None:
-    for baud in setup.BAUD_RATES:
-        code = setup.code_of_baud(baud)
-        assert code is not None
-        assert setup.baud_of_code(code) == baud
-    assert setup.baud_of_code(0x80) == setup.baud_of_code(0x0A) == 921_600
-    assert setup.code_of_baud(921_600) == 0x0A
-    assert setup.baud_of_code(0x55) is None
-    assert setup.code_of_baud(12_345) is None
 
 
 @pytest.mark.parametrize(

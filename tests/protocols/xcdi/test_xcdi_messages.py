@@ -23,10 +23,10 @@ from jointfit_protocols.xcdi import (
     XcdiIds,
     decode,
     encode,
+    id_block,
     layout,
     quaternion_counts,
 )
-from jointfit_protocols.xcdi._messages import id_block
 
 if TYPE_CHECKING:
     from pathlib import Path

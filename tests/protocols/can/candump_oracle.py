@@ -1,4 +1,4 @@
-"""Logs of ``candump -L`` (can-utils), converted to CAN frames.
+"""Second reader of ``candump -L`` logs (can-utils), for comparison with the one of the daemon.
 
     (1436509052.249713) vcan0 044#2A366C2BBA        (time) interface id#data
     (1436509052.449847) vcan0 0F6#R                 remote request
@@ -12,7 +12,7 @@ from __future__ import annotations
 from binascii import unhexlify
 from typing import TYPE_CHECKING
 
-from jointfit_protocols.can._frame import EXTENDED_MAX, STANDARD_MAX, CanFrame
+from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, CanFrame
 from jointfit_protocols.corrupt import CorruptBytes
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def _parsed(log: bytes) -> Iterator[CanFrame | CorruptBytes]:
 def _frame(line: bytes) -> CanFrame | None:
     """Return the frame in `line`, or None."""
     words = line.split()
-    if len(words) < 3:  # noqa: PLR2004 - time, interface, frame; direction flags may follow
+    if len(words) < 3:
         return None
 
     t_ns = _time_ns(words[0])
@@ -60,7 +60,7 @@ def _frame(line: bytes) -> CanFrame | None:
 
     error, extended = bool(number & _ERROR_FLAG), len(digits) == _EXTENDED_DIGITS
     number &= ~_ERROR_FLAG
-    if len(data) > 8 or number > (EXTENDED_MAX if extended else STANDARD_MAX):  # noqa: PLR2004 - classic
+    if len(data) > 8 or number > (EXTENDED_MAX if extended else STANDARD_MAX):
         return None
     return CanFrame(t_ns, number, data, extended and not error, error, remote)
 
@@ -73,6 +73,6 @@ def _time_ns(word: bytes) -> int | None:
     seconds, _, fraction = word[1:-1].partition(b".")
     if not seconds.isdigit() or not (fraction.isdigit() or not fraction):
         return None
-    if len(seconds) > 10 or len(fraction) > _NS_DIGITS:  # noqa: PLR2004 - longer times exceed 64 bits
+    if len(seconds) > 10 or len(fraction) > _NS_DIGITS:
         return None
     return int(seconds) * 1_000_000_000 + int(fraction.ljust(_NS_DIGITS, b"0") or b"0")
