@@ -66,18 +66,6 @@ class AlignedModel(SegmentModel):
         sd = widen_sd(self.residual_sd, self.movements)
         return Prediction(fuse_one(turned, self.weights), sd, False)
 
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "kind": self.kind,
-            "worlds": [list(q) for q in self.worlds],
-            "mounts": [list(q) for q in self.mounts],
-            "weights": list(self.weights),
-            "residual_sd": self.residual_sd,
-            "movements": self.movements,
-        }
-
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> AlignedModel:

@@ -10,18 +10,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model._json_form import fields_form
 from jointfit_daemon.limb_model._marker_cluster import StoredCluster, vector
 from jointfit_daemon.limb_model._segment_model import SegmentModel
 from jointfit_daemon.limb_model._sensor_link import SensorLink
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-
-if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.model import Chain, Quaternion, Vector
+
+Method = Literal["anchored", "patent12", "patent6", "markley", "mean", "single"]
 
 SCHEMA = 1
 """Version of the JSON form; other versions are rejected."""
@@ -114,26 +113,7 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form: dicts, lists, numbers, strings, None."""
-        return {
-            "schema": SCHEMA,
-            "method": self.method,
-            "joints": list(self.joints),
-            "segments": list(self.segments),
-            "chain_sensors": [list(group) for group in self.chain_sensors],
-            "sensor": {name: _sensor_dict(item) for name, item in self.sensor.items()},
-            "segment": {name: _segment_dict(item) for name, item in self.segment.items()},
-            "joint": {name: _joint_dict(item) for name, item in self.joint.items()},
-            "clusters": {name: _cluster_dict(item) for name, item in self.clusters.items()},
-            "flags": list(self.flags),
-            "notes": list(self.notes),
-            "quality": dict(self.quality),
-            "digest": self.digest,
-            "software": self.software,
-            "created_utc": self.created_utc,
-            "links": [link.to_dict() for link in self.links],
-            "correlations": dict(self.correlations),
-            "memory": self.memory,
-        }
+        return {"schema": SCHEMA, **fields_form(self)}
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Calibration:
@@ -163,52 +143,34 @@ def model_key(sensors: Sequence[str], other: str | None) -> str:
     return f"{'+'.join(sensors)}|{other or ''}"
 
 
-def _sensor_dict(item: SensorCalibration) -> dict[str, Any]:
-    return {
-        "q_optical_world": list(item.q_optical_world),
-        "q_sensor_segment": list(item.q_sensor_segment),
-        "lag_ns": item.lag_ns,
-        "spread": item.spread,
-    }
-
-
-def _segment_dict(item: SegmentCalibration) -> dict[str, Any]:
-    return {
-        "q_static": list(item.q_static),
-        "length": item.length,
-        "length_sd": item.length_sd,
-        "models": {key: model.to_dict() for key, model in item.models.items()},
-    }
-
-
-def _joint_dict(item: JointCalibration) -> dict[str, Any]:
-    return {
-        "center": None if item.center is None else list(item.center),
-        "sd": item.sd,
-        "source": item.source,
-        "residual_rms": item.residual_rms,
-        "gap_rms": item.gap_rms,
-    }
-
-
-def _cluster_dict(item: StoredCluster) -> dict[str, Any]:
-    return {
-        "markers": list(item.markers),
-        "body": item.body,
-        "template": [list(row) for row in item.template],
-        "origin": list(item.origin),
-        "q_body": list(item.q_body),
-    }
-
-
 def _from_dict(data: Mapping[str, Any]) -> Calibration:
+    correlations = {name: float(rho) for name, rho in data.get("correlations", {}).items()}
+    if wrong := [rho for rho in correlations.values() if not -1.0 < rho < 1.0]:
+        raise ValueError(f"correlation {wrong[0]}")
+
     return Calibration(
         method=cast("Method", data["method"]),
         joints=tuple(data["joints"]),
         segments=tuple(data["segments"]),
         chain_sensors=tuple(tuple(group) for group in data["chain_sensors"]),
-        sensor={name: _sensor(item) for name, item in data["sensor"].items()},
-        segment={name: _segment(item) for name, item in data["segment"].items()},
+        sensor={
+            name: SensorCalibration(
+                as_quaternion(item["q_optical_world"]),
+                as_quaternion(item["q_sensor_segment"]),
+                int(item["lag_ns"]),
+                float(item["spread"]),
+            )
+            for name, item in data["sensor"].items()
+        },
+        segment={
+            name: SegmentCalibration(
+                as_quaternion(item["q_static"]),
+                item["length"],
+                item["length_sd"],
+                {key: SegmentModel.from_dict(model) for key, model in item["models"].items()},
+            )
+            for name, item in data["segment"].items()
+        },
         joint={name: _joint(item) for name, item in data["joint"].items()},
         clusters={name: _cluster(item) for name, item in data["clusters"].items()},
         flags=tuple(data["flags"]),
@@ -218,34 +180,8 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         software=data["software"],
         created_utc=data["created_utc"],
         links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
-        correlations={
-            name: _correlation(rho) for name, rho in data.get("correlations", {}).items()
-        },
+        correlations=correlations,
         memory=str(data.get("memory", "")),
-    )
-
-
-def _correlation(value: Any) -> float:
-    if not -1.0 < (rho := float(value)) < 1.0:
-        raise ValueError(f"correlation {rho}")
-    return rho
-
-
-def _sensor(item: Mapping[str, Any]) -> SensorCalibration:
-    return SensorCalibration(
-        as_quaternion(item["q_optical_world"]),
-        as_quaternion(item["q_sensor_segment"]),
-        int(item["lag_ns"]),
-        float(item["spread"]),
-    )
-
-
-def _segment(item: Mapping[str, Any]) -> SegmentCalibration:
-    return SegmentCalibration(
-        as_quaternion(item["q_static"]),
-        item["length"],
-        item["length_sd"],
-        {key: SegmentModel.from_dict(model) for key, model in item["models"].items()},
     )
 
 
@@ -267,6 +203,3 @@ def _cluster(item: Mapping[str, Any]) -> StoredCluster:
         vector(item["origin"]),
         as_quaternion(item["q_body"]),
     )
-
-
-Method = Literal["anchored", "patent12", "patent6", "markley", "mean", "single"]

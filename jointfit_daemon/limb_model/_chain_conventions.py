@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
-if TYPE_CHECKING:
-    from jointfit_daemon.model import Chain
 
 
 FLEXES_FORWARD = ("hip", "ankle", "elbow", "shoulder", "wrist")

@@ -66,18 +66,6 @@ class KernelExpert:
         correction = np.clip(phi @ np.array(self.coefficients).T, -LARGEST, LARGEST)
         return correction, far / self.hull_leverage
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "width": self.width,
-            "tilted": self.tilted,
-            "coefficients": [list(row) for row in self.coefficients],
-            "centers": [list(row) for row in self.centers],
-            "leverage": [list(row) for row in self.leverage],
-            "hull_leverage": self.hull_leverage,
-            "carried": list(self.carried),
-        }
-
     @staticmethod
     def read(data: Mapping[str, Any]) -> KernelExpert:
         """Return the expert of its JSON form."""

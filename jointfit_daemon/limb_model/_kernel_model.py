@@ -29,7 +29,7 @@ from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import perturb_one
-from jointfit_daemon.limb_model._kernel_expert import KernelExpert
+from jointfit_daemon.limb_model._kernel_expert import KernelExpert, as_rows
 from jointfit_daemon.limb_model._kernel_features import (
     relative_rotations,
     relative_rotations_one,
@@ -128,29 +128,16 @@ class KernelModel(SegmentModel):
         sd = sqrt((x * x + y * y + z * z) / 3.0)
         return Prediction(perturb_one(mean, c), sd, far > OUTSIDE, sds)
 
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "kind": self.kind,
-            "sensors": self.sensors,
-            "plain": self.plain.to_dict(),
-            "tilted": self.tilted.to_dict(),
-            "trend": [list(row) for row in self.trend],
-            "spread": self.spread.to_dict(),
-            "residual_sd": self.residual_sd,
-            "mean_sd": self.mean_sd,
-        }
-
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> KernelModel:
         """Return the model of its JSON form."""
+        trend_x, trend_y = as_rows(data["trend"])
         return cls(
             sensors=data["sensors"],
             plain=KernelExpert.read(data["plain"]),
             tilted=KernelExpert.read(data["tilted"]),
-            trend=_rows_xy(data["trend"]),
+            trend=(trend_x, trend_y),
             spread=LeverageVariance.read(data["spread"]),
             residual_sd=data["residual_sd"],
             mean_sd=data["mean_sd"],
@@ -172,8 +159,3 @@ def mix_corrections(line: Array, a: Array, a_ratio: Array, b: Array, b_ratio: Ar
     tilted = inside_b * b + (1.0 - inside_b) * instead_of_b
     mixed: Array = (1.0 - SHARE) * plain + SHARE * tilted
     return mixed
-
-
-def _rows_xy(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    x, y = rows
-    return tuple(x), tuple(y)

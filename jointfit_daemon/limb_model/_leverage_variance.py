@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+from jointfit_daemon.limb_model._marker_cluster import vector
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.model import Vector
 
 FARTHEST = 30.0
 """Leverage ratio above which the variance no longer increases."""
@@ -25,27 +28,18 @@ WITHIN = 0.5
 class LeverageVariance:
     """Variances of the three axes as a function of the leverage ratio."""
 
-    inside: tuple[float, float, float]
+    inside: Vector
     """a, rad²."""
-    outside: tuple[float, float, float]
+    outside: Vector
     """b, rad²."""
 
-    def at(self, ratio: float) -> tuple[float, float, float]:
+    def at(self, ratio: float) -> Vector:
         """Return the standard deviations about x, y and z of the segment, rad."""
         (ax, ay, az), (bx, by, bz) = self.inside, self.outside
         r = max(min(ratio, FARTHEST) - WITHIN, 0.0)
         return (sqrt(ax + bx * r), sqrt(ay + by * r), sqrt(az + bz * r))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {"inside": list(self.inside), "outside": list(self.outside)}
-
     @staticmethod
     def read(data: Mapping[str, Any]) -> LeverageVariance:
         """Return the variances of a JSON form."""
-        return LeverageVariance(_three(data["inside"]), _three(data["outside"]))
-
-
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
+        return LeverageVariance(vector(data["inside"]), vector(data["outside"]))

@@ -10,13 +10,10 @@ import numpy as np
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Quaternion
-if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from jointfit_daemon.model import Quaternion, Vector
-if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Quaternion, Vector
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,15 +42,6 @@ class MeanModel(SegmentModel):
         """Return the weighted mean of one frame."""
         return Prediction(fuse_one(sensors, self.weights), self.residual_sd, False)
 
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "kind": self.kind,
-            "weights": list(self.weights),
-            "residual_sd": self.residual_sd,
-        }
-
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> MeanModel:

@@ -79,18 +79,6 @@ class PatentModel(SegmentModel):
         w, x, y, z = said
         return Prediction((w / length, x / length, y / length, z / length), sd, False)
 
-    @override
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "kind": self.kind,
-            "reading": self.reading,
-            "coefficients": [list(row) for row in self.coefficients],
-            "q_sign": list(self.q_sign),
-            "residual_sd": self.residual_sd,
-            "movements": self.movements,
-        }
-
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> PatentModel:

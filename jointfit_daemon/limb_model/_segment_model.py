@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from typing_extensions import override  # typing has it from Python 3.12
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from jointfit_daemon.model import Quaternion
+from jointfit_daemon.limb_model._json_form import fields_form
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -80,9 +77,9 @@ class SegmentModel(ABC):
     ) -> Prediction:
         """Return the estimate of one frame from plain tuples."""
 
-    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form, exact also through text."""
+        return {"kind": self.kind, **fields_form(self)}
 
     @classmethod
     @abstractmethod

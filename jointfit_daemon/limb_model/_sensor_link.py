@@ -75,20 +75,6 @@ class SensorLink:
             stray = max(stray, abs(value - kept[-1]) - STRAY * (high - low))
         return tuple(kept), stray
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return {
-            "a": self.a,
-            "b": self.b,
-            "kind": self.kind,
-            "near": list(self.near),
-            "weights": [list(row) for row in self.weights],
-            "low": list(self.low),
-            "high": list(self.high),
-            "spread": self.spread,
-            "total": self.total,
-        }
-
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> SensorLink:
         """Return the link of a JSON form."""
@@ -140,6 +126,3 @@ def level_axis(q: Quaternion) -> tuple[float, float]:
     """Return the horizontal components of the flexion axis (x) of a segment."""
     w, x, y, z = q
     return 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
-
-
-# --- learning -----------------------------------------------------------------------------------

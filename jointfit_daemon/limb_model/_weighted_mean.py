@@ -21,12 +21,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jointfit_daemon.arrays import Array
-    from jointfit_daemon.model import Quaternion
-
 
 def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
     """Return the weighted mean orientation of every frame, shape (n, 4).
