@@ -4,7 +4,7 @@ from jointfit_daemon.center_of_rotation._bounds import circle_rms_bound
 from jointfit_daemon.center_of_rotation._fused_estimate import fuse_centers
 from jointfit_daemon.center_of_rotation._methods import METHODS, estimate_center
 from jointfit_daemon.center_of_rotation._movement import BodyPoses, Movement
-from jointfit_daemon.center_of_rotation._result import CenterEstimate
+from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
 
 __all__ = [
     "METHODS",
@@ -14,4 +14,5 @@ __all__ = [
     "circle_rms_bound",
     "estimate_center",
     "fuse_centers",
+    "refusal",
 ]

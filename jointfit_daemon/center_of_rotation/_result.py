@@ -45,6 +45,9 @@ class CenterEstimate:
     """Unit directions in which nothing was observed, shape (u, d)."""
     axis: Array | None = None
     """Unit axis of a hinge in the parent's coordinates, shape (3,), where one was found."""
+    leverage: Array | None = None
+    """Covariance of the center per m² of radial soft-tissue artefact, shape (d, d); None if not
+    computed. The artefact repeats with posture, so more frames do not reduce it."""
     flags: tuple[str, ...] = ()
     """Findings about the data, e.g. ``orientation_inconsistent``."""
     within95: float | None = None

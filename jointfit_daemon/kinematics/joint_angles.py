@@ -53,7 +53,7 @@ def patent_angles(q_joint: ArrayLike) -> AngleSequence:
               \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
 
     The patent's joint angle is pi - abs(alpha), which is right only for pure flexion about x:
-    ``inner_angle`` is right for all. One frame of plain tuples: ``read_patent``.
+    pi minus ``included_angle`` is right for all. One frame of plain tuples: ``read_patent``.
     """
     w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
     alpha = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -111,12 +111,6 @@ def included_angle(q_joint: ArrayLike) -> Array:
     return angle
 
 
-def inner_angle(q_joint: ArrayLike) -> Array:
-    """Return the angle between the two segments, rad, shape (...): pi when straight."""
-    angle: Array = np.pi - included_angle(q_joint)
-    return angle
-
-
 def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
     r"""Split a rotation: first a twist about `axis` of the distal frame, then a swing normal to it.
 
@@ -150,57 +144,6 @@ def functional_axis(q_joint: ArrayLike) -> Array:
     return -axis if axis[0] < 0.0 else axis
 
 
-def rates_matrix(angles: ArrayLike) -> Array:
-    r"""Return E with delta = E (d phi, d theta, d psi), delta the turn in distal axes.
-
-    .. math:: E = [\, R^T e_x,\; R_z(\psi)^T e_y,\; e_z \,]
-
-    Parameters
-    ----------
-    angles : array_like, shape (..., 3)
-        ``grood_suntay`` angles. Singular at abs(theta) = 90 degrees.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    _, theta, psi = np.moveaxis(np.asarray(angles, dtype=np.float64), -1, 0)
-    zero, one = np.zeros_like(psi), np.ones_like(psi)
-    rows = (
-        (np.cos(theta) * np.cos(psi), np.sin(psi), zero),
-        (-np.cos(theta) * np.sin(psi), np.cos(psi), zero),
-        (np.sin(theta), zero, one),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def joint_covariance(q_joint: ArrayLike, proximal: ArrayLike, distal: ArrayLike) -> Array:
-    r"""Return the covariance of the joint rotation in distal axes, rad^2, shape (..., 3, 3).
-
-    .. math:: \Sigma_j = \Sigma_{distal} + R^T \Sigma_{proximal} R
-
-    The errors of the segments, each in its own axes, are treated as independent.
-    """
-    R = rotation.to_matrix(q_joint)
-    turned: Array = np.swapaxes(R, -1, -2) @ np.asarray(proximal) @ R
-    return np.asarray(distal, dtype=np.float64) + turned
-
-
-def angle_covariance(angles: ArrayLike, covariance: ArrayLike) -> Array:
-    r"""Return the covariance of ``grood_suntay`` angles, rad^2, shape (..., 3, 3).
-
-    .. math:: \Sigma_{angles} = E^{-1} \Sigma_j E^{-T}
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        abs(theta) is exactly 90 degrees.
-    """
-    inverse: Array = np.asarray(np.linalg.inv(rates_matrix(angles)), dtype=np.float64)
-    found: Array = inverse @ np.asarray(covariance, dtype=np.float64) @ np.swapaxes(inverse, -1, -2)
-    return found
-
-
 class JointReading(NamedTuple):
     """The angles of one joint in one frame."""
 
@@ -215,7 +158,7 @@ def read_joint(
 ) -> JointReading:
     """Return anatomical and inner angle of one frame of plain tuples.
 
-    The same as ``anatomical(grood_suntay(...))`` and ``inner_angle``.
+    The same as ``anatomical(grood_suntay(...))`` and pi minus ``included_angle``.
     """
     w, x, y, z = between_one(q_proximal, q_distal)
     r02 = 2.0 * (x * z + w * y)

@@ -177,27 +177,6 @@ def heading_of(q: ArrayLike) -> Array:
     return wrapped
 
 
-def from_two(a: ArrayLike, b: ArrayLike) -> Array:
-    """Return the shortest rotation from direction a to direction b; shape (..., 4).
-
-    For opposite directions, where it is not unique, a rotation about a normal of a is returned.
-    """
-    a = _unit(a)
-    b = _unit(b)
-    q = np.concatenate((1.0 + np.sum(a * b, axis=-1, keepdims=True), np.cross(a, b)), axis=-1)
-    opposite = np.linalg.norm(q, axis=-1, keepdims=True) < _SMALL_ANGLE
-    aside = np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    normal = np.cross(a, aside)
-    half_turn = np.concatenate((np.zeros_like(q[..., :1]), normal), axis=-1)
-    return normalize(np.where(opposite, half_turn, q))
-
-
-def _unit(v: ArrayLike) -> Array:
-    v = _floats(v)
-    unit: Array = v / np.linalg.norm(v, axis=-1, keepdims=True)
-    return unit
-
-
 def interpolate(q0: ArrayLike, q1: ArrayLike, a: ArrayLike) -> Array:
     """Return the rotation at fraction `a` (shape (...)) from q0 to q1: q0 exp(a log(q0* q1))."""
     share = _floats(a)[..., None]
@@ -231,12 +210,7 @@ def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
     if q.shape[-2] == 0:
         raise ValueError("no rotations to average")
     weighted = q if weights is None else q * _floats(weights)[..., None]
-    return first_eigenvector(np.swapaxes(weighted, -1, -2) @ q)
-
-
-def first_eigenvector(M: ArrayLike) -> Array:
-    """Return the unit eigenvector, w >= 0, of the largest eigenvalue; (..., 4, 4) to (..., 4)."""
-    largest: Array = np.linalg.eigh(_floats(M))[1][..., -1]
+    largest: Array = np.linalg.eigh(np.swapaxes(weighted, -1, -2) @ q)[1][..., -1]
     return np.where(largest[..., :1] < 0.0, -largest, largest)
 
 

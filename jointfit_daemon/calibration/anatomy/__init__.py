@@ -2,8 +2,6 @@
 
 from jointfit_daemon.calibration.anatomy._joint_center import (
     MIN_DIRECTION_RAD,
-    UNSEEN_SD_M,
-    JointCenterFit,
 )
 from jointfit_daemon.calibration.anatomy._marker_clusters import (
     ClusterTrack,
@@ -27,11 +25,9 @@ from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_p
 __all__ = [
     "MIN_DIRECTION_RAD",
     "SKIN_SD_M",
-    "UNSEEN_SD_M",
     "Anatomy",
     "ClusterTrack",
     "JointCenter",
-    "JointCenterFit",
     "apply_standing_prior",
     "columns",
     "find_anatomy",

@@ -1,17 +1,18 @@
 """Joint centers from the markers of one body part relative to its neighbor.
 
-A fit has one center with a covariance, and the directions that the movement did not excite: a hinge
-does not determine the position of the center along its axis.
+A fit is a `CenterEstimate` with its leverage. Its `unseen` directions are those that the movement
+did not excite: a hinge does not determine the position of the center along its axis.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.center_of_rotation import refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     SphereLimits,
     SphereOptions,
@@ -45,29 +46,7 @@ ON_SKIN = SphereOptions(
 _STEEP = 0.5  # smallest horizontal part of an unobserved direction to slide along
 
 
-@dataclass(frozen=True, slots=True)
-class JointCenterFit:
-    """The point that is fixed in a body part and in its neighbor, with its uncertainty."""
-
-    center: Array
-    """m, shape (3,), in the coordinates of the points."""
-    covariance: Array
-    """m², shape (3, 3), increased for residuals that are correlated in time."""
-    residual_rms: float
-    """RMS deviation of the marker distances from their means, m."""
-    frames: int
-    arc: float
-    """Range of the marker directions about the center, rad (4 times the RMS)."""
-    unseen: Array
-    """Unobserved unit directions, shape (0..2, 3)."""
-    leverage: Array
-    """Covariance of the center per m² of radial soft-tissue artefact, shape (3, 3). The artefact
-    repeats with posture, so more frames do not reduce it."""
-    refused: str | None = None
-    """Reason for the rejection of the center; None if it is accepted."""
-
-
-def fit_center(points: Array, start: Array) -> JointCenterFit:
+def fit_center(points: Array, start: Array) -> CenterEstimate:
     r"""Fit the point at a constant distance from each marker.
 
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
@@ -75,7 +54,7 @@ def fit_center(points: Array, start: Array) -> JointCenterFit:
 
     This is the geometric sphere fit with options for skin markers: directions in which the markers
     rotated by less than `MIN_DIRECTION_RAD` would be dominated by the soft-tissue artefact. They
-    are left at `start` with the standard deviation `UNSEEN_SD_M`.
+    are left at `start` and listed as unseen.
 
     Parameters
     ----------
@@ -86,14 +65,16 @@ def fit_center(points: Array, start: Array) -> JointCenterFit:
 
     Returns
     -------
-    JointCenterFit
-        With `refused` set if there are too few frames, no arc, or an implausible radius.
+    CenterEstimate
+        With `leverage`; `refused` is set if there are too few frames, no arc, or an implausible
+        radius.
     """
-    points = _thin(points)
+    points = points[:: max(1, -(-len(points) // MAX_FRAMES))]
     seen = visible(points)
     frames = int(np.count_nonzero(seen.any(axis=1)))
     if frames < MIN_FRAMES:
-        return _refused(start, frames, f"{frames} usable frames, at least {MIN_FRAMES} are needed")
+        reason = f"{frames} usable frames, at least {MIN_FRAMES} are needed"
+        return refusal("sphere", 3, frames, reason)
 
     options = replace(ON_SKIN, start=np.asarray(start, dtype=np.float64))
     fit = solve_sphere(points, options)
@@ -101,41 +82,21 @@ def fit_center(points: Array, start: Array) -> JointCenterFit:
 
     # Covariance of the center per variance of the radial residuals.
     lever = fit.basis @ np.linalg.pinv(fit.information / max(float(fit.weights.sum()), 1e-12))
-    return JointCenterFit(
-        fit.center,
-        found.covariance + UNSEEN_SD_M**2 * fit.unseen.T @ fit.unseen,
-        found.residual,
-        frames,
-        found.arc,
-        fit.unseen,
-        lever @ fit.basis.T,
-        _objection(found, found.covariance),
-    )
+    return replace(found, leverage=lever @ fit.basis.T, refused=_objection(found))
 
 
-def _thin(points: Array) -> Array:
-    return points[:: max(1, -(-len(points) // MAX_FRAMES))]
-
-
-def _objection(found: CenterEstimate, shown: Array) -> str | None:
+def _objection(found: CenterEstimate) -> str | None:
     if found.radii.size == 0:
         return found.refused
     if (basic := objection(found.arc, float(np.median(found.radii)), np.inf, LIMITS)) is not None:
         return basic
-    sd = float(np.sqrt(np.linalg.norm(shown, 2)))
+    sd = float(np.sqrt(np.linalg.norm(found.covariance, 2)))
     if sd > MAX_SD_M:
         return f"uncertain to {1000 * sd:.0f} mm: move this joint further, and in other directions"
     return None
 
 
-def _refused(start: Array, frames: int, reason: str) -> JointCenterFit:
-    wide = np.eye(3)
-    none = np.zeros((0, 3))
-    at = np.asarray(start, float)
-    return JointCenterFit(at, wide, np.inf, frames, 0.0, none, np.zeros((3, 3)), reason)
-
-
-def align_vertically(found: JointCenterFit, above: Array | None) -> JointCenterFit:
+def align_vertically(found: CenterEstimate, above: Array | None) -> CenterEstimate:
     """Move a center along its unobserved directions above or below a point.
 
     A hinge does not determine the position along its axis. Nearly vertical directions are
@@ -143,7 +104,7 @@ def align_vertically(found: JointCenterFit, above: Array | None) -> JointCenterF
 
     Parameters
     ----------
-    found : JointCenterFit
+    found : CenterEstimate
         In coordinates with vertical z.
     above : ndarray, shape (2,), or None
         Horizontal target position, m; None leaves the center unchanged.
@@ -160,7 +121,7 @@ def _pinv(A: Array) -> Array:
     return np.asarray(Vt.T @ (inverse[:, None] * U.T))
 
 
-def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> JointCenterFit:
+def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> CenterEstimate:
     """Fit the center between two body parts, in static-world coordinates, m (shape (3,)).
 
     The markers of the distal part are first transformed to static-world coordinates of the proximal

@@ -18,7 +18,7 @@ import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
 from jointfit_daemon.calibration.anatomy._joint_center import (
-    JointCenterFit,
+    UNSEEN_SD_M,
     align_vertically,
     carried_center_gap,
     joint_center,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.anatomy._marker_clusters import ClusterTrack
+    from jointfit_daemon.center_of_rotation import CenterEstimate
     from jointfit_daemon.model import Chain
 
 
@@ -54,7 +55,7 @@ _STANDING = rotation.IDENTITY
 
 @dataclass(frozen=True, slots=True)
 class JointCenter:
-    """One joint center in the static world."""
+    """Anatomical joint center in the static world, placed with all other joints of the chain."""
 
     center: Array
     """m, shape (3,)."""
@@ -62,7 +63,8 @@ class JointCenter:
     """m², shape (3, 3)."""
     source: str
     """``fit``, or ``length``: from the other end of a segment and its configured length."""
-    fit: JointCenterFit | None
+    fit: CenterEstimate | None
+    """Center of rotation from the movement; None for ``length``."""
     gap_rms: float | None
     """RMS distance between the centers carried by the two body parts, m."""
 
@@ -169,7 +171,7 @@ def _jointed(
 def _fit_centers(
     chain: Chain, tracks: Mapping[str, ClusterTrack]
 ) -> tuple[dict[str, JointCenter | None], list[str]]:
-    found: dict[str, JointCenterFit] = {}
+    found: dict[str, CenterEstimate] = {}
     notes, jointed = [], _jointed(chain, tracks)
     for joint, (above, below) in jointed.items():
         fit = joint_center(above, below, (above.origin + below.origin) / 2)
@@ -188,8 +190,8 @@ def _fit_centers(
 
 
 def place_unobserved(
-    chain: Chain, found: Mapping[str, JointCenterFit]
-) -> dict[str, JointCenterFit]:
+    chain: Chain, found: Mapping[str, CenterEstimate]
+) -> dict[str, CenterEstimate]:
     """Move centers along their unobserved directions above or below their neighbors.
 
     The leg is straight in the static pose, so neighboring joints are above each other. Centers next
@@ -203,9 +205,15 @@ def place_unobserved(
     return settled
 
 
-def on_skin(fit: JointCenterFit) -> Array:
-    """Return the covariance of a center, m², with the posture-dependent soft-tissue artefact."""
-    return fit.covariance + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
+def on_skin(fit: CenterEstimate) -> Array:
+    r"""Return the covariance of a joint center from skin markers, m², shape (3, 3).
+
+    .. math:: C + \sigma_u^2\, U^T U + \sigma_r^2 L
+
+    with the unseen directions U and the leverage L: the posture-dependent soft-tissue artefact.
+    """
+    whole = fit.covariance + UNSEEN_SD_M**2 * fit.unseen.T @ fit.unseen
+    return whole if fit.leverage is None else whole + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
 
 
 def _plumbed(found: dict[str, JointCenter | None]) -> dict[str, JointCenter | None]:
@@ -228,7 +236,7 @@ def _distance(chain: Chain, joint: str, others: list[str]) -> int:
     return min((abs(i - chain.joints.index(other)) for other in others), default=0)
 
 
-def _beside(chain: Chain, joint: str, settled: Mapping[str, JointCenterFit]) -> Array | None:
+def _beside(chain: Chain, joint: str, settled: Mapping[str, CenterEstimate]) -> Array | None:
     """Return the mean horizontal position of the neighbors of a joint, (x, y), m."""
     i = chain.joints.index(joint)
     near = [chain.joints[k] for k in (i - 1, i + 1) if 0 <= k < len(chain.joints)]

@@ -23,8 +23,6 @@ import numpy as np
 from jointfit_daemon.calibration.anatomy import (
     MIN_DIRECTION_RAD,
     SKIN_SD_M,
-    UNSEEN_SD_M,
-    JointCenterFit,
     apply_standing_prior,
     on_skin,
     place_unobserved,
@@ -108,7 +106,7 @@ class LiveJointCenters:
             RunningSphere(size, near=start) for size, start in zip(self._sizes, starts, strict=True)
         ]
         self._frames = np.zeros(len(pairs), dtype=np.int64)
-        self._latest: dict[str, tuple[LiveJointCenter, JointCenterFit | None]] = {
+        self._latest: dict[str, tuple[LiveJointCenter, CenterEstimate | None]] = {
             joint: (_unknown(joint, 0, 0.0, 3, "no frame yet"), None) for joint in self.joints
         }
         self._turn = -1
@@ -154,7 +152,7 @@ class LiveJointCenters:
 
     def _observed_estimate(
         self, k: int, fit: CenterEstimate
-    ) -> tuple[LiveJointCenter, JointCenterFit | None]:
+    ) -> tuple[LiveJointCenter, CenterEstimate | None]:
         """Return an estimate without directions in which the markers hardly rotated."""
         joint, frames = self.joints[k], int(self._frames[k])
         center = np.asarray(fit.center, dtype=np.float64)
@@ -174,17 +172,14 @@ class LiveJointCenters:
         own = basis.T @ fit.covariance @ basis
         lever = basis @ np.linalg.inv(basis.T @ shown @ basis) @ basis.T
         rest = axes[:, ~clear].T
-        covariance = basis @ own @ basis.T + UNSEEN_SD_M**2 * rest.T @ rest
         variances = np.maximum(np.linalg.eigvalsh(own), 0.0)
 
         one = LiveJointCenter(
             joint, center, sqrt(float(variances.mean())), sqrt(float(variances[:2].mean())), inf,
             _finite(fit.arc), _finite(fit.conditioning), frames, unseen, fit.refused,
         )  # fmt: skip
-        found = JointCenterFit(
-            center, covariance, _finite(fit.residual), frames, one.arc, rest, lever, fit.refused
-        )
-        return one, found
+        observed = basis @ own @ basis.T
+        return one, replace(fit, center=center, covariance=observed, unseen=rest, leverage=lever)
 
     def _direction_spread(self, k: int, center: Array) -> Array:
         """Return the mean square change of the marker directions, rad², shape (3, 3)."""

@@ -324,7 +324,7 @@ def _joint(found: JointCenter | None) -> JointCalibration:
     if found is None:
         return JointCalibration(None, None, "unknown")
     sd = float(np.sqrt(np.trace(found.covariance) / 3.0 + SKIN_SD_M**2))
-    residual = None if found.fit is None else found.fit.residual_rms
+    residual = None if found.fit is None else found.fit.residual
     return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
 
 

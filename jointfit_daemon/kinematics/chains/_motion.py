@@ -11,7 +11,7 @@ joint is the step of its coordinate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import sin, sqrt
 from typing import TYPE_CHECKING
 
@@ -247,24 +247,3 @@ def between_coordinates(layout: ChainLayout, a: ChainState, b: ChainState, step:
     if a.couplings is not None and b.couplings is not None:
         columns = [column for _, column, _ in layout.coupled]
         step[:, columns] = b.couplings[..., 0] - a.couplings[..., 0]
-
-
-def hinge_angles(model: ChainModel, state: ChainState) -> dict[str, Array]:
-    """Return the angle of every hinge from its rest, rad, by segment name, shape (T,) each."""
-    rest = replace(rest_state(model, len(state)), origins=state.origins)
-    step = step_between(model, rest, state)
-    return {
-        s.name: step[:, columns.start]
-        for s, columns in zip(model.segments, model.columns, strict=True)
-        if s.joint.kind == "hinge"
-    }
-
-
-def coupled_coordinates(model: ChainModel, state: ChainState) -> dict[str, Array]:
-    """Return the coordinate of every coupled joint, rad, by segment name, shape (T,) each."""
-    if state.couplings is None:
-        return {}
-    return {
-        model.segment_names[segment]: state.couplings[:, c, 0]
-        for c, (segment, _, _) in enumerate(layout_of(model).coupled)
-    }

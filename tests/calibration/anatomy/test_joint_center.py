@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jointfit_daemon.calibration.anatomy import on_skin
 from jointfit_daemon.calibration.anatomy._joint_center import align_vertically, fit_center
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def test_a_hinge_shows_its_axis_and_leaves_the_rest_to_the_start() -> None:
     assert np.linalg.norm(off - axis * (axis @ off)) < 3e-3
     moved = align_vertically(found, CENTER[:2])
     assert np.linalg.norm(moved.center - CENTER) < 3e-3
-    assert np.sqrt(axis @ found.covariance @ axis) == pytest.approx(0.03, rel=0.05)
+    assert np.sqrt(axis @ on_skin(found) @ axis) == pytest.approx(0.03, rel=0.05)
 
 
 def test_markers_that_never_move_are_refused() -> None:

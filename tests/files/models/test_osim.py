@@ -12,9 +12,9 @@ from jointfit_daemon.files.models import read_osim, to_y_up, to_z_up
 from jointfit_daemon.files.models._osim import read_marker_set
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics.chains import apply_step, marker_positions, rest_state
-from jointfit_daemon.kinematics.chains._motion import coupled_coordinates, hinge_angles
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
 from tests.files.models.osim_writer import LINEAR, ZERO, Hung, spline, write_osim
+from tests.kinematics.chain_coordinates import coupled_coordinates, hinge_angles
 
 if TYPE_CHECKING:
     from pathlib import Path

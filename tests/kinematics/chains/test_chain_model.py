@@ -24,7 +24,7 @@ from jointfit_daemon.kinematics.chains import (
     segment_poses,
     step_between,
 )
-from jointfit_daemon.kinematics.chains._motion import hinge_angles
+from tests.kinematics.chain_coordinates import hinge_angles
 
 
 def winding(rng: np.random.Generator, count: int = 12) -> tuple[Sample, ...]:

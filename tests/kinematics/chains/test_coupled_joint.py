@@ -26,7 +26,6 @@ from jointfit_daemon.kinematics.chains import (
     rest_state,
     step_between,
 )
-from jointfit_daemon.kinematics.chains._motion import coupled_coordinates
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
     marker_fit,
@@ -34,6 +33,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     solve_frames,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import normal_equations
+from tests.kinematics.chain_coordinates import coupled_coordinates
 
 BENT = np.linspace(-0.3, 2.3, 40)
 

@@ -22,7 +22,6 @@ from jointfit_daemon.kinematics.chains import (
     rest_state,
     step_between,
 )
-from jointfit_daemon.kinematics.chains._motion import hinge_angles
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
     marker_fit,
@@ -31,6 +30,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     tracking_error,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import normal_equations
+from tests.kinematics.chain_coordinates import hinge_angles
 
 if TYPE_CHECKING:
     from pathlib import Path
