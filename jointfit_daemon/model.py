@@ -9,6 +9,7 @@ arrays), never 0. See CONVENTIONS.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 if TYPE_CHECKING:
@@ -218,6 +219,50 @@ class JointState(NamedTuple):
     """Rates of change of the angles over the last 50 ms, rad/s."""
 
 
+class FusionMode(StrEnum):
+    """Measurements on which a limb state is based."""
+
+    UNCALIBRATED = "uncalibrated"
+    IMU = "imu"
+    IMU_AND_MOCAP = "imu+mocap"
+
+
+class SyncState(StrEnum):
+    """State of the clock estimates of a frame."""
+
+    SETTLING = "settling"
+    LOCKED = "locked"
+
+
+class FrameFlag(StrEnum):
+    """A limitation of a limb state; docs/mqtt.md explains each."""
+
+    UNCALIBRATED = "uncalibrated"
+    OTHER_CHAIN = "other_chain"
+    HEADINGS_FROM_STATIC = "headings_from_static"
+    SAME_POSE_ASSUMED = "same_pose_assumed"
+    FACING_UNKNOWN = "facing_unknown"
+    EXTRAPOLATING = "extrapolating"
+    ORIGIN_FIXED = "origin_fixed"
+    HEADING_UNSEEN = "heading_unseen"
+    GIMBAL = "gimbal"
+
+    # Flags of one sensor, segment or joint.
+    STUCK = "stuck"
+    SLIPPED = "slipped"
+    PAIR_DISAGREES = "pair_disagrees"
+    HEADING_DISAGREES = "heading_disagrees"
+    ONE_SENSOR = "one_sensor"
+    HELD = "held"
+    LOST = "lost"
+    UNTRAINED = "untrained"
+    AXIS_VERTICAL = "axis_vertical"
+
+    def of(self, name: str) -> str:
+        """Return the flag of one sensor, segment or joint, as ``held:thigh``."""
+        return f"{self.value}:{name}"
+
+
 class LimbState(NamedTuple):
     """State of the limb at ``t_ns``: one per frame, even without sensors."""
 
@@ -225,10 +270,9 @@ class LimbState(NamedTuple):
     t_ns: int
     completed_ns: int
     """Arrival of the sample, or the deadline, that completed this frame, ns."""
-    mode: str
-    """``uncalibrated`` | ``imu`` | ``imu+mocap``."""
-    sync: str
-    """``settling`` | ``locked`` | ``stale``: state of the clock estimates of this frame."""
+    mode: FusionMode
+    sync: SyncState
     flags: tuple[str, ...]
+    """`FrameFlag`, those of one sensor, segment or joint with its name."""
     segments: tuple[SegmentState, ...]
     joints: tuple[JointState, ...]

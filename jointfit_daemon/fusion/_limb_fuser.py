@@ -23,7 +23,14 @@ from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
 from jointfit_daemon.fusion.faults import ConsistencyMonitor, SensorMonitor
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.limb_model import flexion_sign, neighbor
-from jointfit_daemon.model import JointState, LimbState, SegmentState
+from jointfit_daemon.model import (
+    FrameFlag,
+    FusionMode,
+    JointState,
+    LimbState,
+    SegmentState,
+    SyncState,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -63,9 +70,9 @@ class LimbFuser:
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
         usable = calibration is not None and calibration.fits(chain)
         self._calibration = calibration if usable else None
-        self._base_flags: tuple[str, ...] = ("uncalibrated",)
+        self._base_flags: tuple[str, ...] = (FrameFlag.UNCALIBRATED,)
         if calibration is not None and not usable:
-            self._base_flags = ("uncalibrated", "other_chain")
+            self._base_flags = (FrameFlag.UNCALIBRATED, FrameFlag.OTHER_CHAIN)
         self._fusers: list[SegmentFuser] = []
         self._lengths: list[SegmentLength] = []
         self._alignments: list[tuple[str, Quaternion, Quaternion]] = []
@@ -107,8 +114,8 @@ class LimbFuser:
         *,
         extrapolated: frozenset[str] = _NO_SENSORS,
         optical_origin: Vector | None = None,
-        sync: str = "locked",
-        mode: str = "imu",
+        sync: SyncState = SyncState.LOCKED,
+        mode: FusionMode = FusionMode.IMU,
     ) -> LimbState:
         """Return the state of the limb at `t_ns`.
 
@@ -123,7 +130,7 @@ class LimbFuser:
             Sensors whose value is extrapolated beyond their last sample.
         optical_origin : Vector, optional
             Position of O1 in the current mocap frame, m; overrides the configured origin.
-        sync, mode : str
+        sync, mode
             Passed through; without a calibration the mode is ``uncalibrated``.
 
         Notes
@@ -149,11 +156,11 @@ class LimbFuser:
 
         flags = [*self._base_flags]
         if extrapolated and not extrapolated.isdisjoint(inputs):
-            flags.append("extrapolating")
-        if optical_origin is None and mode == "imu+mocap":
-            flags.append("origin_fixed")
+            flags.append(FrameFlag.EXTRAPOLATING)
+        if optical_origin is None and mode == FusionMode.IMU_AND_MOCAP:
+            flags.append(FrameFlag.ORIGIN_FIXED)
         if stuck:
-            flags += [f"stuck:{name}" for name in stuck]
+            flags += [FrameFlag.STUCK.of(name) for name in stuck]
         flags += fault_flags
         for segment in fused:
             flags += segment.flags
@@ -260,18 +267,18 @@ class LimbFuser:
             if estimate is None:
                 joints.append(JointState(name, position, sd))
                 continue
-            if estimate.gimbal and "gimbal" not in flags:
-                flags.append("gimbal")
+            if estimate.gimbal and FrameFlag.GIMBAL not in flags:
+                flags.append(FrameFlag.GIMBAL)
             angles, inner, flexion_sd, gimbal = estimate
             measured = angles if proximal.used and distal.used else None  # not while held
             rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
             joints.append(JointState(name, position, sd, angles, inner, flexion_sd, rates))
         return tuple(joints)
 
-    def _uncalibrated(self, t_ns: int, completed_ns: int, seq: int, sync: str) -> LimbState:
+    def _uncalibrated(self, t_ns: int, completed_ns: int, seq: int, sync: SyncState) -> LimbState:
         segments = tuple(SegmentState(name, None, None, ()) for name in self._chain.segments)
         joints = tuple(JointState(name, None, None) for name in self._chain.joints)
-        mode = "uncalibrated"
+        mode = FusionMode.UNCALIBRATED
         return LimbState(seq, t_ns, completed_ns, mode, sync, self._base_flags, segments, joints)
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.rotation_scalar import difference_one, normalize_one, perturb_one
 from jointfit_daemon.limb_model import UNREFERENCED_SD, Prediction, model_key
+from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -138,17 +139,17 @@ class SegmentFuser:
         single = len(alive) == 1 and len(self._sensors) > 1
         if not single and not extrapolating:
             return ()
-        flags = (f"one_sensor:{self._name}",) if single else ()
-        return (*flags, f"untrained:{self._name}") if extrapolating else flags
+        flags = (FrameFlag.ONE_SENSOR.of(self._name),) if single else ()
+        return (*flags, FrameFlag.UNTRAINED.of(self._name)) if extrapolating else flags
 
     def _hold(self, t_ns: int) -> FusedSegment:
         if self._last is None or t_ns - self._last[0] > HOLD_NS:
             self._before = self._fading = None
-            return FusedSegment(None, None, (), (f"lost:{self._name}",))
+            return FusedSegment(None, None, (), (FrameFlag.LOST.of(self._name),))
         last_ns, q, sd = self._last
         age_s = (t_ns - last_ns) * 1e-9
         held_sd = sqrt(sd * sd + (HELD_RATE * age_s) ** 2)
-        return FusedSegment(q, held_sd, (), (f"held:{self._name}",))
+        return FusedSegment(q, held_sd, (), (FrameFlag.HELD.of(self._name),))
 
     def _predict(self, alive: Names, near: Names, inputs: Inputs) -> Prediction:
         """Return the prediction of the chosen model, or the mean if there is none."""

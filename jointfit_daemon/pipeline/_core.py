@@ -6,11 +6,11 @@ in the same order give the same outputs, byte for byte, so a recording can be re
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import drifting_imus, heading_warning
 from jointfit_daemon.fusion import LimbFuser, SensorMonitor
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_daemon.model import Corrupt, DeviceEvent, FusionMode, ImuSample, SyncState
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
 from jointfit_daemon.pipeline._health import core_health
 from jointfit_daemon.pipeline._mocap_router import MocapRouter
@@ -24,6 +24,8 @@ from jointfit_daemon.pipeline.events import (
     DeviceStatus,
     JobFinished,
     Notice,
+    NoticeKind,
+    NoticeLevel,
     Request,
     SourceClosed,
     SourceOpened,
@@ -50,10 +52,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
     from jointfit_daemon.timing.clock import Stamp
 
-_CLOSED_LEVELS: dict[str, Literal["info", "warning", "error"]] = {
-    "removed": "info",
-    "lost": "warning",
-    "misconfigured": "error",
+_CLOSED_LEVELS = {
+    "removed": NoticeLevel.INFO,
+    "lost": NoticeLevel.WARNING,
+    "misconfigured": NoticeLevel.ERROR,
 }
 
 
@@ -137,7 +139,9 @@ class Core:
         session = _session(event)
         if before is not None:
             outputs += self._session.abort(event.t_ns, "the configuration was reloaded")
-            outputs.append(Notice(event.t_ns, "reload", rig.name, "configuration reloaded"))
+            outputs.append(
+                Notice(event.t_ns, NoticeKind.RELOAD, rig.name, "configuration reloaded")
+            )
             same_rig = _calibration_inputs(before) == _calibration_inputs(rig)
             session.resume(self._session, same_rig=same_rig)
 
@@ -157,7 +161,9 @@ class Core:
             self._fuser.resume(fuser)
 
         if (warning := heading_warning(rig.sources)) is not None:
-            outputs.append(Notice(event.t_ns, "device", rig.name, warning, "warning"))
+            outputs.append(
+                Notice(event.t_ns, NoticeKind.DEVICE, rig.name, warning, NoticeLevel.WARNING)
+            )
         text = "stored calibration loaded" if event.calibration else "no stored calibration"
         return [*outputs, session.status(event.t_ns, text)]
 
@@ -214,7 +220,7 @@ class Core:
     def _close_source(self, event: SourceClosed) -> list[Output]:
         state = self._sources.get(event.source)
         level = _CLOSED_LEVELS[event.reason]
-        notice = Notice(event.t_ns, "device", event.source, event.text, level)
+        notice = Notice(event.t_ns, NoticeKind.DEVICE, event.source, event.text, level)
         if state is None:
             return [notice]
 
@@ -256,7 +262,7 @@ class Core:
             if state.open and not state.online:  # not by the rest of a closed decoder
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
-                outputs.append(Notice(self._now_ns, "device", source, "streaming"))
+                outputs.append(Notice(self._now_ns, NoticeKind.DEVICE, source, "streaming"))
 
             measurement, stamp = item
             if isinstance(measurement, ImuSample):
@@ -330,8 +336,8 @@ class Core:
             frame.orientations,
             extrapolated=frame.extrapolated,
             optical_origin=self._mocap.origin if mocap else None,
-            sync="locked" if frame.synced else "settling",
-            mode="imu+mocap" if mocap else "imu",
+            sync=SyncState.LOCKED if frame.synced else SyncState.SETTLING,
+            mode=FusionMode.IMU_AND_MOCAP if mocap else FusionMode.IMU,
         )
         self._collector.add_frame(frame, state.flags)
         return state
@@ -384,4 +390,6 @@ def _calibration_inputs(rig: Rig) -> tuple[object, ...]:
 
 def _sensor_notice(now_ns: int, report: SensorReport) -> Notice:
     data = {"state": report.state, **report.data}
-    return Notice(now_ns, "sensor", report.id, report.text, report.level, data)
+    return Notice(
+        now_ns, NoticeKind.SENSOR, report.id, report.text, NoticeLevel(report.level), data
+    )

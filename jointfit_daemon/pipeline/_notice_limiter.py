@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent
-from jointfit_daemon.pipeline.events import Notice
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,12 +26,9 @@ _NS_PER_S = 1_000_000_000
 STEP_NS = 2_000_000
 """Smallest step of UNIX time that is reported, ns: NTP adjusts by less."""
 
-Level = Literal["info", "warning", "error"]
-_LEVELS: dict[str, Level] = {
-    "warning": "warning",
-    "error": "error",
-}
-_JUMPS = {"restart": "clock", "clock": "clock", "counter": "wire"}
+_LEVELS = {"warning": NoticeLevel.WARNING, "error": NoticeLevel.ERROR}
+"""Level of the notice by kind of device event, if it is not ``info``."""
+_JUMPS = {"restart": NoticeKind.CLOCK, "clock": NoticeKind.CLOCK, "counter": NoticeKind.WIRE}
 """Kind of the notice for device events that are reported by their last text and their number."""
 
 
@@ -64,8 +61,8 @@ class NoticeLimiter:
             )
         if item.kind in _JUMPS:
             return self._collect(now_ns, (source, item.kind), 1, item.text, item.data)
-        level: Level = _LEVELS.get(item.kind, "info")
-        return [Notice(now_ns, "device", source, item.text, level, dict(item.data))]
+        level = _LEVELS.get(item.kind, NoticeLevel.INFO)
+        return [Notice(now_ns, NoticeKind.DEVICE, source, item.text, level, dict(item.data))]
 
     def due(self, now_ns: int) -> list[Notice]:
         """Return the collected notices whose quiet time has passed."""
@@ -115,7 +112,7 @@ def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
         text = f"{text}, in the last {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
     data = _totals(kind, condition)
     condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
-    return Notice(now_ns, "wire", source, text, "warning", data)
+    return Notice(now_ns, NoticeKind.WIRE, source, text, NoticeLevel.WARNING, data)
 
 
 def _end_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
@@ -125,7 +122,7 @@ def _end_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Not
     quiet_s = (now_ns - condition.reported_ns) / _NS_PER_S
     condition.reported_ns, condition.lasting = now_ns, False
     text = f"{what} for {quiet_s:.0f} s"
-    return Notice(now_ns, "wire", source, text, "info", _totals(kind, condition))
+    return Notice(now_ns, NoticeKind.WIRE, source, text, NoticeLevel.INFO, _totals(kind, condition))
 
 
 def _totals(kind: str, condition: _Condition) -> dict[str, object]:
@@ -142,7 +139,7 @@ def _jump_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> No
         text = f"{text} (last of {condition.count} such events)"
         data["events"] = condition.count
     condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
-    return Notice(now_ns, _JUMPS[kind], source, text, "warning", data)
+    return Notice(now_ns, _JUMPS[kind], source, text, NoticeLevel.WARNING, data)
 
 
 def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
@@ -153,4 +150,4 @@ def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
     text = f"UNIX time of this host was set back by {-step_s:.3f} s"
     if step_s > 0:  # CLOCK_MONOTONIC stops in suspend
         text = f"UNIX time was set forward by {step_s:.3f} s, or the host was suspended that long"
-    return [Notice(now_ns, "clock", "host", text, "warning", {"step_s": step_s})]
+    return [Notice(now_ns, NoticeKind.CLOCK, "host", text, NoticeLevel.WARNING, {"step_s": step_s})]

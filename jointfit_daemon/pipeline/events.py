@@ -15,6 +15,7 @@ from jointfit_daemon.model import LimbState
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from jointfit_daemon.calibration import CalibrationJob, FitResult
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chunk
@@ -104,8 +105,15 @@ class JobFinished:
 
     t_ns: int
     job: int
-    result: Mapping[str, object] | None
+    result: FitResult | None
     error: str | None
+
+    @property
+    def failure(self) -> str | None:
+        """Reason why there is no usable result; None if there is one."""
+        if self.result is None:
+            return self.error or "no result"
+        return self.error or self.result.refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,17 +150,38 @@ Event = (
 # --- outputs ----------------------------------------------------------------------------------
 
 
+class NoticeKind(StrEnum):
+    """Subject of a notice."""
+
+    DEVICE = "device"
+    SENSOR = "sensor"
+    CLOCK = "clock"
+    WIRE = "wire"
+    CALIBRATION = "calibration"
+    RELOAD = "reload"
+    RECORDING = "recording"
+    STATE = "state"
+    """The state directory."""
+
+
+class NoticeLevel(StrEnum):
+    """Severity of a notice."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
 @dataclass(frozen=True, slots=True)
 class Notice:
     """A change worth reporting: published on ``bridge/event`` and logged."""
 
     t_ns: int
-    kind: str
-    """``device`` | ``sensor`` | ``clock`` | ``calibration`` | ``wire`` | ``reload`` |
-    ``frames``."""
+    kind: NoticeKind
     id: str
+    """Name of the device, rig or phase."""
     text: str
-    level: Literal["info", "warning", "error"] = "info"
+    level: NoticeLevel = NoticeLevel.INFO
     data: Mapping[str, object] = field(default_factory=dict)
 
 
@@ -203,10 +232,10 @@ class CalibrationStatus:
     """Quality of the rejected result."""
 
     @property
-    def level(self) -> Literal["info", "warning"]:
+    def level(self) -> NoticeLevel:
         """Level of the event: a rejected result or an aborted phase is a warning."""
         aborted = self.phase == CalibrationPhase.ABORTED
-        return "warning" if aborted or self.kept is not None else "info"
+        return NoticeLevel.WARNING if aborted or self.kept is not None else NoticeLevel.INFO
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,11 +252,11 @@ class CalibrationProgress:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """A job for the worker process: ``calibration.jobs.run_job(kind, payload)``, picklable."""
+    """A job for the worker process."""
 
     job: int
-    kind: str
-    payload: Mapping[str, object]
+    """Its number, never reused."""
+    work: CalibrationJob
 
 
 @dataclass(frozen=True, slots=True)

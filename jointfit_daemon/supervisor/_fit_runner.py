@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import orjson
 
+from jointfit_daemon.calibration import FitResult
 from jointfit_daemon.pipeline.events import JobFinished
 from jointfit_daemon.supervisor.worker import HEADER
 
@@ -54,7 +55,7 @@ class FitRunner:
     def start(self, job: FitJob) -> None:
         """Start a job; a running job is cancelled."""
         self.cancel()
-        self._running = self._tasks.create_task(self._run(job), name=f"fit {job.kind}")
+        self._running = self._tasks.create_task(self._run(job), name=f"fit {job.work.name}")
 
     def cancel(self) -> None:
         """Kill the running job, if any; no result is delivered for it."""
@@ -69,15 +70,17 @@ class FitRunner:
                 answer = await _in_worker(job)
         except TimeoutError:
             answer = {"error": f"the fit did not end within {FIT_TIMEOUT_S:g} s"}
+
         error = answer.get("error")
+        result = None if error else FitResult.from_dict(answer["result"])
         took_s = time.monotonic() - began
-        log.info("fit %s: %s, %.1f s", job.kind, "failed" if error else "done", took_s)
-        self._deliver(JobFinished(time.monotonic_ns(), job.job, answer.get("result"), error))
+        log.info("fit %s: %s, %.1f s", job.work.name, "failed" if error else "done", took_s)
+        self._deliver(JobFinished(time.monotonic_ns(), job.job, result, error))
 
 
 async def _in_worker(job: FitJob) -> dict[str, Any]:
     # Pickling minutes of samples takes tens of milliseconds, so it runs in a thread.
-    words = await asyncio.to_thread(pickle.dumps, (job.kind, dict(job.payload)))
+    data = await asyncio.to_thread(pickle.dumps, job.work)
     command = [sys.executable, "-m", "jointfit_daemon.supervisor.worker"]
     pipe = asyncio.subprocess.PIPE
     worker = await asyncio.create_subprocess_exec(
@@ -86,8 +89,8 @@ async def _in_worker(job: FitJob) -> dict[str, Any]:
     try:
         async with asyncio.TaskGroup() as pipes:
             answer = pipes.create_task(_read(worker.stdout), name="fit result")
-            said = pipes.create_task(_read(worker.stderr), name="fit words")
-            pipes.create_task(_write(worker.stdin, words), name="fit job")
+            printed = pipes.create_task(_read(worker.stderr), name="fit output")
+            pipes.create_task(_write(worker.stdin, data), name="fit job")
         code = await worker.wait()
     finally:
         with contextlib.suppress(ProcessLookupError):
@@ -95,8 +98,8 @@ async def _in_worker(job: FitJob) -> dict[str, Any]:
         await worker.wait()
         if worker.stdin is not None:
             worker.stdin.close()
-    if text := said.result()[-_STDERR_TAIL:].decode("utf-8", "replace").strip():
-        log.warning("fit %s: output of the worker:\n%s", job.kind, text)
+    if text := printed.result()[-_STDERR_TAIL:].decode("utf-8", "replace").strip():
+        log.warning("fit %s: output of the worker:\n%s", job.work.name, text)
     if not answer.result():
         return {"error": f"the worker process ended with exit code {code} and without a result"}
     found: dict[str, Any] = orjson.loads(answer.result())
@@ -107,11 +110,10 @@ async def _read(pipe: asyncio.StreamReader | None) -> bytes:
     return b"" if pipe is None else await pipe.read()
 
 
-async def _write(pipe: asyncio.StreamWriter | None, words: bytes) -> None:
+async def _write(pipe: asyncio.StreamWriter | None, data: bytes) -> None:
     """Send the job and keep the pipe open: the worker exits when it closes."""
     if pipe is not None:
-        with contextlib.suppress(
-            BrokenPipeError, ConnectionResetError
-        ):  # the worker ended; the missing answer is reported
-            pipe.write(HEADER.pack(len(words)) + words)
+        # If the worker ended early, its missing answer is reported.
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            pipe.write(HEADER.pack(len(data)) + data)
             await pipe.drain()

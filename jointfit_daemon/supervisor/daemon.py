@@ -42,6 +42,8 @@ from jointfit_daemon.pipeline.events import (
     DeviceStatus,
     FitJob,
     Notice,
+    NoticeKind,
+    NoticeLevel,
     Reply,
 )
 from jointfit_daemon.supervisor._calibration_store import (
@@ -86,7 +88,11 @@ FAREWELL_S = 0.5
 """Longest wait for the broker to accept the last messages, s."""
 STOP_S = 4.8
 """Longest duration of a stop, s; the documentation promises five seconds."""
-_LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
+_LEVELS = {
+    NoticeLevel.INFO: logging.INFO,
+    NoticeLevel.WARNING: logging.WARNING,
+    NoticeLevel.ERROR: logging.ERROR,
+}
 
 
 class Daemon:
@@ -205,7 +211,7 @@ class Daemon:
             self._recorder = EventLogWriter(folder, self._rig.name)
         except OSError as fault:
             text = f"recording is off: cannot create a file in {folder}: {fault.strerror}"
-            self._report("recording", text, "error")
+            self._report(NoticeKind.RECORDING, text, NoticeLevel.ERROR)
         else:
             log.info("recording events in %s", self._recorder.path)
             self._core.subscribe(self._recorder)
@@ -218,18 +224,18 @@ class Daemon:
         self._state_fault = fault
         if fault is not None:
             self._report(
-                "state",
+                NoticeKind.STATE,
                 f"state directory cannot be written: {fault}. A calibration will be used and "
                 "published, but lost at a restart: check mount, permissions and free space, or "
                 "set STATE_DIRECTORY",
-                "error",
+                NoticeLevel.ERROR,
             )
         elif before is not None:
-            self._report("state", "state directory can be written again")
+            self._report(NoticeKind.STATE, "state directory can be written again")
         self._calibrations.retry()
 
     def _report_not_stored(self, text: str) -> None:
-        self._report("calibration", text, "error")
+        self._report(NoticeKind.CALIBRATION, text, NoticeLevel.ERROR)
         if self._calibration is not None:
             now_ns = time.monotonic_ns()
             self._topics.output(replace(self._calibration, t_ns=now_ns, text=text))
@@ -237,12 +243,12 @@ class Daemon:
     def _publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
         self._topics.publish_log_line(level, name, text, suppressed)
 
-    def _report(self, kind: str, text: str, level: str = "info") -> None:
+    def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
         """Report a state of the shell on the log and on ``bridge/event``."""
         fields = journal_fields(kind, self._rig.name)
         log.log(_LEVELS[level], "%s: %s", kind, text, extra=fields)
-        notice = Notice(time.monotonic_ns(), kind, self._rig.name, text)
-        self._topics.publish_notice(notice, level)
+        notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
+        self._topics.publish_notice(notice)
 
     # --- outputs of the core -----------------------------------------------------------------
 
@@ -340,7 +346,7 @@ class Daemon:
     def _configure(self, rig: Rig) -> None:
         loaded = self._calibrations.load(rig)
         for warning in loaded.warnings:
-            self._report("calibration", warning, "warning")
+            self._report(NoticeKind.CALIBRATION, warning, NoticeLevel.WARNING)
 
         now_ns = time.monotonic_ns()
         age_s = 0.0 if loaded.calibration is None else calibration_age_s(loaded.calibration)
@@ -355,14 +361,14 @@ class Daemon:
                 rig = await asyncio.to_thread(load_rig, self._config)
             except ConfigError as fault:
                 text = f"refused, the running configuration stays in force: {fault}"
-                self._report("reload", text, "error")
+                self._report(NoticeKind.RELOAD, text, NoticeLevel.ERROR)
             except Exception as error:
                 log.exception("reload")
                 text = (
                     "refused because of a bug, the running configuration stays in force; please "
                     f"report it: {error!r}"
                 )
-                self._report("reload", text, "error")
+                self._report(NoticeKind.RELOAD, text, NoticeLevel.ERROR)
             else:
                 await self._change_to(rig)
             self._systemd.ready()
@@ -371,7 +377,9 @@ class Daemon:
         """Apply `rig`; sources and connections without changes continue."""
         before, self._rig = self._rig, rig
         if before.recording != rig.recording:
-            self._report("reload", "a change of [recording] requires a restart", "warning")
+            self._report(
+                NoticeKind.RELOAD, "a change of [recording] requires a restart", NoticeLevel.WARNING
+            )
         await self._sources.retire(rig.sources)
 
         self._topics.configure(rig)  # clears topics of removed devices before any are moved

@@ -1,8 +1,8 @@
 """The worker process: one fit, started as ``python -m jointfit_daemon.supervisor.worker``.
 
-The worker reads a pickled (kind, payload) from standard input and writes one JSON object:
-``{"result": …}`` or ``{"error": text}``; both ends are this program. What the fit prints goes to
-standard error. The parent keeps its end of the input open: when that closes, the worker dies.
+The worker reads a pickled job from standard input and writes one JSON object: ``{"result": …}`` or
+``{"error": text}``. Everything else that a fit prints is redirected to standard error. The parent
+keeps its end of the input open: when that closes, the worker exits.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ import traceback
 import orjson
 
 HEADER = struct.Struct("<Q")
-"""Length of what follows."""
-_NICE = 10  # the samples come first
+"""Length of the pickled job, bytes."""
+_NICE = 10
+"""Decrease of the priority: acquisition comes first."""
 
 
 def main() -> int:
@@ -28,25 +29,28 @@ def main() -> int:
         os.nice(_NICE)
     answer_fd = os.dup(sys.stdout.fileno())
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+
     source = sys.stdin.buffer
     (length,) = HEADER.unpack(source.read(HEADER.size))
-    words = source.read(length)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    data = source.read(length)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+
     try:
         from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - its fault is an answer
 
-        kind, payload = pickle.loads(words)  # noqa: S301 - written by our parent
-        answer: dict[str, object] = {"result": run_job(kind, payload)}
-    except Exception as error:  # noqa: BLE001 - the parent tells it
+        job = pickle.loads(data)  # noqa: S301 - written by our parent
+        answer: dict[str, object] = {"result": run_job(job).to_dict()}
+    except Exception as error:  # noqa: BLE001 - the parent reports it
         traceback.print_exc()
         answer = {"error": f"{type(error).__name__}: {error}"}
+
     with os.fdopen(answer_fd, "wb") as output:
         output.write(orjson.dumps(answer, option=orjson.OPT_SERIALIZE_NUMPY))
     return 0
 
 
-def _die_with_parent() -> None:
-    os.read(sys.stdin.fileno(), 1)  # not the buffered reader: its lock would hold up a normal end
+def _exit_with_parent() -> None:
+    os.read(sys.stdin.fileno(), 1)  # not the buffered reader: its lock would delay a normal end
     os._exit(1)
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from jointfit_daemon.calibration.phases import fit_static
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.fusion import LimbFuser
-from jointfit_daemon.model import Chain, Quaternion
+from jointfit_daemon.model import Chain, FusionMode, Quaternion, SyncState
 from tests.calibration.synthetic_limb import (
     CHAIN,
     LENGTH,
@@ -222,15 +222,19 @@ def test_flags_origin_sync_and_mode_are_passed_through(
     chain = replace(CHAIN, origin=(0.0, 0.0, 0.9))
     flagged = replace(calibration, flags=("headings_from_static",))
     fuser = LimbFuser(chain, flagged)
-    state = fuser.fuse(t, t + 5, 7, orientations, extrapolated=frozenset({"S3"}), sync="stale")
+    state = fuser.fuse(
+        t, t + 5, 7, orientations, extrapolated=frozenset({"S3"}), sync=SyncState.SETTLING
+    )
     assert state.flags == ("headings_from_static", "extrapolating")
-    assert (state.seq, state.completed_ns, state.sync, state.mode) == (7, t + 5, "stale", "imu")
+    assert (state.seq, state.completed_ns, state.sync, state.mode) == (7, t + 5, "settling", "imu")
     assert state.joints[0].position == (0.0, 0.0, 0.9)
-    seen = fuser.fuse(t, t, 8, orientations, optical_origin=(1.0, 2.0, 3.0), mode="imu+mocap")
+    seen = fuser.fuse(
+        t, t, 8, orientations, optical_origin=(1.0, 2.0, 3.0), mode=FusionMode.IMU_AND_MOCAP
+    )
     assert seen.joints[0].position == (1.0, 2.0, 3.0)
     assert seen.mode == "imu+mocap"
     assert "origin_fixed" not in seen.flags
-    unseen = fuser.fuse(t, t, 9, orientations, mode="imu+mocap")
+    unseen = fuser.fuse(t, t, 9, orientations, mode=FusionMode.IMU_AND_MOCAP)
     assert unseen.joints[0].position == (0.0, 0.0, 0.9)
     assert unseen.flags == ("headings_from_static", "origin_fixed")
     assert fuser.fuse(t, t, 9, {**orientations, "S9": (1.0, 0.0, 0.0, 0.0)}).flags == (

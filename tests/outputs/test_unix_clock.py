@@ -11,7 +11,7 @@ import orjson
 import pytest
 
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.model import LimbState
+from jointfit_daemon.model import FusionMode, LimbState, SyncState
 from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
@@ -101,7 +101,7 @@ async def test_mono_us_is_monotonic_across_a_step_of_unix_time(
             host.offset_ns -= 3_600 * S
         host.now_ns += 10 * MS
         t_ns = host.now_ns - 5 * MS
-        reporter.output(LimbState(number, t_ns, t_ns, "imu", "locked", (), (), ()))
+        reporter.output(LimbState(number, t_ns, t_ns, FusionMode.IMU, SyncState.LOCKED, (), (), ()))
         poses += (await sent(outbox)).get("pose", [])
     steps = [b["t_us"] - a["t_us"] for a, b in itertools.pairwise(poses)]
     assert sum(step < 0 for step in steps) == 1

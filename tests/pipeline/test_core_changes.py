@@ -149,7 +149,7 @@ def calibrated_by_standing(rig_table: dict[str, Any]) -> tuple[Bench, Calibratio
     bench.feed([Request(at(20), "calibrate", "t", {"phase": "static"})])
     bench.feed(still(names, 20, 700))
     (job,) = [output for output in bench.out if isinstance(output, FitJob)]
-    result = run_job(job.kind, job.payload)
+    result = run_job(job.work)
     bench.feed([JobFinished(at(700), job.job, result, None)])
     bench.feed(still(names, 701, 720))
     (ready,) = [output for output in bench.out if isinstance(output, CalibrationReady)]
@@ -257,7 +257,7 @@ def test_reconnect_with_changed_time_or_counter_discards_the_pose(
         ("S3", "clock"),
         ("S3", "calibration"),
     ]
-    assert "Repeat the static pose" in notices[1].text
+    assert "and then the static pose" in notices[1].text
 
 
 @pytest.mark.parametrize(("params", "mode"), [(0, "imu+mocap"), (4, "imu")])

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any, cast
 import orjson
 import pytest
 
+from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, StaticJob
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.driver import DeviceLostError
+from jointfit_daemon.model import Chain
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.outputs.unix_clock import UnixClock
@@ -471,11 +473,17 @@ def test_watchdog_trips_only_if_samples_produce_no_state() -> None:
 # --- fits ---------------------------------------------------------------------------------------
 
 
-async def fit(kind: str, *, cancel_after_s: float | None = None) -> list[JobFinished]:
+def broken_job() -> FitJob:
+    """Return a job that fails: it has no trial."""
+    chain = Chain(("hip", "knee"), ("thigh",), (("S1",),))
+    return FitJob(1, StaticJob(chain, CalibrationSettings(), cast("CalibrationTrial", None)))
+
+
+async def fit(*, cancel_after_s: float | None = None) -> list[JobFinished]:
     ended: list[Any] = []
     async with asyncio.TaskGroup() as tasks:
         runner = FitRunner(tasks, ended.append)
-        runner.start(FitJob(1, kind, {}))
+        runner.start(broken_job())
         if cancel_after_s is not None:
             await asyncio.sleep(cancel_after_s)
             runner.cancel()
@@ -483,13 +491,13 @@ async def fit(kind: str, *, cancel_after_s: float | None = None) -> list[JobFini
 
 
 async def test_failed_fit_reports_its_reason() -> None:
-    (ended,) = await fit("no such kind")
+    (ended,) = await fit()
     assert ended.result is None
-    assert "KeyError" in str(ended.error)
+    assert "AttributeError" in str(ended.error)
 
 
 async def test_cancelled_fit_is_killed_without_a_result() -> None:
-    assert await fit("static", cancel_after_s=0.05) == []
+    assert await fit(cancel_after_s=0.05) == []
 
 
 async def test_request_on_an_invalid_topic_is_ignored(broker: Broker) -> None:

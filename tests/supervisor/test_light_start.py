@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, StaticJob
+from jointfit_daemon.model import Chain
 from jointfit_daemon.pipeline.events import FitJob
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 
@@ -24,6 +26,7 @@ async def test_fit_uses_one_thread_by_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given: list[dict[str, str]] = []
+    broken = StaticJob(Chain((), (), ()), CalibrationSettings(), CalibrationTrial({}, None))
     start = asyncio.create_subprocess_exec
 
     async def watched(*words: str, env: dict[str, str], **more: Any) -> Any:
@@ -36,7 +39,7 @@ async def test_fit_uses_one_thread_by_default(
         if told:
             monkeypatch.setenv("OPENBLAS_NUM_THREADS", told)
         async with asyncio.TaskGroup() as tasks:
-            FitRunner(tasks, lambda _: None).start(FitJob(1, "no such kind", {}))
+            FitRunner(tasks, lambda _: None).start(FitJob(1, broken))
     assert [env["OPENBLAS_NUM_THREADS"] for env in given] == ["1", "2"]
 
 

@@ -68,12 +68,12 @@ async def test_worker_ends_with_its_parent(tmp_path: Path) -> None:
         "time.sleep(60)\n"
     )
     worker = (
-        "import time, jointfit_daemon.calibration.phases._job_runner as jobs\n"
-        "jobs.run_job = lambda kind, payload: time.sleep(60)\n"
+        "import time, jointfit_daemon.calibration.phases as phases\n"
+        "phases.run_job = lambda job: time.sleep(60)\n"
         "from jointfit_daemon.supervisor.worker import main\n"
         "main()\n"
     )
-    job = pickle.dumps(("static", {}))
+    job = pickle.dumps("any job")
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-c", parent, worker,
         stdin=subprocess.PIPE, stdout=subprocess.PIPE,

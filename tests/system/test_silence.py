@@ -98,10 +98,10 @@ async def test_poses_go_on_as_held_then_lost_while_all_imus_are_silent(
             devices = await listener.health(lambda _: set(SENSORS) <= listener.online)
             assert [devices[name]["reconnects"] for name in SENSORS] == [1, 1, 1, 1]
             assert [devices[name]["restarts"] for name in SENSORS] == [0, 0, 0, 0], listener.texts()
-            assert not [e for e in listener.events if "Repeat the static pose" in e["text"]]
+            assert not [e for e in listener.events if "then the static pose" in e["text"]]
 
             await simulator.say("reboot S1")
-            await listener.until(lambda: listener.said("S1", "Repeat the static pose"))
+            await listener.until(lambda: listener.said("S1", "then the static pose"))
             await listener.health(lambda d: d["S1"]["restarts"] == 1)
             await simulator.quit()
             await listener.until(lambda: not listener.online)

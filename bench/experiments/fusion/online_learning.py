@@ -35,7 +35,6 @@ from jointfit_daemon.calibration.phases import (
 from jointfit_daemon.calibration.registration import sensor_at
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import Calibration
 from jointfit_simulators.body import SENSORS, SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.limb_model import Calibration
 
 SEEDS = (1, 2, 5, 6, 7, 8)
 SEGMENTS = ("thigh", "shank")
@@ -171,8 +171,8 @@ def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
         begin_s = LEARN_S + k * ROUND_S
         new = fresh(person(seed), calibration, begin_s, begin_s + ROUND_S)
         result = refit_models(calibration, new, bench_rig().chain)
-        if "calibration" in result:
-            calibration, taken = Calibration.from_dict(result["calibration"]), taken + 1
+        if result.calibration is not None:
+            calibration, taken = result.calibration, taken + 1
     return calibration, taken
 
 
@@ -278,9 +278,8 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
         person.cache_clear()
         for name, spoil in SPOILERS.items():
             try:
-                taken[name] += "calibration" in refit_models(
-                    calibration, spoil(new), bench_rig().chain
-                )
+                result = refit_models(calibration, spoil(new), bench_rig().chain)
+                taken[name] += result.calibration is not None
             except CalibrationError:
                 continue
     return [Result(f"accepted refits, {name}", float(n), 0.0, unit="") for name, n in taken.items()]

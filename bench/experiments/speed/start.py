@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from bench.framework.measurement import speed_experiment, timed_result
 from bench.subjects.simulated_wearer import bench_rig, phases
+from jointfit_daemon.calibration import FunctionalJob
 from jointfit_daemon.calibration.phases import fit_plate_alignment, run_job
 
 if TYPE_CHECKING:
@@ -51,14 +52,12 @@ def fit_rows(quick: bool) -> list[Result]:
     """The jobs of the worker, on trials as long as the demo's."""
     del quick  # one fit is quick enough
     trials, rig = phases(), bench_rig()
-    payload = {"chain": rig.chain, "settings": rig.calibration, "previous": None}
-    payload["alignment"] = fit_plate_alignment(trials.align, rig.calibration).to_dict()
+    alignment = fit_plate_alignment(trials.align, rig.calibration).to_dict()
+    job = FunctionalJob(rig.chain, rig.calibration, trials.static, trials.functional, alignment)
     began = time.thread_time(), time.perf_counter()
-    found = run_job(
-        "functional", payload | {"static": trials.static, "functional": trials.functional}
-    )
+    found = run_job(job)
     cpu, wall = time.thread_time() - began[0], time.perf_counter() - began[1]
-    assert "calibration" in found, found
+    assert found.calibration is not None, found.refused
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     note = f"{wall:.2f} s of wall time, OPENBLAS_NUM_THREADS {threads}"
     return [

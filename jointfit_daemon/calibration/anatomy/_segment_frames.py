@@ -26,6 +26,7 @@ from jointfit_daemon.calibration.anatomy._joint_center import (
 from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import body_parts, flexion_sign, visible
+from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -134,7 +135,7 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
     axes = _flexion_axes(chain, tracks, z)
 
     flags = [
-        f"axis_vertical:{segment}"
+        FrameFlag.AXIS_VERTICAL.of(segment)
         for segment, end in zip(chain.segments, ends, strict=True)
         if None in end
     ]
@@ -148,7 +149,7 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
                 "flex and extend it (squats)"
             )
         if x is None:  # a single segment: its heading is not observable
-            flags.append("facing_unknown")
+            flags.append(FrameFlag.FACING_UNKNOWN)
             x = np.array([1.0, 0.0, 0.0])
         q_static[segment] = _STANDING.copy() if chain.static_axes else _frame(segment, x, z[i])
         lengths[segment], sources[segment] = _length(chain, i, *ends[i])

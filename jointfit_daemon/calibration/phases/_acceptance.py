@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.model import FrameFlag
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -49,7 +51,7 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
             has, "only the new one used cameras" if has else "the old one used cameras"
         )
 
-    assumed = "headings_from_static"
+    assumed = FrameFlag.HEADINGS_FROM_STATIC
     if (assumed in old.flags) != (assumed in new.flags):
         aligned = assumed in old.flags
         return CalibrationComparison(

@@ -57,6 +57,7 @@ from jointfit_daemon.limb_model import (
     vector,
     visible,
 )
+from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -146,7 +147,7 @@ def fit_calibration(
         segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
         joint={name: _joint(found) for name, found in anatomy.joints.items()},
         clusters={name: cluster_record(cluster) for name, cluster in refined.clusters.items()},
-        flags=(*anatomy.flags, *(["headings_from_static"] if alignment is None else [])),
+        flags=(*anatomy.flags, *([FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else [])),
         notes=notes,
         quality={
             "static": pose.quality,

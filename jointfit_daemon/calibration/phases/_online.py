@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration._jobs import FitResult
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
     evenly,
@@ -68,7 +69,7 @@ TURN_FRAMES = 150
 
 def refit_models(
     calibration: Calibration, frames: OnlineFrames, chain: Chain, *, software: str = ""
-) -> dict[str, Any]:
+) -> FitResult:
     """Refit the models to new frames.
 
     Parameters
@@ -80,9 +81,9 @@ def refit_models(
 
     Returns
     -------
-    dict
-        ``quality`` with ``online``: errors before and after, rad; and either ``calibration`` (JSON
-        form) or ``kept``: the reason to retain the models in force.
+    FitResult
+        ``quality`` with ``online``: errors before and after, rad; and either ``calibration`` or
+        ``kept``: the reason to retain the models in force.
 
     Raises
     ------
@@ -119,7 +120,7 @@ def refit_models(
         or _too_far(chain, in_force, candidate, known)
     )
     if kept is not None:
-        return {"quality": {"online": figures}, "kept": kept}
+        return FitResult({"online": figures}, kept=kept)
 
     # Accepted: fit all sets of sensors to all frames.
     whole = evenly(chain, joined(known, new))
@@ -137,7 +138,7 @@ def refit_models(
         memory=pack(chain, whole),
         quality={**calibration.quality, "online": figures},
     )
-    return {"quality": dict(found.quality), "calibration": found.to_dict()}
+    return FitResult(found.quality, calibration=found)
 
 
 # --- optical reference ------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from jointfit_daemon.limb_model import (
     model_key,
     rigid_fit,
 )
+from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -138,7 +139,9 @@ def fit_static_only(
     ``headings_from_static``.
     """
     upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    flags = ["facing_unknown"] if alignment is not None else ["headings_from_static"]
+    flags = (
+        [FrameFlag.FACING_UNKNOWN] if alignment is not None else [FrameFlag.HEADINGS_FROM_STATIC]
+    )
     worlds = {
         name: upright if alignment is None else alignment.world(name) for name in pose.sensors
     }
@@ -226,8 +229,8 @@ def with_new_static(
             lag_ns = lag_ns if found_ns is None else found_ns
         sensors[name] = sensor_calibration(pose.sensors[name], world, q_now[owner[name]], lag_ns)
 
-    flags = [flag for flag in calibration.flags if flag != "same_pose_assumed"]
-    flags += ["same_pose_assumed"] if assumed else []
+    flags = [flag for flag in calibration.flags if flag != FrameFlag.SAME_POSE_ASSUMED]
+    flags += [FrameFlag.SAME_POSE_ASSUMED] if assumed else []
     quality = {**calibration.quality, "static": pose.quality}
     if alignment is not None:
         quality["alignment"] = alignment.quality

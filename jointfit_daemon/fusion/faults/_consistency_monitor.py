@@ -32,6 +32,7 @@ from jointfit_daemon.fusion.faults._magnetic_disturbance import (
 from jointfit_daemon.fusion.faults._slip import SlipDetector, pair_corrections, untrained_link
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.limb_model import axis_heading_one, up_one
+from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -343,9 +344,9 @@ class ConsistencyMonitor:
                 for k in (i, i + 1):
                     spread[k] = sqrt(spread[k] * spread[k] + variance)
             if joint.inconsistent:
-                flags.append(f"heading_disagrees:{self._chain.joints[i + 1]}")
+                flags.append(FrameFlag.HEADING_DISAGREES.of(self._chain.joints[i + 1]))
         if self._common is not None and self._common.sd > REPORTED_DRIFT:
-            flags.append("heading_unseen")
+            flags.append(FrameFlag.HEADING_UNSEEN)
 
         if not slipped and not flags and not any(spread):
             return self._no_fault
@@ -358,9 +359,9 @@ class ConsistencyMonitor:
             outlier = None if self._consistent[i] else self._slipped_sensor(i, inputs)
             if outlier is not None:
                 slipped.add(outlier)
-                flags.append(f"slipped:{outlier}")
+                flags.append(FrameFlag.SLIPPED.of(outlier))
             elif not self._consistent[i] and any(pair.inconsistent for pair in pairs):
-                flags.append(f"pair_disagrees:{self._chain.segments[i]}")
+                flags.append(FrameFlag.PAIR_DISAGREES.of(self._chain.segments[i]))
 
             remaining = pairs
             if outlier is not None:

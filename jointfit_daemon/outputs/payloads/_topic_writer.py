@@ -24,6 +24,7 @@ from jointfit_daemon.pipeline.events import (
     DeviceInfo,
     DeviceStatus,
     Notice,
+    NoticeKind,
     Reply,
 )
 
@@ -135,12 +136,12 @@ class TopicWriter:
             for i, joint in enumerate(state.joints):
                 self._publish(topics.JOINT, encode_joint(state, i, t_us), joint.name)
 
-    def publish_notice(self, notice: Notice, level: str | None = None) -> None:
-        """Publish a notice on ``bridge/event``, with its own level or with `level`."""
+    def publish_notice(self, notice: Notice) -> None:
+        """Publish a notice on ``bridge/event``."""
         payload = {
             "kind": notice.kind,
             "id": notice.id,
-            "level": level or notice.level,
+            "level": notice.level,
             "text": printable(notice.text),
             "data": printable_data(notice.data),
         }
@@ -158,7 +159,9 @@ class TopicWriter:
 
         data = {"quality": status.refused} if status.refused else {}
         self.publish_notice(
-            Notice(status.t_ns, "calibration", status.phase, status.text, status.level, data)
+            Notice(
+                status.t_ns, NoticeKind.CALIBRATION, status.phase, status.text, status.level, data
+            )
         )
 
     def _publish_reply(self, reply: Reply) -> None:

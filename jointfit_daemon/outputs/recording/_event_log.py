@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon import __version__
+from jointfit_daemon.calibration import FitResult
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chunk, JointState, LimbState, SegmentState
@@ -90,7 +91,8 @@ def _line(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return per eve
                 "arguments": arguments,
             }
         case JobFinished(t_ns, job, result, error):
-            return {"e": "job", "t_ns": t_ns, "job": job, "result": result, "error": error}
+            found = None if result is None else result.to_dict()
+            return {"e": "job", "t_ns": t_ns, "job": job, "result": found, "error": error}
         case CalibrationStored(t_ns, version):
             return {"e": "stored", "t_ns": t_ns, "version": version}
         case UnixOffset(t_ns, offset_ns):
@@ -127,6 +129,8 @@ def _event(line: dict[str, Any]) -> Event:
         given["rig"] = parse_rig(given.pop("table"), source="event log")
         stored = given["calibration"]
         given["calibration"] = None if stored is None else Calibration.from_dict(stored)
+    if kind == "job" and given["result"] is not None:
+        given["result"] = FitResult.from_dict(given["result"])
 
     if kind not in _EVENTS:
         raise ValueError(f"unknown event: {kind!r}")

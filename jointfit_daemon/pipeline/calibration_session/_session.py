@@ -10,12 +10,11 @@ Invariant: the session never computes a fit itself, so it never blocks acquisiti
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.calibration import PLATE
+from jointfit_daemon.calibration import PLATE, AlignJob, FunctionalJob, RefitJob, StaticJob
 from jointfit_daemon.calibration.guidance import MovementGuide
-from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.pipeline.calibration_session._phase_recording import (
     INSTRUCTIONS,
     STATIC_TIMEOUT_S,
@@ -37,24 +36,25 @@ from jointfit_daemon.pipeline.events import (
     CancelJob,
     FitJob,
     Notice,
+    NoticeKind,
+    NoticeLevel,
 )
 from jointfit_daemon.pipeline.online_learning import OnlineRefits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, OnlineFrames
+    from jointfit_daemon.calibration import (
+        CalibrationJob,
+        CalibrationSettings,
+        CalibrationTrial,
+        FitResult,
+        OnlineFrames,
+    )
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
     from jointfit_daemon.pipeline.sources import LagMonitor
-
-
-@dataclass(frozen=True, slots=True)
-class _RunningFit:
-    job: int
-    phase: CalibrationPhase
-    static: CalibrationTrial | None
-    """Static trial that the session retains if the fit accepts it."""
 
 
 class CalibrationSession:
@@ -91,7 +91,7 @@ class CalibrationSession:
         """Configured lags, and lags estimated during operation."""
         self._state = self._resting_phase
         self._recording: PhaseRecording | None = None
-        self._fit: _RunningFit | None = None
+        self._fit: FitJob | None = None
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
         self._static_s = settings.static_s
@@ -137,7 +137,7 @@ class CalibrationSession:
         recording = self._recording
         if recording is not None and recording.add_sample(sensor, t_ns, q_world_sensor):
             text = f"{sensor} moved: stillness is timed from the start again"
-            return [Notice(t_ns, "calibration", sensor, text)]
+            return [Notice(t_ns, NoticeKind.CALIBRATION, sensor, text)]
         return []
 
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
@@ -173,10 +173,10 @@ class CalibrationSession:
         posed, self._static = self._static is not None, None
         if posed or self._alignment is not None or self.calibration is not None:
             text = (
-                f"{sensor} restarted: without a heading reference of its own, its heading changed. "
-                "Repeat the static pose, and the align phase before it if there was one"
+                f"{sensor} restarted, so its heading may have changed (without a magnetometer it "
+                "always does). Repeat the align phase, if you used it, and then the static pose"
             )
-            outputs.append(Notice(t_ns, "calibration", sensor, text, "warning"))
+            outputs.append(Notice(t_ns, NoticeKind.CALIBRATION, sensor, text, NoticeLevel.WARNING))
         return outputs
 
     # --- requests ----------------------------------------------------------------------------
@@ -229,8 +229,8 @@ class CalibrationSession:
         if self.calibration is None:
             return []
         self._jobs += 1
-        job = self._jobs, self.calibration, self._chain, self._settings, fresh
-        return [self.refits.request(*job)]
+        self.refits.job = self._jobs
+        return [FitJob(self._jobs, RefitJob(self._chain, self.calibration, fresh))]
 
     def _finish_refit(self, event: JobFinished, before: Calibration) -> list[Output]:
         found, notice = self.refits.finish(event, before, self.version)
@@ -312,26 +312,13 @@ class CalibrationSession:
     def _start_fit(self, recording: PhaseRecording, now_ns: int) -> list[Output]:
         self._change(SessionEvent.RECORDED)
         self._recording = None
-        phase, trial, settings = recording.phase, recording.trial(now_ns), self._settings
-
-        payload: dict[str, object] = {"chain": self._chain}
-        if phase == CalibrationPhase.ALIGN:
-            payload["trial"] = trial
-        else:
-            stored = None if self.calibration is None else self.calibration.to_dict()
-            payload |= {"alignment": self._alignment, "previous": stored, phase.value: trial}
+        phase = recording.phase
         if phase == CalibrationPhase.STATIC:
             self._static_s = recording.wanted_s
-        elif phase == CalibrationPhase.FUNCTIONAL:
-            payload["static"] = self._static
-        payload["settings"] = replace(settings, static_s=self._static_s)
-        if self.lags is not None:
-            payload |= {"lag_ns": self.lags.known_ns(), "tracked": self.lags.tracked()}
 
         self._jobs += 1
         self.refits.job = None  # the only worker drops a running refit for this fit
-        static = trial if phase == CalibrationPhase.STATIC else None
-        self._fit = _RunningFit(self._jobs, phase, static)
+        self._fit = FitJob(self._jobs, self._job(phase, recording.trial(now_ns)))
 
         outputs: list[Output] = []
         if recording.overflowed:
@@ -339,14 +326,25 @@ class CalibrationSession:
                 f"{recording.overflowed} measurements exceeded the size of the recording and were "
                 "dropped: choose a shorter phase"
             )
-            outputs.append(Notice(now_ns, "calibration", phase, text, "warning"))
+            outputs += _notices(now_ns, phase, [text])
         outputs += _notices(now_ns, phase, recording.missing)
         text = "; ".join((f"fitting the {phase} trial", *recording.missing))
-        return [
-            *outputs,
-            self._status(now_ns, CalibrationPhase.FITTING, text),
-            FitJob(self._jobs, phase.value, payload),
-        ]
+        return [*outputs, self._status(now_ns, CalibrationPhase.FITTING, text), self._fit]
+
+    def _job(self, phase: CalibrationPhase, trial: CalibrationTrial) -> CalibrationJob:
+        """Return the fit of the phase that ended."""
+        chain, settings = self._chain, replace(self._settings, static_s=self._static_s)
+        lag_ns = None if self.lags is None else self.lags.known_ns()
+        if phase == CalibrationPhase.ALIGN:
+            return AlignJob(chain, settings, trial, lag_ns)
+
+        alignment, previous = self._alignment, self.calibration
+        if phase == CalibrationPhase.STATIC or self._static is None:
+            return StaticJob(chain, settings, trial, alignment, previous)
+        tracked = None if self.lags is None else self.lags.tracked()
+        return FunctionalJob(
+            chain, settings, self._static, trial, alignment, previous, lag_ns, tracked
+        )
 
     def finish_job(self, event: JobFinished) -> list[Output]:
         """Use the result of the worker. Results of cancelled jobs are ignored."""
@@ -357,49 +355,45 @@ class CalibrationSession:
             return []
 
         self._fit = None
-        result = event.result or {}
-        failure = event.error or result.get("refused") or (None if result else "no result")
-        if fit.phase == CalibrationPhase.STATIC:
-            self._static = fit.static if failure is None else None
-        if failure is not None:
+        failure, work = event.failure, fit.work
+        if isinstance(work, StaticJob):
+            self._static = work.static if failure is None else None
+        if event.result is None or failure is not None:
             self._change(SessionEvent.FAILED)
-            text = f"{fit.phase}: {failure}"
+            text = f"{work.name}: {failure}"
             return [self._status(event.t_ns, CalibrationPhase.ABORTED, text)]
-        return self._use_result(event.t_ns, fit.phase, dict(result))
+        return self._use_result(event.t_ns, CalibrationPhase(work.name), event.result)
 
-    def _use_result(
-        self, t_ns: int, phase: CalibrationPhase, result: dict[str, Any]
-    ) -> list[Output]:
-        quality = result.get("quality", {})
-        if phase == CalibrationPhase.ALIGN:
+    def _use_result(self, t_ns: int, phase: CalibrationPhase, result: FitResult) -> list[Output]:
+        quality = result.quality
+        if result.alignment is not None:
             self._change(SessionEvent.ALIGNMENT_FITTED)
-            self._alignment = result["alignment"]
+            self._alignment = result.alignment
             quality = {"alignment": quality}
             status = self._status(t_ns, CalibrationPhase.ALIGNED, "worlds aligned", quality)
-            return [*_notices(t_ns, phase, result["alignment"].get("notes", ())), status]
+            return [*_notices(t_ns, phase, result.alignment.get("notes", ())), status]
 
         static = phase == CalibrationPhase.STATIC
         if static:
             quality = {"static": quality}
-        if "calibration" not in result:
+        if result.calibration is None:
             self._change(SessionEvent.POSE_FITTED)
             return [self._status(t_ns, CalibrationPhase.POSED, "static pose recorded", quality)]
 
-        worse = result.get("worse")
-        if worse is not None and not self._force:
+        if (worse := result.worse) is not None and not self._force:
             self._change(SessionEvent.RESULT_WORSE)
             text = f"new calibration rejected, it is worse than the stored one: {worse}; use force"
             status = self._status(t_ns, self.phase, f"{text} to replace it")
-            return [replace(status, kept=str(worse), refused=quality)]
+            return [replace(status, kept=worse, refused=quality)]
 
         self._change(SessionEvent.POSE_FITTED if static else SessionEvent.CALIBRATION_FITTED)
-        self.calibration, self.version = Calibration.from_dict(result["calibration"]), None
+        self.calibration, self.version = result.calibration, None
         if phase == CalibrationPhase.FUNCTIONAL:
             self.refits = OnlineRefits()
         text = "static pose recorded: sensor alignments updated" if static else "calibrated"
         return [
             *(() if static else _notices(t_ns, phase, self.calibration.notes)),
-            *_notices(t_ns, phase, result.get("notes", ()), "info"),
+            *_notices(t_ns, phase, result.notes or (), NoticeLevel.INFO),
             CalibrationReady(self.calibration),
             self._status(t_ns, self._state, text, quality),
         ]
@@ -446,6 +440,9 @@ def _seconds(value: object) -> float | None:
 
 
 def _notices(
-    t_ns: int, phase: str, notes: Sequence[str], level: Literal["info", "warning"] = "warning"
+    t_ns: int,
+    phase: CalibrationPhase,
+    notes: Sequence[str],
+    level: NoticeLevel = NoticeLevel.WARNING,
 ) -> list[Output]:
-    return [Notice(t_ns, "calibration", phase, note, level) for note in notes]
+    return [Notice(t_ns, NoticeKind.CALIBRATION, phase, note, level) for note in notes]

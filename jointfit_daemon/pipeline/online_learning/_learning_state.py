@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.pipeline.events import Notice
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,7 +59,7 @@ class LearningMonitor:
             if self._obstacle is not None:
                 return []
             self._reported = False
-            return [Notice(now_ns, "calibration", "online", "online learning resumed")]
+            return [Notice(now_ns, NoticeKind.CALIBRATION, "online", "online learning resumed")]
 
         present = self._mocap_present(now_ns) and self._in_view
         if self._obstacle is None or now_ns - self._usable_ns < REPORT_NS or not present:
@@ -68,7 +68,7 @@ class LearningMonitor:
         stopped_s = (now_ns - self._usable_ns) // _NS
         text = f"online learning stopped for {stopped_s} s: {self._obstacle}"
         data = {"reason": self._obstacle, "stopped_s": stopped_s}
-        return [Notice(now_ns, "calibration", "online", text, "warning", data)]
+        return [Notice(now_ns, NoticeKind.CALIBRATION, "online", text, NoticeLevel.WARNING, data)]
 
     def _mocap_present(self, now_ns: int) -> bool:
         return self._mocap_ns is not None and now_ns - self._mocap_ns <= MOCAP_SILENT_NS

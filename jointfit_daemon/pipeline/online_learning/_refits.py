@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jointfit_daemon.limb_model import Calibration
-from jointfit_daemon.pipeline.events import FitJob, Notice
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.calibration import CalibrationSettings, OnlineFrames
-    from jointfit_daemon.model import Chain
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import JobFinished
     from jointfit_daemon.pipeline.online_learning._frame_collector import OnlineFrameCollector
 
@@ -37,41 +35,24 @@ class OnlineRefits:
     paused: bool = False
     """Whether online learning waits for the next functional calibration, after a reversal."""
 
-    def request(
-        self,
-        job: int,
-        calibration: Calibration,
-        chain: Chain,
-        settings: CalibrationSettings,
-        fresh: OnlineFrames,
-    ) -> FitJob:
-        """Return the job of a refit."""
-        self.job = job
-        payload = {"chain": chain, "settings": settings, "fresh": fresh}
-        return FitJob(job, "online", payload | {"previous": calibration.to_dict()})
-
     def finish(self, event: JobFinished, before: Calibration, version: int | None) -> RefitOutcome:
         """Return the outcome of the running refit."""
         self.job = None
-        result: dict[str, Any] = dict(event.result or {})
-        failure = event.error or result.get("refused") or (None if result else "no result")
-        if failure is not None:
-            text = f"models unchanged: {failure}"
-            return RefitOutcome(None, Notice(event.t_ns, "calibration", "online", text, "warning"))
+        result, kind = event.result, NoticeKind.CALIBRATION
+        if result is None or event.failure is not None:
+            text = f"models unchanged: {event.failure}"
+            return RefitOutcome(None, Notice(event.t_ns, kind, "online", text, NoticeLevel.WARNING))
 
-        data = _notice_data(result.get("quality", {}).get("online", {}))
-        if "calibration" not in result:
-            text = f"models unchanged: {result.get('kept')}"
-            return RefitOutcome(
-                None, Notice(event.t_ns, "calibration", "online", text, "info", data)
-            )
+        info, data = NoticeLevel.INFO, _notice_data(result.quality.get("online", {}))
+        if (found := result.calibration) is None:
+            text = f"models unchanged: {result.kept}"
+            return RefitOutcome(None, Notice(event.t_ns, kind, "online", text, info, data))
 
         self.original = self.original or before
-        found = Calibration.from_dict(result["calibration"])
         online = {**found.quality["online"], "from_version": version}
         found = replace(found, quality={**found.quality, "online": online})
         text = f"models refitted with {online['frames']} frames of sensors and mocap"
-        return RefitOutcome(found, Notice(event.t_ns, "calibration", "online", text, "info", data))
+        return RefitOutcome(found, Notice(event.t_ns, kind, "online", text, info, data))
 
     def health(self, collector: OnlineFrameCollector, now_ns: int) -> dict[str, object]:
         """Return the state of online learning as JSON values, for ``bridge/health``."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from jointfit_daemon.driver import ImuSettings
 from jointfit_daemon.limb_model import restore_cluster, rigid_fit
-from jointfit_daemon.pipeline.events import Notice
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.timing.lag import (
     LagEstimate,
     LagSettings,
@@ -279,7 +279,16 @@ class LagMonitor:
             f"{abs(difference) / sigma:.0f} standard deviations apart; check the sync cable and "
             "lag_ms in rig.toml"
         )
-        return [Notice(now_ns, "clock", name, text, "warning", {"lag_ms": tracked.lag_ns * 1e-6})]
+        return [
+            Notice(
+                now_ns,
+                NoticeKind.CLOCK,
+                name,
+                text,
+                NoticeLevel.WARNING,
+                {"lag_ms": tracked.lag_ns * 1e-6},
+            )
+        ]
 
     # --- output ------------------------------------------------------------------------------
 
@@ -363,8 +372,8 @@ def _step_notice(now_ns: int, name: str, step_ns: float) -> Notice:
         text += "; the calibration may be invalid: repeat the functional phase"
     data = {"step_ms": round(step_ns * 1e-6, 3)}
     if not invalid:
-        return Notice(now_ns, "clock", name, text, "info", data)
-    return Notice(now_ns, "calibration", name, text, "warning", data)
+        return Notice(now_ns, NoticeKind.CLOCK, name, text, NoticeLevel.INFO, data)
+    return Notice(now_ns, NoticeKind.CALIBRATION, name, text, NoticeLevel.WARNING, data)
 
 
 def _drift_notice(now_ns: int, name: str, tracked: TrackedLag) -> Notice:
@@ -373,7 +382,7 @@ def _drift_notice(now_ns: int, name: str, tracked: TrackedLag) -> Notice:
         "of the two clock fits is wrong; restart the sensor, then the mocap server"
     )
     data = {"drift_ppm": round(1e6 * tracked.drift, 2)}
-    return Notice(now_ns, "clock", name, text, "warning", data)
+    return Notice(now_ns, NoticeKind.CLOCK, name, text, NoticeLevel.WARNING, data)
 
 
 def _ms(value_ns: float) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from jointfit_daemon.calibration import FunctionalJob
 from jointfit_daemon.calibration.anatomy import track_clusters
 from jointfit_daemon.calibration.phases import StaticPose, fit_static, run_job
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
@@ -174,11 +175,8 @@ def test_rigid_bodies_show_no_markers_and_that_is_said() -> None:
 @pytest.mark.timeout(90)
 def test_the_worker_stores_and_tells_what_refining_did() -> None:
     static, functional, _ = trials()
-    payload = {
-        "chain": CHAIN, "settings": replace(SETTINGS, method="mean"), "static": static,
-        "functional": functional, "alignment": None, "previous": None,
-    }  # fmt: skip
-    result = run_job("functional", payload)
+    job = FunctionalJob(CHAIN, replace(SETTINGS, method="mean"), static, functional)
+    result = run_job(job).to_dict()
     figures = json.loads(json.dumps(result["quality"]["markers"], allow_nan=False))
     assert figures["parts"]["thigh"]["after_m"] < figures["parts"]["thigh"]["before_m"]
     stored = Calibration.from_dict(result["calibration"])

@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, SensorTrack
+from jointfit_daemon.calibration import (
+    AlignJob,
+    CalibrationSettings,
+    CalibrationTrial,
+    FunctionalJob,
+    SensorTrack,
+    StaticJob,
+)
 from jointfit_daemon.calibration.phases import PlateAlignment, fit_static, run_job
 from jointfit_daemon.calibration.phases._plate_alignment import AlignedSensor
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
@@ -63,13 +70,10 @@ def said(
 
 def static_job(
     trial: CalibrationTrial, previous: Calibration, alignment: PlateAlignment | None
-) -> Any:
+) -> Calibration:
     stored = None if alignment is None else alignment.to_dict()
-    payload = {
-        "chain": CHAIN, "settings": SETTINGS, "static": trial, "alignment": stored,
-        "previous": previous.to_dict(),
-    }  # fmt: skip
-    return Calibration.from_dict(run_job("static", payload)["calibration"])
+    result = run_job(StaticJob(CHAIN, SETTINGS, trial, stored, previous))
+    return Calibration.from_dict(result.to_dict()["calibration"])
 
 
 def test_a_new_alignment_counts_when_sensors_are_put_on_anew() -> None:
@@ -111,21 +115,19 @@ def test_models_of_unaligned_worlds_are_not_moved_to_aligned_ones() -> None:
 def test_a_sensor_that_is_silent_on_the_plate_is_named_at_once() -> None:
     trial = standing(worlds(dict.fromkeys(SENSORS, 0.0)), mounts())
     heard = {name: track for name, track in trial.sensors.items() if name != "S3"}
-    payload = {"chain": CHAIN, "settings": SETTINGS, "trial": CalibrationTrial(heard, None)}
-    assert "S3" in run_job("align", payload)["refused"]
+    result = run_job(AlignJob(CHAIN, SETTINGS, CalibrationTrial(heard, None)))
+    assert "S3" in str(result.refused)
 
 
 def test_a_sensor_that_alone_was_moved_is_told_when_a_new_pose_is_taken() -> None:
     room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
     before = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), room, CHAIN)
     moved = {**worn, "S4": rotation.multiply(worn["S4"], rotation.exp(np.array([0.2, 0.0, 0.0])))}
-    notes: list[str] = []
+    notes: tuple[str, ...] = ()
     for trial, expected in ((standing(room, worn), []), (standing(room, moved), ["shank"])):
-        payload = {
-            "chain": CHAIN, "settings": SETTINGS, "static": trial, "alignment": None,
-            "previous": before.to_dict(),
-        }  # fmt: skip
-        notes = run_job("static", payload)["notes"]
+        result = run_job(StaticJob(CHAIN, SETTINGS, trial, None, before))
+        assert result.notes is not None
+        notes = result.notes
         assert [note.partition(":")[0] for note in notes] == expected
     assert "S3 and S4 differ by 11.5 deg" in notes[0]
 
@@ -143,9 +145,5 @@ def test_a_movement_is_given_the_lags_of_the_calibration_before(
 
     monkeypatch.setattr("jointfit_daemon.calibration.phases._job_runner.fit_calibration", fit)
     trial = standing(room, worn)
-    payload = {
-        "chain": CHAIN, "settings": SETTINGS, "static": trial, "functional": trial,
-        "alignment": None, "previous": before.to_dict(),
-    }  # fmt: skip
-    run_job("functional", payload)
+    run_job(FunctionalJob(CHAIN, SETTINGS, trial, trial, None, before))
     assert given["previous"] == before

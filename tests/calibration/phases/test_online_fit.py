@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration import CalibrationError, CalibrationSettings, OnlineFrames
+from jointfit_daemon.calibration import CalibrationError, OnlineFrames, RefitJob
 from jointfit_daemon.calibration.phases import refit_models, run_job
 from jointfit_daemon.calibration.record._content_check import content_faults
 from jointfit_daemon.calibration.soft_tissue import evenly, joined, pack, unpack
@@ -19,14 +19,9 @@ from tests.calibration.calibrated_subject import CHAIN, calibration, fresh, movi
 
 
 @pytest.fixture(scope="module")
-def learned() -> dict[str, Any]:
-    payload = {
-        "chain": CHAIN,
-        "settings": CalibrationSettings(),
-        "previous": calibration().to_dict(),
-        "fresh": fresh(moving(600, 1.2, 1)),
-    }
-    return run_job("online", payload)
+def learned() -> Calibration:
+    result = run_job(RefitJob(CHAIN, calibration(), fresh(moving(600, 1.2, 1)))).to_dict()
+    return Calibration.from_dict(result["calibration"])
 
 
 def error(one: Calibration, bend: float) -> float:
@@ -38,14 +33,13 @@ def error(one: Calibration, bend: float) -> float:
     return float(np.sqrt(np.mean(off**2)))
 
 
-def test_far_bends_are_learned_and_small_ones_are_not_forgotten(learned: dict[str, Any]) -> None:
-    after = Calibration.from_dict(learned["calibration"])
-    assert error(after, 1.2) < 0.6 * error(calibration(), 1.2)
-    assert error(after, 0.5) < error(calibration(), 0.5) + np.deg2rad(0.3)
+def test_far_bends_are_learned_and_small_ones_are_not_forgotten(learned: Calibration) -> None:
+    assert error(learned, 1.2) < 0.6 * error(calibration(), 1.2)
+    assert error(learned, 0.5) < error(calibration(), 0.5) + np.deg2rad(0.3)
 
 
-def test_only_models_memory_and_figures_change(learned: dict[str, Any]) -> None:
-    before, after = calibration(), Calibration.from_dict(learned["calibration"])
+def test_only_models_memory_and_figures_change(learned: Calibration) -> None:
+    before, after = calibration(), learned
     assert content_faults(after) == []
     blank: dict[str, Any] = {"segment": {}, "quality": {}, "memory": "", "correlations": {}}
     assert replace(before, **blank) == replace(after, **blank)
@@ -59,11 +53,10 @@ def test_only_models_memory_and_figures_change(learned: dict[str, Any]) -> None:
     assert all(online["after_rad"][k] <= was for k, was in online["before_rad"].items())
 
 
-def test_more_of_what_is_known_teaches_nothing(learned: dict[str, Any]) -> None:
-    after = Calibration.from_dict(learned["calibration"])
-    result = refit_models(after, fresh(moving(400, 0.5, 3)), CHAIN)
-    assert "calibration" not in result
-    assert "newest frames" in result["kept"]
+def test_more_of_what_is_known_teaches_nothing(learned: Calibration) -> None:
+    result = refit_models(learned, fresh(moving(400, 0.5, 3)), CHAIN)
+    assert result.calibration is None
+    assert "newest frames" in str(result.kept)
 
 
 def spoilt(kind: str) -> OnlineFrames:

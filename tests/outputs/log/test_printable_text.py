@@ -22,7 +22,7 @@ from jointfit_daemon.outputs.log import (
 from jointfit_daemon.outputs.log._printable_text import LONGEST
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
-from jointfit_daemon.pipeline.events import DeviceInfo, Notice
+from jointfit_daemon.pipeline.events import DeviceInfo, Notice, NoticeKind, NoticeLevel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,7 +88,9 @@ def test_events_and_device_info_contain_no_control_characters(table: dict[str, A
     outbox: Any = _Outbox()
     reporter = TopicWriter(parse_rig(table), outbox, UnixClock())
     outbox.payloads.clear()
-    reporter.output(Notice(1, "device", "S1", FORGED, "warning", {"name": [FORGED]}))
+    reporter.output(
+        Notice(1, NoticeKind.DEVICE, "S1", FORGED, NoticeLevel.WARNING, {"name": [FORGED]})
+    )
     reporter.output(DeviceInfo("S1", {"model": FORGED}))
     event, info = map(orjson.loads, outbox.payloads)
     assert all(

@@ -15,7 +15,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.model import JointAngles, JointState, LimbState, SegmentState
+from jointfit_daemon.model import (
+    FusionMode,
+    JointAngles,
+    JointState,
+    LimbState,
+    SegmentState,
+    SyncState,
+)
 from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter, encode_pose
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
@@ -27,6 +34,7 @@ from jointfit_daemon.pipeline.events import (
     DeviceInfo,
     DeviceStatus,
     Notice,
+    NoticeKind,
     Reply,
     ReplyAddress,
 )
@@ -49,8 +57,8 @@ STATE = LimbState(
     seq=184211,
     t_ns=5_000_123_000,
     completed_ns=5_004_000_000,
-    mode="imu",
-    sync="locked",
+    mode=FusionMode.IMU,
+    sync=SyncState.LOCKED,
     flags=(),
     segments=(
         SegmentState("thigh", (0.9914, 0.1276, 0.0094, -0.0251), math.radians(0.9), ("S1", "S2")),
@@ -153,7 +161,9 @@ def test_unknown_joint_is_null() -> None:
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_payload_contains_no_nan_or_infinity(value: float) -> None:
     joint = JointState("knee", (value, value, value), value, JointAngles(value, value, value))
-    pose = encode_pose(STATE.__class__(1, 0, 0, "imu", "locked", (), (), (joint,)), 0, 0)
+    pose = encode_pose(
+        STATE.__class__(1, 0, 0, FusionMode.IMU, SyncState.LOCKED, (), (), (joint,)), 0, 0
+    )
     json.loads(pose, parse_constant=lambda word: pytest.fail(f"{word} in a pose"))
 
 
@@ -209,7 +219,16 @@ async def test_pose_ui_and_joint_rates_are_as_documented(
     for number in range(1000):
         t_ns = 3_000_000_000 + number * 10_000_000
         reporter.output(
-            LimbState(number, t_ns, t_ns, "imu", "locked", (), STATE.segments, STATE.joints)
+            LimbState(
+                number,
+                t_ns,
+                t_ns,
+                FusionMode.IMU,
+                SyncState.LOCKED,
+                (),
+                STATE.segments,
+                STATE.joints,
+            )
         )
         for topic, payloads in (await sent(outbox)).items():
             counts[topic] = counts.get(topic, 0) + len(payloads)
@@ -238,7 +257,7 @@ async def test_device_topics_start_offline_and_are_cleared_on_removal(
 
 async def test_outputs_are_published_on_their_topics(table: dict[str, Any], outbox: Outbox) -> None:
     reporter = TopicWriter(parse_rig(rig_table(table)), outbox, UnixClock())
-    reporter.output(Notice(0, "device", "S1", "streaming"))
+    reporter.output(Notice(0, NoticeKind.DEVICE, "S1", "streaming"))
     reporter.output(CalibrationStatus(0, CalibrationPhase.CALIBRATED, "done", 3, {"rms_m": 0.004}))
     reporter.output(
         CalibrationProgress(0, CalibrationPhase.FUNCTIONAL, 0.5, "keep moving", {"arc_deg": 40.0})

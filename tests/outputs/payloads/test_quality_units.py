@@ -8,7 +8,7 @@ import numpy as np
 import orjson
 import pytest
 
-from jointfit_daemon.model import JointState, LimbState
+from jointfit_daemon.model import FusionMode, JointState, LimbState, SyncState
 from jointfit_daemon.outputs.payloads import encode_pose
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 
@@ -48,7 +48,7 @@ def test_texts_flags_lists_and_nulls_pass_unchanged() -> None:
 
 def test_unknown_knee_has_keys_and_hip_has_none() -> None:
     lost = [JointState(name, None, None) for name in ("hip", "knee", "ankle")]
-    state = LimbState(1, 1, 1, "uncalibrated", "settling", (), (), tuple(lost))
+    state = LimbState(1, 1, 1, FusionMode.UNCALIBRATED, SyncState.SETTLING, (), (), tuple(lost))
     joints = orjson.loads(encode_pose(state, 0, 1))["joints"]
     nothing = {"p_m": None, "sd_m": None}
     names = ("flexion", "adduction", "rotation")

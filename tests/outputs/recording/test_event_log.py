@@ -12,8 +12,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jointfit_daemon.calibration import FitResult
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.model import Chunk, JointAngles, JointState, LimbState, SegmentState
+from jointfit_daemon.model import (
+    Chain,
+    Chunk,
+    FusionMode,
+    JointAngles,
+    JointState,
+    LimbState,
+    SegmentState,
+    SyncState,
+)
 from jointfit_daemon.outputs.recording import (
     EventLogWriter,
     _event_log,
@@ -33,6 +43,7 @@ from jointfit_daemon.pipeline.events import (
     Tick,
     UnixOffset,
 )
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
@@ -45,13 +56,24 @@ json_values = st.recursive(
     max_leaves=5,
 )
 tables = st.dictionaries(words, json_values, max_size=3)
+reasons = st.none() | words
+chain = Chain(("hip", "knee"), ("thigh",), (("S1",),))
+results = st.builds(FitResult, refused=words) | st.builds(
+    FitResult,
+    tables,
+    st.none() | tables,
+    st.none() | st.just(plain_calibration(chain)),
+    reasons,
+    reasons,
+    st.none() | st.lists(words, max_size=3).map(tuple),
+)
 events = st.one_of(
     st.builds(ChunkArrived, words, st.builds(Chunk, instants, st.binary(max_size=100))),
     st.builds(Tick, instants),
     st.builds(SourceOpened, instants, words),
     st.builds(SourceClosed, instants, words, st.sampled_from(["lost", "removed"]), words),
     st.builds(Request, instants, words, words, tables),
-    st.builds(JobFinished, instants, st.integers(0, 99), st.none() | tables, st.none() | words),
+    st.builds(JobFinished, instants, st.integers(0, 99), st.none() | results, st.none() | words),
     st.builds(CalibrationStored, instants, st.integers(1, 99)),
     st.builds(UnixOffset, instants, st.integers(-(2**62), 2**62)),
 )
@@ -89,7 +111,7 @@ def test_states_are_equal_exactly_when_their_bytes_are(one: LimbState, other: Li
 async def test_log_returns_events_and_states_in_order(tmp_path: Path) -> None:
     log = EventLogWriter(tmp_path / "logs", "rig")
     writing = asyncio.create_task(log.run(), name="log")
-    state = LimbState(1, 2, 3, "imu", "locked", (), (), ())
+    state = LimbState(1, 2, 3, FusionMode.IMU, SyncState.LOCKED, (), (), ())
     given_events = [Tick(n) for n in range(1000)]
     for event in given_events:
         log.event(event)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial
+from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, FitResult
 from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
@@ -84,7 +84,7 @@ def only(outputs: list[Output], kind: type[Any]) -> list[Any]:
 
 
 def done(one: CalibrationSession, job: FitJob, **result: object) -> list[Output]:
-    return one.finish_job(JobFinished(99 * SECOND, job.job, result, None))
+    return one.finish_job(JobFinished(99 * SECOND, job.job, FitResult.from_dict(result), None))
 
 
 def posed() -> CalibrationSession:
@@ -119,7 +119,7 @@ def test_stillness_ends_the_static_phase_and_only_it_is_fitted() -> None:
     moving = feed(one, 0, 4, speed=0.5)
     assert not only(moving, FitJob)
     (job,) = only(feed(one, 4, 12), FitJob)
-    trial = job.payload["static"]
+    trial = job.work.static
     assert isinstance(trial, CalibrationTrial)
     span_s = (trial.sensors["S1"].t_ns[-1] - trial.sensors["S1"].t_ns[0]) / SECOND
     assert span_s == pytest.approx(SETTINGS.static_s, abs=0.5)
@@ -183,7 +183,7 @@ def test_worse_calibration_is_rejected_with_the_reason() -> None:
     ask(one, 10 * SECOND, "functional")
     (job,) = only(feed(one, 10, 16, speed=0.3), FitJob)
     outputs = done(
-        one, job, calibration={"schema": 1}, worse="knee 3.0 against 1.0 deg", quality={}
+        one, job, calibration=PLAIN.to_dict(), worse="knee 3.0 against 1.0 deg", quality={}
     )
     assert not only(outputs, CalibrationReady)
     assert one.calibration is None
@@ -200,7 +200,7 @@ def test_job_contains_the_alignment_of_the_session() -> None:
     done(one, job, alignment={"sensors": {}, "notes": []}, quality={})
     ask(one, 6 * SECOND, "static")
     (job,) = only(feed(one, 6, 16), FitJob)
-    assert job.payload["alignment"] == {"sensors": {}, "notes": []}
+    assert job.work.alignment == {"sensors": {}, "notes": []}
 
 
 # --- missing data --------------------------------------------------------------------------------
@@ -261,8 +261,7 @@ def test_static_fit_uses_the_requested_length() -> None:
     one = session()
     ask(one, 0, "static", seconds=1.5)
     (job,) = only(feed(one, 0, 5), FitJob)
-    settings: Any = job.payload["settings"]
-    assert settings.static_s == 1.5
+    assert job.work.settings.static_s == 1.5
 
 
 def test_functional_fit_uses_the_requested_length_of_the_pose() -> None:
@@ -276,8 +275,7 @@ def test_functional_fit_uses_the_requested_length_of_the_pose() -> None:
     for after in (one, reloaded):
         ask(after, 5 * SECOND, "functional")
         (job,) = only(feed(after, 5, 12), FitJob)
-        settings: Any = job.payload["settings"]
-        assert settings.static_s == 1.5
+        assert job.work.settings.static_s == 1.5
 
 
 # --- restarts and reloads ------------------------------------------------------------------------
@@ -297,7 +295,8 @@ def test_sensor_restart_discards_the_pose_with_a_notice() -> None:
     (notice,) = one.restart_sensor(11 * SECOND, "S2")
     assert isinstance(notice, Notice)
     assert notice.level == "warning"
-    assert "S2" in notice.text
+    assert notice.text.startswith("S2 restarted, so its heading may have changed")
+    assert notice.text.endswith("Repeat the align phase, if you used it, and then the static pose")
     (reply,) = only(ask(one, 12 * SECOND, "functional"), Reply)
     assert "static" in str(reply.error)
 
@@ -326,7 +325,7 @@ def test_reload_preserves_alignment_and_pose_of_an_equal_rig(same_rig: bool) -> 
     assert reply.status == ("accepted" if same_rig else "error")
     if same_rig:
         (job,) = only(feed(after, 18, 24, 0.3), FitJob)
-        assert job.payload["alignment"] is not None
+        assert job.work.alignment is not None
 
 
 def test_job_numbers_are_unique_across_reloads() -> None:

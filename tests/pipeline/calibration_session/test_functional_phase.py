@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from jointfit_daemon.calibration import FitResult
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.outputs.payloads._encoding import encode
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
@@ -28,6 +29,7 @@ from tests.calibration.synthetic_limb import (
     Subject,
     static_and_functional,
 )
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial
@@ -83,7 +85,7 @@ def posed(settings: CalibrationSettings) -> CalibrationSession:
     one = CalibrationSession(CHAIN, settings, mocap=True, calibration=None)
     ask(one, 0, phase="static")
     (job,) = only(play(one, trials()[0], 0), FitJob)
-    one.finish_job(JobFinished(10 * SECOND, job.job, {"quality": {}}, None))
+    one.finish_job(JobFinished(10 * SECOND, job.job, FitResult(), None))
     return one
 
 
@@ -167,7 +169,8 @@ def test_rejected_result_gives_its_reason_in_the_status() -> None:
     one = posed(QUICK)
     ask(one, 10 * SECOND, phase="functional", seconds=2.0)
     (job,) = only(play(one, trials()[1], 10 * SECOND), FitJob)
-    result = {"calibration": {}, "quality": {}, "worse": "knee: flexion error 5.0 deg, was 2.0"}
+    new = plain_calibration(CHAIN)
+    result = FitResult(calibration=new, worse="knee: flexion error 5.0 deg, was 2.0")
     (status,) = only(
         one.finish_job(JobFinished(90 * SECOND, job.job, result, None)), CalibrationStatus
     )

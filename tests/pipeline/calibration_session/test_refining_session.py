@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from jointfit_daemon.calibration import FitResult, FunctionalJob
 from jointfit_daemon.calibration.phases import fit_static, run_job
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
@@ -55,10 +56,11 @@ def test_status_contains_the_quality_of_refined_markers() -> None:
     one = CalibrationSession(CHAIN, REFINING, mocap=True, calibration=None)
     job = asked(one, 0, "static")
     pose = fit_static(static, REFINING, CHAIN)
-    one.finish_job(JobFinished(30 * S, job.job, {"quality": pose.quality}, None))
+    one.finish_job(JobFinished(30 * S, job.job, FitResult(pose.quality), None))
     one._static = static  # the recording of this test has no markers
     job = asked(one, 40 * S, "functional")
-    result = run_job("functional", {**job.payload, "static": static, "functional": functional})
+    assert isinstance(job.work, FunctionalJob)
+    result = run_job(replace(job.work, static=static, functional=functional))
     out = one.finish_job(JobFinished(90 * S, job.job, result, None))
     (status,) = only(out, CalibrationStatus)
     assert status.phase == "calibrated"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration import CalibrationSettings
+from jointfit_daemon.calibration import CalibrationSettings, FitResult, RefitJob
 from jointfit_daemon.kinematics.rotation_scalar import angle_between_one
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
@@ -166,7 +166,7 @@ def asked(one: CalibrationSession) -> FitJob:
     return job
 
 
-def better() -> dict[str, Any]:
+def better() -> FitResult:
     models = calibration().segment
     swapped = {name: replace(item, models={}) for name, item in models.items()}
     found = replace(
@@ -176,17 +176,17 @@ def better() -> dict[str, Any]:
         memory="x",
         correlations={"knee": -0.25},
     )
-    return {"calibration": found.to_dict(), "quality": dict(found.quality)}
+    return FitResult(found.quality, calibration=found)
 
 
-def finish(one: CalibrationSession, job: int, result: dict[str, Any]) -> list[Output]:
+def finish(one: CalibrationSession, job: int, result: FitResult | None) -> list[Output]:
     return one.finish_job(JobFinished(9 * S, job, result, None))
 
 
 def test_better_models_are_used_reported_and_stored_with_their_origin() -> None:
     one = session()
     job = asked(one)
-    assert job.kind == "online"
+    assert isinstance(job.work, RefitJob)
     assert not one.may_learn
     out = finish(one, job.job, better())
     (ready,) = only(out, CalibrationReady)
@@ -202,8 +202,10 @@ def test_better_models_are_used_reported_and_stored_with_their_origin() -> None:
     assert one.may_learn
 
 
-@pytest.mark.parametrize("result", [{"kept": "no better"}, {"refused": "markers"}, {}])
-def test_models_that_are_not_better_are_rejected_with_the_reason(result: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "result", [FitResult(kept="no better"), FitResult(refused="markers"), None]
+)
+def test_models_that_are_not_better_are_rejected_with_the_reason(result: FitResult | None) -> None:
     one = session()
     before = one.calibration
     out = finish(one, asked(one).job, result)
@@ -224,7 +226,7 @@ def test_static_fit_cancels_the_refit() -> None:
         for sensor in SENSORS:
             out += one.add_sample(sensor, t_ns, turned(0.0))
         out += one.advance(t_ns)
-    assert [found.kind for found in only(out, FitJob)] == ["static"]
+    assert [found.work.name for found in only(out, FitJob)] == ["static"]
     before = one.calibration
     assert finish(one, job.job, better()) == []
     assert one.calibration is before
