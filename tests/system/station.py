@@ -1,10 +1,15 @@
-"""A whole gateway for tests: virtual hardware, the real daemon, and somebody who listens."""
+"""A complete gateway for tests: simulated devices, the daemon process, and an MQTT listener.
+
+Retained messages overtake queued events, and events overtake queued poses and health messages. A
+test that has waited for one message therefore waits for each other message that it asserts.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
+import os
 import signal
 import time
 from dataclasses import dataclass, field
@@ -24,49 +29,66 @@ from jointfit_daemon.tools.child_processes import daemon as daemon_child
 from jointfit_daemon.tools.child_processes import simulator as simulator_child
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Collection
     from pathlib import Path
 
     from jointfit_simulators.scene import Scene
 
 BASE = "jointfit/station"
 SENSORS = ("S1", "S2", "S3", "S4")
-VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
+OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 TOPICS = (
     "pose", "calibration", "bridge/state", "bridge/info", "bridge/event", "bridge/health",
     "device/+/availability",
 )  # fmt: skip
-RETRY_S = 0.1
+RECONNECT_S = 0.1
+"""Pause of the listener before it connects again, s."""
+PATIENCE_S = 60.0
+"""Time limit for a message that arrives within 3 s on an idle machine, s."""
 
 
 def broker(port: int, base: str = BASE) -> MqttSettings:
-    """Return where a test's broker is."""
+    """Return the settings of a client of the test's broker."""
     return MqttSettings(host="127.0.0.1", port=port, base=base)
+
+
+def load_factor() -> float:
+    """Return the factor by which the load of this machine slows a process down, at least 1.
+
+    It is the number of runnable processes per core. Time limits that belong to a claim about the
+    daemon hold on an idle machine and are multiplied by this factor.
+    """
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 @dataclass
 class Listener:
-    """Everything the daemon said since the listener came, across restarts of the broker."""
+    """Messages that the daemon published since the listener connected.
+
+    The listener reconnects when the broker restarts.
+    """
 
     settings: MqttSettings
+    topics: tuple[str, ...] = TOPICS
     poses: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     latest: dict[str, Any] = field(default_factory=dict)
     """Newest payload by topic."""
     healths: int = 0
+    """Number of health messages received."""
     client: MqttClient | None = None
     calibration: PhaseTracker = field(default_factory=lambda: PhaseTracker(lambda *_: None))
 
     async def run(self) -> None:
-        """Listen until cancelled."""
+        """Receive messages until cancelled."""
         while True:
             with contextlib.suppress(BrokerLostError):
                 async with MqttClient(self.settings) as self.client:
-                    await self.client.subscribe(*TOPICS)
+                    await self.client.subscribe(*self.topics)
                     async for topic, payload in self.client.messages():
                         self._take(topic, payload)
             self.client = None
-            await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(RECONNECT_S)
 
     def _take(self, topic: str, payload: Any) -> None:
         self.latest[topic] = payload
@@ -81,47 +103,72 @@ class Listener:
 
     @property
     def online(self) -> set[str]:
-        """Devices that are available."""
+        """Devices whose availability is online."""
         return {
             topic.split("/")[1]
             for topic, payload in self.latest.items()
             if topic.endswith("/availability") and payload == {"v": 1, "state": "online"}
         }
 
-    def said(self, device: str, *parts: str) -> dict[str, Any] | None:
-        """Return the event of `device` whose text holds all `parts`."""
+    def find_event(self, device: str, *parts: str) -> dict[str, Any] | None:
+        """Return the first event of `device` whose text contains all `parts`, if any."""
         for event in self.events:
             if event["id"] == device and all(part in event["text"] for part in parts):
                 return event
         return None
 
-    def texts(self) -> str:
-        """Return all events, for messages of tests."""
+    def format_events(self) -> str:
+        """Return all events, one a line, for the messages of failed assertions."""
         return "\n".join(f"{e['level']} {e['kind']} {e['id']}: {e['text']}" for e in self.events)
 
-    async def until(self, condition: Callable[[], object], within_s: float = 10.0) -> None:
-        """Wait for a condition; what was said is in the failure."""
+    async def until(self, condition: Callable[[], object], within_s: float = PATIENCE_S) -> None:
+        """Wait for a condition; a failure lists the events."""
         try:
             async with asyncio.timeout(within_s):
                 while not condition():
                     await asyncio.sleep(0.01)
         except TimeoutError:
             raise AssertionError(
-                f"not within {within_s:g} s; online: {sorted(self.online)}\n{self.texts()}"
+                f"not within {within_s:g} s; online: {sorted(self.online)};"
+                f" health: {self.latest.get('bridge/health')}\n{self.format_events()}"
             ) from None
 
-    async def connected(self, devices: set[str], within_s: float = 15.0) -> None:
-        """Wait until exactly these are among the available."""
-        await self.until(lambda: devices <= self.online, within_s)
+    async def connected(self, devices: Collection[str], within_s: float = PATIENCE_S) -> None:
+        """Wait until all of these devices are online."""
+        await self.until(lambda: self.online.issuperset(devices), within_s)
 
-    async def more_poses(self, count: int = 20, within_s: float = 10.0) -> list[dict[str, Any]]:
-        """Wait for `count` poses from now on and return just these; more may have come at once."""
+    async def disconnected(self, devices: Collection[str], within_s: float = PATIENCE_S) -> None:
+        """Wait until none of these devices is online."""
+        await self.until(lambda: self.online.isdisjoint(devices), within_s)
+
+    async def event(self, device: str, *parts: str, within_s: float = PATIENCE_S) -> dict[str, Any]:
+        """Wait for an event of `device` whose text contains all `parts`; return it."""
+        await self.until(lambda: self.find_event(device, *parts), within_s)
+        event = self.find_event(device, *parts)
+        assert event is not None
+        return event
+
+    async def more_poses(
+        self, count: int = 20, within_s: float = PATIENCE_S
+    ) -> list[dict[str, Any]]:
+        """Wait for `count` further poses; return exactly these."""
         before = len(self.poses)
         await self.until(lambda: len(self.poses) >= before + count, within_s)
         return self.poses[before : before + count]
 
-    async def health(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Wait for a health message from now on that meets `condition`."""
+    async def poses_after(self, t_us: int, count: int = 1) -> list[dict[str, Any]]:
+        """Wait for `count` poses of instants after `t_us` (UNIX time, µs); return exactly these."""
+
+        def later() -> list[dict[str, Any]]:
+            return [pose for pose in self.poses[-20 * count :] if pose["t_us"] > t_us]
+
+        await self.until(lambda: len(later()) >= count)
+        return later()[:count]
+
+    async def health(
+        self, condition: Callable[[dict[str, Any]], object] = lambda _: True
+    ) -> dict[str, Any]:
+        """Wait for a further health message whose devices meet `condition`; return its devices."""
         before = self.healths
         await self.until(
             lambda: self.healths > before and condition(self.latest["bridge/health"]["devices"])
@@ -129,32 +176,41 @@ class Listener:
         devices: dict[str, Any] = self.latest["bridge/health"]["devices"]
         return devices
 
+    async def final_health(self) -> dict[str, Any]:
+        """Return the devices of a health message in which all are offline and no sample waits."""
+        await self.until(lambda: not self.online)
+        return await self.health(
+            lambda devices: not any(d["online"] or d["pending"] for d in devices.values())
+        )
+
     async def phase(self, name: str, seconds: float, *, force: bool = False) -> Any:
         """Run one phase of a calibration; return the status that ended it."""
         assert self.client is not None
         self.calibration.begin()
-        asked = {"phase": name, "seconds": seconds, "force": force}
-        answer = await self.client.request("calibrate", asked)
+        request = {"phase": name, "seconds": seconds, "force": force}
+        answer = await self.client.request("calibrate", request)
         assert answer["status"] == "accepted", answer
-        async with asyncio.timeout(seconds + 30):
+        async with asyncio.timeout(seconds + PATIENCE_S):
             return await self.calibration.wait_for_end(name)
 
 
 def sensors_in(pose: dict[str, Any]) -> set[str]:
-    """Return which sensors a pose was made from."""
+    """Return the sensors that contributed to a pose."""
     return {sensor for part in pose["segments"].values() for sensor in part["used"]}
 
 
 def knee_angles(poses: list[dict[str, Any]]) -> list[float]:
-    """Return the knee's inner angle of each pose that has one, deg."""
-    found = [pose["joints"]["knee"]["inner_deg"] for pose in poses]
-    return [angle for angle in found if angle is not None and math.isfinite(angle)]
+    """Return the known inner angles of the knee, deg."""
+    angles = [pose["joints"]["knee"]["inner_deg"] for pose in poses]
+    return [angle for angle in angles if angle is not None and math.isfinite(angle)]
 
 
 @contextlib.asynccontextmanager
-async def listening(port: int, base: str = BASE) -> AsyncIterator[Listener]:
-    """Yield somebody who listens to everything."""
-    listener = Listener(broker(port, base))
+async def listening(
+    port: int, base: str = BASE, topics: tuple[str, ...] = TOPICS
+) -> AsyncIterator[Listener]:
+    """Yield a listener."""
+    listener = Listener(broker(port, base), topics)
     task = asyncio.create_task(listener.run(), name="listener")
     try:
         yield listener
@@ -165,26 +221,26 @@ async def listening(port: int, base: str = BASE) -> AsyncIterator[Listener]:
 
 @dataclass
 class Station:
-    """A simulator and a daemon on its rig."""
+    """A simulator process and a daemon process on its rig."""
 
     folder: Path
     port: int
     options: tuple[str, ...] = ()
     more_toml: str = ""
-    """Appended to the rig.toml that the simulator wrote."""
+    """Appended to the rig.toml of the simulator."""
 
     @property
     def rig(self) -> Path:
-        """The daemon's rig.toml."""
+        """Path of the daemon's rig.toml."""
         return self.folder / "daemon.toml"
 
     @property
     def log(self) -> str:
-        """What the daemon wrote to its log."""
+        """Log of the daemon."""
         return (self.folder / "daemon.log").read_text("utf-8", "replace")
 
     def write_rig(self, *changes: tuple[str, str]) -> None:
-        """Write the simulator's rig for the daemon, each (old, new) replaced once."""
+        """Write the rig of the daemon: that of the simulator with each (old, new) replaced once."""
         text = (self.folder / "rig.toml").read_text(encoding="utf-8") + self.more_toml
         text = text.replace("[mqtt]\n", "[mqtt]\nhealth_s = 0.5\n")
         for old, new in changes:
@@ -195,7 +251,7 @@ class Station:
 
     @contextlib.asynccontextmanager
     async def simulator(self, *changes: tuple[str, str]) -> AsyncIterator[Simulator]:
-        """Yield virtual hardware that is ready; the rig is written."""
+        """Yield the simulator once it is ready and the daemon's rig is written."""
         async with simulator_child(self.folder, self.port, BASE, self.options) as child:
             await child.ready()
             self.write_rig(*changes)
@@ -203,14 +259,14 @@ class Station:
 
     @contextlib.asynccontextmanager
     async def daemon(self) -> AsyncIterator[ChildProcess]:
-        """Yield the daemon's process."""
+        """Yield the daemon process."""
         async with daemon_child(self.folder, self.rig) as child:
             yield child
 
 
 @contextlib.asynccontextmanager
 async def in_this_process(scene: Scene) -> AsyncIterator[None]:
-    """Run virtual hardware here, where a test can reach into it; raise what it raised."""
+    """Run simulated devices in this process, where a test can change them; raise their errors."""
     ready = asyncio.Event()
     task = asyncio.create_task(scene.run(lambda _: ready.set()), name="scene")
     try:
@@ -224,49 +280,48 @@ async def in_this_process(scene: Scene) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def running(
-    station: Station, within_s: float = 15.0
+    station: Station, within_s: float = PATIENCE_S
 ) -> AsyncIterator[tuple[Simulator, ChildProcess, Listener]]:
-    """Yield simulator, daemon and listener, all sources online."""
+    """Yield simulator, daemon and listener once all sources are online."""
     async with (
         station.simulator() as simulator,
         station.daemon() as daemon,
         listening(station.port) as listener,
     ):
-        wanted = {source.id for source in load_rig(station.rig).sources}
-        await listener.connected(wanted, within_s)
+        await listener.connected({source.id for source in load_rig(station.rig).sources}, within_s)
         yield simulator, daemon, listener
 
 
 async def stopped(
     daemon: ChildProcess, number: signal.Signals = signal.SIGTERM
 ) -> tuple[int, float]:
-    """Send a signal; return the exit code and how long it took, s."""
+    """Send a signal; return the exit code and the time until the exit, s."""
     assert daemon.process is not None
     began = time.monotonic()
     daemon.process.send_signal(number)
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE_S):
         code = await daemon.process.wait()
     return code, time.monotonic() - began
 
 
 def restore_signals() -> None:
-    """Let a child process be stopped, whoever started the tests: nohup and `&` ignore signals."""
+    """Reset the handlers of stop signals in a child process: nohup and `&` ignore signals."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
 
 def hang_up(daemon: ChildProcess) -> None:
-    """Ask for a reload."""
+    """Send SIGHUP: the daemon reloads its rig."""
     assert daemon.process is not None
     daemon.process.send_signal(signal.SIGHUP)
 
 
 def unbalanced(devices: dict[str, Any]) -> dict[str, dict[str, int]]:
-    """Return the devices whose samples do not add up, or wait for a verdict still."""
+    """Return the counters of devices whose outcomes do not add up, or with pending samples."""
     return {
-        name: {key: device[key] for key in ("received", *VERDICTS, "pending")}
+        name: {key: device[key] for key in ("received", *OUTCOMES, "pending")}
         for name, device in devices.items()
-        if device["received"] != sum(device[key] for key in VERDICTS) or device["pending"]
+        if device["received"] != sum(device[key] for key in OUTCOMES) or device["pending"]
     }
 
 

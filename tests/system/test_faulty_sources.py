@@ -1,4 +1,4 @@
-"""One daemon with almost everything wrong: each fault is named with its remedy, the rest runs."""
+"""A rig with a fault at almost every source: the daemon reports each with its remedy."""
 
 from __future__ import annotations
 
@@ -29,9 +29,11 @@ from jointfit_simulators.devices import (
 from jointfit_simulators.wires import PtyLine, SlcanAdapter
 from tests.system.station import (
     BASE,
+    PATIENCE_S,
     Listener,
     knee_angles,
     listening,
+    load_factor,
     sensors_in,
     store_calibration,
 )
@@ -47,10 +49,15 @@ pytestmark = pytest.mark.system
 PERIOD_NS = 10_000_000
 NMEA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
 MODEM = b"AT+CGMI\r\r\nERROR\r\n"
+"""Command of ModemManager and its echo."""
 MODEM_EVERY = 40
+"""Messages between two such commands."""
 SERVED_US, STALL_US = 200_000, 20_000
-"""Poses count whose hardware sent without a stall before and after: without samples the daemon
-rightly sends poses without sensors, and a loaded machine stops this process."""
+"""A pose is checked if the simulated devices sent without a pause longer than `STALL_US` from
+`SERVED_US` before to `SERVED_US` after it: on a loaded machine this process may stop sending, and
+poses without sensors are then correct."""
+APPEARS_S = 2.0
+"""Limit from the appearance of a port to the availability of its device, s."""
 SHARED = XcdiIds(0x105, 0x106, 0x121, status_word=None, error=None)
 MARKERS = ("T1", "T2", "T3", "C1", "C2", "C3")
 
@@ -98,27 +105,25 @@ baud = 921600
 """
 
 
-def _modem_in_between() -> Callable[[bytes], bytes]:
-    sent = 0
+def _modem_noise() -> Callable[[bytes], bytes]:
+    numbers = itertools.count(1)
 
     def noise(message: bytes) -> bytes:
-        nonlocal sent
-        sent += 1
-        return MODEM + message if sent % MODEM_EVERY == 0 else message
+        return MODEM + message if next(numbers) % MODEM_EVERY == 0 else message
 
     return noise
 
 
 @dataclass
-class Hardware:
-    """The devices at the daemon's ports; none is as its rig.toml says but good and modem."""
+class FaultyHardware:
+    """Devices at the daemon's ports; only `good` and `modem` agree with the rig.toml."""
 
     folder: Path
     server: NatNetServer = field(init=False)
 
     def __post_init__(self) -> None:
         self.good = XbusDevice(self.folder / "good")
-        self.modem = XbusDevice(self.folder / "modem", wire_noise=_modem_in_between())
+        self.modem = XbusDevice(self.folder / "modem", wire_noise=_modem_noise())
         self.slow = XbusDevice(
             self.folder / "slow", options=XbusDeviceOptions(baud=115_200, measures_at_once=True)
         )
@@ -139,25 +144,23 @@ class Hardware:
             for device in (self.good, self.modem, self.slow, self.bus, self.server):
                 tasks.create_task(device.run())
             tasks.create_task(self._play())
-            await self._appearing(tasks)
 
-    async def _appearing(self, tasks: asyncio.TaskGroup) -> None:
-        while self.absent is None:
-            await asyncio.sleep(0.01)
-        tasks.create_task(self.absent.run())
+            while self.absent is None:
+                await asyncio.sleep(0.01)
+            tasks.create_task(self.absent.run())
 
     async def _play(self) -> None:
         number, began_ns = 0, time.monotonic_ns()
         while True:
             number += 1
-            t_ns = began_ns + number * PERIOD_NS  # after a stall too: a sensor samples in time
+            t_ns = began_ns + number * PERIOD_NS  # a sensor samples on time, whatever the load
             await asyncio.sleep(max(0.0, (t_ns - time.monotonic_ns()) / 1e9))
             self._push(t_ns, 0.4 * math.sin(0.03 * number), number)
 
     def _push(self, t_ns: int, half: float, number: int) -> None:
-        """All sensors of the thigh rest but for their noise, those of the shank turn."""
+        """Send one sample of each device: the thigh rests apart from noise, the shank turns."""
         self.pushed_us.append(time.time_ns() // 1000)
-        noise = 1e-4 * math.sin(number)  # exactly the same again and again is a stuck sensor
+        noise = 1e-4 * math.sin(number)  # without noise the sensors would be reported as stuck
         rest = (math.cos(noise), math.sin(noise), 0.0, 0.0)
         turned = (math.cos(half), 0.0, math.sin(half), 0.0)
         resting: list[XbusDevice | XcdiDevice] = [self.good, self.slow, *self.twins]
@@ -187,11 +190,11 @@ class Hardware:
 
 
 @contextlib.asynccontextmanager
-async def plugged_in(folder: Path) -> AsyncIterator[Hardware]:
-    hardware = Hardware(folder)
+async def plugged_in(folder: Path) -> AsyncIterator[FaultyHardware]:
+    hardware = FaultyHardware(folder)
     running = asyncio.create_task(hardware.run(), name="hardware")
     held = os.open(folder / "taken", os.O_RDWR | os.O_NOCTTY)
-    fcntl.flock(held, fcntl.LOCK_EX)  # as another program holds it
+    fcntl.flock(held, fcntl.LOCK_EX)  # as a program that uses the port
     try:
         yield hardware
     finally:
@@ -222,17 +225,17 @@ EXPECTED = {
 }
 
 
-@pytest.mark.timeout(60)
-async def test_each_fault_is_named_with_its_remedy_and_the_rest_runs(
+@pytest.mark.timeout(180)
+async def test_each_faulty_source_is_reported_with_a_remedy_while_the_others_work(
     tmp_path: Path, broker: Broker
 ) -> None:
     async with plugged_in(tmp_path) as hardware, listening(broker.port) as listener:
         rig = write_rig(tmp_path, broker.port, hardware.server.command_port)
         store_calibration(rig, tmp_path / "state")
         async with daemon(tmp_path, rig) as child:
-            await listener.until(
-                lambda: all(listener.said(name, *parts) for name, parts in EXPECTED.items()), 25
-            )
+            for name, parts in EXPECTED.items():
+                await listener.event(name, *parts)
+
             poses = await served_poses(hardware, listener, 100)
             lacking = [pose for pose in poses if not {"good", "modem"} <= sensors_in(pose)]
             assert not lacking, lacking[-1]
@@ -240,20 +243,25 @@ async def test_each_fault_is_named_with_its_remedy_and_the_rest_runs(
             angles = knee_angles(poses)
             assert len(angles) == len(poses)
             assert max(angles) - min(angles) > 5
-            await appears(hardware, listener)
-            devices = await listener.health(lambda d: d["modem"]["received"] > 3 * MODEM_EVERY)
+
+            await plug_absent(hardware, listener)
+            devices = await listener.health(
+                lambda d: d["modem"]["received"] > 3 * MODEM_EVERY and d["twin"]["corrupt"] > 20
+            )
             assert devices["modem"]["corrupt"] >= 3
             assert devices["modem"]["lost"] == 0
-            assert devices["twin"]["received"] < 20 < devices["twin"]["corrupt"]
-            assert {"good", "modem", "mocap"} <= listener.online
+            assert devices["twin"]["received"] < 20
+            await listener.connected({"good", "modem", "mocap"})
             assert not {"slow", "gps", "taken", "mute"} & listener.online
             child.check()
 
 
-async def served_poses(hardware: Hardware, listener: Listener, count: int) -> list[dict[str, Any]]:
-    """Return the poses from now on for which the hardware sent its samples without a stall."""
+async def served_poses(
+    hardware: FaultyHardware, listener: Listener, count: int
+) -> list[dict[str, Any]]:
+    """Return further poses around which the devices sent their samples without a pause."""
     began, found = len(listener.poses), list[dict[str, Any]]()
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE_S):
         while len(found) < count:
             await listener.more_poses(count)
             await asyncio.sleep(SERVED_US / 1e6)
@@ -261,10 +269,10 @@ async def served_poses(hardware: Hardware, listener: Listener, count: int) -> li
     return found
 
 
-async def appears(hardware: Hardware, listener: Listener) -> None:
-    """A port that was absent is used within two seconds of its coming."""
+async def plug_absent(hardware: FaultyHardware, listener: Listener) -> None:
+    """Create the missing port and check that its device is used within `APPEARS_S`."""
     hardware.absent = XbusDevice(hardware.folder / "absent")
-    await listener.until(lambda: "absent" in listener.online, 2.0)
-    (pose,) = await listener.more_poses(1)
-    await listener.until(lambda: "absent" in sensors_in(listener.poses[-1]), 1.0)
+    await listener.connected({"absent"}, APPEARS_S * load_factor())
+    await listener.until(lambda: "absent" in sensors_in(listener.poses[-1]))
+    pose = (await served_poses(hardware, listener, 1))[0]
     assert {"good", "modem"} <= sensors_in(pose)

@@ -81,7 +81,7 @@ async def errors_deg(scene: Scene, listener: Listener, folder: Path) -> dict[str
     return {n: math.degrees(np.sqrt(np.mean(np.square(angles)))) for n, angles in off.items()}
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(180)
 async def test_a_chain_of_three_with_six_sensors_is_calibrated_followed_and_put_on_anew(
     tmp_path: Path, broker: Broker
 ) -> None:

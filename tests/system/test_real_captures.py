@@ -1,37 +1,33 @@
-"""What real devices sent, at its own timing, through the real daemon: the known counts come out.
+"""Recordings of real devices, replayed at their timing through the daemon process.
 
-The recorded Xsens messages go into a pty after a handshake, the recorded NatNet frames into a
-socket; every count is read where a user reads it, at the broker.
+The recorded Xsens messages are written to a pty after a handshake, the recorded NatNet frames to a
+socket. The counters are read from the health messages.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.files.captures._packet_capture import read_udp
-from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon
 from jointfit_simulators.devices._natnet_replay import NatNetReplay
 from jointfit_simulators.devices._xbus_replay import XbusReplay
+from tests.system.station import OUTCOMES, TOPICS, Listener, listening
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from tests.broker_fixture import Broker
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
 BASE = "jointfit/captures"
-TOPICS = ("bridge/health", "bridge/event", "bridge/log", "device/+/info", "device/+/availability")
-VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
 RIG = """
 [rig]
 name = "captures"
@@ -62,50 +58,20 @@ rigid_body.thigh = "RaceQuad"
 """
 
 
-class Heard:
-    """The newest of every topic, and all that was told."""
-
-    def __init__(self) -> None:
-        self.latest: dict[str, Any] = {}
-        self.texts: list[str] = []
-
-    async def listen(self, client: MqttClient) -> None:
-        async for topic, payload in client.messages():
-            self.latest[topic] = payload
-            if topic in {"bridge/event", "bridge/log"}:
-                self.texts.append(json.dumps(payload))
-
-    def device(self, name: str) -> dict[str, Any]:
-        health = self.latest.get("bridge/health", {"devices": {}})
-        found: dict[str, Any] = health["devices"].get(name, {})
-        return found
-
-    async def until(self, condition: Callable[[], object], within_s: float = 15.0) -> None:
-        try:
-            async with asyncio.timeout(within_s):
-                while not condition():
-                    await asyncio.sleep(0.05)
-        except TimeoutError:
-            told = "\n".join(self.texts)
-            raise AssertionError(f"{self.latest.get('bridge/health')}\n{told}") from None
-
-
 @asynccontextmanager
 async def gateway(
     folder: Path, broker: Broker, device: XbusReplay, server: NatNetReplay | None = None
-) -> AsyncIterator[Heard]:
-    """Run the daemon on a device and perhaps a server of recordings; yield what is heard of it."""
+) -> AsyncIterator[Listener]:
+    """Run the daemon on replayed recordings of an IMU and, optionally, a camera server."""
     rig = folder / "rig.toml"
     mocap = MOCAP.format(port=server.command_port) if server else ""
     rig.write_text(RIG.format(port=folder / "imu", mocap=mocap, broker=broker.port))
-    heard = Heard()
-    async with MqttClient(MqttSettings(host="127.0.0.1", port=broker.port, base=BASE)) as client:
-        await client.subscribe(*TOPICS)
-        tasks = [asyncio.create_task(heard.listen(client)), asyncio.create_task(device.run())]
+    async with listening(broker.port, BASE, (*TOPICS, "device/+/info")) as listener:
+        tasks = [asyncio.create_task(device.run())]
         tasks += [asyncio.create_task(server.run())] if server else []
         try:
             async with daemon(folder, rig):
-                yield heard
+                yield listener
         finally:
             for task in tasks:
                 task.cancel()
@@ -115,55 +81,70 @@ async def gateway(
                 server.unplug()
 
 
+async def read_infos(listener: Listener, *names: str) -> list[dict[str, Any]]:
+    """Wait for the info messages of devices; return them."""
+    topics = [f"device/{name}/info" for name in names]
+    await listener.until(lambda: all(topic in listener.latest for topic in topics))
+    return [listener.latest[topic] for topic in topics]
+
+
 def xsens(shared_data: Path, number: int) -> bytes:
     return (shared_data / "imu" / "xsens" / f"{number}.output.bin").read_bytes()
 
 
-async def test_real_quaternions_and_real_camera_frames_are_counted_to_the_last_one(
+async def test_samples_of_recorded_imu_and_camera_streams_are_all_counted(
     tmp_path: Path, shared_data: Path, broker: Broker
 ) -> None:
     device = XbusReplay(tmp_path / "imu", xsens(shared_data, 5))
     traffic = shared_data / "mocap/natnet_v3_mje-nz/test_data/raw/traffic.pcapng"
     server = NatNetReplay((p.t_ns, p.payload) for p in read_udp(traffic.read_bytes()))
-    async with gateway(tmp_path, broker, device, server) as heard:
+    async with gateway(tmp_path, broker, device, server) as listener:
         began = time.monotonic()
         await device.play()
         took_s = time.monotonic() - began
-        await heard.until(lambda: heard.device("mocap").get("received") == 518)
-        await heard.until(lambda: heard.device("S1").get("pending") == 0)
-        imu, mocap = heard.device("S1"), heard.device("mocap")
-        infos = {name: heard.latest[f"device/{name}/info"] for name in ("S1", "mocap")}
+        devices = await listener.health(
+            lambda devices: (
+                devices["mocap"]["received"] == 518
+                and devices["S1"]["received"] == 92
+                and devices["S1"]["pending"] == 0
+            )
+        )
+        imu_info, mocap_info = await read_infos(listener, "S1", "mocap")
+
     assert device.messages == device.sent == 100
-    assert took_s > 0.92  # its own timing
-    assert imu["received"] == sum(imu[verdict] for verdict in VERDICTS) == 92
-    for count in ("lost", "restarts", "corrupt", "discarded_bytes", "late", "duplicate"):
-        assert imu[count] == 0, count
+    assert took_s > 0.92  # the timing of the recording
     assert server.sent == server.frames == 518
-    assert mocap["received"] == sum(mocap[verdict] for verdict in VERDICTS) == 518
-    for count in ("lost", "restarts", "corrupt", "discarded_bytes", "late", "duplicate"):
-        assert mocap[count] == 0, count
-    said = infos["S1"]
-    assert (said["serial"], said["model"]) == ("0360A1B2", "MTi-3-8A7G6")
-    assert said["outputs"]["0x2010"] == 100
-    said = infos["mocap"]
-    assert (said["model"], said["firmware"], said["natnet"]) == ("Motive", "2.1.0.0", "3.0.0.0")
-    assert said["clock_hz"] == 3_312_787
-    assert said["bodies"] == ["RaceQuad"]
-    assert said["markers"] == [f"Marker{number}" for number in range(1, 6)]
+    for name, received in (("S1", 92), ("mocap", 518)):
+        counts = devices[name]
+        assert sum(counts[outcome] for outcome in (*OUTCOMES, "pending")) == received
+        for count in ("lost", "restarts", "corrupt", "discarded_bytes", "late", "duplicate"):
+            assert counts[count] == 0, (name, count)
+
+    assert (imu_info["serial"], imu_info["model"]) == ("0360A1B2", "MTi-3-8A7G6")
+    assert imu_info["outputs"]["0x2010"] == 100
+    assert mocap_info["model"] == "Motive"
+    assert (mocap_info["firmware"], mocap_info["natnet"]) == ("2.1.0.0", "3.0.0.0")
+    assert mocap_info["clock_hz"] == 3_312_787
+    assert mocap_info["bodies"] == ["RaceQuad"]
+    assert mocap_info["markers"] == [f"Marker{number}" for number in range(1, 6)]
 
 
 @pytest.mark.parametrize("number", [1, 3])
-async def test_a_real_stream_without_quaternions_gives_no_sample_and_no_corruption(
+async def test_recorded_stream_without_quaternions_yields_neither_samples_nor_corrupt_bytes(
     tmp_path: Path, shared_data: Path, broker: Broker, number: int
 ) -> None:
     device = XbusReplay(tmp_path / "imu", xsens(shared_data, number))
-    async with gateway(tmp_path, broker, device) as heard:
+    async with gateway(tmp_path, broker, device) as listener:
         await device.play()
         assert device.sent == 100
-        await heard.until(lambda: any("silent for 1 s" in text for text in heard.texts))
-        await heard.until(lambda: heard.device("S1").get("last_age_ms") is not None)
-        imu = heard.device("S1")
-        assert heard.latest["device/S1/info"]["serial"] == "0360A1B2"
-    assert imu["online"] is False
+        await listener.event("S1", "silent for 1 s")
+        devices = await listener.health(
+            lambda devices: (
+                devices["S1"]["last_age_ms"] is not None and devices["S1"]["online"] is False
+            )
+        )
+        (info,) = await read_infos(listener, "S1")
+
+    assert info["serial"] == "0360A1B2"
     for count in ("received", "lost", "restarts", "corrupt", "discarded_bytes"):
-        assert imu[count] == 0, count
+        assert devices["S1"][count] == 0, count

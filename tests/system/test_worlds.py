@@ -112,7 +112,7 @@ async def knee_error_deg(listener: Listener, folder: Path) -> float:
     return score.flexion.rms
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(180)
 async def test_worlds_a_right_angle_apart_are_aligned_or_the_assumption_is_said(
     tmp_path: Path, broker: Broker
 ) -> None:
