@@ -36,7 +36,7 @@ LONGEST_S = 600.0
 """Longest phase that can be requested, s, as in the request's schema."""
 ORDER = ("align", "static", "functional")
 IMMEDIATE_REQUESTS = {
-    "abort": "aborted; current state: ",
+    "abort": "no phase is running now; current state: ",
     "revert": "online learning reverted; current state: ",
 }
 INSTRUCTIONS = {
@@ -103,6 +103,8 @@ def calibrate(
         )
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
+    if abort and phase:
+        raise ValueError("--abort ends the running phase: omit --phase")
 
     rig = load_rig(config)
     default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
@@ -234,6 +236,7 @@ async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator
     from rich.progress import Progress
     from rich.text import Text
 
+    from jointfit_daemon.outputs.mqtt import BrokerLostError
     from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker
     from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines
 
@@ -256,7 +259,20 @@ async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator
                 typer.echo(line, err=True)
 
         tracker = PhaseTracker(show, show_details)
-        listener = asyncio.create_task(_listen(client, tracker, console), name="calibrate listener")
+
+        async def listen() -> None:
+            try:
+                async for topic, payload in client.messages():
+                    if isinstance(payload, dict) and (
+                        line := handle_message(tracker, topic, payload)
+                    ):
+                        console.print(line, markup=False, highlight=False, soft_wrap=True)
+            except BrokerLostError as lost:
+                tracker.fail(lost)
+            except (OSError, SystemExit) as error:  # rich converts a broken pipe into SystemExit
+                tracker.fail(OutputLostError(str(error)))
+
+        listener = asyncio.create_task(listen(), name="calibrate listener")
         try:
             yield tracker
         finally:
@@ -264,45 +280,25 @@ async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator
             await asyncio.wait([listener])
 
 
-async def _listen(client: MqttClient, tracker: PhaseTracker, console: Console) -> None:
-    from jointfit_daemon.outputs.mqtt import BrokerLostError
-
-    try:
-        async for topic, payload in client.messages():
-            if isinstance(payload, dict) and (line := _handle_message(tracker, topic, payload)):
-                console.print(line, markup=False, highlight=False, soft_wrap=True)
-    except BrokerLostError as lost:
-        tracker.fail(lost)
-    except (OSError, SystemExit) as error:  # rich converts a broken pipe into SystemExit
-        tracker.fail(OutputLostError(str(error)))
-
-
-def _handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -> str | None:
+def handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -> str | None:
     """Pass a message to the tracker; return a line that must be shown at once, if any."""
-    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseAbortedError
-
     text = str(payload.get("text", ""))
     if topic == "calibration":
         tracker.on_status(payload)
         return None if sys.stderr.isatty() else f"{payload.get('phase')}: {text}"
     if topic == "calibration/progress":
         tracker.on_progress(payload)
-    elif topic == "bridge/state" and payload.get("state") != "online":
-        tracker.fail(
-            PhaseAbortedError(
-                "the daemon is offline: check that jointfitd runs and reaches the broker"
-            )
-        )
-    elif topic == "bridge/event" and _is_urgent(payload):
-        if text == tracker.status.get("text") and not sys.stderr.isatty():
-            return None  # the status line contains the same text
-        return f"{payload.get('id')}: {text}"
-    return None
+        return None
+    if topic == "bridge/state":
+        return tracker.on_state(payload.get("state"))
 
-
-def _is_urgent(event: dict[str, Any]) -> bool:
-    level = ("warning", "error") if event.get("kind") == "device" else ("error",)
-    return event.get("kind") in ("device", "calibration") and event.get("level") in level
+    # Events of the calibration at level "warning" repeat the status line.
+    urgent = {"device": ("warning", "error"), "calibration": ("error",)}
+    if payload.get("level") not in urgent.get(str(payload.get("kind")), ()):
+        return None
+    if text == tracker.status.get("text") and not sys.stderr.isatty():
+        return None  # the status line contains the same text
+    return f"{payload.get('id')}: {text}"
 
 
 async def _wait_for_enter() -> None:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 STORING_S = 1.5
 """Longest wait for the version number of a stored result, s."""
+OFFLINE_S = 60.0
+"""Longest wait for a daemon that is offline, s: more than a restart takes on a Raspberry Pi."""
 
 
 class PhaseAbortedError(Exception):
@@ -36,7 +38,12 @@ class PhaseTracker:
     status: Mapping[str, Any] = field(default_factory=dict)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
     _unread: list[Mapping[str, Any]] = field(default_factory=list)
+    """Status messages to process; one without a phase marks an interruption."""
     _failure: Exception | None = None
+    _waiting: bool = False
+    """Whether a task waits for the end of a phase."""
+    _offline_until: float | None = None
+    """End of the wait for the daemon, s of the event loop; None while it is online."""
 
     def on_status(self, payload: Mapping[str, Any]) -> None:
         """Process a message of topic ``calibration``."""
@@ -51,6 +58,22 @@ class PhaseTracker:
         if self.show_details is not None:
             self.show_details(payload.get("data") or {})
 
+    def on_state(self, state: object) -> str | None:
+        """Process the state in a message of topic ``bridge/state``; return a line for the user."""
+        before = self._offline_until
+        if state == "online":
+            self._offline_until = None
+            return "the daemon is online again" if before is not None and self._waiting else None
+        if before is not None:
+            return None
+
+        self._offline_until = asyncio.get_running_loop().time() + OFFLINE_S
+        if not self._waiting:
+            return None
+        self._unread.append({})
+        self._changed.set()
+        return f"the daemon is offline: waiting up to {OFFLINE_S:g} s for it"
+
     def fail(self, error: Exception) -> None:
         """Report that no further messages will arrive; waiting tasks raise `error`."""
         self._failure = error
@@ -60,6 +83,7 @@ class PhaseTracker:
         """Discard the messages received so far."""
         self._unread.clear()
         self._changed.clear()
+        self._waiting = False
 
     async def wait_for_end(self, phase: str) -> Mapping[str, Any]:
         """Wait until `phase` has begun and ended; return the status message that ended it.
@@ -69,18 +93,31 @@ class PhaseTracker:
         Raises
         ------
         PhaseAbortedError
-            The daemon aborted the phase; the message gives its reason.
+            The daemon aborted the phase, was restarted, or was offline for `OFFLINE_S`; the message
+            gives the reason.
         """
-        began = False
+        began, interrupted, version = False, False, self.status.get("version")
+        self._waiting = True
         while True:
             for status in self._unread:
                 current = status.get("phase")
-                if current == phase:
-                    began = True
+                if current is None:
+                    began = interrupted = True
+                elif current == phase:
+                    began, version = True, status.get("version")
                 elif began and current == "aborted":
                     why = status.get("text", "no reason given")
                     raise PhaseAbortedError(f"{phase} was aborted: {why}")
                 elif began and current != "fitting":
+                    # A completed phase changes the version, or gives a reason why it does not.
+                    restored = current == "calibrated" and status.get("version") == version
+                    if interrupted and (
+                        current == "uncalibrated"
+                        or (restored and version is not None and status.get("kept") is None)
+                    ):
+                        raise PhaseAbortedError(
+                            f"{phase} was lost when the daemon was restarted: repeat it"
+                        )
                     return status
             self._unread.clear()
             await self._next_message()
@@ -98,6 +135,13 @@ class PhaseTracker:
         if self._failure is not None:
             raise self._failure
         self._changed.clear()
-        await self._changed.wait()
+        try:
+            async with asyncio.timeout_at(self._offline_until):
+                await self._changed.wait()
+        except TimeoutError as late:
+            raise PhaseAbortedError(
+                f"the daemon was offline for {OFFLINE_S:g} s: check that jointfitd runs and reaches"
+                " the broker"
+            ) from late
         if self._failure is not None:
             raise self._failure

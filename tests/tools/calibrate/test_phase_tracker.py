@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -16,6 +17,9 @@ from jointfit_daemon.tools.calibrate import (
     movement_lines,
     report,
 )
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 def tracker_after(*phases: str) -> PhaseTracker:
@@ -122,7 +126,57 @@ def test_result_that_is_not_stored_is_printed_once(
     one, text = tracker_after(), "in force but not stored: no space left"
     event = {"kind": "calibration", "level": "error", "id": "bench", "text": text}
     printed = [
-        _command._handle_message(one, "calibration", {"phase": "calibrated", "text": text}),
-        _command._handle_message(one, "bridge/event", event),
+        _command.handle_message(one, "calibration", {"phase": "calibrated", "text": text}),
+        _command.handle_message(one, "bridge/event", event),
     ]
     assert sum(line is not None for line in printed) == 1
+
+
+async def interrupted(phase: str, *states: Mapping[str, object]) -> object:
+    """Return the status that ends `phase` if the daemon was offline before `states`."""
+    one = tracker_after("calibrated", phase)
+    waiting = asyncio.create_task(one.wait_for_end(phase))
+    await asyncio.sleep(0)
+    assert one.on_state("offline") == "the daemon is offline: waiting up to 60 s for it"
+    assert one.on_state("offline") is None  # said once
+    for status in states:
+        one.on_status(status)
+    assert one.on_state("online") == "the daemon is online again"
+    async with asyncio.timeout(5):
+        return await waiting
+
+
+async def test_phase_goes_on_after_the_daemon_was_offline_briefly() -> None:
+    running = {"phase": "functional", "version": 1}  # the retained status, sent again
+    ended = {"phase": "calibrated", "version": None}
+    assert await interrupted("functional", running, ended) is ended
+
+
+async def test_phase_may_end_while_the_daemon_is_offline() -> None:
+    rejected = {"phase": "calibrated", "version": 1, "kept": "worse than version 1"}
+    assert await interrupted("functional", rejected) is rejected
+    posed = {"phase": "posed", "version": None}
+    assert await interrupted("static", posed) is posed
+
+
+@pytest.mark.parametrize(
+    "state", [{"phase": "uncalibrated"}, {"phase": "calibrated", "version": 1}]
+)
+async def test_restart_of_the_daemon_loses_the_phase(state: dict[str, object]) -> None:
+    with pytest.raises(PhaseAbortedError, match="static was lost when the daemon was restarted"):
+        await interrupted("static", state)
+
+
+async def test_wait_for_an_offline_daemon_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_phase_tracker, "OFFLINE_S", 0.05)
+    one = tracker_after("static")
+    asyncio.get_running_loop().call_later(0.01, one.on_state, "offline")
+    with pytest.raises(
+        PhaseAbortedError, match=r"was offline for 0\.05 s: check that jointfitd runs"
+    ):
+        await one.wait_for_end("static")
+
+
+async def test_state_of_the_daemon_between_phases_is_not_reported() -> None:
+    one = PhaseTracker(lambda *_: None)
+    assert [one.on_state(state) for state in ("online", "offline", "online")] == [None] * 3
