@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 64 * 1024 * 1024
 """Size of the largest file that is read; a calibration of four sensors has about 1 MB."""
+LAST_VERSION = 999_999_999
+"""Largest version number: file names of more than nine digits are not read."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP)
 _NUMBERED = re.compile(r"(\d{4,9})\.json")
 _TAKEN = re.compile(r"(\d{4,9})\.json(\.bad\d*)?")
@@ -100,7 +102,7 @@ class CalibrationStore:
         Raises
         ------
         OSError
-            The medium is full, read-only or missing; nothing was changed.
+            The medium is full, read-only or missing, or `LAST_VERSION` is used; nothing changed.
         """
         self._directory.mkdir(parents=True, exist_ok=True)
         content = calibration.to_dict()
@@ -123,6 +125,11 @@ class CalibrationStore:
         names = (_TAKEN.fullmatch(path.name) for path in self._directory.iterdir())
         version = max((int(match[1]) for match in names if match), default=0) + 1
         while True:
+            if version > LAST_VERSION:
+                raise OSError(
+                    f"{self._directory}: version {LAST_VERSION} is the last possible number: move"
+                    " the file of that number to another directory"
+                )
             try:
                 os.link(aside, self.path(version))
             except FileExistsError:  # another process used this number

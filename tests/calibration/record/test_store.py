@@ -123,6 +123,19 @@ def test_a_version_of_another_process_is_never_overwritten(
     assert ours.load(2).created_utc == "theirs"
 
 
+def test_last_version_number_is_followed_by_no_other(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path, "s")
+    store.save(numbered("first"))
+    (tmp_path / "s" / "0001.json").rename(tmp_path / "s" / "999999998.json")
+    assert store.save(numbered("last")) == 999_999_999
+    with pytest.raises(OSError, match="version 999999999 is the last possible number: move"):
+        store.save(numbered("beyond"))
+    assert store.versions() == [999_999_998, 999_999_999]
+    latest = store.latest()
+    assert latest is not None
+    assert latest.calibration.created_utc == "last"
+
+
 def test_a_file_system_without_links_still_stores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
