@@ -19,10 +19,13 @@ from jointfit_daemon.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from jointfit_daemon.driver import Decoder, Driver
     from jointfit_daemon.model import Decoded
+
+SHOWN = 60
+"""Most characters of a setting quoted in a message."""
 
 
 @dataclass(slots=True)
@@ -60,6 +63,20 @@ class CaptureSummary:
         self.first_quaternion = self.first_quaternion or q
         self.last_quaternion = q
 
+    def table(self, decoder: Decoder) -> dict[str, object]:
+        """Return the counts of decoder and items by name."""
+        found: dict[str, object] = {
+            "messages": decoder.messages,
+            "corrupt": self.corrupt,
+            "discarded_bytes": decoder.discarded_bytes,
+            "quaternions": self.quaternions,
+            "first_quaternion": self.first_quaternion,
+            "last_quaternion": self.last_quaternion,
+            "time_resets": self.time_resets,
+            "counter_gaps": self.counter_gaps,
+        }
+        return found | ({"mocap_frames": self.frames} if self.frames else {})
+
 
 def decode(
     protocol: Annotated[str, typer.Argument(help="Driver: xbus, xcdi, natnet, or another.")],
@@ -79,9 +96,14 @@ def decode(
 
     driver = find_driver(protocol)
     decoder = driver(_settings(driver, protocol, setting or [])).decoder()
-    chunks = read_capture(file, driver.wire)
     counts = CaptureSummary()
-    for item in _items(decoder, chunks):
+
+    def items() -> Iterator[Decoded]:
+        for chunk in read_capture(file, driver.wire):
+            yield from decoder.feed(chunk)
+        yield from decoder.flush()
+
+    for item in items():
         counts.add(item)
         if jsonl:
             row = orjson.dumps(_row(item), default=str, option=orjson.OPT_SERIALIZE_NUMPY)
@@ -93,90 +115,63 @@ def decode(
             f"{file}: no message of protocol {protocol} found: select the driver of the recorded"
             " device, and set CAN identifiers and other settings with --set"
         )
-    found = _found(decoder, counts)
+
+    found = counts.table(decoder)
     if summary:
         typer.echo(orjson.dumps(found))
     else:
         _print_table(found, counts.warnings)
 
 
-def _print_table(found: Mapping[str, object], warnings: list[str]) -> None:
+def _print_table(found: dict[str, object], warnings: list[str]) -> None:
     for key, value in found.items():
-        typer.echo(f"{key:18} {_cell(value)}")
-    if explanation := _explanation(found):
-        typer.echo(explanation, err=True)
+        if isinstance(value, tuple):
+            cell = "  ".join(f"{part:.6f}" for part in value)
+        else:
+            cell = "-" if value is None else str(value)
+        typer.echo(f"{key:18} {cell}")
+    if not found["quaternions"]:
+        typer.echo("no orientation found: configure the device to send quaternions", err=True)
     for text in dict.fromkeys(warnings):
         typer.echo(f"warning: {text}", err=True)
 
 
-def _cell(value: object) -> str:
-    if isinstance(value, tuple):
-        return "  ".join(f"{part:.6f}" for part in value)
-    return "-" if value is None else str(value)
-
-
-def _explanation(found: Mapping[str, object]) -> str | None:
-    """Return an explanation if the capture has no orientation."""
-    if not found["quaternions"]:
-        return "no orientation found: configure the device to send quaternions"
-    return None
-
-
-def _items(decoder: Decoder, chunks: Any) -> Iterator[Decoded]:
-    for chunk in chunks:
-        yield from decoder.feed(chunk)
-    yield from decoder.flush()
-
-
-def _found(decoder: Decoder, counts: CaptureSummary) -> dict[str, object]:
-    found: dict[str, object] = {
-        "messages": decoder.messages,
-        "corrupt": counts.corrupt,
-        "discarded_bytes": decoder.discarded_bytes,
-        "quaternions": counts.quaternions,
-        "first_quaternion": counts.first_quaternion,
-        "last_quaternion": counts.last_quaternion,
-        "time_resets": counts.time_resets,
-        "counter_gaps": counts.counter_gaps,
-    }
-    return found | ({"mocap_frames": counts.frames} if counts.frames else {})
-
-
 def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
     """Return driver settings for decoding; required keys of the connection get placeholders."""
-    import tomllib
-
-    from pydantic import ValidationError
+    from pydantic import BaseModel, ValidationError
 
     from jointfit_daemon.config import faults_of
+    from jointfit_daemon.files.text import MAX_NESTING, find_structure_fault, parse_toml
 
     given: dict[str, Any] = {"driver": name}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals:
-            message = f"--set {pair}: expected KEY=VALUE"
-            raise ValueError(message)
+            raise ValueError(f"--set {pair}: expected KEY=VALUE")
         try:
-            given |= tomllib.loads(f"{key} = {value}")
-        except (ValueError, RecursionError):  # a bare word is text
-            given[key] = value
+            table = parse_toml(f"{key} = {value}")
+        except RecursionError:
+            raise ValueError(
+                f"--set {key[:SHOWN]}: nested more than {MAX_NESTING} levels deep"
+            ) from None
+        except ValueError:  # a bare word is text
+            table = {key: value}
+        if fault := find_structure_fault(table):
+            raise ValueError(f"--set {fault}")
+        given |= table
+
     for key, info in driver.Settings.model_fields.items():
         if info.is_required() and key not in given:
-            given[key] = _placeholder(info.annotation)
+            kinds = [info.annotation, *get_args(info.annotation)]
+            if any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds):
+                given[key] = {"interface": "virtual", "channel": "file"}
+            else:
+                given[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(given)
     except ValidationError as error:
         faults = faults_of(error, driver.Settings, name)
         raise ValueError("; ".join(fault.text() for fault in faults)) from None
-
-
-def _placeholder(annotation: Any) -> Any:
-    from pydantic import BaseModel
-
-    kinds = [annotation, *get_args(annotation)]
-    if any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds):
-        return {"interface": "virtual", "channel": "file"}
-    return "file" if str in kinds else 1
 
 
 def _row(item: Decoded) -> dict[str, object]:
