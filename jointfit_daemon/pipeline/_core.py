@@ -12,7 +12,6 @@ from jointfit_daemon.config import drifting_imus, heading_warning
 from jointfit_daemon.fusion import LimbFuser, SensorMonitor
 from jointfit_daemon.model import Corrupt, DeviceEvent, FusionMode, ImuSample, SyncState
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
-from jointfit_daemon.pipeline._health import core_health
 from jointfit_daemon.pipeline._mocap_router import MocapRouter
 from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_notices
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
@@ -32,6 +31,7 @@ from jointfit_daemon.pipeline.events import (
     Tick,
     UnixOffset,
 )
+from jointfit_daemon.pipeline.health import CoreHealth, FrameCounts
 from jointfit_daemon.pipeline.online_learning import OnlineFrameCollector, only_models_differ
 from jointfit_daemon.pipeline.sources import (
     LagMonitor,
@@ -111,22 +111,25 @@ class Core:
         """Latest host time of the next ``Tick``; None before the configuration."""
         return None if self._rig is None else self._aligner.next_deadline_ns
 
-    def health(self, now_ns: int) -> dict[str, object]:
-        """Return the core's part of ``bridge/health`` as JSON values."""
+    def health(self, now_ns: int) -> CoreHealth:
+        """Return the core's part of ``bridge/health``."""
         if self._grid is None:
-            return {"devices": {}, "frames": {}, "calibration": {}, "learning": {}}
+            return CoreHealth()
 
-        counts = {"mocap": self._mocap.counts()} | self._grid.counts()
-        lags = {} if self._lags is None else self._lags.health()
-        return core_health(self._sources, counts, self._session, self._fuser, now_ns) | {
-            "lags": lags,
-            "frames": {
-                "sent": self._seq,
-                "empty": self._empty,
-                "skipped": self._aligner.skipped_frames,
+        fuser, session = self._fuser, self._session
+        samples = {"mocap": self._mocap.counts()} | self._grid.counts()
+        return CoreHealth(
+            devices={
+                name: state.health(now_ns, samples[name], fuser.sensor_monitor)
+                for name, state in self._sources.items()
             },
-            "learning": self._session.refits.health(self._collector, now_ns),
-        }
+            phase=session.phase,
+            version=session.version,
+            fusion={} if fuser.consistency is None else fuser.consistency.health(),
+            lags={} if self._lags is None else self._lags.health(),
+            frames=FrameCounts(self._seq, self._empty, self._aligner.skipped_frames),
+            learning=session.refits.health(self._collector, now_ns),
+        )
 
     # --- configuration -----------------------------------------------------------------------
 

@@ -10,13 +10,13 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from jointfit_daemon.model import LimbState
 from jointfit_daemon.pipeline.events import Tick, UnixOffset
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.sink import Sink
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.health import CoreHealth
 
 LONGEST_TICK_INTERVAL_NS = 100_000_000
 """Longest time without an event for the core, ns."""
@@ -35,7 +35,7 @@ class CoreInterface(Protocol):
     def feed(self, event: Event) -> list[Output]:
         """Process one event and return its outputs."""
 
-    def health(self, now_ns: int) -> dict[str, object]:
+    def health(self, now_ns: int) -> CoreHealth:
         """Return counters and clock estimates."""
 
 
@@ -52,8 +52,6 @@ class CoreRunner:
 
     def __init__(self, core: CoreInterface, clock: UnixClock) -> None:
         self.core = core
-        self.states = 0
-        """Number of limb states so far."""
         self._sinks: list[Sink] = []
         self._fed_ns = time.monotonic_ns()
         self._loop = asyncio.get_running_loop()
@@ -78,8 +76,6 @@ class CoreRunner:
 
         self._fed_ns = time.monotonic_ns()
         for output in self.core.feed(event):
-            if isinstance(output, LimbState):
-                self.states += 1
             for sink in self._sinks:
                 sink.output(output)
         self._arm()

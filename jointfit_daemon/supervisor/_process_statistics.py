@@ -10,6 +10,8 @@ import time
 from collections import deque
 from pathlib import Path
 
+from jointfit_daemon.outputs.payloads import ProcessHealth
+
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _STATM = Path("/proc/self/statm")
 _DELAYS = 600
@@ -17,7 +19,7 @@ _DELAYS = 600
 
 
 class ProcessStatistics:
-    """Statistics of this process since the last call of `figures`."""
+    """Statistics of this process since the last call of `health`."""
 
     def __init__(self) -> None:
         self._wall_s, self._cpu_s = time.monotonic(), time.process_time()
@@ -27,19 +29,16 @@ class ProcessStatistics:
         """Add the delay of one timer of the event loop, s."""
         self._delays_s.append(seconds)
 
-    def figures(self) -> dict[str, object]:
-        """Return ``process`` of ``bridge/health``."""
+    def health(self) -> ProcessHealth:
+        """Return CPU share, memory and event loop delay."""
         wall_s, cpu_s = time.monotonic(), time.process_time()
         share = (cpu_s - self._cpu_s) / max(1e-9, wall_s - self._wall_s)
         self._wall_s, self._cpu_s = wall_s, cpu_s
 
         delays = sorted(self._delays_s)
         p99 = delays[int(0.99 * len(delays))] if delays else None
-        return {
-            "cpu_pct": round(100 * share, 1),
-            "rss_bytes": _resident_bytes(),
-            "loop_delay_p99_ms": None if p99 is None else round(1e3 * p99, 2),
-        }
+        delay_ms = None if p99 is None else round(1e3 * p99, 2)
+        return ProcessHealth(round(100 * share, 1), _resident_bytes(), delay_ms)
 
 
 def _resident_bytes() -> int | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from jointfit_daemon.pipeline.health import CoreHealth
 
 _OUTCOMES_WITHOUT_STATE = ("late", "duplicate", "dropped", "idle")
 """Outcomes of samples that do not contribute to a limb state."""
@@ -21,26 +21,14 @@ class ProgressMonitor:
     def __init__(self) -> None:
         self._states = self._expected = 0
 
-    def has_progressed(
-        self, health: Mapping[str, object], states: int, imus: frozenset[str]
-    ) -> bool:
-        """Return whether limb states were produced since the last call, or none was expected.
-
-        Parameters
-        ----------
-        health
-            Health of the core.
-        states
-            Number of limb states computed from samples so far.
-        imus
-            Ids of the devices whose samples produce limb states.
-        """
-        devices = health.get("devices")
+    def has_progressed(self, health: CoreHealth) -> bool:
+        """Return whether limb states were produced since the last call, or none was expected."""
+        states = health.frames.sent - health.frames.empty
         expected = sum(
-            counts.get("received", 0)
-            - sum(counts.get(outcome, 0) for outcome in _OUTCOMES_WITHOUT_STATE)
-            for name, counts in (devices.items() if isinstance(devices, dict) else ())
-            if name in imus
+            device.samples["received"]
+            - sum(device.samples.get(outcome, 0) for outcome in _OUTCOMES_WITHOUT_STATE)
+            for device in health.devices.values()
+            if device.sensor is not None  # mocap frames produce no limb states
         )
         progressed = states > self._states or expected <= self._expected
         self._states, self._expected = states, expected

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.pipeline.events import CalibrationPhase
+
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
+    from collections.abc import Collection, Sequence
 
     from jointfit_daemon.config import Source
+
+_PLAIN_PHASES = (CalibrationPhase.CALIBRATED, CalibrationPhase.UNCALIBRATED)
+"""Phases that are clear without the word calibration."""
 
 
 class FrameRateCounter:
@@ -25,53 +29,43 @@ class FrameRateCounter:
         return more / passed_s if passed_s else float("nan")
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceStatus:
-    """State of the daemon at one instant."""
-
-    online: Collection[str]
-    """Ids of the connected sources."""
-    phase: str
-    """Phase of the calibration, as on its topic."""
-    rate_hz: float
-    """Limb states per second; NaN if unknown."""
-    connected: bool
-    """Whether the broker is connected."""
-
-
-def status_line(sources: Iterable[Source], status: ServiceStatus) -> str:
+def status_line(
+    sources: Sequence[Source],
+    online: Collection[str],
+    phase: CalibrationPhase,
+    rate_hz: float,
+    *,
+    connected: bool,
+) -> str:
     """Return the state of the rig in one line: counts, and the names of missing sensors.
 
     Parameters
     ----------
     sources
         Sources of rig.toml.
-    status
-        Present state.
+    online
+        Ids of the connected sources.
+    phase
+        Phase of the calibration.
+    rate_hz
+        Limb states per second; NaN if unknown.
+    connected
+        Whether the broker is connected.
     """
-    rig = list(sources)
-    imus = [source.id for source in rig if source.kind == "imu"]
-    missing = [name for name in imus if name not in status.online]
+    imus = [source.id for source in sources if source.kind == "imu"]
+    missing = [name for name in imus if name not in online]
     words = [f"{len(imus) - len(missing)} of {len(imus)} IMUs"]
     if missing:
         words.append(f"missing {', '.join(missing)}")
 
     words += [
-        "cameras" if source.id in status.online else "no cameras"
-        for source in rig
+        "cameras" if source.id in online else "no cameras"
+        for source in sources
         if source.kind == "mocap"
     ]
-    plain = status.phase in {"calibrated", "uncalibrated"}
-    words.append(status.phase if plain else f"calibration: {status.phase}")
-    if not math.isnan(status.rate_hz):
-        words.append(f"{status.rate_hz:.0f} poses/s")
-    if not status.connected:
+    words.append(phase if phase in _PLAIN_PHASES else f"calibration: {phase}")
+    if not math.isnan(rate_hz):
+        words.append(f"{rate_hz:.0f} poses/s")
+    if not connected:
         words.append("no broker")
     return ", ".join(words)
-
-
-def phase_of(health: Mapping[str, object]) -> str:
-    """Return the phase of the calibration in the health of the core."""
-    calibration = health.get("calibration")
-    phase = calibration.get("phase") if isinstance(calibration, dict) else None
-    return "uncalibrated" if phase is None else str(phase)

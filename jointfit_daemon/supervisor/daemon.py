@@ -30,7 +30,7 @@ from jointfit_daemon.config import ConfigError, load_rig
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import MqttLogHandler, journal_fields
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
-from jointfit_daemon.outputs.payloads import TopicWriter
+from jointfit_daemon.outputs.payloads import BridgeHealth, StateHealth, TopicWriter
 from jointfit_daemon.outputs.recording import EventLogWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
@@ -56,19 +56,14 @@ from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._source_tasks import SourceTasks, stop
-from jointfit_daemon.supervisor._status_line import (
-    FrameRateCounter,
-    ServiceStatus,
-    phase_of,
-    status_line,
-)
+from jointfit_daemon.supervisor._status_line import FrameRateCounter, status_line
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.process_exit import exit_within
 from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
 from jointfit_daemon.supervisor.state_directory import state_directory, write_fault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
     from pathlib import Path
 
     from jointfit_daemon.config import Rig
@@ -310,36 +305,38 @@ class Daemon:
             now_s = loop.time()
             self._process.add_delay(now_s - due)
 
-            if now_s - fed_s > watchdog_s / 3 and self._has_progressed():
-                fed_s = now_s
-                self._systemd.alive()
+            if now_s - fed_s > watchdog_s / 3:
+                health = self._core.core.health(time.monotonic_ns())
+                if self._progress.has_progressed(health):
+                    fed_s = now_s
+                    self._systemd.alive()
             if now_s >= self._health_due_s:
                 self._health_due_s = now_s + self._rig.mqtt.health_s
                 self._publish_health()
 
-    def _has_progressed(self) -> bool:
-        health = self._core.core.health(time.monotonic_ns())
-        imus = frozenset(source.id for source in self._rig.sources if source.kind == "imu")
-        return self._progress.has_progressed(health, self._states_from_samples(health), imus)
-
-    def _states_from_samples(self, health: Mapping[str, object]) -> int:
-        """Return the number of limb states that were computed from samples."""
-        frames = health.get("frames")
-        empty = frames.get("empty", 0) if isinstance(frames, dict) else 0
-        return self._core.states - int(empty)
-
     def _publish_health(self) -> None:
         health = self._core.core.health(time.monotonic_ns())
-        health["process"] = self._process.figures()
-        health["link"] = self._link.figures() | {"noise": self._loop_errors.dropped}
-        health["state"] = {"fault": self._state_fault, "not_stored": self._calibrations.fault}
-        if self._recorder is not None:
-            health["recording"] = self._recorder.figures()
-        self._topics.publish_health(health)
+        self._topics.publish_health(
+            BridgeHealth(
+                health,
+                self._process.health(),
+                self._link.health(self._loop_errors.dropped),
+                StateHealth(self._state_fault, self._calibrations.fault),
+                None if self._recorder is None else self._recorder.health(),
+            )
+        )
 
-        rate_hz = self._frame_rate.rate_hz(self._states_from_samples(health), time.monotonic())
-        status = ServiceStatus(self._online, phase_of(health), rate_hz, self._link.connected)
-        self._systemd.status(status_line(self._rig.sources, status))
+        states = health.frames.sent - health.frames.empty
+        rate_hz = self._frame_rate.rate_hz(states, time.monotonic())
+        self._systemd.status(
+            status_line(
+                self._rig.sources,
+                self._online,
+                health.phase,
+                rate_hz,
+                connected=self._link.connected,
+            )
+        )
 
     # --- configuration -----------------------------------------------------------------------
 

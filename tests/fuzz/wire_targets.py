@@ -11,6 +11,7 @@ from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
+from jointfit_daemon.outputs.payloads._health_encoding import core_payload
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
@@ -104,7 +105,7 @@ def feed_core(source: str, chunks: Iterable[bytes]) -> None:
         for output in core.feed(ChunkArrived(source, Chunk(t_ns, data))):
             reporter.output(output)
 
-    reporter.publish_health(core.health(t_ns))
+    encode_payload(core_payload(core.health(t_ns)))
     for output in core.feed(SourceClosed(t_ns, source, "lost", "over")):
         reporter.output(output)
 

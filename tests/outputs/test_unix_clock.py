@@ -16,6 +16,7 @@ from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import UnixOffset
+from jointfit_daemon.pipeline.health import CoreHealth
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 
 if TYPE_CHECKING:
@@ -123,8 +124,8 @@ class Listening:
         self.heard.append(event)
         return []
 
-    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the shape of a core
-        return {}
+    def health(self, now_ns: int) -> CoreHealth:  # noqa: ARG002 - the shape of a core
+        return CoreHealth()
 
 
 async def test_core_receives_the_unix_offset_first_and_after_each_step(

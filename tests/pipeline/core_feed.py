@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, LimbState
+from jointfit_daemon.outputs.payloads._health_encoding import core_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened, Tick
 from jointfit_protocols.can import CanFrame, pack_frames
@@ -168,5 +169,5 @@ class Bench:
 
     def devices(self) -> dict[str, Any]:
         """Return the core's counters of every device."""
-        found: Any = self.core.health(arrival_ns(self.fed[-1]))["devices"]
-        return dict(found)
+        found: dict[str, Any] = core_payload(self.core.health(arrival_ns(self.fed[-1])))["devices"]
+        return found

@@ -20,6 +20,7 @@ from jointfit_daemon.pipeline.events import (
     Configured,
     Request,
 )
+from jointfit_daemon.pipeline.health import CoreHealth
 from jointfit_daemon.supervisor import _calibration_store
 from jointfit_daemon.supervisor._calibration_store import CalibrationWriter
 from jointfit_daemon.supervisor.daemon import Daemon
@@ -117,8 +118,8 @@ class ReadyCore:
             return [CalibrationReady(self.calibration), status]
         return []
 
-    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
-        return {"devices": {}, "frames": {}}
+    def health(self, now_ns: int) -> CoreHealth:  # noqa: ARG002 - the core's interface
+        return CoreHealth()
 
 
 async def test_a_reload_while_a_calibration_is_written_finds_it(

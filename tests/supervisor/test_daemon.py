@@ -32,6 +32,13 @@ from jointfit_daemon.pipeline.events import (
     SourceOpened,
     Tick,
 )
+from jointfit_daemon.pipeline.health import (
+    ClockHealth,
+    CoreHealth,
+    DeviceHealth,
+    FrameCounts,
+    WireCounts,
+)
 from jointfit_daemon.supervisor._core_runner import LONGEST_TICK_INTERVAL_NS, CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
@@ -66,8 +73,8 @@ class RecordingCore:
             return [event.reply("accepted", dict(event.arguments))]
         return self.answers.pop(type(event), [])
 
-    def health(self, now_ns: int) -> dict[str, object]:  # noqa: ARG002 - the core's interface
-        return {"devices": {}, "frames": {}}
+    def health(self, now_ns: int) -> CoreHealth:  # noqa: ARG002 - the core's interface
+        return CoreHealth()
 
     def of(self, kind: type[Any]) -> list[Any]:
         return [event for event in self.events if isinstance(event, kind)]
@@ -452,22 +459,27 @@ def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> Non
     SystemdNotifier().ready()
 
 
-def counters(received: int, late: int = 0) -> dict[str, object]:
-    return {"devices": {"S1": {"received": received, "late": late}, "mocap": {"received": 99}}}
+def counters(received: int, states: int, late: int = 0) -> CoreHealth:
+    """Return the health of a core with one IMU and a camera server."""
+    clock = ClockHealth("arrival", 0, None, None, None, None, 0, 0, None, None, None)
+    imu, mocap = {"received": received, "late": late}, {"received": 99}
+    return CoreHealth(
+        {
+            "S1": DeviceHealth(True, WireCounts(), None, imu, clock, sensor="ok"),
+            "mocap": DeviceHealth(True, WireCounts(), None, mocap, clock),
+        },
+        frames=FrameCounts(states + 3, 3, 0),
+    )
 
 
 def test_watchdog_trips_only_if_samples_produce_no_state() -> None:
-    progress, imus = ProgressMonitor(), frozenset({"S1"})
-    assert progress.has_progressed(counters(0), 0, imus)  # nothing arrives
-    assert progress.has_progressed(counters(10), 5, imus)  # states come
-    assert progress.has_progressed(
-        counters(20, late=10), 5, imus
-    )  # arrives, too late for any state
-    assert not progress.has_progressed(
-        counters(40, late=10), 5, imus
-    )  # arrives, and nothing comes of it
-    assert progress.has_progressed(counters(60, late=10), 6, imus)
-    assert progress.has_progressed({}, 6, imus)
+    progress = ProgressMonitor()
+    assert progress.has_progressed(counters(0, 0))  # nothing arrives
+    assert progress.has_progressed(counters(10, 5))  # states come
+    assert progress.has_progressed(counters(20, 5, late=10))  # arrives, too late for any state
+    assert not progress.has_progressed(counters(40, 5, late=10))  # arrives, and nothing comes of it
+    assert progress.has_progressed(counters(60, 6, late=10))
+    assert progress.has_progressed(CoreHealth(frames=FrameCounts(9, 3, 0)))
 
 
 # --- fits ---------------------------------------------------------------------------------------

@@ -9,13 +9,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.pipeline.events import CalibrationPhase
 from jointfit_daemon.supervisor._source_tasks import SourceTasks
-from jointfit_daemon.supervisor._status_line import (
-    FrameRateCounter,
-    ServiceStatus,
-    phase_of,
-    status_line,
-)
+from jointfit_daemon.supervisor._status_line import FrameRateCounter, status_line
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
@@ -33,27 +29,30 @@ NAN = float("nan")
     ("seen", "line"),
     [
         (
-            ServiceStatus({"S1", "S2", "mocap"}, "calibrated", 49.98, True),
+            ({"S1", "S2", "mocap"}, CalibrationPhase.CALIBRATED, 49.98, True),
             "2 of 2 IMUs, cameras, calibrated, 50 poses/s",
         ),
         (
-            ServiceStatus({"S1"}, "uncalibrated", NAN, False),
+            ({"S1"}, CalibrationPhase.UNCALIBRATED, NAN, False),
             "1 of 2 IMUs, missing S2, no cameras, uncalibrated, no broker",
         ),
         (
-            ServiceStatus({"S2", "mocap"}, "functional", 0.0, True),
+            ({"S2", "mocap"}, CalibrationPhase.FUNCTIONAL, 0.0, True),
             "1 of 2 IMUs, missing S1, cameras, calibration: functional, 0 poses/s",
         ),
     ],
 )
-def test_status_line_counts_sensors_and_names_missing_ones(seen: ServiceStatus, line: str) -> None:
-    assert status_line(RIG, seen) == line
+def test_status_line_counts_sensors_and_names_missing_ones(
+    seen: tuple[set[str], CalibrationPhase, float, bool], line: str
+) -> None:
+    online, phase, rate_hz, connected = seen
+    assert status_line(RIG, online, phase, rate_hz, connected=connected) == line
 
 
 def test_status_line_of_a_rig_without_cameras_omits_them() -> None:
-    assert "cameras" not in status_line(
-        RIG[:2], ServiceStatus({"S1", "S2"}, "calibrated", NAN, True)
-    )
+    imus = {"S1", "S2"}
+    line = status_line(RIG[:2], imus, CalibrationPhase.CALIBRATED, NAN, connected=True)
+    assert "cameras" not in line
 
 
 def test_frame_rate_is_that_since_the_last_call() -> None:
@@ -61,12 +60,6 @@ def test_frame_rate_is_that_since_the_last_call() -> None:
     assert pace.rate_hz(7, 100.0) != pace.rate_hz(7, 100.0)  # NaN: nothing to compare with, no time
     assert pace.rate_hz(507, 110.0) == 50.0
     assert pace.rate_hz(507, 120.0) == 0.0
-
-
-@pytest.mark.parametrize("health", [{}, {"calibration": {}}, {"calibration": None}])
-def test_missing_phase_is_uncalibrated(health: dict[str, object]) -> None:
-    assert phase_of(health) == "uncalibrated"
-    assert phase_of({"calibration": {"phase": "aligned"}}) == "aligned"
 
 
 class Driver:

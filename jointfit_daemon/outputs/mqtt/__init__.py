@@ -7,7 +7,7 @@ from jointfit_daemon.outputs.mqtt._connection import (
     Incoming,
 )
 from jointfit_daemon.outputs.mqtt._outbox import Outbox
-from jointfit_daemon.outputs.mqtt._publisher import MqttPublisher
+from jointfit_daemon.outputs.mqtt._publisher import LinkHealth, MqttPublisher
 from jointfit_daemon.outputs.mqtt._secret_files import RequestKeyError, request_key_of
 from jointfit_daemon.outputs.mqtt._signature import (
     SIGNATURE_LIFETIME_US,
@@ -23,6 +23,7 @@ __all__ = [
     "BrokerLostError",
     "DisconnectErrorFilter",
     "Incoming",
+    "LinkHealth",
     "MqttClient",
     "MqttPublisher",
     "NoAnswerError",

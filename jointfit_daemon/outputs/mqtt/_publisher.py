@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.outputs import topics
@@ -60,6 +60,24 @@ _HEALTHY_S = 5.0
 """Duration of a connection that resets the wait, s."""
 
 
+@dataclass(frozen=True, slots=True)
+class LinkHealth:
+    """State of the connection to the broker; docs/mqtt.md explains the fields."""
+
+    connected: bool
+    connects: int
+    confirmed: bool
+    """Whether the broker accepts and returns the daemon's messages."""
+    denied: list[str]
+    """Topics below the base on which the broker refuses messages."""
+    sent: int
+    queued: int
+    dropped: int
+    ignored_requests: int
+    noise: int
+    """Harmless errors of the MQTT library about closed connections."""
+
+
 class MqttPublisher:
     """Publishes an outbox and passes on requests, with reconnection.
 
@@ -104,20 +122,21 @@ class MqttPublisher:
         self._correcting = False
         outbox.retain(outbox.state_topic, ONLINE)
 
-    def figures(self) -> dict[str, object]:
-        """Return ``link`` of ``bridge/health``."""
+    def health(self, noise: int = 0) -> LinkHealth:
+        """Return the state of the connection; `noise` is the count of `DisconnectErrorFilter`."""
+        echoed = self._echoes[self._outbox.state_topic].arrived.is_set()
         oversized = 0 if self._connection is None else self._connection.oversized
-        return {
-            "connected": self.connected,
-            "connects": self.connects,
-            "confirmed": self._echoes[self._outbox.state_topic].arrived.is_set()
-            and not self.denied,
-            "denied": sorted(topic.removeprefix(f"{self._base}/") for topic in self.denied),
-            "sent": self.sent,
-            "queued": self._outbox.queued,
-            "dropped": self._outbox.dropped,
-            "ignored_requests": self.ignored_requests + oversized,
-        }
+        return LinkHealth(
+            connected=self.connected,
+            connects=self.connects,
+            confirmed=echoed and not self.denied,
+            denied=sorted(topic.removeprefix(f"{self._base}/") for topic in self.denied),
+            sent=self.sent,
+            queued=self._outbox.queued,
+            dropped=self._outbox.dropped,
+            ignored_requests=self.ignored_requests + oversized,
+            noise=noise,
+        )
 
     async def run(self) -> None:
         """Connect and serve, again after each loss, until cancelled."""

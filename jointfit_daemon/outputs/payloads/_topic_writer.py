@@ -16,6 +16,7 @@ from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint, encode_pose
+from jointfit_daemon.outputs.payloads._health_encoding import health_payload
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from jointfit_daemon.outputs.topics import OFFLINE, ONLINE, PAYLOAD_VERSION
 from jointfit_daemon.pipeline.events import (
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Outbox
+    from jointfit_daemon.outputs.payloads._health_encoding import BridgeHealth
     from jointfit_daemon.outputs.topics import Topic
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
@@ -177,9 +179,10 @@ class TopicWriter:
         }
         self._outbox.event(topic, encode(payload), correlation=address.correlation)
 
-    def publish_health(self, health: Mapping[str, object]) -> None:
+    def publish_health(self, health: BridgeHealth) -> None:
         """Publish ``bridge/health``."""
-        self._publish(topics.BRIDGE_HEALTH, self._stamped(health, time.monotonic_ns()))
+        payload = health_payload(health)
+        self._publish(topics.BRIDGE_HEALTH, self._stamped(payload, time.monotonic_ns()))
 
     def publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
         """Publish one log line on ``bridge/log``."""

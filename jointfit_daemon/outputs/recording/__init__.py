@@ -2,9 +2,10 @@
 
 from jointfit_daemon.outputs.recording._event_log import (
     EventLogWriter,
+    RecordingHealth,
     encode_state,
     read_events,
     read_states,
 )
 
-__all__ = ["EventLogWriter", "encode_state", "read_events", "read_states"]
+__all__ = ["EventLogWriter", "RecordingHealth", "encode_state", "read_events", "read_states"]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -200,6 +201,18 @@ def _lines(path: Path) -> Iterator[bytes]:
                 yield line[:-1]
 
 
+@dataclass(frozen=True, slots=True)
+class RecordingHealth:
+    """State of a recording."""
+
+    file: str
+    written_bytes: int
+    backlog_bytes: int
+    """Not yet written."""
+    failure: str | None
+    """Reason for which logging ended early; None while it works."""
+
+
 class EventLogWriter:
     """Writes events and limb states to a new file, within half a second; a `Sink` of the core.
 
@@ -239,14 +252,9 @@ class EventLogWriter:
         if isinstance(output, LimbState) and self.failure is None:
             self._add(b"".join((_STATE, encode_state(output), b"}")))
 
-    def figures(self) -> dict[str, object]:
-        """Return ``recording`` of ``bridge/health``."""
-        return {
-            "file": self.path.name,
-            "written_bytes": self.written_bytes,
-            "backlog_bytes": self._bytes,
-            "failure": self.failure,
-        }
+    def health(self) -> RecordingHealth:
+        """Return the state of the recording."""
+        return RecordingHealth(self.path.name, self.written_bytes, self._bytes, self.failure)
 
     def _add(self, line: bytes) -> None:
         if self._bytes > PENDING_BYTES:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Quaternion
     from jointfit_daemon.pipeline.events import Notice
+    from jointfit_daemon.pipeline.health import LearningHealth
     from jointfit_daemon.timing.alignment import AlignedFrame
 
 INTERVAL_NS = 100_000_000
@@ -99,8 +100,8 @@ class OnlineFrameCollector:
         """Return the notices about obstacles to learning that are due, each once."""
         return self._monitor.notices(now_ns)
 
-    def health(self, now_ns: int) -> dict[str, object]:
-        """Return the state of online learning as JSON values."""
+    def health(self, now_ns: int) -> LearningHealth:
+        """Return the state of online learning."""
         return self._monitor.health(now_ns, len(self._kept))
 
     @property

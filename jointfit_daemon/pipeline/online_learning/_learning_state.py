@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.pipeline.health import LearningHealth, LearningState
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,33 +74,19 @@ class LearningMonitor:
     def _mocap_present(self, now_ns: int) -> bool:
         return self._mocap_ns is not None and now_ns - self._mocap_ns <= MOCAP_SILENT_NS
 
-    def health(self, now_ns: int, kept: int) -> dict[str, object]:
-        """Return the state as JSON values, for ``bridge/health``.
-
-        Parameters
-        ----------
-        now_ns : int
-            Host time.
-        kept : int
-            Number of frames that wait for a refit.
-        """
-        state, reason, since_ns = "learning", self._obstacle, self._usable_ns
+    def health(self, now_ns: int, kept: int) -> LearningHealth:
+        """Return the state; `kept` is the number of frames that wait for a refit."""
         if self._off is not None:
-            state, reason = "off", self._off
-        elif not self._mocap_present(now_ns):
-            state, reason = "waiting", "no live mocap frames"
-        elif not self._in_view:
-            state = "waiting"
-        elif self._obstacle is not None:
-            state = "stopped"
-
-        stopped = state == "stopped" and since_ns is not None
-        return {
-            "state": state,
-            "reason": reason,
-            "stopped_s": round((now_ns - (since_ns or 0)) / _NS, 1) if stopped else None,
-            "kept": kept,
-        }
+            return LearningHealth(LearningState.OFF, self._off, kept=kept)
+        if not self._mocap_present(now_ns):
+            return LearningHealth(LearningState.WAITING, "no live mocap frames", kept=kept)
+        if not self._in_view:
+            return LearningHealth(LearningState.WAITING, self._obstacle, kept=kept)
+        if self._obstacle is None:
+            return LearningHealth(LearningState.LEARNING, kept=kept)
+        since_ns = self._usable_ns
+        stopped_ns = None if since_ns is None else now_ns - since_ns
+        return LearningHealth(LearningState.STOPPED, self._obstacle, stopped_ns, kept)
 
 
 def not_visible(markers: Sequence[str]) -> str:

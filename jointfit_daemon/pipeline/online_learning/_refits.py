@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.pipeline.health import LearningHealth, LearningState
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -54,12 +55,12 @@ class OnlineRefits:
         text = f"models refitted with {online['frames']} frames of sensors and mocap"
         return RefitOutcome(found, Notice(event.t_ns, kind, "online", text, info, data))
 
-    def health(self, collector: OnlineFrameCollector, now_ns: int) -> dict[str, object]:
-        """Return the state of online learning as JSON values, for ``bridge/health``."""
+    def health(self, collector: OnlineFrameCollector, now_ns: int) -> LearningHealth:
+        """Return the state of online learning."""
         found = collector.health(now_ns)
-        if self.paused and found["state"] != "off":
+        if self.paused and found.state != LearningState.OFF:
             reason = "reverted; paused until the next functional calibration"
-            return found | {"state": "off", "reason": reason, "stopped_s": None}
+            return LearningHealth(LearningState.OFF, reason, kept=found.kept)
         return found
 
     def revert(self, calibration: Calibration) -> Calibration | None:

@@ -16,6 +16,7 @@ import numpy as np
 from jointfit_daemon.driver import ImuSettings
 from jointfit_daemon.limb_model import restore_cluster, rigid_fit
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.pipeline.health import LagHealth, LagSource
 from jointfit_daemon.timing.lag import (
     LagEstimate,
     LagSettings,
@@ -304,35 +305,25 @@ class LagMonitor:
             if lag.tracked is not None
         }
 
-    def health(self) -> dict[str, dict[str, object]]:
-        """Return used and estimated lag of every sensor as JSON values, for ``bridge/health``."""
+    def health(self) -> dict[str, LagHealth]:
+        """Return used and estimated lag of every sensor."""
         return {sensor: self._sensor_health(sensor) for sensor in self.sensors}
 
-    def _sensor_health(self, sensor: str) -> dict[str, object]:
-        lag = self.sensors[sensor]
-        known, tracked = self._known.get(sensor), lag.tracked
-        calibrated = self._calibrated.get(sensor)
-        used, source = (None, "none") if calibrated is None else (float(calibrated), "calibration")
+    def _sensor_health(self, sensor: str) -> LagHealth:
+        lag, known = self.sensors[sensor], self._known.get(sensor)
         if known is not None:
-            used, source = known.lag_ns, "configured"
-        quality = self._quality.get(sensor, {})
+            source = LagSource.CONFIGURED
+            return LagHealth(source, known.lag_ns, known.sigma_ns, None, lag.tracked, lag.refused)
 
-        return {
-            "lag_ms": _rounded_ms(used),
-            "lag_sigma_ms": _rounded_ms(
-                quality.get("sigma_ns") if known is None else known.sigma_ns
-            ),
-            "lag_source": source,
-            "lag_found_by": None if known is not None else quality.get("source"),
-            "tracked_ms": None if tracked is None else _rounded_ms(tracked.lag_ns),
-            "tracked_sigma_ms": None if tracked is None else _rounded_ms(tracked.sigma_ns),
-            "tracked_drift_ppm": None if tracked is None else round(1e6 * tracked.drift, 3),
-            "tracked_refused": lag.refused,
-        }
-
-
-def _rounded_ms(value_ns: float | None) -> float | None:
-    return None if value_ns is None else round(value_ns * 1e-6, 3)
+        used, quality = self._calibrated.get(sensor), self._quality.get(sensor, {})
+        return LagHealth(
+            LagSource.NONE if used is None else LagSource.CALIBRATION,
+            used,
+            quality.get("sigma_ns"),
+            quality.get("source"),
+            lag.tracked,
+            lag.refused,
+        )
 
 
 def _orientations(

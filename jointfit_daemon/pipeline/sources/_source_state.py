@@ -6,10 +6,11 @@ calibration or other sources.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
+from jointfit_daemon.pipeline.health import ClockHealth, DeviceHealth, WireCounts
 from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
 from jointfit_daemon.pipeline.sources._sync_lines import SyncLines
 from jointfit_daemon.timing.clock import DeviceClock, Edge
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Source
     from jointfit_daemon.driver import Decoder
+    from jointfit_daemon.fusion import SensorMonitor
     from jointfit_daemon.model import Chunk, Decoded, TickClock
     from jointfit_daemon.timing.clock import Stamp
 
@@ -33,24 +35,6 @@ class StampedMeasurement(NamedTuple):
 
     measurement: ImuSample | MocapFrame
     stamp: Stamp
-
-
-@dataclass(slots=True)
-class WireCounts:
-    """Counts since the daemon started; they go on when a reconnect replaces the decoder."""
-
-    received: int = 0
-    """Samples decoded."""
-    corrupt: int = 0
-    """Runs of discarded bytes."""
-    discarded_bytes: int = 0
-    lost: int = 0
-    """Samples that the device counted but that did not arrive."""
-    restarts: int = 0
-    """Restarts of the device, reported by it or seen in its clock. A device that was away counts as
-    restarted unless its clock shows otherwise."""
-    opened: int = 0
-    """Times the source was opened; all but the first are reconnects."""
 
 
 @dataclass(slots=True)
@@ -126,6 +110,49 @@ class SourceState:
         return {
             name: count + getattr(self._decoder, name, 0) for name, count in self._withheld.items()
         }
+
+    def health(
+        self, now_ns: int, samples: Mapping[str, int], sensors: SensorMonitor
+    ) -> DeviceHealth:
+        """Return the health of the device; `samples` are the counts of the frame grid or router."""
+        sensor = None
+        if self.source.kind == "imu":
+            sensor = sensors.state(self.source.id)
+        else:
+            # Add the frames that the decoder withheld.
+            withheld = self.withheld()
+            samples = {
+                **samples,
+                "received": self.counts.received + sum(withheld.values()),
+                "decimated": 0,
+                "late": withheld["late"],
+                "duplicate": withheld["duplicates"],
+                "dropped": withheld["unpublished"],
+                "pending": 0,
+            }
+
+        clock, last_ns = self.clock, self.last_arrival_ns
+        return DeviceHealth(
+            self.online,
+            replace(self.counts),
+            None if last_ns is None else now_ns - last_ns,
+            samples,
+            ClockHealth(
+                clock.state,
+                clock.epoch,
+                clock.offset_ns,
+                clock.skew_ppm,
+                clock.sigma_ns,
+                clock.bound_ns,
+                clock.latency_ns,
+                clock.latency_sd_ns,
+                clock.jitter_ns,
+                clock.minute.delays,
+                clock.minute.rate_hz,
+            ),
+            self.info.get("orientation_filter"),
+            sensor,
+        )
 
     def feed(self, chunk: Chunk) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
         """Return the stamped samples and events that `chunk` completes; none while closed."""

@@ -219,7 +219,7 @@ async def test_stopped_daemon_publishes_offline(broker: Broker) -> None:
 
 async def test_late_will_of_an_earlier_process_is_overwritten(broker: Broker) -> None:
     async with running(Link(broker.port)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(broker.port)) as other:
             await other.publish(Outgoing(LIFE, OFFLINE, 1, retain=True))
         async with asyncio.timeout(5):
@@ -247,7 +247,7 @@ async def test_with_mqtt_5_stored_requests_are_not_sent(mosquitto: Broker) -> No
     async with MqttConnection(settings(mosquitto.port)) as operator:
         await operator.publish(Outgoing(topic, b'{"phase":"abort"}', 1, retain=True))
         async with running(Link(mosquitto.port)) as link:
-            await until(lambda: bool(link.publisher.figures()["confirmed"]))
+            await until(lambda: bool(link.publisher.health().confirmed))
             await operator.publish(Outgoing(topic, b'{"phase":"static"}', 1))
             await until(lambda: len(link.requests) == 1)
     assert link.requests[0].payload == b'{"phase":"static"}'
@@ -258,7 +258,7 @@ async def test_with_mqtt_5_new_retained_request_is_not_executed(
     mosquitto: Broker,
 ) -> None:  # "retain as published", which the embedded broker lacks
     async with running(Link(mosquitto.port)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(mosquitto.port)) as operator:
             topic = f"{BASE}/bridge/request/calibrate"
             await operator.publish(Outgoing(topic, b"{}", 1, retain=True))
@@ -319,7 +319,7 @@ async def test_the_embedded_broker_serves_both_versions(
 ) -> None:
     port = embedded_broker.port_of(version)
     async with running(Link(port, version=version)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(port, version=version)) as watcher:
             await watcher.subscribe([f"{BASE}/pose"])
             link.outbox.stream(f"{BASE}/pose", b"{}")
@@ -341,7 +341,7 @@ async def test_forbidden_topic_is_detected_by_the_echo(
     async with running(Link(broker.port)) as link:
         await until(lambda: link.publisher.connected)
         await asyncio.sleep(1)
-        assert link.publisher.figures()["confirmed"] is False
+        assert link.publisher.health().confirmed is False
     assert "check its ACL" in caplog.text
 
 
@@ -388,7 +388,7 @@ async def test_client_receives_the_answer_to_its_request(broker: Broker) -> None
 
     link.publisher = MqttPublisher(settings(broker.port), link.outbox, answer)
     async with running(link), MqttClient(settings(broker.port)) as client:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         reply = await client.request("calibrate", {"phase": "static"})
         assert reply["status"] == "ok"
         assert reply["data"]["phase"] == "static"

@@ -105,7 +105,7 @@ async def test_a_message_over_the_limit_is_dropped_and_the_next_one_read(
 ) -> None:
     port = broker.port_of(version)
     async with running(Link(port, version=version)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(port, version=version)) as attacker:
             await attacker.publish(Outgoing(REQUEST, bytes(900_000), 1))
             await attacker.publish(Outgoing(REQUEST, b"{}", 1))
@@ -116,12 +116,12 @@ async def test_a_message_over_the_limit_is_dropped_and_the_next_one_read(
 
 async def test_packet_limit_is_announced_to_mosquitto(mosquitto: Broker) -> None:
     async with running(Link(mosquitto.port)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(mosquitto.port)) as attacker:
             await attacker.publish(Outgoing(REQUEST, bytes(900_000), 1))
             await attacker.publish(Outgoing(REQUEST, b"{}", 1))
             await until(lambda: bool(link.requests))
-        assert link.publisher.figures()["ignored_requests"] == 0
+        assert link.publisher.health().ignored_requests == 0
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
@@ -134,7 +134,7 @@ async def test_ten_thousand_stored_messages_do_not_prevent_connecting(
             await attacker.publish(f"{BASE}/bridge/request/r{number}", b"{}", retain=True)
         await attacker.publish(f"{BASE}/x", b"", qos=1)
     async with running(Link(mosquitto.port, version=version)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]), 30)
+        await until(lambda: bool(link.publisher.health().confirmed), 30)
         assert link.publisher.connects == 1
         if version == "3.1.1":  # MQTT 5 does not send them
             await until(lambda: link.publisher.ignored_requests > 0)
@@ -145,7 +145,7 @@ async def test_requests_are_passed_on_at_a_limited_rate(
     broker: Broker, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with running(Link(broker.port)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         began = time.monotonic()
         async with MqttConnection(settings(broker.port)) as attacker:
             for _ in range(500):
@@ -170,7 +170,7 @@ async def test_requests_beyond_the_rate_are_dropped_before_they_are_decoded(
 
     monkeypatch.setattr(MqttConnection, "messages", counted)
     async with running(Link(broker.port)) as link:
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
+        await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(broker.port)) as attacker:
             for number in range(500):
                 await attacker.publish(Outgoing(REQUEST, b"[[", qos=number % 2))
@@ -196,9 +196,9 @@ async def test_denied_pose_is_reported(
     rules.chmod(0o600)
     broker = start_mosquitto(f"acl_file {rules}\n")
     async with running(Link(broker.port, version=version)) as link, poses(link):
-        await until(lambda: bool(link.publisher.figures()["denied"]))
-        assert link.publisher.figures()["denied"] == ["pose"]
-        assert link.publisher.figures()["confirmed"] is False
+        await until(lambda: bool(link.publisher.health().denied))
+        assert link.publisher.health().denied == ["pose"]
+        assert link.publisher.health().confirmed is False
     assert f"{BASE}/pose" in caplog.text
 
 
@@ -207,8 +207,8 @@ async def test_an_allowed_pose_is_confirmed(broker: Broker, version: str) -> Non
     port = broker.port_of(version)
     async with running(Link(port, version=version)) as link, poses(link):
         await until(lambda: link.publisher.sent > 10)
-        await until(lambda: bool(link.publisher.figures()["confirmed"]))
-        assert link.publisher.figures()["denied"] == []
+        await until(lambda: bool(link.publisher.health().confirmed))
+        assert link.publisher.health().denied == []
 
 
 async def test_a_response_topic_that_the_broker_denies_costs_one_entry(
@@ -223,7 +223,7 @@ async def test_a_response_topic_that_the_broker_denies_costs_one_entry(
         for number in range(20):
             link.outbox.event(f"{BASE}/bridge/response/calibrate/{number}", b"{}")
         await until(lambda: link.publisher.sent >= 21)
-        assert link.publisher.figures()["denied"] == ["bridge/response/#"]
+        assert link.publisher.health().denied == ["bridge/response/#"]
 
 
 @contextlib.asynccontextmanager

@@ -23,8 +23,14 @@ from jointfit_daemon.model import (
     SegmentState,
     SyncState,
 )
-from jointfit_daemon.outputs.mqtt import Outbox
-from jointfit_daemon.outputs.payloads import TopicWriter, encode_pose
+from jointfit_daemon.outputs.mqtt import LinkHealth, Outbox
+from jointfit_daemon.outputs.payloads import (
+    BridgeHealth,
+    ProcessHealth,
+    StateHealth,
+    TopicWriter,
+    encode_pose,
+)
 from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
@@ -38,6 +44,7 @@ from jointfit_daemon.pipeline.events import (
     Reply,
     ReplyAddress,
 )
+from jointfit_daemon.pipeline.health import CoreHealth
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -255,6 +262,17 @@ async def test_device_topics_start_offline_and_are_cleared_on_removal(
     assert "device/S1/availability" not in found
 
 
+HEALTH = BridgeHealth(
+    CoreHealth(),
+    ProcessHealth(3.0, 1_000_000, None),
+    LinkHealth(
+        connected=True, connects=1, confirmed=True, denied=[], sent=9, queued=0, dropped=0,
+        ignored_requests=0, noise=0,
+    ),
+    StateHealth(None, None),
+)  # fmt: skip
+
+
 async def test_outputs_are_published_on_their_topics(table: dict[str, Any], outbox: Outbox) -> None:
     reporter = TopicWriter(parse_rig(rig_table(table)), outbox, UnixClock())
     reporter.output(Notice(0, NoticeKind.DEVICE, "S1", "streaming"))
@@ -262,7 +280,7 @@ async def test_outputs_are_published_on_their_topics(table: dict[str, Any], outb
     reporter.output(
         CalibrationProgress(0, CalibrationPhase.FUNCTIONAL, 0.5, "keep moving", {"arc_deg": 40.0})
     )
-    reporter.publish_health({"devices": {}, "process": {"cpu_pct": 3.0}})
+    reporter.publish_health(HEALTH)
     reporter.publish_log_line("warning", "x", "hot", 2)
     found = await sent(outbox)
     device, calibration = found["bridge/event"]
@@ -271,7 +289,9 @@ async def test_outputs_are_published_on_their_topics(table: dict[str, Any], outb
     assert found["calibration"][0]["version"] == 3
     assert found["calibration"][0]["quality"] == {"rms_m": 0.004}
     assert found["calibration/progress"][0]["progress"] == 0.5
-    assert found["bridge/health"][0]["process"] == {"cpu_pct": 3.0}
+    assert found["bridge/health"][0]["process"] == {
+        "cpu_pct": 3.0, "rss_bytes": 1_000_000, "loop_delay_p99_ms": None,
+    }  # fmt: skip
     assert found["bridge/log"][0]["suppressed"] == 2
     assert found["bridge/info"][0]["joints"] == ["hip", "knee", "ankle"]
     for payloads in found.values():

@@ -117,7 +117,7 @@ async def test_log_returns_events_and_states_in_order(tmp_path: Path) -> None:
         log.event(event)
         log.output(state)
     await asyncio.sleep(2 * _event_log.FLUSH_S)
-    assert log.figures()["backlog_bytes"] == 0
+    assert log.health().backlog_bytes == 0
     log.event(Tick(1000))
     writing.cancel()
     await asyncio.wait([writing])
@@ -150,9 +150,9 @@ async def test_a_full_disk_ends_the_log_and_not_the_daemon(
     log._file = await asyncio.to_thread(Path("/dev/full").open, "wb", 0)
     log.event(Tick(1))
     await asyncio.wait_for(log.run(), 5)
-    assert "No space left" in str(log.figures()["failure"])
+    assert "No space left" in str(log.health().failure)
     log.event(Tick(2))
-    assert log.figures()["backlog_bytes"] == 0
+    assert log.health().backlog_bytes == 0
     assert "ended early" in caplog.text
 
 
@@ -161,5 +161,5 @@ async def test_slow_disk_ends_the_log(tmp_path: Path, monkeypatch: pytest.Monkey
     log = EventLogWriter(tmp_path, "rig")
     for n in range(200):
         log.event(Tick(n))
-    assert "too slow" in str(log.figures()["failure"])
+    assert "too slow" in str(log.health().failure)
     log.close()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.model import MocapFrame, MocapLayout
+from jointfit_daemon.outputs.payloads._health_encoding import learning_payload
 from jointfit_daemon.pipeline.online_learning import (
     OnlineFrameCollector,
     OnlineRefits,
@@ -59,7 +60,7 @@ def feed(
 
 
 def state(one: OnlineFrameCollector, now_s: float) -> tuple[Any, Any]:
-    found = one.health(round(now_s * S))
+    found = learning_payload(one.health(round(now_s * S)))
     return found["state"], found["reason"]
 
 
@@ -70,9 +71,9 @@ def test_missing_marker_is_named_and_reported_once() -> None:
     (notices,) = feed(one, 150.0, 10.0, unseen=(1,))
     assert notices == "warning: online learning stopped for 60 s: not visible to the cameras: B"
     assert state(one, 160.0) == ("stopped", "not visible to the cameras: B")
-    assert one.health(160 * S)["stopped_s"] == pytest.approx(150.0, abs=0.3)
+    assert learning_payload(one.health(160 * S))["stopped_s"] == pytest.approx(150.0, abs=0.3)
     assert feed(one, 5.0, 160.0) == ["info: online learning resumed"]
-    assert one.health(165 * S)["stopped_s"] is None
+    assert learning_payload(one.health(165 * S))["stopped_s"] is None
 
 
 def test_marker_missing_from_the_start_is_reported() -> None:
@@ -136,8 +137,8 @@ def test_reverted_learning_gives_its_reason() -> None:
     one = collector()
     feed(one, 5.0)
     found = OnlineRefits(paused=True).health(one, 5 * S)
-    assert found["state"] == "off"
-    assert "reverted" in str(found["reason"])
+    assert found.state == "off"
+    assert "reverted" in str(found.reason)
 
 
 def test_long_lists_of_markers_are_shortened() -> None:

@@ -12,6 +12,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
 from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
+from jointfit_daemon.outputs.payloads._health_encoding import lag_payload
 from jointfit_daemon.pipeline.sources import LagMonitor
 from jointfit_daemon.pipeline.sources._lag_monitor import KnownLag
 
@@ -88,16 +89,16 @@ def play(
 
 def test_lag_is_estimated_during_movement() -> None:
     monitor = LagMonitor(CHAIN, CALIBRATION)
-    assert monitor.health()["S1"]["lag_source"] == "calibration"
+    assert lag_payload(monitor.health()["S1"])["lag_source"] == "calibration"
     assert play(monitor, 16.0, 7.3) == []
-    found = monitor.health()["S1"]
+    found = lag_payload(monitor.health()["S1"])
     assert found["lag_source"] == "calibration"
     assert found["lag_ms"] == 2.0  # in use: the estimate is not applied
     assert (found["lag_sigma_ms"], found["lag_found_by"]) == (0.2, "plate and movement")
     assert found["tracked_ms"] == pytest.approx(7.3, abs=0.1)
     assert found["tracked_refused"] is None
     kept = LagMonitor(CHAIN, replace(CALIBRATION, notes=("new",)), monitor)
-    assert kept.health()["S1"]["tracked_ms"] == found["tracked_ms"]
+    assert lag_payload(kept.health()["S1"])["tracked_ms"] == found["tracked_ms"]
 
 
 def test_lag_step_is_reported_once_within_20_s_as_a_calibration_warning() -> None:
@@ -107,27 +108,27 @@ def test_lag_step_is_reported_once_within_20_s_as_a_calibration_warning() -> Non
     assert [(one.notice.kind, one.notice.id) for one in notices] == [("calibration", "S1")]
     assert notices[0].t_s < 40.0
     assert notices[0].notice.data["step_ms"] == pytest.approx(3.0, abs=0.3)
-    assert monitor.health()["S1"]["tracked_ms"] == pytest.approx(7.0, abs=0.1)
+    assert lag_payload(monitor.health()["S1"])["tracked_ms"] == pytest.approx(7.0, abs=0.1)
 
 
 def test_clock_restart_changes_the_lag_by_less_than_its_standard_deviation() -> None:
     monitor = LagMonitor(CHAIN, CALIBRATION)
     play(monitor, 16.0, 4.0)
-    before = monitor.health()["S1"]
+    before = lag_payload(monitor.health()["S1"])
     assert play(monitor, 16.0, 4.0, start_s=16.0, epoch=1) == []
-    after = monitor.health()["S1"]
+    after = lag_payload(monitor.health()["S1"])
     assert abs(float(str(after["tracked_ms"])) - float(str(before["tracked_ms"]))) <= float(
         str(before["tracked_sigma_ms"])
     )
     # Settled elsewhere, within the accuracy of a clock: no step.
     assert play(monitor, 16.0, 4.8, start_s=32.0, epoch=2) == []
-    assert monitor.health()["S1"]["tracked_ms"] == pytest.approx(4.8, abs=0.1)
+    assert lag_payload(monitor.health()["S1"])["tracked_ms"] == pytest.approx(4.8, abs=0.1)
 
 
 def test_standing_still_gives_no_estimate_and_the_remedy() -> None:
     monitor = LagMonitor(CHAIN, CALIBRATION)
     play(monitor, 12.0, 4.0, still=True)
-    found = monitor.health()["S1"]
+    found = lag_payload(monitor.health()["S1"])
     assert found["lag_source"] == "calibration"
     assert found["lag_ms"] == 2.0
     assert "move faster" in str(found["tracked_refused"])
@@ -137,7 +138,7 @@ def test_standing_still_gives_no_estimate_and_the_remedy() -> None:
 def test_stream_without_markers_of_the_segment_gives_no_estimate(named: int) -> None:
     monitor = LagMonitor(CHAIN, CALIBRATION)
     play(monitor, 14, 5.0, named=named)
-    health = monitor.health()["S1"]
+    health = lag_payload(monitor.health()["S1"])
     assert health["tracked_ms"] is None
     assert "no gapless stretch of data" in str(health["tracked_refused"])
 
@@ -147,11 +148,11 @@ def test_configured_lag_is_used_and_only_checked_by_the_estimate() -> None:
     notices = play(monitor, 19.0, 4.0)
     assert [one.notice.kind for one in notices] == ["clock"]
     assert "standard deviations apart" in notices[0].notice.text
-    assert monitor.health()["S1"]["lag_source"] == "configured"
-    assert monitor.health()["S1"]["lag_ms"] == 1.0
+    assert lag_payload(monitor.health()["S1"])["lag_source"] == "configured"
+    assert lag_payload(monitor.health()["S1"])["lag_ms"] == 1.0
 
 
 def test_without_clusters_nothing_is_estimated() -> None:
     monitor = LagMonitor(CHAIN, None)
     assert play(monitor, 11.0, 4.0) == []
-    assert monitor.health()["S1"]["lag_source"] == "none"
+    assert lag_payload(monitor.health()["S1"])["lag_source"] == "none"

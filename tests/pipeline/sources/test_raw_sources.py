@@ -8,6 +8,7 @@ import pytest
 
 from jointfit_daemon.config import heading_warning, parse_rig
 from jointfit_daemon.model import Chunk
+from jointfit_daemon.outputs.payloads._health_encoding import core_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, Notice, SourceOpened
 from jointfit_protocols.xbus import XbusMessageId, encode
@@ -58,7 +59,7 @@ def test_health_of_a_raw_source_contains_rest_and_bias() -> None:
     core.feed(SourceOpened(2, "S1"))
     for k in range(1500):
         core.feed(ChunkArrived("S1", Chunk(k * 10_000_000 + 3, message(k))))
-    devices: Any = core.health(15_000_000_000)["devices"]
+    devices: Any = core_payload(core.health(15_000_000_000))["devices"]
     said = devices["S1"]["orientation_filter"]
     assert said["rest"] is True
     assert said["bias_rad_s"] == pytest.approx([0.01, 0.0, 0.0], abs=1e-3)

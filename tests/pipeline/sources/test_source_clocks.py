@@ -9,6 +9,7 @@ import pytest
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, ImuSample, SyncPulse, TickClock
+from jointfit_daemon.outputs.payloads._health_encoding import core_payload
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, Notice, SourceOpened
 from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
@@ -81,7 +82,7 @@ class Rig:
         return [out for out in self.out if isinstance(out, Notice) and out.kind == kind]
 
     def health(self, name: str, now_ns: int) -> dict[str, Any]:
-        devices: Any = self.core.health(now_ns)["devices"]
+        devices: Any = core_payload(self.core.health(now_ns))["devices"]
         return dict(devices[name])
 
 

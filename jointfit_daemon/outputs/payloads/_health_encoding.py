@@ -1,0 +1,151 @@
+"""JSON form of ``bridge/health``: units in the keys, and rounding."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jointfit_daemon.outputs.mqtt import LinkHealth
+    from jointfit_daemon.outputs.recording import RecordingHealth
+    from jointfit_daemon.pipeline.health import (
+        ClockHealth,
+        CoreHealth,
+        DeviceHealth,
+        LagHealth,
+        LearningHealth,
+    )
+
+_NS_PER_US, _NS_PER_MS, _NS_PER_S = 1e3, 1e6, 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessHealth:
+    """The process since the last health message."""
+
+    cpu_pct: float
+    """CPU time over elapsed time, percent of one core."""
+    rss_bytes: int | None
+    """Resident memory; None if unknown."""
+    loop_delay_p99_ms: float | None
+    """0.99 quantile of the event loop's delay in the last minute."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateHealth:
+    """Persistent data; the fields are reasons, None without a fault."""
+
+    fault: str | None
+    """Why the state directory cannot be written."""
+    not_stored: str | None
+    """Why the calibration in force is not stored."""
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeHealth:
+    """Health of the daemon."""
+
+    core: CoreHealth
+    process: ProcessHealth
+    link: LinkHealth
+    state: StateHealth
+    recording: RecordingHealth | None = None
+
+
+def health_payload(health: BridgeHealth) -> dict[str, Any]:
+    """Return the payload of ``bridge/health``."""
+    parts = {
+        "process": asdict(health.process),
+        "link": asdict(health.link),
+        "state": asdict(health.state),
+    }
+    if health.recording is not None:
+        parts["recording"] = asdict(health.recording)
+    return core_payload(health.core) | parts
+
+
+def core_payload(core: CoreHealth) -> dict[str, Any]:
+    """Return the part of the payload that describes the core."""
+    return {
+        "devices": {name: _device(device) for name, device in core.devices.items()},
+        "calibration": {"phase": core.phase, "version": core.version},
+        "fusion": core.fusion,
+        "lags": {name: lag_payload(lag) for name, lag in core.lags.items()},
+        "frames": asdict(core.frames),
+        "learning": learning_payload(core.learning),
+    }
+
+
+def _device(device: DeviceHealth) -> dict[str, Any]:
+    wire, silent_ns = device.wire, device.silent_ns
+    payload = {
+        "online": device.online,
+        "received": wire.received,
+        "corrupt": wire.corrupt,
+        "discarded_bytes": wire.discarded_bytes,
+        "lost": wire.lost,
+        "restarts": wire.restarts,
+        "reconnects": max(0, wire.opened - 1),
+        "last_age_ms": None if silent_ns is None else round(silent_ns / _NS_PER_MS, 1),
+        **device.samples,
+        **_clock(device.clock),
+    }
+    if device.orientation_filter is not None:
+        payload["orientation_filter"] = device.orientation_filter
+    if device.sensor is not None:
+        payload["sensor"] = device.sensor
+    return payload
+
+
+def _clock(clock: ClockHealth) -> dict[str, Any]:
+    delays = clock.delays
+    return {
+        "clock": clock.state,
+        "epoch": clock.epoch,
+        "offset_us": _us(clock.offset_ns),
+        "skew_ppm": None if clock.skew_ppm is None else round(clock.skew_ppm, 2),
+        "sigma_us": _us(clock.sigma_ns),
+        "bound_us": _us(clock.bound_ns),
+        "latency_prior_us": [_us(clock.latency_ns), _us(clock.latency_sd_ns)],
+        "jitter_us": _us(clock.jitter_ns),
+        "delay_us": None
+        if delays is None
+        else {"p50": _us(delays.p50_ns), "p99": _us(delays.p99_ns), "max": _us(delays.max_ns)},
+        "rate_hz": None if clock.rate_hz is None else round(clock.rate_hz, 2),
+    }
+
+
+def lag_payload(lag: LagHealth) -> dict[str, Any]:
+    """Return the lag of one sensor, in milliseconds."""
+    tracked = lag.tracked
+    return {
+        "lag_ms": _ms(lag.used_ns),
+        "lag_sigma_ms": _ms(lag.sigma_ns),
+        "lag_source": lag.source,
+        "lag_found_by": lag.found_by,
+        "tracked_ms": None if tracked is None else _ms(tracked.lag_ns),
+        "tracked_sigma_ms": None if tracked is None else _ms(tracked.sigma_ns),
+        "tracked_drift_ppm": None if tracked is None else round(1e6 * tracked.drift, 3),
+        "tracked_refused": lag.refused,
+    }
+
+
+def learning_payload(learning: LearningHealth) -> dict[str, Any]:
+    """Return the state of online learning."""
+    stopped_ns = learning.stopped_ns
+    return {
+        "state": learning.state,
+        "reason": learning.reason,
+        "stopped_s": None if stopped_ns is None else round(stopped_ns / _NS_PER_S, 1),
+        "kept": learning.kept,
+    }
+
+
+def _us(value_ns: float | None) -> float | None:
+    """Return a time in microseconds; None if it is unknown or infinite."""
+    return None if value_ns is None or not isfinite(value_ns) else round(value_ns / _NS_PER_US, 1)
+
+
+def _ms(value_ns: float | None) -> float | None:
+    return None if value_ns is None else round(value_ns * 1e-6, 3)

@@ -1,0 +1,153 @@
+"""Health of the core at one instant: devices, clocks, lags, frames and online learning.
+
+Times are in nanoseconds; `jointfit_daemon.outputs.payloads` converts them for ``bridge/health``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.pipeline.events import CalibrationPhase
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.fusion.faults import SensorState
+    from jointfit_daemon.timing.clock import DelayPercentiles
+    from jointfit_daemon.timing.lag import TrackedLag
+
+
+@dataclass(slots=True)
+class WireCounts:
+    """Counts since the daemon started; they go on when a reconnect replaces the decoder."""
+
+    received: int = 0
+    """Samples decoded."""
+    corrupt: int = 0
+    """Runs of discarded bytes."""
+    discarded_bytes: int = 0
+    lost: int = 0
+    """Samples that the device counted but that did not arrive."""
+    restarts: int = 0
+    """Restarts of the device, reported by it or seen in its clock. A device that was away counts as
+    restarted unless its clock shows otherwise."""
+    opened: int = 0
+    """Times the source was opened; all but the first are reconnects."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockHealth:
+    """Clock of one device."""
+
+    state: str
+    epoch: int
+    """Number of restarts of the clock."""
+    offset_ns: int | None
+    """Host minus device time."""
+    skew_ppm: float | None
+    sigma_ns: float | None
+    """Standard deviation of the last stamp."""
+    bound_ns: float | None
+    """Limit of the constant error; None without echoes."""
+    latency_ns: int
+    """Prior mean of the smallest delay from sample to arrival."""
+    latency_sd_ns: int
+    jitter_ns: float | None
+    delays: DelayPercentiles | None
+    """Delays from sampling instant to arrival in the last minute."""
+    rate_hz: float | None
+    """Sample rate in the last minute."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceHealth:
+    """One device.
+
+    Invariant: ``received = used + decimated + idle + late + duplicate + dropped + pending``.
+    Pending samples are counted elsewhere within a few sample periods.
+    """
+
+    online: bool
+    wire: WireCounts
+    silent_ns: int | None
+    """Time since the last chunk; None before the first."""
+    samples: Mapping[str, int]
+    """Samples by outcome (CONVENTIONS.md), and ``pending``."""
+    clock: ClockHealth
+    orientation_filter: object = None
+    """Report of an orientation filter on the gateway; None without one."""
+    sensor: SensorState | None = None
+    """State of an IMU; None for mocap."""
+
+
+class LagSource(StrEnum):
+    """Origin of the lag in use."""
+
+    NONE = "none"
+    CALIBRATION = "calibration"
+    CONFIGURED = "configured"
+
+
+@dataclass(frozen=True, slots=True)
+class LagHealth:
+    """Lag of one sensor behind the mocap system."""
+
+    source: LagSource
+    used_ns: float | None
+    sigma_ns: float | None
+    """Standard deviation of the lag in use."""
+    found_by: str | None
+    """Method of the calibration that estimated it."""
+    tracked: TrackedLag | None
+    """Estimate during operation."""
+    refused: str | None
+    """Reason why the last window gave no estimate."""
+
+
+class LearningState(StrEnum):
+    """State of online learning."""
+
+    OFF = "off"
+    WAITING = "waiting"
+    LEARNING = "learning"
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class LearningHealth:
+    """Online learning."""
+
+    state: LearningState = LearningState.OFF
+    reason: str | None = None
+    stopped_ns: int | None = None
+    """Time since the last usable frame; None unless stopped."""
+    kept: int = 0
+    """Number of frames that wait for a refit."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameCounts:
+    """Frames since the daemon started."""
+
+    sent: int = 0
+    empty: int = 0
+    """Without any sensor."""
+    skipped: int = 0
+    """Omitted after a stall of the process."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoreHealth:
+    """Health of the core; the default is that of a core without configuration."""
+
+    devices: Mapping[str, DeviceHealth] = field(default_factory=dict)
+    phase: CalibrationPhase = CalibrationPhase.UNCALIBRATED
+    version: int | None = None
+    """Version of the calibration in force."""
+    fusion: Mapping[str, object] = field(default_factory=dict)
+    """Consistency of the sensors, JSON form."""
+    lags: Mapping[str, LagHealth] = field(default_factory=dict)
+    frames: FrameCounts = field(default_factory=FrameCounts)
+    learning: LearningHealth = field(default_factory=LearningHealth)
