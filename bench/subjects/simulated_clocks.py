@@ -109,7 +109,7 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
         said = OrientationSensor(knobs, name).report(_seconds(taken[name][0]), q)
         hush = (gap_ns, gap_ns + NS // 2) if name == INTERRUPTED else (0, 0)
         _sensor(made, name, taken[name], said.tolist(), hush)
-    _cameras(made, cameras, taken["mocap"], cameras.see(seen))
+    _cameras(made, cameras, taken["mocap"], cameras.capture(seen))
     _echoes(made, tickers["mocap"], end_ns, knobs)
     rig = _rig()
     events: list[Event] = [Configured(BEGIN_NS, rig, None)]

@@ -60,7 +60,7 @@ def phases(seed: int = 1, rate_hz: float = 100.0) -> Phases:
         for name, q in zip(SENSORS, seen.sensors, strict=True)
     }
     cameras = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz)
-    frames = cameras.see(seen)
+    frames = cameras.capture(seen)
 
     def cut(begin_s: float, length_s: float) -> CalibrationTrial:
         low, high = begin_s + _LEAD_S, begin_s + length_s

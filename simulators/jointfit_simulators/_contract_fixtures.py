@@ -1,42 +1,51 @@
-"""The scenery of the conformance suite: a device that serves, a daemon that listens, bad wires.
+"""Host, device and noisy wire for the conformance suite of drivers.
 
-Law: no driver and no device is named here; claims are made in ``driver_contract``.
+Invariant: no driver and no device is named here.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import math
 import os
 import random
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Coroutine
+    from collections.abc import AsyncIterator
 
     from jointfit_daemon.driver import Driver
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_simulators.imu_device import Quaternion
 
+_POLL_S = 0.005
+"""Interval between two checks for new measurements, s."""
+_SETTLE_S = 0.03
+"""Time without a new measurement after which all have arrived, s."""
+_CLEAN_SHARE = 0.6
+"""Share of the messages that the noise leaves unchanged."""
+
 
 class ContractDevice(Protocol):
-    """What the suite needs of a simulated device."""
+    """Simulated device of the conformance suite."""
 
     async def run(self) -> None:
         """Serve until cancelled."""
 
     def unplug(self) -> None:
-        """Take the wire away; again, or on a device that never ran, it does nothing."""
+        """Disconnect the wire; no effect on a disconnected device or before ``run``."""
 
     def plug(self) -> None:
-        """Put the wire back."""
+        """Connect the wire."""
 
 
 def orientation(number: int) -> Quaternion:
-    """Return the orientation of sample `number`: each more than 0.1 rad from its neighbours."""
+    """Return the orientation of sample `number`, more than 0.1 rad from adjacent samples."""
     turn, tilt = 0.06 * number, 0.025 * number
     return (
         math.cos(turn) * math.cos(tilt),
@@ -47,7 +56,7 @@ def orientation(number: int) -> Quaternion:
 
 
 class DecodingReceiver:
-    """Stands where the daemon stands: takes chunks, decodes them at once, keeps both."""
+    """Receiver in place of the daemon: decodes each chunk at once and stores chunks and events."""
 
     def __init__(self, driver: Driver, measurement: type) -> None:
         self.chunks: list[Chunk] = []
@@ -56,23 +65,23 @@ class DecodingReceiver:
         self._measurement = measurement
 
     def emit(self, chunk: Chunk) -> None:
-        """Take one chunk."""
+        """Store and decode one chunk."""
         self.chunks.append(chunk)
         self.events += self.decoder.feed(chunk)
 
     async def wait_for(self, count: int, within_s: float) -> None:
-        """Wait until `count` measurements are here, or for `within_s`."""
-        for _ in range(round(within_s / 0.005)):
+        """Wait until `count` measurements have arrived, at most `within_s`."""
+        for _ in range(round(within_s / _POLL_S)):
             if len(self.measurements) >= count:
                 return
-            await asyncio.sleep(0.005)
+            await asyncio.sleep(_POLL_S)
 
     async def settle(self) -> None:
-        """Wait until no more measurements come."""
-        seen = -1
-        while seen != len(self.measurements):
-            seen = len(self.measurements)
-            await asyncio.sleep(0.03)
+        """Wait until no further measurements arrive."""
+        before = -1
+        while before != len(self.measurements):
+            before = len(self.measurements)
+            await asyncio.sleep(_SETTLE_S)
 
     @property
     def measurements(self) -> list[Any]:
@@ -81,20 +90,22 @@ class DecodingReceiver:
 
 
 class SwitchableNoise:
-    """A wire that is clean until told otherwise: flips, cuts, repeats and adds bytes."""
+    """Wire noise that flips bits, truncates, inserts bytes and repeats parts while `on`."""
 
     def __init__(self) -> None:
         self.on = False
-        self._random = random.Random(7)  # noqa: S311 - the same noise every time
+        self._random = random.Random(7)  # noqa: S311 - the same noise in every run
 
     def __call__(self, data: bytes) -> bytes:
-        """Return what arrives of `data`."""
-        if not self.on or self._random.random() < 0.6:  # noqa: PLR2004 - four in ten suffer
+        """Return `data` as it arrives at the host."""
+        if not self.on or self._random.random() < _CLEAN_SHARE:
             return data
+
         place = self._random.randrange(len(data))
         match self._random.randrange(4):
             case 0:
-                bit = self._random.choice((0x01, 0x10, 0x80, 0x80))  # signs are what hurts most
+                # sign bits are more likely: their errors are the largest
+                bit = self._random.choice((0x01, 0x10, 0x80, 0x80))
                 return data[:place] + bytes((data[place] ^ bit,)) + data[place + 1 :]
             case 1:
                 return data[:place]
@@ -104,20 +115,15 @@ class SwitchableNoise:
                 return data[:place] + data
 
 
-def require(condition: object, claim: str) -> None:
-    """Raise AssertionError unless `condition`: a driver breaks its contract."""
+def require(condition: object, requirement: str) -> None:
+    """Raise AssertionError with the violated requirement unless `condition` is true."""
     if not condition:
-        raise AssertionError(f"not so: {claim}")
-
-
-def run_scene(scene: Coroutine[Any, Any, None]) -> None:
-    """Run a scene on a loop of its own, so that the suite needs no plug-in of pytest."""
-    asyncio.run(scene)
+        raise AssertionError(f"contract violated: {requirement}")
 
 
 @contextlib.asynccontextmanager
 async def serve_device(device: ContractDevice) -> AsyncIterator[None]:
-    """Have the device serve; unplug it at the end."""
+    """Run the device for the duration of the block; unplug it at the end."""
     task = asyncio.create_task(device.run())
     try:
         yield
@@ -127,42 +133,38 @@ async def serve_device(device: ContractDevice) -> AsyncIterator[None]:
 
 
 async def cancel_and_wait(task: asyncio.Task[None]) -> None:
-    """Cancel and see it end within a second."""
+    """Cancel a task and require that it ends with CancelledError within a second."""
     task.cancel()
-    _, late = await asyncio.wait({task}, timeout=1.0)
-    require(not late, "a cancelled run ends within a second")
+    _, pending = await asyncio.wait({task}, timeout=1.0)
+    require(not pending, "a cancelled run must end within a second")
     if not task.cancelled():
-        task.result()
-        raise AssertionError("not so: a cancelled run raises CancelledError")
+        task.result()  # raises the exception that ended it
+    require(task.cancelled(), "a cancelled run must raise CancelledError")
 
 
 async def require_error(kind: type[Exception], task: asyncio.Task[None], within_s: float) -> None:
-    """See `task` end with exactly `kind`."""
-    _, late = await asyncio.wait({task}, timeout=within_s)
-    if late:
+    """Require that `task` ends with exactly `kind` within `within_s`."""
+    _, pending = await asyncio.wait({task}, timeout=within_s)
+    if pending:
         await cancel_and_wait(task)
-        raise AssertionError(f"not so: {kind.__name__} within {within_s:g} s")
+    require(not pending, f"run must raise {kind.__name__} within {within_s:g} s")
+
     error = task.exception()
     if error is not None and type(error) is not kind:
         raise error
-    require(error is not None, f"{kind.__name__} is raised, run does not just return")
+    require(error is not None, f"run must raise {kind.__name__}; it returned")
     require(
-        kind not in {DeviceLostError, DeviceMisconfiguredError} or str(error), "it says something"
+        kind not in {DeviceLostError, DeviceMisconfiguredError} or str(error),
+        f"{kind.__name__} must have a message",
     )
 
 
 def count_descriptors() -> int:
-    """Return how many descriptors this process has open."""
+    """Return the number of open descriptors of this process."""
     return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - a count, not paths
 
 
 def content_of(measurement: Any) -> str:
-    """Return everything of a measurement but when it arrived."""
-    changed: Callable[..., Any] | None = getattr(measurement, "_replace", None)
-    if changed is not None:
-        return repr(changed(arrival_ns=0))
-    return repr([(k, getattr(measurement, k)) for k in _fields(measurement)])
-
-
-def _fields(measurement: Any) -> list[str]:
-    return [name for name in measurement.__dataclass_fields__ if name != "arrival_ns"]
+    """Return all values of a measurement except its arrival time."""
+    replace = getattr(measurement, "_replace", None) or partial(dataclasses.replace, measurement)
+    return repr(replace(arrival_ns=0))

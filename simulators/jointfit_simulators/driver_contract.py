@@ -1,32 +1,32 @@
-"""The conformance suite: what every driver owes the daemon, tried against its simulated device.
+"""Conformance suite for drivers, run against the simulated device of each driver.
 
-Law: no driver and no device is named here, and nothing but the driver interface is used. The suite
-needs pytest to collect it but imports none of it.
+Invariant: the suite uses only the driver interface. It names no driver and no device, and it does
+not import pytest.
 
 Use
 ---
-Derive a class whose name starts with ``Test``, name the driver and the device, and pytest runs
-the whole suite::
+Derive a class whose name starts with ``Test`` and return driver and device. pytest then collects
+all tests of the suite::
 
     from jointfit_simulators.driver_contract import DriverContract
 
     class TestXbus(DriverContract):
-        registered_as = "xbus"                      # its entry point
+        registered_as = "xbus"                      # name of its entry point
 
-        def make_device(self, folder, wire_noise):  # not running yet; plugged in
+        def make_device(self, folder, wire_noise):  # plugged in, not running
             return XbusDevice(folder / "imu", wire_noise=wire_noise)
 
-        def make_driver(self, folder):              # a fresh driver for that device
+        def make_driver(self, folder):              # a new driver for this device
             return XbusImu(XbusSettings(..., port=str(folder / "imu"), silence_s=0.5))
 
-        def make_wrong_device(self, folder):        # optional: what is no such device
+        def make_wrong_device(self, folder):        # optional: a device of another kind
             return WrongDevice(folder / "imu")
 
-`folder` is empty and fresh for every test. A device needs ``push`` (or override ``send``), ``run``,
-``unplug`` and ``plug``. For a driver that yields no ``ImuSample`` override ``measurement``,
-``send`` and ``matches``. Numbers that differ on slow wires are class attributes. Where a wire
-cannot do something, return ``None`` from ``make_wrong_device``, or set ``has_noise`` or
-``has_plug`` to False: those tests are then skipped and say so.
+`folder` is an empty directory for each test. A device needs ``push`` (or override ``send``),
+``run``, ``unplug`` and ``plug``. If the driver yields a type other than ``ImuSample``, override
+``measurement``, ``send`` and ``matches``. Time limits for slow wires are class attributes. If a
+wire lacks a feature, return ``None`` from ``make_wrong_device``, or set ``has_noise`` or
+``has_plug`` to False; the corresponding tests are skipped with a reason.
 """
 
 from __future__ import annotations
@@ -50,7 +50,6 @@ from jointfit_simulators._contract_fixtures import (
     orientation,
     require,
     require_error,
-    run_scene,
     serve_device,
 )
 from jointfit_simulators.imu_device import clean_wire
@@ -62,26 +61,29 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
-_STEP_NS = 10_000_000  # device time between two samples
-_PACE_S = 0.002  # host time between two samples: faster than real, so that the suite is short
+_STEP_NS = 10_000_000
+"""Device time between two samples, ns."""
+_PACE_S = 0.002
+"""Host time between two samples, s; shorter than the device time, to shorten the suite."""
 
 
 class DriverContract(ABC):
-    """All tests every driver must pass; derive, name driver and device, done."""
+    """Tests that every driver must pass."""
 
     registered_as: ClassVar[str | None] = None
-    """Entry point name; None while it has none."""
+    """Name of the entry point; None for an unregistered driver."""
     measurement: ClassVar[type] = ImuSample
-    """What its decoder yields for a sample."""
+    """Type of the measurements that the decoder returns."""
     starts_within_s: ClassVar[float] = 10.0
+    """Longest time from the start of ``run`` to the first sample, s."""
     lost_within_s: ClassVar[float] = 1.0
-    """From unplugging, or from the last byte, to DeviceLostError."""
+    """Longest time from unplugging, or from the last byte, to DeviceLostError, s."""
     refused_within_s: ClassVar[float] = 15.0
-    """From meeting a wrong device to DeviceMisconfiguredError."""
+    """Longest time from the start on a wrong device to DeviceMisconfiguredError, s."""
     has_noise: ClassVar[bool] = True
     has_plug: ClassVar[bool] = True
 
-    # --- what a driver names ------------------------------------------------------------------
+    # --- to be implemented or overridden for a driver -----------------------------------------
 
     @abstractmethod
     def make_device(self, folder: Path, wire_noise: WireNoise) -> Any:
@@ -89,186 +91,217 @@ class DriverContract(ABC):
 
     @abstractmethod
     def make_driver(self, folder: Path) -> Driver:
-        """Return a fresh driver for that device; ``silence_s`` at most 0.5."""
+        """Return a new driver for this device, with ``silence_s`` at most 0.5."""
 
-    def make_wrong_device(self, folder: Path) -> Any:  # noqa: ARG002 - for those who override
-        """Return another kind of device in the same place; None if that cannot be told apart."""
+    def make_wrong_device(self, folder: Path) -> Any:  # noqa: ARG002 - for overriding methods
+        """Return a device of another kind at the same port; None if drivers cannot detect it."""
         return None
 
     def send(self, device: Any, number: int) -> None:
-        """Have the device send sample `number` now."""
+        """Make the device send sample `number` now."""
         device.push(number * _STEP_NS, orientation(number))
 
     def matches(self, number: int, measurement: Any) -> bool:
-        """Whether `measurement` is sample `number`: within 0.03 rad by default."""
+        """Return whether `measurement` is sample `number`; by default within 0.03 rad."""
         w, x, y, z = orientation(number)
         a, b, c, d = measurement.q_world_sensor
         return bool(abs(a * w + b * x + c * y + d * z) > 1 - 1e-4)
 
-    # --- the suite ----------------------------------------------------------------------------
+    # --- tests --------------------------------------------------------------------------------
 
-    def test_settings_are_frozen_typed_and_refuse_unknown_keys(self, tmp_path: Path) -> None:
-        """A typo in rig.toml must not pass."""
+    def test_settings_are_frozen_and_reject_unknown_keys(self, tmp_path: Path) -> None:
+        """A misspelled key of rig.toml is an error."""
         kind = type(self.make_driver(tmp_path))
-        require(issubclass(kind.Settings, Settings), "Settings derives from driver.Settings")
-        require(kind.Settings.model_config.get("frozen") is True, "Settings are frozen")
-        require(kind.Settings.model_config.get("extra") == "forbid", "unknown keys are refused")
-        require(kind.wire in {"stream", "datagram", "can"}, "wire says how chunks are cut")
+        require(issubclass(kind.Settings, Settings), "Settings must derive from driver.Settings")
+        require(kind.Settings.model_config.get("frozen") is True, "Settings must be frozen")
+        require(
+            kind.Settings.model_config.get("extra") == "forbid", "Settings must reject unknown keys"
+        )
+        require(kind.wire in {"stream", "datagram", "can"}, "wire must be stream, datagram or can")
 
-    def test_the_entry_point_finds_the_driver(self, tmp_path: Path) -> None:
-        """The daemon knows drivers by name only."""
+    def test_entry_point_finds_the_driver(self, tmp_path: Path) -> None:
+        """The daemon finds drivers by name."""
         if self.registered_as is None:
             raise SkipTest("not registered")
         found = find_driver(self.registered_as)
-        require(found is type(self.make_driver(tmp_path)), f"entry point names {found}")
+        require(
+            found is type(self.make_driver(tmp_path)),
+            f"entry point {self.registered_as} must name the driver; it names {found}",
+        )
 
-    def test_it_opens_configures_and_streams_every_sample(self, tmp_path: Path) -> None:
-        """What was sent arrives whole, in order, stamped with a plausible arrival."""
+    def test_driver_opens_configures_and_streams_every_sample(self, tmp_path: Path) -> None:
+        """All samples arrive once, in order, with a plausible arrival time."""
 
         async def scene() -> None:
             began_ns = time.monotonic_ns()
             device = self.make_device(tmp_path, clean_wire)
-            async with self._streaming(device, self.make_driver(tmp_path)) as (heard, first):
-                numbers = await self._send_all(device, heard, first, 50)
-            got = heard.measurements[-len(numbers) :]
-            require(all(map(self.matches, numbers, got)), "every sample arrives once and in order")
-            stamps = [item.arrival_ns for item in got]
-            require(stamps == sorted(stamps), "arrivals do not run backwards")
-            require(began_ns < stamps[0] <= time.monotonic_ns(), "arrival is host monotonic time")
-            require(heard.decoder.messages >= len(numbers), "messages are counted")
-            require(heard.decoder.discarded_bytes == 0, "a clean wire discards nothing")
+            async with self.streaming(device, self.make_driver(tmp_path)) as (receiver, first):
+                numbers = await self._send_all(device, receiver, first, 50)
 
-        run_scene(scene())
+            received = receiver.measurements[-len(numbers) :]
+            require(
+                all(map(self.matches, numbers, received)),
+                "every sample must arrive once and in order",
+            )
 
-    def test_the_cut_of_the_stream_does_not_matter(self, tmp_path: Path) -> None:
-        """Byte at a time, or all at once: the same samples. Datagrams are cut by the sender."""
+            stamps = [item.arrival_ns for item in received]
+            require(stamps == sorted(stamps), "arrival times must not decrease")
+            require(
+                began_ns < stamps[0] <= time.monotonic_ns(),
+                "arrival times must be host CLOCK_MONOTONIC",
+            )
+
+            require(
+                receiver.decoder.messages >= len(numbers), "the decoder must count its messages"
+            )
+            require(
+                receiver.decoder.discarded_bytes == 0,
+                "the decoder must not discard bytes of a clean wire",
+            )
+
+        asyncio.run(scene())
+
+    def test_samples_do_not_depend_on_the_split_of_the_stream(self, tmp_path: Path) -> None:
+        """Single bytes and one large chunk give the same samples. Datagrams remain whole."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
-            async with self._streaming(device, driver) as (heard, first):
-                await self._send_all(device, heard, first, 20)
-            wire = b"".join(chunk.data for chunk in heard.chunks)
-            t_ns = heard.chunks[-1].t_ns
-            cuts = {
-                "stream": [[wire], [bytes((byte,)) for byte in wire]],
-                "can": [[wire]],
-                "datagram": [[chunk.data for chunk in heard.chunks]],
+            async with self.streaming(device, driver) as (receiver, first):
+                await self._send_all(device, receiver, first, 20)
+
+            data = b"".join(chunk.data for chunk in receiver.chunks)
+            t_ns = receiver.chunks[-1].t_ns
+            splits = {
+                "stream": [[data], [bytes((byte,)) for byte in data]],
+                "can": [[data]],
+                "datagram": [[chunk.data for chunk in receiver.chunks]],
             }
-            for pieces in cuts[driver.wire]:
+            for pieces in splits[driver.wire]:
                 again = DecodingReceiver(driver, self.measurement)
                 for piece in pieces:
                     again.emit(Chunk(t_ns, piece))
-                same = list(map(content_of, again.measurements))
                 require(
-                    same == list(map(content_of, heard.measurements)),
-                    f"{len(pieces)} pieces give the same samples",
+                    list(map(content_of, again.measurements))
+                    == list(map(content_of, receiver.measurements)),
+                    f"{len(pieces)} pieces must give the same samples as the original chunks",
                 )
                 require(
-                    again.decoder.discarded_bytes == heard.decoder.discarded_bytes,
-                    "and the same losses",
+                    again.decoder.discarded_bytes == receiver.decoder.discarded_bytes,
+                    f"{len(pieces)} pieces must give the same number of discarded bytes",
                 )
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_a_replay_gives_the_same_events(self, tmp_path: Path) -> None:
-        """A decoder is a function of its chunks: no clock, no chance, no shared state."""
+    def test_replay_returns_the_same_events(self, tmp_path: Path) -> None:
+        """Decoder output depends on the chunks only: no clock, random numbers or shared state."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
-            async with self._streaming(device, driver) as (heard, first):
-                await self._send_all(device, heard, first, 20)
+            async with self.streaming(device, driver) as (receiver, first):
+                await self._send_all(device, receiver, first, 20)
+
             again = DecodingReceiver(driver, self.measurement)
-            for chunk in heard.chunks:
+            for chunk in receiver.chunks:
                 again.emit(chunk)
-            require(repr(again.events) == repr(heard.events), "the same events")
+            require(
+                repr(again.events) == repr(receiver.events), "a replay must give the same events"
+            )
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_any_bytes_give_events_and_never_an_exception(self, tmp_path: Path) -> None:
-        """Corruption is an event; what waits for more is bounded."""
-        noise, decoder = random.Random(11), self.make_driver(tmp_path).decoder()  # noqa: S311 - as above
+    def test_random_bytes_never_raise(self, tmp_path: Path) -> None:
+        """Corrupt bytes are events, and the number of pending bytes is bounded."""
+        noise = random.Random(11)  # noqa: S311 - the same bytes in every run
+        decoder = self.make_driver(tmp_path).decoder()
         fed = lost = 0
         for t_ns in range(0, 400_000_000, 1_000_000):
             data = noise.randbytes(noise.randrange(200))
             fed += len(data)
             events = decoder.feed(Chunk(t_ns, data))
             lost += sum(event.discarded for event in events if isinstance(event, Corrupt))
-        lost += sum(event.discarded for event in decoder.flush() if isinstance(event, Corrupt))
-        require(lost <= fed, "no more bytes are reported lost than came")
-        require(decoder.discarded_bytes <= fed, "no more bytes are counted lost than came")
 
-    def test_noise_on_the_line_costs_only_what_it_hit(self, tmp_path: Path) -> None:
-        """The driver keeps running, good samples come through, bad ones never look good."""
+        lost += sum(event.discarded for event in decoder.flush() if isinstance(event, Corrupt))
+        require(lost <= fed, f"{lost} bytes reported as corrupt, but only {fed} received")
+        require(
+            decoder.discarded_bytes <= fed,
+            f"{decoder.discarded_bytes} bytes counted as discarded, but only {fed} received",
+        )
+
+    def test_line_noise_affects_only_damaged_samples(self, tmp_path: Path) -> None:
+        """The driver continues, undamaged samples arrive, and damaged ones are rejected."""
         if not self.has_noise:
             raise SkipTest("this wire has its own error detection")
 
         async def scene() -> None:
             noise = SwitchableNoise()
             device = self.make_device(tmp_path, noise)
-            async with self._streaming(device, self.make_driver(tmp_path)) as (heard, first):
-                before = len(heard.measurements)
+            async with self.streaming(device, self.make_driver(tmp_path)) as (receiver, first):
+                before = len(receiver.measurements)
                 noise.on = True
                 for number in range(first, first + 200):
                     self.send(device, number)
                     await asyncio.sleep(_PACE_S)
                 noise.on = False
-                await asyncio.sleep(0.3)  # silence ends what a broken length still waits for
+
+                # silence ends a message whose length field is damaged
+                await asyncio.sleep(0.3)
                 self.send(device, first + 200)
-                await heard.settle()
-                clean = await self._send_all(device, heard, first + 201, 10)
-            got = heard.measurements[before:]
+                await receiver.settle()
+                clean = await self._send_all(device, receiver, first + 201, 10)
+
+            received = receiver.measurements[before:]
             numbers = range(first, clean[-1] + 1)
-            require(len(got) >= len(numbers) // 2, f"most samples survive, {len(got)} did")
             require(
-                all(any(self.matches(number, item) for number in numbers) for item in got),
-                "what comes through was sent",
+                len(received) >= len(numbers) // 2,
+                f"at least half of the {len(numbers)} samples must arrive; {len(received)} did",
             )
-            require(heard.decoder.discarded_bytes > 0, "losses are counted")
+            require(
+                all(any(self.matches(number, item) for number in numbers) for item in received),
+                "every received sample must be one that was sent",
+            )
+            require(receiver.decoder.discarded_bytes > 0, "the decoder must count damaged bytes")
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_silence_is_a_lost_device(self, tmp_path: Path) -> None:
-        """A device that stops talking is lost, not waited for."""
+    def test_silence_raises_device_lost(self, tmp_path: Path) -> None:
+        """The driver does not wait for a silent device."""
 
         async def scene() -> None:
-            device = self.make_device(tmp_path, clean_wire)
-            driver, heard = self.make_driver(tmp_path), None
+            device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             async with serve_device(device):
-                heard = DecodingReceiver(driver, self.measurement)
-                task = asyncio.create_task(driver.run(heard.emit))
-                first = await self._first(device, heard, task)
-                await self._send_all(device, heard, first, 5)
+                receiver = DecodingReceiver(driver, self.measurement)
+                task = asyncio.create_task(driver.run(receiver.emit))
+                first = await self._send_first(device, receiver, task)
+                await self._send_all(device, receiver, first, 5)
                 await require_error(DeviceLostError, task, self.lost_within_s)
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_unplugging_is_noticed_and_replugging_heals(self, tmp_path: Path) -> None:
-        """Unplugged: DeviceLostError in time. Plugged in again: the same driver runs again."""
+    def test_driver_detects_unplugging_and_runs_again_after_plugging(self, tmp_path: Path) -> None:
+        """Unplugging raises DeviceLostError. After plugging, the same driver runs again."""
         if not self.has_plug:
             raise SkipTest("this wire cannot be unplugged")
 
         async def scene() -> None:
-            device = self.make_device(tmp_path, clean_wire)
-            driver = self.make_driver(tmp_path)
+            device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             async with serve_device(device):
-                heard = DecodingReceiver(driver, self.measurement)
-                task = asyncio.create_task(driver.run(heard.emit))
-                first = await self._first(device, heard, task)
+                receiver = DecodingReceiver(driver, self.measurement)
+                task = asyncio.create_task(driver.run(receiver.emit))
+                first = await self._send_first(device, receiver, task)
                 device.unplug()
                 await require_error(DeviceLostError, task, self.lost_within_s)
-                await require_error(
-                    DeviceLostError,
-                    asyncio.create_task(driver.run(heard.emit)),
-                    self.starts_within_s,
-                )
+
+                task = asyncio.create_task(driver.run(receiver.emit))
+                await require_error(DeviceLostError, task, self.starts_within_s)
+
                 device.plug()
-                async with self._reading(device, driver, first) as (heard, number):
-                    await self._send_all(device, heard, number, 10)
+                async with self._reading(device, driver, first) as (receiver, number):
+                    await self._send_all(device, receiver, number, 10)
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_a_device_that_is_not_there_may_come(self, tmp_path: Path) -> None:
-        """Absent is DeviceLostError: the supervisor tries again."""
+    def test_absent_device_raises_device_lost(self, tmp_path: Path) -> None:
+        """The supervisor retries a device that is absent at the start."""
         if not self.has_plug:
             raise SkipTest("this wire cannot be unplugged")
 
@@ -278,23 +311,23 @@ class DriverContract(ABC):
             task = asyncio.create_task(driver.run(lambda _: None))
             await require_error(DeviceLostError, task, self.starts_within_s)
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_a_wrong_device_is_named_not_retried(self, tmp_path: Path) -> None:
-        """What can never work is DeviceMisconfiguredError, with words to act on."""
+    def test_wrong_device_raises_device_misconfigured(self, tmp_path: Path) -> None:
+        """An error that a retry cannot resolve has a message for the user."""
         device = self.make_wrong_device(tmp_path)
         if device is None:
-            raise SkipTest("a wrong device cannot be told apart on this wire")
+            raise SkipTest("this wire does not allow detection of a wrong device")
 
         async def scene() -> None:
             async with serve_device(device):
                 task = asyncio.create_task(self.make_driver(tmp_path).run(lambda _: None))
                 await require_error(DeviceMisconfiguredError, task, self.refused_within_s)
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_a_bug_in_the_daemon_is_not_taken_for_a_lost_device(self, tmp_path: Path) -> None:
-        """What ``emit`` raises reaches the caller of ``run`` as it is."""
+    def test_exception_of_emit_reaches_the_caller(self, tmp_path: Path) -> None:
+        """A bug in the daemon is not reported as a lost device."""
 
         async def scene() -> None:
             device = self.make_device(tmp_path, clean_wire)
@@ -312,16 +345,18 @@ class DriverContract(ABC):
                         await asyncio.sleep(_PACE_S)
                 await require_error(ZeroDivisionError, task, self.starts_within_s)
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    def test_cancelling_closes_everything(self, tmp_path: Path) -> None:
-        """Five times over: no descriptor and no task is left, before, while and after opening."""
+    def test_cancelling_closes_all_descriptors_and_tasks(self, tmp_path: Path) -> None:
+        """``run`` is cancelled five times: before, during and after opening."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             async with serve_device(device):
+                # the first run creates objects with the lifetime of the process (executors, caches)
                 async with self._reading(device, driver, 0):
-                    pass  # whatever is made once (executors, caches) is made now
+                    pass
+
                 before, tasks = count_descriptors(), asyncio.all_tasks()
                 for pause_s in (0.0, 0.001, 0.02):
                     task = asyncio.create_task(driver.run(lambda _: None))
@@ -330,18 +365,18 @@ class DriverContract(ABC):
                 for _ in range(2):
                     async with self._reading(device, driver, 0):
                         pass
-                require(asyncio.all_tasks() == tasks, "no task is left")
-                require(count_descriptors() == before, "no descriptor is left")
+                require(asyncio.all_tasks() == tasks, "run must not leave tasks")
+                require(count_descriptors() == before, "run must not leave open descriptors")
 
-        run_scene(scene())
+        asyncio.run(scene())
 
-    # --- scenery ------------------------------------------------------------------------------
+    # --- driver and device at work ------------------------------------------------------------
 
     @contextlib.asynccontextmanager
-    async def _streaming(
+    async def streaming(
         self, device: Any, driver: Driver
     ) -> AsyncIterator[tuple[DecodingReceiver, int]]:
-        """Device and driver at work; yields the listener and the next sample number."""
+        """Run device and driver; yield the receiver and the next sample number."""
         async with serve_device(device), self._reading(device, driver, 0) as state:
             yield state
 
@@ -349,38 +384,38 @@ class DriverContract(ABC):
     async def _reading(
         self, device: Any, driver: Driver, number: int
     ) -> AsyncIterator[tuple[DecodingReceiver, int]]:
-        """Driver at work on a device that runs; yields as ``_streaming``; cancels at the end."""
-        heard = DecodingReceiver(driver, self.measurement)
-        task = asyncio.create_task(driver.run(heard.emit))
+        """Run the driver on a running device; yield like `streaming`."""
+        receiver = DecodingReceiver(driver, self.measurement)
+        task = asyncio.create_task(driver.run(receiver.emit))
         try:
-            yield heard, await self._first(device, heard, task, number)
+            yield receiver, await self._send_first(device, receiver, task, number)
         finally:
             await cancel_and_wait(task)
 
-    async def _first(
-        self, device: Any, heard: DecodingReceiver, task: asyncio.Task[None], number: int = 0
+    async def _send_first(
+        self, device: Any, receiver: DecodingReceiver, task: asyncio.Task[None], number: int = 0
     ) -> int:
-        """Send until the first sample arrives, then let the rest arrive; return the next number."""
+        """Send until a sample arrives, then wait for the others; return the next number."""
         async with asyncio.timeout(self.starts_within_s):
-            while not heard.measurements:
+            while not receiver.measurements:
                 if task.done():
-                    task.result()  # raises what ended it
-                    raise AssertionError("not so: run reads until cancelled")
+                    task.result()  # raises the exception that ended it
+                    require(False, "run must read until it is cancelled")
                 self.send(device, number)
                 number += 1
                 await asyncio.sleep(_PACE_S)
-        await heard.settle()
+        await receiver.settle()
         return number
 
     async def _send_all(
-        self, device: Any, heard: DecodingReceiver, first: int, count: int
+        self, device: Any, receiver: DecodingReceiver, first: int, count: int
     ) -> range:
         """Send `count` samples and wait for all of them."""
-        before = len(heard.measurements)
+        before = len(receiver.measurements)
         for number in range(first, first + count):
             self.send(device, number)
             await asyncio.sleep(_PACE_S)
-        await heard.wait_for(before + count, self.lost_within_s / 2)
-        got = len(heard.measurements) - before
-        require(got == count, f"{count} samples sent, {got} arrived")
+        await receiver.wait_for(before + count, self.lost_within_s / 2)
+        received = len(receiver.measurements) - before
+        require(received == count, f"all {count} samples must arrive; {received} did")
         return range(first, first + count)

@@ -17,7 +17,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 def clean_wire(data: bytes) -> bytes:
-    """Return `data` as it is: a wire without noise."""
+    """Return `data` unchanged: a wire without noise."""
     return data
 
 
@@ -26,30 +26,30 @@ class ImuDevice(Protocol):
 
     @property
     def streaming(self) -> bool:
-        """Whether the device was told to measure (on CAN: its bus is open)."""
+        """Whether the device is in measurement mode (on CAN: whether its bus is open)."""
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second, as the host's handshake (or the constructor) configured it."""
+        """Samples per second, as configured by the host or the constructor."""
 
     @property
     def sent(self) -> int:
-        """Samples written to the wire so far, whole."""
+        """Number of complete samples written to the wire."""
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Encode one sample and put it on the wire now.
+        """Encode one sample and send it now.
 
         Parameters
         ----------
         device_ns
-            The device's own clock, ns since its power-up; turned into its ticks here.
+            Time of the device clock since power-up, ns; the device converts it to ticks.
         q_world_sensor
             Unit quaternion, sensor to the sensor's own world (ENU).
 
         Notes
         -----
-        A device that does not stream counts the sample as produced but sends nothing. Where the
-        wire is full (nobody reads) the sample is lost whole and does not count as sent.
+        A device that does not stream counts the sample but sends nothing. On a full wire (no
+        reader) the whole sample is lost and not counted as sent.
         """
 
     async def run(self) -> None:

@@ -214,7 +214,7 @@ def frames(
     cameras = Cameras(knobs, wearer, rate_hz=120.0)
     t = np.arange(0.0, seconds, 1 / 120)
     observation = wearer.observe([NONE] * 4, t, t)
-    return cameras, cameras.see(observation), observation
+    return cameras, cameras.capture(observation), observation
 
 
 def test_markers_are_hidden_for_their_share_of_the_time_in_bursts() -> None:
@@ -282,7 +282,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
             OrientationSensor(knobs, name).report(T, q)
             for name, q in zip(SENSORS, found.sensors, strict=True)
         ]
-        markers = Cameras(knobs, wearer, rate_hz=120.0).see(found).markers
+        markers = Cameras(knobs, wearer, rate_hz=120.0).capture(found).markers
         return np.concatenate([*map(np.ravel, said), np.ravel(markers)])
 
     np.testing.assert_array_equal(run(3), run(3))

@@ -114,7 +114,7 @@ def test_reference_bones_are_streamed_as_bodies(squats: list[Path]) -> None:
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
     t = np.arange(2.0, 8.0, 0.1)
     observation = subject.observe([NONE] * 4, t, t)
-    seen = cameras.see(observation)
+    seen = cameras.capture(observation)
     assert cameras.bodies == ("Thigh", "Shank")
     body = Rotation.from_quat(seen.body_orientations[:, 1], scalar_first=True)
     apart = body.inv() * observation.truth.orientations["shank"]
@@ -168,7 +168,7 @@ def test_cameras_see_bones_standing_and_recorded_but_never_made_up(squats: list[
     subject = RecordedSubject(read_recorded_trial(squats), SENSORS, steps, transition_s=1.0)
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
     t = np.array([1.0, 1.99, 2.01, 2.5, 2.99, 3.0, 5.0, 7.0, 7.01, 9.9, 10.5, 11.01])
-    seen = cameras.see(subject.observe([NONE] * 4, t, t)).body_positions[:, :, 0]
+    seen = cameras.capture(subject.observe([NONE] * 4, t, t)).body_positions[:, :, 0]
     visible = [True, True, False, False, False, True, True, True, False, False, False, True]
     assert np.isfinite(seen).all(axis=1).tolist() == visible
 

@@ -22,7 +22,7 @@ NOW = 10**13
 
 def test_a_clock_runs_as_it_is_asked_to() -> None:
     ticker = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
-    ticker.ask(ClockFault.parse("50,3600"), NOW)
+    ticker.set_fault(ClockFault.parse("50,3600"), NOW)
     assert ticker.device_ns(NOW) == pytest.approx(3600 * NS * (1 + 50e-6), abs=1)
     hour_later = ticker.device_ns(NOW + 3600 * NS) - ticker.device_ns(NOW)
     assert hour_later == pytest.approx(3600 * NS + 3600 * 50_000, abs=2)
@@ -33,7 +33,7 @@ def test_a_clock_runs_as_it_is_asked_to() -> None:
 def test_a_skew_alone_leaves_the_start_to_the_dice() -> None:
     ticker = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
     boot_ns = ticker.clock.boot_ns
-    ticker.ask(ClockFault.parse("-20"), NOW)
+    ticker.set_fault(ClockFault.parse("-20"), NOW)
     assert ticker.clock.boot_ns == boot_ns
     assert ticker.clock.skew == pytest.approx(-20e-6)
 

@@ -15,8 +15,8 @@ import pytest
 
 from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.tools.child_processes import daemon
-from jointfit_simulators.devices._natnet_replay import NatNetReplay
-from jointfit_simulators.devices._xbus_replay import XbusReplay
+from tests.simulators.natnet_replay import NatNetReplay
+from tests.simulators.xbus_replay import XbusReplay
 from tests.system.station import OUTCOMES, TOPICS, Listener, listening
 
 if TYPE_CHECKING:

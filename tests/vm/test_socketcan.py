@@ -84,8 +84,8 @@ class TestXcdiOnVcanThatGoesDown(DriverContract):
         return XcdiImu(settings())
 
     # CAN has its own error detection, and anything at all may be on a bus.
-    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
-    test_a_wrong_device_is_named_not_retried = None  # type: ignore[assignment]
+    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
+    test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]
 
 
 class TestXcdiOnVcanThatIsRemoved(TestXcdiOnVcanThatGoesDown):

@@ -111,7 +111,7 @@ def person(seed: int) -> Person:
         for name, q in zip(SENSORS, seen.sensors, strict=True)
     }
     cameras = Cameras(knobs, wearer, rate_hz=RATE_HZ)
-    frames = cameras.see(seen)
+    frames = cameras.capture(seen)
     optical = OpticalTrack(
         np.round(camera_s * NS).astype(np.int64),
         cameras.markers,

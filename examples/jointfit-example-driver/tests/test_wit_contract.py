@@ -52,7 +52,7 @@ class TestWitThatMustBeToldToSendQuaternions(TestWit):
         device = self.make_device(tmp_path, lambda data: data)
 
         async def scene() -> None:
-            async with self._streaming(device, self.make_driver(tmp_path)):
+            async with self.streaming(device, self.make_driver(tmp_path)):
                 pass
 
         asyncio.run(scene())

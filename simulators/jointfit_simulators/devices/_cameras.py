@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 _FIT = 3
-"""Markers a body needs to be tracked."""
+"""Number of visible markers from which a rigid body is tracked."""
 _UP_TO_Y = Rotation.from_euler("x", 90, degrees=True)
 
 
 class CameraFrames(NamedTuple):
-    """What was seen in one block; NaN where nothing was."""
+    """Camera frames of one block; occluded markers and untracked bodies are NaN."""
 
     markers: NDArray[np.float64]
     """Shape (n, markers, 3)."""
@@ -37,26 +37,27 @@ class CameraFrames(NamedTuple):
 
 
 class Cameras:
-    """An optical system that watches one subject.
+    """Optical system that records one subject.
 
-    Rigid bodies are made as an operator makes them: from the markers in upright stance, with the
-    body's axes along those of the (y-up) optical world and its pivot in the middle.
+    Rigid bodies are defined as by an operator: from the markers in upright stance, with axes
+    parallel to the (y-up) optical world and the pivot at the mean marker position.
 
     Parameters
     ----------
     knobs
-        Occlusion and scatter.
+        Occlusion and marker noise.
     subject
-        Whose markers these are.
+        Subject with markers.
     rate_hz
-        Camera frames a second.
+        Camera frames per second.
     """
 
     def __init__(self, knobs: Knobs, subject: InstrumentedSubject, *, rate_hz: float) -> None:
         turned = knobs.random("optical world").uniform(-1, 1)
         self.heading_rad = float(np.radians(knobs.optical_heading_deg) * turned)
         self.world = heading(self.heading_rad)
-        """Base world to the optical world."""
+        """Rotation from the base world to the optical world."""
+
         self.markers = tuple(name for names in subject.clusters.values() for name in names)
         self._templates = {
             part: (self.world.inv() * _UP_TO_Y).inv().apply(points - points.mean(axis=0))
@@ -68,70 +69,71 @@ class Cameras:
         }
         self._bones = subject.visible_bones
         self.bodies = tuple(part.capitalize() for part in (*self._templates, *self._bones))
+
         self._random = knobs.random("cameras")
         self._noise_m = knobs.marker_noise_mm / 1e3 / np.sqrt(3)
+
+        # transition probabilities of the Markov chain, from mean burst length and occluded share
         self._reappear = min(1.0, 1 / max(knobs.occlusion_burst_s * rate_hz, 1.0))
         self._vanish = self._reappear * knobs.occlusion / max(1e-9, 1 - knobs.occlusion)
         self._hidden = self._random.random(len(self.markers)) < knobs.occlusion
         self.covered = False
-        """Somebody stands in front of everything."""
+        """Whether everything is occluded."""
 
-    def see(self, observation: Observation) -> CameraFrames:
+    def capture(self, observation: Observation) -> CameraFrames:
         """Return the camera frames of one block."""
         n = len(observation.markers)
-        seen: NDArray[np.float64] = observation.markers @ self.world.as_matrix().T
-        seen = seen + self._random.standard_normal(seen.shape) * self._noise_m
-        seen[self._occluded(n)] = np.nan
-        fitted = [
-            _fit(self._templates[part], seen[:, columns]) for part, columns in self._columns.items()
+        markers: NDArray[np.float64] = observation.markers @ self.world.as_matrix().T
+        markers = markers + self._random.standard_normal(markers.shape) * self._noise_m
+        markers[self._occluded(n)] = np.nan
+
+        bodies = [
+            _fit(self._templates[part], markers[:, columns])
+            for part, columns in self._columns.items()
         ]
-        fitted += [self._bone(observation, bone) for bone in self._bones]
-        if not fitted:
-            return CameraFrames(seen, np.empty((n, 0, 3)), np.empty((n, 0, 4)))
-        positions, orientations = zip(*fitted, strict=True)
-        return CameraFrames(seen, np.stack(positions, axis=1), np.stack(orientations, axis=1))
+        for bone in self._bones:
+            turn, origin = observation.bones[bone]
+            position, orientation = self.world.apply(origin), to_wxyz(self.world * turn)
+            if self.covered:
+                position, orientation = position * np.nan, orientation * np.nan
+            bodies.append((position, orientation))
+        if not bodies:
+            return CameraFrames(markers, np.empty((n, 0, 3)), np.empty((n, 0, 4)))
+        positions, orientations = zip(*bodies, strict=True)
+        return CameraFrames(markers, np.stack(positions, axis=1), np.stack(orientations, axis=1))
 
     def _occluded(self, n: int) -> NDArray[np.bool_]:
-        """Return which markers are hidden, shape (n, markers): a two-state Markov chain each."""
-        dice = self._random.random((n, len(self.markers)))
+        """Return the occlusion of each marker, shape (n, markers): a two-state Markov chain."""
+        draws = self._random.random((n, len(self.markers)))
         hidden = np.empty((n, len(self.markers)), dtype=np.bool_)
         now = self._hidden
-        for row, throw in zip(hidden, dice, strict=True):
-            now = np.where(now, throw >= self._reappear, throw < self._vanish)
+        for row, draw in zip(hidden, draws, strict=True):
+            now = np.where(now, draw >= self._reappear, draw < self._vanish)
             row[:] = now
         self._hidden = now
         return hidden | self.covered
 
-    def _bone(
-        self, observation: Observation, bone: str
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        turn, origin = observation.bones[bone]
-        position, orientation = self.world.apply(origin), to_wxyz(self.world * turn)
-        if self.covered:
-            position, orientation = (
-                np.full_like(position, np.nan),
-                np.full_like(orientation, np.nan),
-            )
-        return position, orientation
-
 
 def _fit(
-    template: NDArray[np.float64], seen: NDArray[np.float64]
+    template: NDArray[np.float64], markers: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return position (n, 3) and orientation (n, 4) of a body from its markers (n, k, 3).
 
-    Kabsch's rotation over the visible markers; NaN where fewer than three are.
+    The rotation over the visible markers is Kabsch's; with fewer than three it is NaN.
     """
-    visible = np.isfinite(seen[:, :, 0])
+    visible = np.isfinite(markers[:, :, 0])
     weight = (visible / np.maximum(visible.sum(axis=1, keepdims=True), 1))[:, :, None]
-    there = np.where(visible[:, :, None], seen, 0.0)
-    body_middle = np.sum(weight * template, axis=1)
-    middle = np.sum(weight * there, axis=1)
-    drawn = (template - body_middle[:, None]) * weight
-    u, _, vt = np.linalg.svd(np.swapaxes(there - middle[:, None], 1, 2) @ drawn)
+
+    measured = np.where(visible[:, :, None], markers, 0.0)
+    body_mean = np.sum(weight * template, axis=1)
+    mean = np.sum(weight * measured, axis=1)
+    centered = (template - body_mean[:, None]) * weight
+
+    u, _, vt = np.linalg.svd(np.swapaxes(measured - mean[:, None], 1, 2) @ centered)
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     turn = u @ vt
-    position = middle - np.einsum("nij,nj->ni", turn, body_middle)
+
+    position = mean - np.einsum("nij,nj->ni", turn, body_mean)
     orientation = to_wxyz(Rotation.from_matrix(turn)) if len(turn) else np.empty((0, 4))
     lost = visible.sum(axis=1) < _FIT
     position[lost] = np.nan

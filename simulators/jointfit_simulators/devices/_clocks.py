@@ -19,17 +19,18 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 NS = 1_000_000_000
+"""Nanoseconds per second."""
 
 
 class SimulatedClock:
-    """An oscillator that counts from power-up, slightly wrong.
+    """Device clock that counts from power-up, with a skew.
 
     Parameters
     ----------
     boot_ns
-        Host time of power-up.
+        Host time of power-up, ns.
     skew
-        Relative speed error: +50e-6 gains 50 us a second.
+        Relative frequency error; a clock with +50e-6 gains 50 us per second.
     """
 
     def __init__(self, boot_ns: int, skew: float) -> None:
@@ -37,57 +38,56 @@ class SimulatedClock:
         self.skew = skew
 
     def device_ns(self, host_ns: int) -> int:
-        """Return what the clock shows at a host instant."""
+        """Return the device time at a host time."""
         return round((host_ns - self.boot_ns) * (1 + self.skew))
 
     def host_ns(self, device_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the host instants at which the clock shows `device_ns`."""
-        since = np.rint(device_ns / (1 + self.skew)).astype(np.int64)
-        return self.boot_ns + since
+        """Return the host times at which the clock shows `device_ns`."""
+        return self.boot_ns + np.rint(device_ns / (1 + self.skew)).astype(np.int64)
 
 
 class ClockFault(NamedTuple):
-    """What is asked of one device's clock, instead of what the dice would give it."""
+    """Prescribed clock error of one device, in place of a random one."""
 
     skew_ppm: float
-    """By how much it runs fast."""
+    """Skew, ppm; positive if the clock is fast."""
     up_s: float | None = None
-    """How long it has been up when the run begins; None: as the dice fall."""
+    """Time since power-up at the start of the run, s; None: random."""
 
     @classmethod
     def parse(cls, text: str) -> ClockFault:
-        """Return what ``SKEW_PPM`` or ``SKEW_PPM,UP_S`` asks for; ValueError if nothing."""
+        """Return the fault of ``SKEW_PPM`` or ``SKEW_PPM,UP_S``; raise ValueError otherwise."""
         skew_ppm, _, up_s = text.partition(",")
         return cls(float(skew_ppm), float(up_s) if up_s else None)
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedSamples:
-    """The samples of one device in one block of time; arrays of shape (n,)."""
+    """Samples of one device in one block of time; arrays of shape (n,)."""
 
     host_ns: NDArray[np.int64]
-    """True instants, host clock."""
+    """True sampling times, host clock."""
     device_ns: NDArray[np.int64]
-    """What the device stamps on them."""
+    """Time stamps of the device."""
     due_ns: NDArray[np.int64]
-    """When they reach the wire; never before an earlier one."""
+    """Host times of transmission; never decreasing."""
     dropped: NDArray[np.bool_]
-    """Which are never sent."""
+    """Whether the sample is dropped before transmission."""
 
 
 class SampleTiming:
-    """A device's sampling: instants, stamps, delays and losses, in blocks.
+    """Sampling times, time stamps, delays and drop-outs of one device, in blocks.
 
     Parameters
     ----------
     knobs
-        Clock, latency and drop-out knobs.
+        Magnitudes of clock, latency and drop-out errors.
     name
-        The device; its dice are its own.
+        Device; it selects the random stream.
     latency_ms
-        Least delay of its transport.
+        Minimum delay of the transport, ms.
     now_ns
-        Host time at which the run begins.
+        Host time of the start of the run, ns.
     """
 
     def __init__(self, knobs: Knobs, name: str, *, latency_ms: float, now_ns: int) -> None:
@@ -97,21 +97,21 @@ class SampleTiming:
         self.clock = SimulatedClock(now_ns - up_ns, skew)
         self._jitter_ns = knobs.clock_jitter_us * 1e3
         self._latency_ns = latency_ms * 1e6
-        self._late_ns = knobs.latency_jitter_ms * 1e6
+        self._latency_jitter_ns = knobs.latency_jitter_ms * 1e6
         self._dropout = knobs.dropout
         self._last_due_ns = 0
 
-    def ask(self, fault: ClockFault, now_ns: int) -> None:
-        """Run as `fault` says, from `now_ns` (the beginning of the run) on."""
+    def set_fault(self, fault: ClockFault, now_ns: int) -> None:
+        """Replace the random clock by that of `fault`, at the start `now_ns` of the run."""
         up_ns = now_ns - self.clock.boot_ns if fault.up_s is None else round(fault.up_s * NS)
         self.clock = SimulatedClock(now_ns - up_ns, fault.skew_ppm * 1e-6)
 
     def device_ns(self, host_ns: int) -> int:
-        """Return what the clock shows at a host instant, whatever became of it since the start."""
+        """Return the device time at a host time, by the clock in use now."""
         return self.clock.device_ns(host_ns)
 
     def reboot(self, host_ns: int) -> None:
-        """Count from 0 again, from `host_ns` on."""
+        """Restart the clock from 0 at `host_ns`."""
         self.clock = SimulatedClock(host_ns, self.clock.skew)
 
     def samples(self, begin_ns: int, end_ns: int, period_ns: float) -> PlannedSamples:
@@ -120,11 +120,13 @@ class SampleTiming:
         ticks = np.arange(np.ceil(first / period_ns), np.ceil(end / period_ns))
         true_ns = np.rint(ticks * period_ns).astype(np.int64)
         host_ns = self.clock.host_ns(true_ns)
+
         n = len(true_ns)
-        stamps = true_ns + np.rint(self._random.standard_normal(n) * self._jitter_ns).astype(
-            np.int64
-        )
-        delay = self._latency_ns + self._random.exponential(1.0, n) * self._late_ns
+        jitter = np.rint(self._random.standard_normal(n) * self._jitter_ns).astype(np.int64)
+        delay = self._latency_ns + self._random.exponential(1.0, n) * self._latency_jitter_ns
+
+        # the transport preserves the order of the samples
         due = np.maximum.accumulate(np.append(self._last_due_ns, host_ns + delay.astype(np.int64)))
         self._last_due_ns = int(due[-1])
-        return PlannedSamples(host_ns, stamps, due[1:], self._random.random(n) < self._dropout)
+        dropped = self._random.random(n) < self._dropout
+        return PlannedSamples(host_ns, true_ns + jitter, due[1:], dropped)

@@ -19,16 +19,17 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
 
 GRAVITY = 9.81
-"""m/s^2."""
+"""Specific force at rest, m/s^2."""
 DIP_RAD = radians(65.0)
-"""Of the magnetic field below the horizon; its size is 1, its heading north."""
+"""Inclination of the magnetic field below the horizon; its magnitude is 1, its heading north."""
 _TINY = 1e-12
+"""Rotation below which the small-angle limit is used, rad."""
 
 Vector = tuple[float, float, float]
 
 
 class InertialSignals:
-    """Follows one sensor."""
+    """Signals of one sensor, computed from its orientations."""
 
     def __init__(self) -> None:
         self._last: tuple[int, Quaternion] | None = None
@@ -36,35 +37,37 @@ class InertialSignals:
         self._step_s = 0.0
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
-    def moved(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Take the orientation at the next instant."""
+    def update(self, device_ns: int, q_world_sensor: Quaternion) -> None:
+        """Add the orientation at the next instant."""
         if self._last is not None:
             at_ns, before = self._last
-            self._turn = _between(before, q_world_sensor)
+            self._turn = _rotation_vector(before, q_world_sensor)
             self._step_s = (device_ns - at_ns) * 1e-9
         self._last, self._q = (device_ns, q_world_sensor), q_world_sensor
 
     def value(self, item: int) -> tuple[float, ...] | None:
-        """Return what an item says of the last interval; None for items that are not felt."""
+        """Return an item for the last interval; None for items that are not inertial signals."""
         x, y, z = self._turn
         step_s = self._step_s
-        if item == Item.RATE_OF_TURN:
-            return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
-        if item == Item.DELTA_Q:
-            angle = sqrt(x * x + y * y + z * z)
-            scale = sin(angle / 2.0) / angle if angle > _TINY else 0.5
-            return (cos(angle / 2.0), scale * x, scale * y, scale * z)
-        if item == Item.ACCELERATION:
-            return _in_sensor(self._q, (0.0, 0.0, GRAVITY))
-        if item == Item.DELTA_V:
-            x, y, z = _in_sensor(self._q, (0.0, 0.0, GRAVITY))
-            return (x * step_s, y * step_s, z * step_s)
-        if item == Item.MAGNETIC_FIELD:
-            return _in_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
-        return None
+        match item:
+            case Item.RATE_OF_TURN:
+                return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
+            case Item.DELTA_Q:
+                angle = sqrt(x * x + y * y + z * z)
+                scale = sin(angle / 2.0) / angle if angle > _TINY else 0.5
+                return (cos(angle / 2.0), scale * x, scale * y, scale * z)
+            case Item.ACCELERATION:
+                return _to_sensor(self._q, (0.0, 0.0, GRAVITY))
+            case Item.DELTA_V:
+                x, y, z = _to_sensor(self._q, (0.0, 0.0, GRAVITY))
+                return (x * step_s, y * step_s, z * step_s)
+            case Item.MAGNETIC_FIELD:
+                return _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
+            case _:
+                return None
 
 
-def _between(before: Quaternion, after: Quaternion) -> Vector:
+def _rotation_vector(before: Quaternion, after: Quaternion) -> Vector:
     """Return log(before* after), rad."""
     a, b, c, d = before
     w, x, y, z = after
@@ -74,6 +77,8 @@ def _between(before: Quaternion, after: Quaternion) -> Vector:
         a * z - b * y + c * x - d * w,
     )
     real = a * w + b * x + c * y + d * z
+
+    # q and -q are one rotation: use the one with a positive real part
     if real < 0.0:
         real, v = -real, (-v[0], -v[1], -v[2])
     length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -81,9 +86,11 @@ def _between(before: Quaternion, after: Quaternion) -> Vector:
     return (scale * v[0], scale * v[1], scale * v[2])
 
 
-def _in_sensor(q: Quaternion, v: Vector) -> Vector:
-    """Return a world vector in the axes of the sensor."""
+def _to_sensor(q: Quaternion, v: Vector) -> Vector:
+    """Return the sensor coordinates of a world vector."""
     w, x, y, z = q[0], -q[1], -q[2], -q[3]
+
+    # t = 2 u x v, v' = v + w t + u x t, with u the vector part of q*
     tx, ty, tz = (
         2.0 * (y * v[2] - z * v[1]),
         2.0 * (z * v[0] - x * v[2]),

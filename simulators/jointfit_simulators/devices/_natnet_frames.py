@@ -9,7 +9,7 @@ marker is omitted, or has bit 0 set and a plausible position.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,25 +37,40 @@ Bodies = Mapping[str, Pose | None]
 Axis = Literal["x", "y", "z"]
 Hiding = Literal["missing", "filled"]
 
-_HALF = math.sqrt(0.5)
-_SEEN = MARKER_POINT_CLOUD_SOLVED | MARKER_HAS_MODEL
-_FILLED = _SEEN | MARKER_OCCLUDED
+_VISIBLE = MARKER_POINT_CLOUD_SOLVED | MARKER_HAS_MODEL
+_FILLED = _VISIBLE | MARKER_OCCLUDED
 _SIZE, _RESIDUAL, _ERROR = 0.02, 2e-4, 2e-4
-_TURNED_FROM: Version = (4, 2)
+"""Marker diameter, marker residual and mean marker error of a body, m."""
+_OFFSET_FROM: Version = (4, 2)
+"""Bitstream from which a body description contains an offset quaternion."""
 _ORIGIN: Vector = (0.0, 0.0, 0.0)
-_NOWHERE: Pose = (_ORIGIN, (1.0, 0.0, 0.0, 0.0))
+_NEVER_TRACKED: Pose = (_ORIGIN, (1.0, 0.0, 0.0, 0.0))
+
+_HALF = math.sqrt(0.5)
+_AXES: dict[Axis, tuple[Callable[..., Vector], Callable[..., Quaternion]]] = {
+    "x": (
+        lambda x, y, z: (z, y, -x),
+        lambda w, x, y, z: (_HALF * (w - y), _HALF * (x + z), _HALF * (y + w), _HALF * (z - x)),
+    ),
+    "y": (
+        lambda x, y, z: (x, z, -y),
+        lambda w, x, y, z: (_HALF * (w + x), _HALF * (x - w), _HALF * (y + z), _HALF * (z - y)),
+    ),
+    "z": (lambda x, y, z: (x, y, z), lambda w, x, y, z: (w, x, y, z)),
+}
+"""Conversion of vectors and of quaternions (w, x, y, z) from z up to the server's up axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class RigidBodyAsset:
-    """One rigid body of the operator's project and the names of its markers."""
+    """Rigid body of a Motive project and the names of its markers."""
 
     name: str
     markers: tuple[str, ...]
     id: int
     """Streaming id."""
     positions: tuple[Vector, ...] = ()
-    """Markers in the body, m, for the description; zeros if not given."""
+    """Marker positions in the body frame for the description, m; zeros if empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,15 +86,15 @@ class FrameStamps:
 
 
 def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> ModelDefinition:
-    """Return the descriptions of `bodies` as Motive orders them.
+    """Return the descriptions of `bodies` in the order of Motive.
 
     Parameters
     ----------
-    bodies : tuple of StagedBody
-        What the operator made.
+    bodies : tuple of RigidBodyAsset
+        Rigid bodies of the project.
     version : (int, int)
-        From 4.0 bodies name their markers; from 4.2 they carry the offset quaternion that the one
-        client which knows 4.2 expects.
+        Bitstream. From 4.0 bodies name their markers; from 4.2 they contain the offset quaternion
+        expected by the only known client for 4.2.
     """
     every = tuple(f"{body.name}_{i}" for body in bodies for i in range(1, len(body.markers) + 1))
     sets = [MarkerSetDescription(body.name, body.markers) for body in bodies]
@@ -90,7 +105,7 @@ def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> Mo
             positions=body.positions or (_ORIGIN,) * len(body.markers),
             labels=(0,) * len(body.markers),
             markers=body.markers if version >= NAMES_FROM else (),
-            rotation=(0.0, 0.0, 0.0, 1.0) if version >= _TURNED_FROM else None,
+            rotation=(0.0, 0.0, 0.0, 1.0) if version >= _OFFSET_FROM else None,
         )
         for body in bodies
     ]
@@ -98,11 +113,11 @@ def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> Mo
 
 
 class NatNetFrameBuilder:
-    """Makes frames; remembers where everything was last seen."""
+    """Converts poses to frames; stores the last valid pose of each marker and body."""
 
     def __init__(self, bodies: tuple[RigidBodyAsset, ...], up_axis: Axis, hiding: Hiding) -> None:
         self.bodies = bodies
-        self._hiding = hiding
+        self._filled = hiding == "filled"
         self._place, self._turn = _AXES[up_axis]
         self._poses: dict[str, Pose] = {}
         self._markers: dict[str, Vector] = {}
@@ -112,21 +127,24 @@ class NatNetFrameBuilder:
 
         Parameters
         ----------
-        stamps : Stamps
-            Its number and its times.
+        stamps : FrameStamps
+            Frame number and times.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None is hidden. Those of no body are sent as unlabeled.
+            World z up, m; None if occluded. Markers without a body are sent as unlabeled.
         bodies : mapping of str to pose or None
-            Position, m, and q_world_body (w, x, y, z); None is not tracked.
+            Position, m, and q_world_body (w, x, y, z); None if untracked.
         """
         self._markers |= {name: self._place(*at) for name, at in markers.items() if at is not None}
         self._poses |= {
-            name: self._posed(pose) for name, pose in bodies.items() if pose is not None
+            name: (self._place(*pose[0]), self._turn(*pose[1]))
+            for name, pose in bodies.items()
+            if pose is not None
         }
+
+        sets = [self._marker_set(body, markers) for body in self.bodies]
+        every = MarkerSet("all", tuple(at for one in sets for at in one.positions))
         owned = {name for body in self.bodies for name in body.markers}
         loose = [name for name, at in markers.items() if at is not None and name not in owned]
-        sets = [self._set(body, markers) for body in self.bodies]
-        every = MarkerSet("all", tuple(at for one in sets for at in one.positions))
         return FrameOfData(
             stamps.number,
             stamps.timestamp,
@@ -140,64 +158,24 @@ class NatNetFrameBuilder:
             other_markers=tuple(self._markers[name] for name in loose),
         )
 
-    def _posed(self, pose: Pose) -> Pose:
-        return self._place(*pose[0]), self._turn(*pose[1])
-
     def _body(self, body: RigidBodyAsset, pose: Pose | None) -> Body:
-        (x, y, z), (w, i, j, k) = self._poses.get(body.name, _NOWHERE)
+        (x, y, z), (w, i, j, k) = self._poses.get(body.name, _NEVER_TRACKED)
         params = 0 if pose is None else BODY_TRACKED
         return Body(body.id, x, y, z, i, j, k, w, _ERROR, params)
 
-    def _set(self, body: RigidBodyAsset, markers: Markers) -> MarkerSet:
-        filled = self._hiding == "filled"
-        return MarkerSet(
-            body.name,
-            tuple(
-                self._markers.get(name, _ORIGIN)
-                if filled or markers.get(name) is not None
-                else _ORIGIN
-                for name in body.markers
-            ),
-        )
+    def _marker_set(self, body: RigidBodyAsset, markers: Markers) -> MarkerSet:
+        shown = [name for name in body.markers if self._filled or markers.get(name) is not None]
+        last = {name: self._markers[name] for name in shown if name in self._markers}
+        return MarkerSet(body.name, tuple(last.get(name, _ORIGIN) for name in body.markers))
 
     def _labeled(self, body: RigidBodyAsset, markers: Markers) -> list[LabeledMarker]:
-        found = []
+        labeled = []
         for member, name in enumerate(body.markers, 1):
-            seen = markers.get(name) is not None
-            if seen or (self._hiding == "filled" and name in self._markers):
+            visible = markers.get(name) is not None
+            if visible or (self._filled and name in self._markers):
                 x, y, z = self._markers[name]
-                params = _SEEN if seen else _FILLED
-                found.append(
+                params = _VISIBLE if visible else _FILLED
+                labeled.append(
                     LabeledMarker(body.id << 16 | member, x, y, z, _SIZE, params, _RESIDUAL)
                 )
-        return found
-
-
-# --- axes: from z up to the server's up axis --------------------------------------------------
-
-
-def _to_x(x: float, y: float, z: float) -> Vector:
-    return z, y, -x
-
-
-def _to_y(x: float, y: float, z: float) -> Vector:
-    return x, z, -y
-
-
-def _to_z(x: float, y: float, z: float) -> Vector:
-    return x, y, z
-
-
-def _turned_x(w: float, x: float, y: float, z: float) -> Quaternion:
-    return _HALF * (w - y), _HALF * (x + z), _HALF * (y + w), _HALF * (z - x)
-
-
-def _turned_y(w: float, x: float, y: float, z: float) -> Quaternion:
-    return _HALF * (w + x), _HALF * (x - w), _HALF * (y + z), _HALF * (z - y)
-
-
-def _turned_z(w: float, x: float, y: float, z: float) -> Quaternion:
-    return w, x, y, z
-
-
-_AXES = {"x": (_to_x, _turned_x), "y": (_to_y, _turned_y), "z": (_to_z, _turned_z)}
+        return labeled

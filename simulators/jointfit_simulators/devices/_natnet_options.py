@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 def same_clock(host_ns: int) -> int:
-    """Return `host_ns`: a server whose clock is the host's."""
+    """Return `host_ns`: the server has the clock of the host."""
     return host_ns
 
 
 @dataclass(frozen=True, slots=True)
 class NatNetServerOptions:
-    """Everything about a server that does not change while it runs."""
+    """Constant properties of a server."""
 
     bodies: tuple[RigidBodyAsset, ...] = ()
     application: str = "Motive"
@@ -29,32 +29,32 @@ class NatNetServerOptions:
     transport: Literal["unicast", "multicast"] = "unicast"
     group: str = "239.255.42.99"
     command_port: int = 0
-    """0: any free port of loopback."""
+    """UDP port on loopback; 0: any free port."""
     data_port: int = 0
     up_axis: Axis = "y"
     rate_hz: float = 120.0
-    """Nominal: for `timestamp` and the request ``FrameRate``; frames come as they are pushed."""
+    """Nominal frame rate, for `timestamp` and the request ``FrameRate``."""
     clock_hz: int = 10_000_000
     device_ns: Callable[[int], int] = same_clock
-    """Server clock, ns, at a host CLOCK_MONOTONIC instant: offset and skew live here."""
+    """Conversion from host CLOCK_MONOTONIC to the server clock, both in ns."""
     received_after_ns: int = 4_600_000
-    """From exposure to the stamp `received`; `transmit` is the true time of sending."""
+    """Delay from exposure to the stamp `received`; `transmit` is the true time of sending."""
     precision_ns: Callable[[int], int] | None = None
-    """PTP time, ns, of cameras on PTP at a host CLOCK_MONOTONIC instant; None: they are not."""
+    """Conversion from host CLOCK_MONOTONIC to PTP time, both in ns; None: cameras without PTP."""
     exposure_stamps: bool = True
-    """False: USB cameras, exposure is 0."""
+    """Whether frames have exposure stamps; USB cameras send 0."""
     hiding: Hiding = "missing"
-    """What a hidden marker looks like."""
+    """Representation of occluded markers."""
     loss: float = 0.0
     duplication: float = 0.0
     reordering: float = 0.0
-    """Probabilities for each frame; a reordered one leaves after its successor."""
+    """Probabilities per frame; a reordered frame is sent after its successor."""
     hostile: float = 0.0
-    """Probability that a frame gets a wrong count or length."""
+    """Probability per frame of a wrong count or length."""
     wire_noise: WireNoise = clean_wire
-    """What the wire does to each frame."""
+    """Noise applied to each frame."""
     keepalive_s: float = 10.0
-    """A unicast client silent for this long is dropped."""
+    """Time without a message after which a unicast client is dropped, s."""
     copy_to_data_port: bool = False
-    """Unicast frames also to the client's address at the announced data port."""
+    """Whether unicast frames are also sent to the announced data port of the client's address."""
     seed: int = 1

@@ -14,28 +14,33 @@ Address = tuple[str, int]
 
 LOOPBACK = "127.0.0.1"
 _MAX_DATAGRAM = 65_507
+"""Largest payload of a UDP datagram over IPv4, bytes."""
 
 
 class NatNetPort:
-    """A command socket on loopback that can be unplugged and plugged in again.
+    """Command socket on loopback that can be unplugged and plugged in again.
 
     Parameters
     ----------
     command_port : int
-        0: any free one; the same again after `plug`.
+        UDP port; 0: any free port, which `plug` opens again.
     data_port : int
-        Port announced for data; 0: any free one.
+        Announced port for data; 0: any free port.
     """
 
     def __init__(self, command_port: int = 0, data_port: int = 0) -> None:
         self.command_port = command_port
-        self.data_port = data_port or _free_port()
+        if not data_port:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind((LOOPBACK, 0))
+                data_port = int(probe.getsockname()[1])
+        self.data_port = data_port
         self._socket: socket.socket | None = None
         self._handle: Callable[[bytes, Address], None] | None = None
         self.plug()
 
     def plug(self) -> None:
-        """Open the socket; on an open one it does nothing."""
+        """Open the socket; no effect if open."""
         if self._socket is not None:
             return
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -50,16 +55,16 @@ class NatNetPort:
             asyncio.get_running_loop().add_reader(opened, self._readable)
 
     def unplug(self) -> None:
-        """Close the socket: who sends here is refused from now on."""
+        """Close the socket; datagrams to its port are then rejected."""
         opened, self._socket = self._socket, None
         if opened is None:
             return
-        with contextlib.suppress(RuntimeError):  # no loop: it is not being served
+        with contextlib.suppress(RuntimeError):  # no loop: the port is not served
             asyncio.get_running_loop().remove_reader(opened)
         opened.close()
 
     async def serve(self, handle: Callable[[bytes, Address], None]) -> None:
-        """Call `handle` with every datagram until cancelled, through unplugging and plugging."""
+        """Call `handle` for every datagram until cancelled, also across unplugging."""
         loop = asyncio.get_running_loop()
         self._handle = handle
         if self._socket is not None:
@@ -72,12 +77,12 @@ class NatNetPort:
                 loop.remove_reader(self._socket)
 
     def send(self, data: bytes, address: Address) -> bool:
-        """Send one datagram; tell whether it went."""
+        """Send one datagram; return whether the system accepted it."""
         if self._socket is None:
             return False
         try:
             self._socket.sendto(data, address)
-        except OSError:  # a client that is gone, a full queue: UDP loses it
+        except OSError:  # closed client or full queue: UDP loses the datagram
             return False
         return True
 
@@ -87,12 +92,6 @@ class NatNetPort:
                 data, address = self._socket.recvfrom(_MAX_DATAGRAM)
             except BlockingIOError:
                 return
-            except OSError:  # the ICMP answer of a client that is gone
+            except OSError:  # ICMP error of a closed client
                 continue
             self._handle(data, address)
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])

@@ -48,17 +48,19 @@ if TYPE_CHECKING:
 
 _NS = 10**9
 _PATIENCE_NS = 50_000_000
+"""Time after CONNECT from which frames are sent without REQUEST_MODELDEF, ns."""
 _ANNOUNCED_FRAMES = 10
-"""A change is announced in this many frames, so that one lost datagram does not hide it."""
+"""Number of frames that announce a change, so that the loss of one datagram does not hide it."""
 _SELECTABLE: Version = (4, 0)
-"""From this bitstream on a unicast client may choose."""
+"""Lowest bitstream from which a unicast client may select its version."""
 _NAME_FIELD = 256
+"""Length of the application name in SERVERINFO, bytes."""
 _I32_MAX = struct.pack("<i", 2**31 - 1)
 
 
 @dataclass(slots=True)
 class Client:
-    """One unicast client, or whoever listens to the group."""
+    """State of one unicast client, or of the multicast group."""
 
     address: Address
     version: Version
@@ -66,35 +68,35 @@ class Client:
     since_ns: int
     described: bool = False
     changed: int = 0
-    """Frames yet to announce its new bitstream."""
+    """Number of frames that still announce the new bitstream."""
     sent: int = 0
     held: bytes | None = None
-    """A frame that waits for its successor (reordering)."""
+    """Frame to be sent after its successor (reordering)."""
 
 
 class NatNetServer:
-    """A server that is plugged in when made; `run` makes it answer.
+    """Simulated server; its port is open from the start, and `run` answers requests.
 
     Attributes
     ----------
     ready : asyncio.Event
-        Set once `run` answers.
+        Set while `run` answers.
     edit_mode : bool
-        Frames say that they are played from a recording.
+        Whether frames are flagged as playback of a recording.
     number : int
-        Number of the next frame; may be set, to jump.
+        Number of the next frame; writable, to simulate a jump.
     """
 
     def __init__(self, options: NatNetServerOptions | None = None) -> None:
         self.options = options or NatNetServerOptions()
         self._port = NatNetPort(self.options.command_port, self.options.data_port)
-        self._stage = NatNetFrameBuilder(
+        self._builder = NatNetFrameBuilder(
             self.options.bodies, self.options.up_axis, self.options.hiding
         )
-        self._random = random.Random(self.options.seed)  # noqa: S311 - the same dice every time
+        self._random = random.Random(self.options.seed)  # noqa: S311 - the same draws in every run
         self._clients: dict[Address, Client] = {}
         group = (self.options.group, self._port.data_port)
-        self._listeners = Client(group, self.options.bitstream, 0, 0, described=True)
+        self._group = Client(group, self.options.bitstream, 0, 0, described=True)
         self._model_changed = 0
         self.ready = asyncio.Event()
         self.edit_mode = False
@@ -103,28 +105,28 @@ class NatNetServer:
 
     @property
     def command_port(self) -> int:
-        """Where CONNECT goes."""
+        """UDP port for commands of clients."""
         return self._port.command_port
 
     @property
     def data_port(self) -> int:
-        """Where multicast frames go."""
+        """UDP port of multicast frames."""
         return self._port.data_port
 
     @property
     def clients(self) -> tuple[Client, ...]:
-        """Unicast clients at present."""
+        """Connected unicast clients."""
         return tuple(self._clients.values())
 
     @property
     def sent(self) -> int:
-        """Frames put on the wire, summed over clients (multicast counts as one)."""
-        return self._sent_before + self._listeners.sent + sum(c.sent for c in self.clients)
+        """Number of frames sent, summed over clients (the multicast group counts as one)."""
+        return self._sent_before + self._group.sent + sum(c.sent for c in self.clients)
 
     @property
     def bitstream(self) -> Version:
-        """What a client gets that does not choose."""
-        return self._listeners.version
+        """Version for clients that select none."""
+        return self._group.version
 
     async def run(self) -> None:
         """Answer until cancelled."""
@@ -135,29 +137,29 @@ class NatNetServer:
             self.ready.clear()
 
     def unplug(self) -> None:
-        """Stop being there; clients are forgotten, as when Motive is closed."""
+        """Close the port and disconnect all clients, as when Motive is closed."""
         self._port.unplug()
         for client in self.clients:
-            self._forget(client)
+            self._disconnect(client)
 
     def plug(self) -> None:
-        """Be there again, at the same port."""
+        """Open the same port again."""
         self._port.plug()
 
     def restart(self) -> None:
-        """Close and open: clients forgotten, frame numbers from 0."""
+        """Close and reopen the server; frame numbers restart from 0."""
         self.unplug()
         self.plug()
         self.number = 0
 
     def set_bodies(self, bodies: tuple[RigidBodyAsset, ...]) -> None:
-        """Change the operator's project while running; the next frames announce it."""
-        self._stage = NatNetFrameBuilder(bodies, self.options.up_axis, self.options.hiding)
+        """Replace the rigid bodies during the run; the next frames announce the change."""
+        self._builder = NatNetFrameBuilder(bodies, self.options.up_axis, self.options.hiding)
         self._model_changed = _ANNOUNCED_FRAMES
 
     def set_bitstream(self, version: Version) -> None:
-        """Change the bitstream for everybody; the next frames announce it."""
-        for client in (*self.clients, self._listeners):
+        """Change the bitstream of all clients; the next frames announce the change."""
+        for client in (*self.clients, self._group):
             client.version, client.changed = version, _ANNOUNCED_FRAMES
 
     def push(self, exposure_host_ns: int, markers: Markers, bodies: Bodies) -> None:
@@ -166,27 +168,27 @@ class NatNetServer:
         Parameters
         ----------
         exposure_host_ns : int
-            When the cameras exposed it, host CLOCK_MONOTONIC, however late it leaves.
+            Exposure time, host CLOCK_MONOTONIC, ns; independent of the time of sending.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None is hidden. Those of no body are sent as unlabeled.
+            World z up, m; None if occluded. Markers without a body are sent as unlabeled.
         bodies : mapping of str to (position, quaternion) or None
-            World z up, m, q_world_body (w, x, y, z); None is not tracked.
+            World z up, m, q_world_body (w, x, y, z); None if untracked.
         """
-        stamps = self._stamps(exposure_host_ns)
-        frame = self._stage.frame(stamps, markers, bodies)
+        frame = self._builder.frame(self._stamps(exposure_host_ns), markers, bodies)
         if self.options.precision_ns is not None:
-            told = divmod(self.options.precision_ns(exposure_host_ns), _NS)
-            frame = frame._replace(precision=told)
+            precision = divmod(self.options.precision_ns(exposure_host_ns), _NS)
+            frame = frame._replace(precision=precision)
         self.number += 1
         self._model_changed = max(0, self._model_changed - 1)
+
         if self.options.transport == "multicast":
-            self._send_frame(self._listeners, frame)
+            self._send_frame(self._group, frame)
             return
         now_ns = time.monotonic_ns()
         for client in self.clients:
             if now_ns - client.heard_ns > self.options.keepalive_s * _NS:
                 self._send(Bare(NatNetMessageId.DISCONNECTBYTIMEOUT), client.address)
-                self._forget(client)
+                self._disconnect(client)
             elif client.described or now_ns - client.since_ns > _PATIENCE_NS:
                 self._send_frame(client, frame)
 
@@ -213,28 +215,26 @@ class NatNetServer:
         if client.changed:
             client.changed -= 1
             frame = frame._replace(params=frame.params | FRAME_BITSTREAM_CHANGED)
-        data = self.options.wire_noise(self._hostile(encode(frame, client.version)))
-        dice, options = self._random.random, self.options
-        if dice() < options.loss:
+
+        # damage on the wire
+        options, draw, data = self.options, self._random.random, encode(frame, client.version)
+        if draw() < options.hostile:
+            at = self._random.choice((2, 8, 12, 16, 20))
+            data = data[:at] + _I32_MAX + data[at + 4 :]
+        data = options.wire_noise(data)
+
+        # loss, reordering and duplication on the network
+        if draw() < options.loss:
             return
-        if client.held is None and dice() < options.reordering:
+        if client.held is None and draw() < options.reordering:
             client.held = data
             return
-        copies = 2 if dice() < options.duplication else 1
+        copies = 2 if draw() < options.duplication else 1
         late, client.held = client.held, None
         for item in [data] * copies + ([late] if late is not None else []):
-            client.sent += self._put(item, client)
-
-    def _put(self, data: bytes, client: Client) -> bool:
-        if self.options.copy_to_data_port:
-            self._port.send(data, (client.address[0], self.data_port))
-        return self._port.send(data, client.address)
-
-    def _hostile(self, data: bytes) -> bytes:
-        if self._random.random() >= self.options.hostile:
-            return data
-        at = self._random.choice((2, 8, 12, 16, 20))
-        return data[:at] + _I32_MAX + data[at + 4 :]
+            if options.copy_to_data_port:
+                self._port.send(item, (client.address[0], self.data_port))
+            client.sent += self._port.send(item, client.address)
 
     # --- answers ------------------------------------------------------------------------------
 
@@ -243,9 +243,10 @@ class NatNetServer:
         client = self._clients.get(address)
         if client is not None:
             client.heard_ns = time.monotonic_ns()
+
         match message:
             case Discovery():
-                self._put_info(address, self.bitstream)
+                self._send_info(address, self.bitstream)
             case Connect():
                 self._connect(message, address)
             case EchoRequest(stamp):
@@ -253,9 +254,12 @@ class NatNetServer:
             case CommandRequest(command):
                 self._send(self._answer(command, client), address)
             case Bare(NatNetMessageId.REQUEST_MODELDEF):
-                self._describe(client or self._listeners, address)
+                client = client or self._group
+                model = model_definition(self._builder.bodies, client.version)
+                self._send(model, address, client.version)
+                client.described = True
             case Bare(NatNetMessageId.DISCONNECT) if client is not None:
-                self._forget(client)
+                self._disconnect(client)
             case _:
                 return
 
@@ -264,55 +268,54 @@ class NatNetServer:
 
     def _connect(self, connect: Connect, address: Address) -> None:
         now_ns = time.monotonic_ns()
-        wanted = connect.bitstream[:2]
         client = self._clients.get(address) or Client(address, self.bitstream, now_ns, now_ns)
-        if wanted != (0, 0) and self._selectable and wanted >= _SELECTABLE:
+        wanted = connect.bitstream[:2]
+        if wanted >= _SELECTABLE and self._selectable:
             client.version = wanted
         if self.options.transport == "unicast":
             self._clients[address] = client
-        self._put_info(address, client.version)
+        self._send_info(address, client.version)
 
     @property
     def _selectable(self) -> bool:
         return self.options.transport == "unicast" and self.options.bitstream >= _SELECTABLE
 
-    def _put_info(self, address: Address, version: Version) -> None:
+    def _send_info(self, address: Address, version: Version) -> None:
         options = self.options
         info = ServerInfo(
             options.application, (3, 0, 0, 0), (*version, 0, 0), options.clock_hz,
             self.data_port, options.transport == "multicast", options.group,
         )  # fmt: skip
         data = bytearray(encode(info))
+
+        # like Motive, leave stale memory after the end of the name
         begin = HEADER.size + len(options.application.encode()) + 1
         end = HEADER.size + _NAME_FIELD
-        data[begin:end] = bytes(0xA5 ^ i & 0xFF for i in range(end - begin))  # stale memory
+        data[begin:end] = bytes(0xA5 ^ i & 0xFF for i in range(end - begin))
         self._port.send(bytes(data), address)
 
     def _answer(self, command: str, client: Client | None) -> Message:
         word, _, rest = command.partition(",")
-        if word == "FrameRate":
-            return CommandResponse(struct.pack("<f", self.options.rate_hz))
-        if word == "UnitsToMillimeters":
-            return CommandResponse(struct.pack("<f", 1000.0))
-        if word == "AnalogSamplesPerMocapFrame":
-            return CommandResponse(bytes(4))
-        version = _version(rest)
-        if word == "Bitstream" and client is not None and version and self._selectable:
-            client.version, client.changed = version, _ANNOUNCED_FRAMES
-            return CommandResponse(command.encode() + b"\0")
+        match word:
+            case "FrameRate":
+                return CommandResponse(struct.pack("<f", self.options.rate_hz))
+            case "UnitsToMillimeters":
+                return CommandResponse(struct.pack("<f", 1000.0))
+            case "AnalogSamplesPerMocapFrame":
+                return CommandResponse(bytes(4))
+            case "Bitstream" if client is not None and self._selectable:
+                if version := _selectable_version(rest):
+                    client.version, client.changed = version, _ANNOUNCED_FRAMES
+                    return CommandResponse(command.encode() + b"\0")
         return Bare(NatNetMessageId.UNRECOGNIZED_REQUEST)
 
-    def _describe(self, client: Client, address: Address) -> None:
-        model = model_definition(self._stage.bodies, client.version)
-        self._send(model, address, client.version)
-        client.described = True
-
-    def _forget(self, client: Client) -> None:
+    def _disconnect(self, client: Client) -> None:
         self._sent_before += client.sent
         self._clients.pop(client.address, None)
 
 
-def _version(text: str) -> Version | None:
+def _selectable_version(text: str) -> Version | None:
+    """Return the version of ``MAJOR.MINOR`` if a client may select it."""
     major, _, minor = text.partition(".")
     if not (major.isdecimal() and minor.isdecimal()):
         return None

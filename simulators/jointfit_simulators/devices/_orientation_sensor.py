@@ -14,23 +14,23 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 _DRIFT_HZ = (0.005, 0.1)
-"""Band of the slow error: a fusion filter wanders over ten seconds to minutes."""
+"""Frequency band of the slow error, Hz: periods of ten seconds to minutes, as of fusion filters."""
 
 
 class OrientationSensor:
-    r"""One IMU's orientation output.
+    r"""Orientation output of one IMU.
 
     .. math:: \hat q(t) = e(t)\; q_{W_s W}\; q(t)\; n(t)
 
-    with the sensor's own world :math:`W_s` (a heading, and a tilt only by radical fault), the slow
-    error *e* on the world side, where fusion filters err, and the white scatter *n*.
+    with the sensor's own world :math:`W_s` (a heading; an inclination only as a fault), the slow
+    error *e* on the world side, like that of fusion filters, and the white noise *n*.
 
     Parameters
     ----------
     knobs
-        Sizes of the errors, and the dice.
+        Magnitudes of the errors.
     name
-        The sensor.
+        Sensor; it selects the random streams.
     """
 
     def __init__(self, knobs: Knobs, name: str) -> None:
@@ -41,7 +41,8 @@ class OrientationSensor:
         tilt = np.radians(knobs.world_tilt_deg) if tilted else 0.0
         level = Rotation.from_rotvec([tilt * np.cos(about), tilt * np.sin(about), 0.0])
         self.world = level * heading(self.heading_rad)
-        """Base world to the sensor's own world."""
+        """Rotation from the base world to the sensor's own world."""
+
         self._slow = random_vector_signal(
             knobs.random(f"slow error {name}"),
             1,
@@ -55,13 +56,12 @@ class OrientationSensor:
     def report(
         self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return what the sensor says, q_world_sensor, shape (n, 4); NaN stays NaN."""
+        """Return the measured q_world_sensor, shape (n, 4); NaN inputs give NaN."""
         known = np.isfinite(q_base_sensor[:, 0])
-        found = np.full_like(q_base_sensor, np.nan)
-        scatter = self._white.standard_normal((len(t_s), 3)) * self._white_rad
+        measured = np.full_like(q_base_sensor, np.nan)
+        noise = self._white.standard_normal((len(t_s), 3)) * self._white_rad
         if np.any(known):
             true = from_wxyz(q_base_sensor[known])
             slow = Rotation.from_rotvec(self._slow.at(t_s[known]))
-            said = slow * self.world * true * Rotation.from_rotvec(scatter[known])
-            found[known] = to_wxyz(said)
-        return found
+            measured[known] = to_wxyz(slow * self.world * true * Rotation.from_rotvec(noise[known]))
+        return measured

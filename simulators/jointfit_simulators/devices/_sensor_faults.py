@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SLIP_S = 0.3
-"""Duration of a slip."""
-_ASKEW = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
+"""Duration of a slip, s."""
+_SLIP_AXIS = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
 """Axis of a slip in the sensor frame, oblique to all sensor axes."""
 
 
@@ -32,40 +32,43 @@ class SensorFaults:
         self._now_s = -np.inf
 
     def stick(self) -> None:
-        """Let it repeat itself."""
+        """Repeat the next output from now on."""
         self._stuck = True
 
     def free(self) -> None:
-        """Let it say the truth again; where it slipped to it stays."""
+        """End the stuck output; slip and heading remain."""
         self._stuck, self._held = False, None
 
     def slip(self, angle_rad: float) -> None:
-        """Let it slide by an angle, on top of where it is."""
+        """Rotate the sensor on the segment by an angle, added to earlier slips."""
         self._before_rad = self._slipped_rad
         self._slipped_rad += angle_rad
         self._slip_s = self._now_s
 
     def drift(self, rate_rad_s: float) -> None:
-        """Let its world turn about the vertical from now on; 0 ends that where it has come to."""
+        """Rotate the sensor's world about the vertical from now on; 0 stops at that heading."""
         self._rate_rad_s = rate_rad_s
 
-    def apply(self, t_s: NDArray[np.float64], said: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the sensor says instead, q_world_sensor, shape (n, 4); NaN stays NaN."""
+    def apply(self, t_s: NDArray[np.float64], measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return q_world_sensor with the faults, shape (n, 4); NaN inputs give NaN."""
         if not len(t_s):
-            return said
+            return measured
         before_s = float(t_s[0]) if np.isinf(self._now_s) else self._now_s
         turned = self._turned_rad + self._rate_rad_s * (t_s - before_s)
         self._now_s, self._turned_rad = float(t_s[-1]), float(turned[-1])
         share = np.clip((t_s - self._slip_s) / SLIP_S, 0.0, 1.0)
         slipped = self._before_rad + share * (self._slipped_rad - self._before_rad)
-        known = np.isfinite(said[:, 0])
+
+        # heading drift rotates the world side, a slip the sensor side
+        known = np.isfinite(measured[:, 0])
         if (np.any(turned) or np.any(slipped)) and np.any(known):
             world = Rotation.from_rotvec(turned[known, None] * np.array([0.0, 0.0, 1.0]))
-            slide = Rotation.from_rotvec(slipped[known, None] * _ASKEW)
-            said = said.copy()
-            said[known] = to_wxyz(world * from_wxyz(said[known]) * slide)
+            slide = Rotation.from_rotvec(slipped[known, None] * _SLIP_AXIS)
+            measured = measured.copy()
+            measured[known] = to_wxyz(world * from_wxyz(measured[known]) * slide)
+
         if self._stuck and self._held is None and np.any(known):
-            self._held = said[known][0].copy()
+            self._held = measured[known][0].copy()
         if self._held is not None:
-            said = np.where(known[:, None], self._held, said)
-        return said
+            measured = np.where(known[:, None], self._held, measured)
+        return measured

@@ -31,28 +31,35 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 WAKE_UP_S = 0.5
-"""How long a device that wakes up waits to be told to enter configuration mode."""
+"""Time after WakeUp in which the host can select configuration mode, s."""
 FILTER_RATE_HZ = 400
-"""Orientations are computed at this rate; slower ones are whole parts of it."""
+"""Rate of the orientation filter, Hz; output rates are integer fractions of it."""
 _MOST_OUTPUTS = 32
+"""Number of items in an output configuration."""
 _COUNTS = 1 << 16
-_FOREIGN_EVERY = 12  # messages: a GNSS receiver at 4 Hz beside orientations at 50 Hz
-_BITS = 10  # of one byte on the line, 8N1
+"""Modulus of the packet counter."""
+_FOREIGN_EVERY = 12
+"""Number of messages between those of a GNSS receiver: 4 Hz with orientations at 50 Hz."""
+_BITS = 10
+"""Bits of one byte on the line (8N1)."""
 _PARAMETER = b"\x21"
+"""Error code for a parameter out of range."""
 _INVALID = b"\x04"
+"""Error code for an invalid message."""
 _MEASURED = (Item.QUATERNION, Item.RATE_OF_TURN, Item.DELTA_Q)
+"""Items that define the sample rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class XbusDeviceOptions:
-    """What kind of device it is, and in which mood."""
+    """Model, settings and faults of a device."""
 
     device_id: bytes = bytes.fromhex("0360a1b2")
     product_code: str = "MTi-3-8A7G6"
     firmware: tuple[int, int, int] = (1, 7, 0)
     filter_profile: bytes = b"General/VRU"
     alignment: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Both alignment rotations."""
+    """Initial value of both alignment rotations."""
     outputs: tuple[tuple[int, int], ...] = (
         (Item.PACKET_COUNTER, setup.MAX_RATE),
         (Item.SAMPLE_TIME_FINE, setup.MAX_RATE),
@@ -63,33 +70,33 @@ class XbusDeviceOptions:
     sync: tuple[setup.SyncSetting, ...] = ()
     """Synchronisation settings in flash at the start."""
     baud: int | None = None
-    """Speed it runs at; where the host's differs, both sides see garbage. None: any (USB)."""
+    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
     measures_at_once: bool = False
-    """Streams from the start, as real devices do; else it waits in configuration mode."""
+    """Whether the device streams from the start; otherwise it starts in configuration mode."""
     wakes_up: bool = False
-    """Begins with WakeUp and the choice of 500 ms."""
+    """Whether the device starts with WakeUp and `WAKE_UP_S` for the reply."""
     stuck: bool = False
-    """Streams and answers nothing but Reset, until that."""
+    """Whether the device streams and ignores all requests except Reset, which ends the fault."""
     gnss: bool = False
-    """Messages with foreign time and no orientation come in between."""
+    """Whether messages of a GNSS receiver, with its own time and no orientation, are inserted."""
     config_delay_s: float = 0.0
-    """Goes on streaming for this long before it acknowledges GoToConfig."""
+    """Delay before GoToConfig is acknowledged, s; the device streams meanwhile."""
     first_tick: int = 0
-    """Its clock at power-up, 100 us ticks."""
+    """Clock at power-up, ticks of 100 us."""
     first_counter: int = 0
 
 
 class XbusDevice:
-    """An ``ImuDevice`` on a pty.
+    """`ImuDevice` on a pty.
 
     Parameters
     ----------
     link
-        Where the host finds the port.
+        Symbolic link to the host's port.
     options
-        What kind of device it is.
+        Model, settings and faults.
     wire_noise
-        What the wire does to each message on its way to the host.
+        Noise applied to each message to the host.
     """
 
     def __init__(
@@ -103,8 +110,9 @@ class XbusDevice:
         self._line = PtyLine(link)
         self._noise = wire_noise
         self._sync = SyncInputs(options.sync)
-        self._felt = InertialSignals()
+        self._inertial = InertialSignals()
         self._decoder = XbusCodec()
+
         self._outputs = tuple(setup.Output(*output) for output in options.outputs)
         self._alignment = dict.fromkeys((0, 1), options.alignment)
         self._modulus = setup.fine_time_modulus(options.product_code) or setup.WRAP_32_BIT
@@ -112,23 +120,23 @@ class XbusDevice:
         self._stuck, self._waking = options.stuck, False
         self._counter = options.first_counter
         self._epoch_ns = self._last_ns = self._messages = self._to_lose = 0
-        self._random = random.Random(3)  # noqa: S311 - the same foreign times every run
+        self._random = random.Random(3)  # noqa: S311 - the same GNSS times in every run
         self._timer: asyncio.TimerHandle | None = None
         self.sent = 0
-        """Samples written to the wire so far, whole."""
+        """Number of complete samples written to the wire."""
         self.flash_writes = 0
-        """Sets stored in flash so far."""
+        """Number of settings stored in flash."""
 
-    # --- what a simulation does with it -------------------------------------------------------
+    # --- control by the simulation ------------------------------------------------------------
 
     @property
     def streaming(self) -> bool:
-        """Whether it measures."""
+        """Whether the device is in measurement mode."""
         return self._measuring
 
     @property
     def rate_hz(self) -> float:
-        """Quaternions per second, as configured; 0 if none are."""
+        """Configured samples per second; 0 without an item that defines it."""
         for data_id, rate in self._outputs:
             if data_id & 0xFFF0 in _MEASURED:
                 return float(FILTER_RATE_HZ if rate in {0, setup.MAX_RATE} else rate)
@@ -141,7 +149,7 @@ class XbusDevice:
 
     @property
     def line_ns(self) -> int:
-        """How long a sample takes on a real line of the host's speed, ns."""
+        """Transmission time of a sample at the speed of the host's port, ns."""
         baud = self._line.host_baud
         size = len(encode(XbusMessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
         return size * _BITS * 1_000_000_000 // baud if baud else 0
@@ -152,9 +160,9 @@ class XbusDevice:
         return self._outputs
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Send one sample now, if it measures; ``ImuDevice.push`` says the rest."""
+        """Send one sample now in measurement mode, as described in `ImuDevice.push`."""
         self._last_ns = device_ns
-        self._felt.moved(device_ns, q_world_sensor)
+        self._inertial.update(device_ns, q_world_sensor)
         if not self._measuring:
             return
         if self._options.gnss and self._messages % _FOREIGN_EVERY == _FOREIGN_EVERY - 1:
@@ -163,7 +171,7 @@ class XbusDevice:
             self.sent += 1
 
     def edge(self, device_ns: int) -> None:
-        """Take a rising edge on the first sync input."""
+        """Add a rising edge on the first sync input."""
         self._sync.edge(IN1, self._ticks(device_ns) % self._modulus)
 
     @property
@@ -172,24 +180,28 @@ class XbusDevice:
         return self._sync.entries
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` messages: they take a counter value and are not sent."""
+        """Lose the next `count` messages: the counter increments, but they are not sent."""
         self._to_lose += count
 
     def power_cycle(self) -> None:
-        """Lose power for a moment: clock and counter begin anew, then the wake-up choice."""
+        """Interrupt the power supply: clock and counter restart, and WakeUp is sent."""
         self._stuck, self._measuring = False, False
         self._epoch_ns, self._counter = self._last_ns, self._options.first_counter
-        self._sync.forget()
+        self._sync.reset()
         self._send(XbusMessageId.WAKE_UP)
         self._waking = True
-        self._after(WAKE_UP_S, self._measure_by_itself)
+
+        def measure() -> None:
+            self._waking, self._measuring = False, True
+
+        self._after(WAKE_UP_S, measure)
 
     def unplug(self) -> None:
-        """Take the wire away."""
+        """Disconnect the wire."""
         self._line.unplug()
 
     def plug(self) -> None:
-        """Put the wire back; the device kept its power."""
+        """Connect the wire; the device remained powered."""
         self._line.plug()
 
     async def run(self) -> None:
@@ -197,14 +209,14 @@ class XbusDevice:
         if self._options.wakes_up:
             self.power_cycle()
         try:
-            await self._line.serve(self._take)
+            await self._line.serve(self._receive)
         finally:
             if self._timer is not None:
                 self._timer.cancel()
 
-    # --- what the host says -------------------------------------------------------------------
+    # --- requests of the host -----------------------------------------------------------------
 
-    def _take(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         if not self._same_speed:
             data = bytes(byte ^ 0x55 for byte in data)
         for event in self._decoder.feed(data):
@@ -224,9 +236,8 @@ class XbusDevice:
                 self._after(self._options.config_delay_s, lambda: self._configure(message.bid))
             else:
                 self._configure(message.bid)
-        elif not self._measuring and message.mid in self._ANSWERS:
-            mid, data = self._ANSWERS[message.mid](self, message.data)
-            self._send(mid, data, message.bid)
+        elif not self._measuring and (reply := self._reply(message.mid, message.data)):
+            self._send(*reply, message.bid)
 
     def _configure(self, bid: int) -> None:
         self._stop()
@@ -237,28 +248,32 @@ class XbusDevice:
         if self._timer is not None:
             self._timer.cancel()
 
-    def _measure_by_itself(self) -> None:
-        self._waking, self._measuring = False, True
-
-    def _go_to_measurement(self, _: bytes) -> tuple[int, bytes]:
-        self._send(XbusMessageId.CONFIGURATION, bytes(118))  # a boot message may come first
-        self._measuring = True
-        return XbusMessageId.GOTO_MEASUREMENT_ACK, b""
-
-    def _device_id(self, _: bytes) -> tuple[int, bytes]:
-        return XbusMessageId.DEVICE_ID, self._options.device_id
-
-    def _product_code(self, _: bytes) -> tuple[int, bytes]:
-        return XbusMessageId.PRODUCT_CODE, self._options.product_code.ljust(20).encode("ascii")
-
-    def _firmware(self, _: bytes) -> tuple[int, bytes]:
-        firmware = setup.Firmware(*self._options.firmware, build=74, scm=0)
-        return XbusMessageId.FIRMWARE, setup.encode_firmware(firmware)
-
-    def _filter_profile(self, data: bytes) -> tuple[int, bytes]:
-        if data:
-            return XbusMessageId.ERROR, _PARAMETER
-        return XbusMessageId.FILTER_PROFILE_ACK, self._options.filter_profile
+    def _reply(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
+        """Return identifier and data of the answer in configuration mode."""
+        options = self._options
+        reply: tuple[int, bytes] | None = None
+        match mid:
+            case XbusMessageId.GOTO_MEASUREMENT:
+                self._send(XbusMessageId.CONFIGURATION, bytes(118))  # sent first by some devices
+                self._measuring = True
+                reply = XbusMessageId.GOTO_MEASUREMENT_ACK, b""
+            case XbusMessageId.REQ_DEVICE_ID:
+                reply = XbusMessageId.DEVICE_ID, options.device_id
+            case XbusMessageId.REQ_PRODUCT_CODE:
+                reply = XbusMessageId.PRODUCT_CODE, options.product_code.ljust(20).encode("ascii")
+            case XbusMessageId.REQ_FIRMWARE:
+                firmware = setup.Firmware(*options.firmware, build=74, scm=0)
+                reply = XbusMessageId.FIRMWARE, setup.encode_firmware(firmware)
+            case XbusMessageId.FILTER_PROFILE:
+                acknowledged = XbusMessageId.FILTER_PROFILE_ACK, options.filter_profile
+                reply = (XbusMessageId.ERROR, _PARAMETER) if data else acknowledged
+            case XbusMessageId.ALIGNMENT_ROTATION:
+                reply = self._alignment_rotation(data)
+            case XbusMessageId.OUTPUT_CONFIGURATION:
+                reply = self._output_configuration(data)
+            case XbusMessageId.SYNC_SETTINGS:
+                reply = self._sync_settings(data)
+        return reply
 
     def _alignment_rotation(self, data: bytes) -> tuple[int, bytes]:
         rotation = setup.decode_alignment(data)
@@ -275,7 +290,7 @@ class XbusDevice:
         wanted = setup.decode_outputs(data)
         if wanted is None or len(wanted) > _MOST_OUTPUTS:
             return XbusMessageId.ERROR, _INVALID
-        if not all(map(_can_do, wanted)):
+        if not all(map(_supported, wanted)):
             return XbusMessageId.ERROR, _PARAMETER
         if wanted:
             self._outputs = tuple(map(_effective, wanted))
@@ -290,18 +305,7 @@ class XbusDevice:
         self.flash_writes += 1
         return XbusMessageId.SYNC_SETTINGS_ACK, b""
 
-    _ANSWERS: dict[int, Callable[[XbusDevice, bytes], tuple[int, bytes]]] = {  # noqa: RUF012 - a table
-        XbusMessageId.GOTO_MEASUREMENT: _go_to_measurement,
-        XbusMessageId.REQ_DEVICE_ID: _device_id,
-        XbusMessageId.REQ_PRODUCT_CODE: _product_code,
-        XbusMessageId.REQ_FIRMWARE: _firmware,
-        XbusMessageId.FILTER_PROFILE: _filter_profile,
-        XbusMessageId.ALIGNMENT_ROTATION: _alignment_rotation,
-        XbusMessageId.OUTPUT_CONFIGURATION: _output_configuration,
-        XbusMessageId.SYNC_SETTINGS: _sync_settings,
-    }
-
-    # --- what it says -------------------------------------------------------------------------
+    # --- messages to the host -----------------------------------------------------------------
 
     @property
     def _same_speed(self) -> bool:
@@ -314,7 +318,7 @@ class XbusDevice:
 
     def _send(self, mid: int, data: bytes = b"", bid: int = MASTER) -> bool:
         wire = encode(mid, data, bid)
-        if not self._same_speed:  # one speed read as another: as many bytes, none of them right
+        if not self._same_speed:  # as many bytes, none of them correct
             wire = bytes((byte * 7 + 1) & 0x7F for byte in wire)
         return self._line.write(self._noise(wire))
 
@@ -322,7 +326,7 @@ class XbusDevice:
         return self._options.first_tick + (device_ns - self._epoch_ns) // setup.TICK_NS
 
     def _measure(self, ticks: int, q: Quaternion | None) -> bool:
-        """Send one MTData2; whether all of it went out."""
+        """Send one MTData2; return whether all of it was sent."""
         counter = self._counter
         self._counter = (counter + 1) % _COUNTS
         self._messages += 1
@@ -336,19 +340,18 @@ class XbusDevice:
     def _content(
         self, counter: int, ticks: int, q: Quaternion | None, edges: Mapping[int, Trigger]
     ) -> bytes:
-        """Return the data of one MTData2."""
-        felt = self._felt
-        said = (
-            (data_id, edges.get(data_id, _value(data_id, counter, ticks, q, felt)))
+        """Return the data of one MTData2; an orientation of None is a message of the GNSS."""
+        values = (
+            (data_id, edges.get(data_id, _value(data_id, counter, ticks, q, self._inertial)))
             for data_id, _ in self._outputs
         )
-        return mtdata2.encode_items((item, value) for item, value in said if value is not None)
+        return mtdata2.encode_items((item, value) for item, value in values if value is not None)
 
 
 def _value(
-    data_id: int, counter: int, ticks: int, q: Quaternion | None, felt: InertialSignals
+    data_id: int, counter: int, ticks: int, q: Quaternion | None, inertial: InertialSignals
 ) -> Value | None:
-    """Return what an item of a message holds; None if the message does without it."""
+    """Return the value of an item in a message; None if the message omits the item."""
     simple: dict[int, Value] = {
         Item.PACKET_COUNTER: counter,
         Item.SAMPLE_TIME_FINE: ticks,
@@ -358,23 +361,24 @@ def _value(
     }
     if data_id in simple:
         return simple[data_id]
+
     world, count = mtdata2.world_of(data_id), mtdata2.reals_in(data_id)
     if q is None or world is None or count is None:
         return None
     if data_id & 0xFFF0 == Item.QUATERNION:
         return native_of(q, world)
-    return felt.value(data_id & 0xFFF0) or (0.0,) * count
+    return inertial.value(data_id & 0xFFF0) or (0.0,) * count
 
 
-def _can_do(output: setup.Output) -> bool:
-    """Whether the device knows this output at this rate."""
+def _supported(output: setup.Output) -> bool:
+    """Return whether the device supports this output at this rate."""
     if output.rate not in {0, setup.MAX_RATE} and output.rate > FILTER_RATE_HZ:
         return False
     return mtdata2.reals_in(output.data_id) is not None or output.data_id in set(Item)
 
 
 def _effective(output: setup.Output) -> setup.Output:
-    """Return the output as the device will really send it."""
+    """Return the output with the rate at which the device sends it."""
     if mtdata2.reals_in(output.data_id) is None:
         return setup.Output(output.data_id, setup.MAX_RATE)
     if output.rate in {0, setup.MAX_RATE}:

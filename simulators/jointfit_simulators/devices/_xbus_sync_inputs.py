@@ -13,12 +13,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MOST_ENTRIES = 10
+"""Number of settings that the device can store."""
 _ITEMS = {IN1: Item.TRIGGER_IN1, IN2: Item.TRIGGER_IN2}
-_WAITING = 16
+_MOST_PENDING = 16
+"""Number of edges per line that wait for a message; older ones are dropped."""
 
 
 class SyncInputs:
-    """What is stored for the lines, and the edges that are still to be told.
+    """Settings of the sync inputs, and edges that are not yet reported.
 
     Parameters
     ----------
@@ -29,44 +31,41 @@ class SyncInputs:
     def __init__(self, entries: Iterable[setup.SyncSetting] = ()) -> None:
         self.entries = tuple(entries)
         """Synchronisation settings in force."""
-        self._seen: dict[int, int] = {}
-        self._told: dict[int, int] = {}
-        self._waiting: dict[Item, deque[Trigger]] = {
-            item: deque(maxlen=_WAITING) for item in _ITEMS.values()
-        }
+        self.reset()
 
     def store(self, data: bytes) -> bool:
-        """Replace the entries by those of a request; False if it makes no sense."""
+        """Replace the settings by those of a request; return False if the request is invalid."""
         entries = setup.decode_sync(data)
         if entries is None or len(entries) > MOST_ENTRIES:
             return False
         self.entries = tuple(entry for entry in entries if entry.polarity)
-        self.forget()
+        self.reset()
         return True
 
-    def forget(self) -> None:
-        """Begin to count anew."""
-        self._seen.clear()
-        self._told.clear()
-        for waiting in self._waiting.values():
-            waiting.clear()
+    def reset(self) -> None:
+        """Restart the counts of edges and drop pending ones."""
+        self._edges: dict[int, int] = {}
+        self._reported: dict[int, int] = {}
+        self._pending: dict[Item, deque[Trigger]] = {
+            item: deque(maxlen=_MOST_PENDING) for item in _ITEMS.values()
+        }
 
     def edge(self, line: int, ticks: int) -> None:
-        """Take a rising edge on an input at a time of the device's clock."""
+        """Add a rising edge on an input, at a time of the device clock."""
         for entry in self.entries:
             if (entry.function, entry.line) == (SyncFunction.TRIGGER_INDICATION, line):
-                seen = self._seen[line] = self._seen.get(line, -1) + 1
-                counts = seen - entry.skip_first
-                if counts < 0 or counts % (entry.skip_factor + 1):
+                edges = self._edges[line] = self._edges.get(line, -1) + 1
+                since_first = edges - entry.skip_first
+                if since_first < 0 or since_first % (entry.skip_factor + 1):
                     continue
-                number = self._told[line] = self._told.get(line, -1) + 1
+                number = self._reported[line] = self._reported.get(line, -1) + 1
                 edge = Trigger(line, entry.polarity, ticks, number & 0xFFFF)
-                self._waiting[_ITEMS[line]].append(edge)
+                self._pending[_ITEMS[line]].append(edge)
 
     def next_triggers(self, items: Iterable[int]) -> dict[int, Trigger]:
-        """Return what the next message tells of, an edge an item at most; it is told then."""
-        found = {}
-        for item, waiting in self._waiting.items():
-            if item in items and waiting:
-                found[int(item)] = waiting.popleft()
-        return found
+        """Remove and return the edges for the next message, at most one for each item."""
+        return {
+            int(item): pending.popleft()
+            for item, pending in self._pending.items()
+            if item in items and pending
+        }

@@ -23,40 +23,38 @@ from jointfit_protocols.xcdi import (
 )
 
 if TYPE_CHECKING:
-    import random
-    from collections.abc import Sequence
-
     from jointfit_protocols.xcdi import ByteOrder
     from jointfit_simulators.imu_device import Quaternion
     from jointfit_simulators.wires import CanWire
 
 _FILTER_VALID = 0x02
+"""Status word of a device with a valid orientation."""
 
 
 @dataclass(frozen=True, slots=True)
 class XcdiDeviceOptions:
-    """How the device was configured over its UART."""
+    """Settings of the device, made over its UART."""
 
     ids: XcdiIds = field(default_factory=XcdiIds)
-    """Identifiers; those that are None are not sent."""
+    """CAN identifiers; messages with the identifier None are not sent."""
     rate_hz: float = 100.0
     sample_time_unit: str = "100us"
-    """``100us`` or ``1us``: the documents disagree."""
+    """``100us`` or ``1us``; the vendor's documents disagree."""
     byte_order: ByteOrder = "big"
     first_tick: int = 0
-    """Its clock at power-up."""
+    """Clock at power-up, ticks."""
     first_counter: int = 0
 
 
 class XcdiDevice:
-    """An ``ImuDevice`` on a CAN wire.
+    """`ImuDevice` on a CAN wire.
 
     Parameters
     ----------
     wire
-        The bus; several devices may share it.
+        Bus; several devices may share it.
     options
-        How it was configured.
+        Settings of the device.
     """
 
     def __init__(self, wire: CanWire, options: XcdiDeviceOptions | None = None) -> None:
@@ -64,9 +62,9 @@ class XcdiDevice:
         self._options = options or XcdiDeviceOptions()
         self._counter = self._options.first_counter
         self._epoch_ns = self._last_ns = 0
-        self._lose: dict[DataId | None, int] = {}
+        self._to_lose: dict[DataId | None, int] = {}  # None: whole groups
         self.sent = 0
-        """Samples put on the wire so far (their quaternion, that is)."""
+        """Number of quaternions written to the wire."""
 
     @property
     def streaming(self) -> bool:
@@ -75,11 +73,11 @@ class XcdiDevice:
 
     @property
     def rate_hz(self) -> float:
-        """Groups a second, as configured."""
+        """Configured groups per second."""
         return self._options.rate_hz
 
     def edge(self, device_ns: int) -> None:
-        """Take an edge and say nothing: there is no message for it."""
+        """Ignore an edge on the sync input; XCDI has no message for it."""
 
     @property
     def counter(self) -> int:
@@ -88,7 +86,7 @@ class XcdiDevice:
 
     @property
     def line_ns(self) -> int:
-        """How long a group takes on the bus, ns."""
+        """Transmission time of a group, ns."""
         ids, bitrate = self._options.ids, self.wire.bitrate
         sent = {
             DataId.SAMPLE_TIME: ids.sample_time,
@@ -104,21 +102,20 @@ class XcdiDevice:
         return bits * 1_000_000_000 // bitrate if bitrate else 0
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Send one group now; ``ImuDevice.push`` says the rest."""
+        """Send one group now, as described in `ImuDevice.push`."""
         frames = self.group(device_ns, q_world_sensor)
-        if not self.wire.is_open or not frames:
-            return
-        if self.wire.send(frames):
+        if self.wire.is_open and frames and self.wire.send(frames):
             self.sent += frames[-1].can_id == self._options.ids.quaternion
 
     def group(self, device_ns: int, q_world_sensor: Quaternion) -> list[CanFrame]:
-        """Return the next group, without the frames that are to be lost; see ``interleaved``."""
+        """Return the next group, without the frames to be lost."""
         self._last_ns = device_ns
         counter, self._counter = self._counter, (self._counter + 1) % COUNTER_MODULUS
         tick_ns = TICK_NS[self._options.sample_time_unit]
         ticks = self._options.first_tick + (device_ns - self._epoch_ns) // tick_ns
         if self._lost(None):
             return []
+
         ids = self._options.ids
         group: list[tuple[DataId, int | None, tuple[int, ...]]] = [
             (DataId.SAMPLE_TIME, ids.sample_time, (ticks % TICKS_MODULUS,)),
@@ -133,53 +130,42 @@ class XcdiDevice:
         ]
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` groups: they take a counter value and are not sent."""
-        self._lose[None] = self._lose.get(None, 0) + count
+        """Lose the next `count` groups: the counter increments, but they are not sent."""
+        self._to_lose[None] = self._to_lose.get(None, 0) + count
 
     def lose_frames(self, data_id: DataId, count: int) -> None:
         """Lose the frame `data_id` of the next `count` groups."""
-        self._lose[data_id] = self._lose.get(data_id, 0) + count
+        self._to_lose[data_id] = self._to_lose.get(data_id, 0) + count
 
     def overflow(self) -> None:
-        """Report that the output buffer overflowed."""
+        """Report an overflow of the output buffer."""
         if self._options.ids.error is not None:
             self.wire.send(
                 [self._frame(self._options.ids.error, encode(DataId.ERROR, (OVERFLOW,)))]
             )
 
     def power_cycle(self) -> None:
-        """Lose power for a moment: clock and counter begin anew."""
+        """Interrupt the power supply: clock and counter restart."""
         self._epoch_ns, self._counter = self._last_ns, self._options.first_counter
 
     def unplug(self) -> None:
-        """Take the wire away."""
+        """Disconnect the wire."""
         self.wire.unplug()
 
     def plug(self) -> None:
-        """Put the wire back; the device kept its power."""
+        """Connect the wire; the device remained powered."""
         self.wire.plug()
 
     async def run(self) -> None:
         """Serve until cancelled."""
         await self.wire.run()
 
-    def _lost(self, what: DataId | None) -> bool:
-        left = self._lose.get(what, 0)
+    def _lost(self, data_id: DataId | None) -> bool:
+        left = self._to_lose.get(data_id, 0)
         if left:
-            self._lose[what] = left - 1
+            self._to_lose[data_id] = left - 1
         return left > 0
 
     def _frame(self, number: int, data: bytes) -> CanFrame:
         extended = self._options.ids.extended or number > STANDARD_MAX
         return CanFrame(0, number, data, extended)
-
-
-def interleaved(groups: Sequence[Sequence[CanFrame]], order: random.Random) -> list[CanFrame]:
-    """Return the frames of several devices' groups mixed, each group in its own order."""
-    left = [list(group) for group in groups if group]
-    mixed: list[CanFrame] = []
-    while left:
-        group = order.choice(left)
-        mixed.append(group.pop(0))
-        left = [each for each in left if each]
-    return mixed

@@ -149,7 +149,7 @@ def _record(
 
     names = tuple(name for part in PARTS for name in wearer.clusters[part])
     cameras = Cameras(knobs, wearer, rate_hz=rate_hz)
-    frames = cameras.see(seen)
+    frames = cameras.capture(seen)
     bodies = {
         body: (frames.body_positions[:, column], frames.body_orientations[:, column])
         for column, body in enumerate(cameras.bodies)

@@ -98,7 +98,7 @@ class OpticalStream:
         """Add markers to the planned frames and return the transmission times, ns."""
         if self._server is None:
             return []
-        seen = self.cameras.see(observation)
+        seen = self.cameras.capture(observation)
         for i, exposure in enumerate(self._taken.host_ns.tolist()):
             self._waiting.append((exposure, self._markers(seen, i), self._bodies(seen, i)))
         return cast("list[int]", self._taken.due_ns.tolist())

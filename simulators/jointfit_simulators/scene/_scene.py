@@ -101,7 +101,7 @@ class Scene:
         ticker = SampleTiming(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
         self._tickers = {n: s.ticker for n, s in self._hardware.streams.items()} | {OPTICAL: ticker}
         for name, fault in options.clocks.items():
-            self._tickers[name].ask(fault, now_ns)
+            self._tickers[name].set_fault(fault, now_ns)
         for stream in self._hardware.streams.values():
             stream.told = told
         self._server: NatNetServer | None = None

@@ -33,44 +33,46 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import WireNoise
 
 _NS_PER_MS = 1_000_000
+_ANSWERS = {"V": b"V1013\r", "v": b"v0100\r", "N": b"NA123\r", "F": b"F00\r", "": DONE}
+"""Answers to queries of version, serial number and status flags, and to an empty line."""
 
 
 class CanWire(Protocol):
-    """A bus as a device sees it."""
+    """CAN bus as seen by a device."""
 
     bitrate: int | None
-    """Speed of a bus whose frames take their time, bit/s; None: they take none."""
+    """Bit rate from which the transmission time of a frame follows, bit/s; None: no delay."""
 
     @property
     def is_open(self) -> bool:
-        """Whether somebody listens, as far as the wire can tell."""
+        """Whether the host listens, as far as the wire can detect it."""
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
-        """Put `frames` on the bus; whether all of them went out."""
+        """Send `frames`; return whether all were sent."""
 
     async def run(self) -> None:
         """Serve until cancelled."""
 
     def unplug(self) -> None:
-        """Take the wire away; again it does nothing."""
+        """Disconnect the wire; no effect if disconnected."""
 
     def plug(self) -> None:
-        """Put it back."""
+        """Connect the wire."""
 
 
 class SlcanAdapter:
-    """An SLCAN adapter with a pty for its serial port.
+    """SLCAN adapter with a pty as its serial port.
 
     Parameters
     ----------
     link
-        Where the host finds the port.
+        Symbolic link to the host's port.
     wire_noise
-        What the serial line does to what is written at once.
+        Noise applied to each write on the serial line.
     bus_bitrate
-        Speed of the sensors on the bus, bit/s; at another one the host hears nothing. None: any.
+        Bit rate of the sensors, bit/s; the host receives nothing at another rate. None: any.
     mute
-        It obeys and answers nothing, like some cheap adapters.
+        Execute commands without an answer, as some adapters do.
     """
 
     def __init__(
@@ -87,9 +89,7 @@ class SlcanAdapter:
         self._serving = asyncio.Lock()
         self._open = self._stamping = False
         self.bitrate: int | None = None
-        """What the host set, bit/s."""
-        self.received: list[CanFrame] = []
-        """Frames the host sent."""
+        """Bit rate set by the host, bit/s."""
 
     @property
     def is_open(self) -> bool:
@@ -97,64 +97,62 @@ class SlcanAdapter:
         return self._open
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
-        """Pass `frames` to the host, whole or not at all."""
+        """Send `frames` to the host; either all or none."""
         if not self._open or self._bus_bitrate not in {None, self.bitrate}:
             return False
         stamp = time.monotonic_ns() // _NS_PER_MS if self._stamping else None
         return self._line.write(self._noise(b"".join(encode_frame(f, stamp) for f in frames)))
 
     def send_bytes(self, data: bytes) -> bool:
-        """Write anything at all to the host."""
+        """Write raw bytes to the host's port."""
         return self._line.write(data)
 
     async def run(self) -> None:
-        """Serve until cancelled; while another device serves the adapter, wait to take over."""
+        """Serve until cancelled; wait while another device serves the adapter."""
         async with self._serving:
-            await self._line.serve(self._take)
+            await self._line.serve(self._receive)
 
     def unplug(self) -> None:
-        """Pull the adapter out: it loses power and forgets."""
+        """Disconnect the adapter; it loses power and its settings."""
         self._line.unplug()
         self._open = self._stamping = False
         self.bitrate = None
 
     def plug(self) -> None:
-        """Put it back."""
+        """Connect the adapter."""
         self._line.plug()
 
-    def _take(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         for item in self._decoder.feed(data, 0):
-            answer = self._obey(item) if isinstance(item, SlcanLine) else REFUSED
+            answer = self._execute(item) if isinstance(item, SlcanLine) else REFUSED
             if not self._mute:
                 self._line.write(self._noise(answer))
 
-    def _obey(self, line: SlcanLine) -> bytes:
-        """Do what a command says; return the answer."""
-        known = {"V": b"V1013\r", "v": b"v0100\r", "N": b"NA123\r", "F": b"F00\r", "": DONE}
-        if line.letter in known:
-            return known[line.letter]
+    def _execute(self, line: SlcanLine) -> bytes:
+        """Execute a command and return the answer."""
+        if line.letter in _ANSWERS:
+            return _ANSWERS[line.letter]
+
         if line.letter == "S" and not self._open and line.argument in set("012345678"):
             self.bitrate = BITRATES[int(line.argument)]
-            return DONE
-        if line.letter == "Z" and not self._open and line.argument in {"0", "1"}:
+        elif line.letter == "Z" and not self._open and line.argument in {"0", "1"}:
             self._stamping = line.argument == "1"
-            return DONE
-        if line.letter in "OL" and not self._open and self.bitrate is not None:
+        elif line.letter in "OL" and not self._open and self.bitrate is not None:
             self._open = True
-            return DONE
-        if line.letter == "C" and self._open:
+        elif line.letter == "C" and self._open:
             self._open = False
-            return DONE
-        return REFUSED
+        else:
+            return REFUSED
+        return DONE
 
 
 class PythonCanWire:
-    """A bus of python-can: ``socketcan`` where the kernel has CAN, ``virtual`` in one process.
+    """Bus of python-can: ``socketcan``, or ``virtual`` within one process.
 
     Parameters
     ----------
     interface, channel
-        As python-can names them.
+        Names of python-can.
     """
 
     def __init__(self, interface: str, channel: str) -> None:
@@ -165,11 +163,11 @@ class PythonCanWire:
 
     @property
     def is_open(self) -> bool:
-        """Whether the wire is plugged in: a bus does not tell who listens."""
+        """Whether the wire is plugged in; listeners on a bus cannot be detected."""
         return self._bus is not None
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
-        """Send `frames`; False where the bus is away, down or full."""
+        """Send `frames`; return False if the bus is absent, down or full."""
         if self._bus is None:
             return False
         try:
@@ -186,18 +184,18 @@ class PythonCanWire:
         return True
 
     async def run(self) -> None:
-        """Wait until cancelled: nothing is ever asked of a device on this bus."""
+        """Wait until cancelled; the devices on this bus receive nothing."""
         await asyncio.get_running_loop().create_future()
 
     def unplug(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         bus, self._bus = self._bus, None
         if bus is not None:
             with suppress(can.CanError, OSError):
                 bus.shutdown()
 
     def plug(self) -> None:
-        """Join the bus."""
+        """Open the bus."""
         if self._bus is None:
             self._bus = can.Bus(
                 interface=self._interface, channel=self._channel, ignore_config=True

@@ -15,25 +15,21 @@ if TYPE_CHECKING:
 
 
 def line_noise(knobs: Knobs, name: str) -> WireNoise:
-    """Return the noise of the line of one device, as the knobs want it."""
-    flip, burst, longest = (
-        knobs.line_flip_per_byte,
-        knobs.line_burst_per_byte,
-        knobs.line_burst_bytes,
-    )
-    if not (flip or burst):
+    """Return the noise function for the serial line of one device."""
+    if not (knobs.line_flip_per_byte or knobs.line_burst_per_byte):
         return clean_wire
     random = knobs.random(f"line {name}")
 
     def noisy(data: bytes) -> bytes:
-        flips = random.random(len(data)) < flip
-        bursts = random.random(len(data)) < burst
+        flips = random.random(len(data)) < knobs.line_flip_per_byte
+        bursts = random.random(len(data)) < knobs.line_burst_per_byte
         if not (flips.any() or bursts.any()):
             return data
+
         out = bytearray()
-        for byte, flipped, garbage in zip(data, flips, bursts, strict=True):
-            if garbage:
-                out += random.bytes(int(random.integers(1, longest + 1)))
+        for byte, flipped, burst in zip(data, flips, bursts, strict=True):
+            if burst:
+                out += random.bytes(int(random.integers(1, knobs.line_burst_bytes + 1)))
             out.append(byte ^ (1 << int(random.integers(8))) if flipped else byte)
         return bytes(out)
 

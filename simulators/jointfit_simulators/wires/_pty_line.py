@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _READ_BYTES = 65536
-_SPEED = 4  # index of the input speed in what tcgetattr returns
+_INPUT_SPEED = 4
+"""Index of the input speed in the result of tcgetattr."""
 _SPEEDS = {
     getattr(termios, f"B{baud}"): baud
     for baud in (
@@ -30,37 +31,32 @@ _SPEEDS = {
 
 
 class PtyLine:
-    """One line, plugged in from the start.
+    """Serial line, plugged in from the start.
 
     Parameters
     ----------
     link
-        Where the host finds its port; replaced if it is there.
+        Symbolic link to the host's port; replaced if it exists.
     """
 
     def __init__(self, link: Path) -> None:
         self.link = link
-        self._fds: tuple[int, int] | None = None  # device's end, host's end
+        self._fds: tuple[int, int] | None = None  # of the device and of the host
         self._rest = b""
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._take: Callable[[bytes], None] = _ignore
+        self._receive: Callable[[bytes], None] = _ignore
         self._ended: asyncio.Future[None] | None = None
         self.plug()
 
     @property
-    def plugged(self) -> bool:
-        """Whether the line exists."""
-        return self._fds is not None
-
-    @property
     def host_baud(self) -> int | None:
-        """Speed the host set its port to, bit/s; None if unplugged or an unusual one."""
+        """Speed of the host's port, bit/s; None if unplugged or not a standard speed."""
         if self._fds is None:
             return None
-        return _SPEEDS.get(termios.tcgetattr(self._fds[1])[_SPEED])
+        return _SPEEDS.get(termios.tcgetattr(self._fds[1])[_INPUT_SPEED])
 
     def plug(self) -> None:
-        """Make the line; nothing happens if it is there."""
+        """Create the line; no effect if it exists."""
         if self._fds is not None:
             return
         device, host = os.openpty()
@@ -73,7 +69,7 @@ class PtyLine:
             self._loop.add_reader(device, self._readable)
 
     def unplug(self) -> None:
-        """Hang up and remove the link; nothing happens if that was done."""
+        """Hang up and remove the link; no effect if unplugged."""
         if self._fds is None:
             return
         if self._loop is not None:
@@ -85,51 +81,54 @@ class PtyLine:
         self.link.unlink(missing_ok=True)
 
     def write(self, data: bytes) -> bool:
-        """Put `data` on the line, all or nothing: False where nobody reads and the line is full."""
-        if self._fds is None or not self._flushed():
+        """Write all of `data` or nothing; return False on a full line (no reader)."""
+        if self._fds is None or not self._flush():
             return False
         self._rest = data
-        self._flushed()
+        self._flush()
         return True
 
-    def _flushed(self) -> bool:
-        """Put what is left of an earlier write on the line; whether nothing is left."""
+    def _flush(self) -> bool:
+        """Write the rest of an earlier message; return whether all is written."""
         if self._rest and self._fds is not None:
             with suppress(BlockingIOError):
                 self._rest = self._rest[os.write(self._fds[0], self._rest) :]
-            if self._loop is not None:  # the last write of all has none after it that would go on
+
+            # no later write may follow to continue this one, so the event loop continues it
+            if self._loop is not None:
                 self._loop.remove_writer(self._fds[0])
                 if self._rest:
-                    self._loop.add_writer(self._fds[0], self._flushed)
+                    self._loop.add_writer(self._fds[0], self._flush)
         return not self._rest
 
-    async def serve(self, take: Callable[[bytes], None]) -> None:
-        """Hand what the host writes to `take` until cancelled; unplugging is survived.
+    async def serve(self, receive: Callable[[bytes], None]) -> None:
+        """Pass bytes of the host to `receive` until cancelled, also across unplugging.
 
         Raises
         ------
         RuntimeError
-            The line is served already.
+            The line is already served.
         """
         if self._loop is not None:
-            raise RuntimeError(f"{self.link}: served twice")
+            raise RuntimeError(f"{self.link}: the line is already served")
         self._loop = asyncio.get_running_loop()
-        self._take, self._ended = take, self._loop.create_future()
+        self._receive, self._ended = receive, self._loop.create_future()
         if self._fds is not None:
             self._loop.add_reader(self._fds[0], self._readable)
+
         try:
             await self._ended
         finally:
             if self._fds is not None:
                 self._loop.remove_reader(self._fds[0])
                 self._loop.remove_writer(self._fds[0])
-            self._loop, self._take = None, _ignore
+            self._loop, self._receive = None, _ignore
 
     def _readable(self) -> None:
         if self._fds is None or self._ended is None:
             return
         try:
-            self._take(os.read(self._fds[0], _READ_BYTES))
+            self._receive(os.read(self._fds[0], _READ_BYTES))
         except BlockingIOError:
             return
         except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
@@ -138,4 +137,4 @@ class PtyLine:
 
 
 def _ignore(_: bytes) -> None:
-    """Take bytes nobody waits for."""
+    """Ignore bytes received while the line is not served."""

@@ -44,7 +44,7 @@ class TestNatNet(DriverContract):
     registered_as = "natnet"
     measurement = MocapFrame
     has_noise = False  # a UDP checksum tells damaged datagrams apart before we see them
-    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
+    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     options = NatNetServerOptions(bodies=(THIGH,), bitstream=(3, 1))
     _devices: list[Any]
 

@@ -21,7 +21,7 @@ from jointfit_drivers.ports.udp_socket import UdpSocket, local_address
 from jointfit_protocols.natnet import NatNetMessageId, ServerInfo, encode
 from jointfit_simulators._contract_fixtures import DecodingReceiver
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
-from jointfit_simulators.devices._natnet_replay import NatNetReplay
+from tests.simulators.natnet_replay import NatNetReplay
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -202,7 +202,7 @@ class Claimant(NatNetServer):
     claims: ServerInfo
 
     @override
-    def _put_info(self, address: tuple[str, int], _: tuple[int, int]) -> None:
+    def _send_info(self, address: tuple[str, int], _: tuple[int, int]) -> None:
         self._port.send(encode(self.claims), address)
 
 

@@ -138,8 +138,8 @@ class Eager(SlcanAdapter):
         return True
 
     @override
-    def _obey(self, line: SlcanLine) -> bytes:
-        answer = super()._obey(line)
+    def _execute(self, line: SlcanLine) -> bytes:
+        answer = super()._execute(line)
         if line.letter != "O":
             return answer
         self.group = []

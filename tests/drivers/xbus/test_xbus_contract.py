@@ -96,6 +96,6 @@ class TestXbusThatOnlyFeels(TestXbus):
     def matches(self, number: int, measurement: Any) -> bool:
         """By what it felt: the orientation remembers all that came before."""
         felt = InertialSignals()
-        felt.moved(0, orientation(number))
+        felt.update(0, orientation(number))
         force = felt.value(Item.ACCELERATION)
         return bool(measurement.acceleration == pytest.approx(force, abs=0.01))

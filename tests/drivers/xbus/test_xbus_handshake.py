@@ -189,13 +189,11 @@ async def test_a_rate_the_device_rounds_is_named(tmp_path: Path) -> None:
 
 async def test_an_error_of_the_device_is_told_in_words(tmp_path: Path) -> None:
     class Refusing(XbusDevice):
-        _ANSWERS = XbusDevice._ANSWERS | {
-            XbusMessageId.OUTPUT_CONFIGURATION: lambda _, data: (
-                (XbusMessageId.ERROR, b"\x21")
-                if data
-                else (XbusMessageId.OUTPUT_CONFIGURATION_ACK, b"")
-            )
-        }
+        @override
+        def _output_configuration(self, data: bytes) -> tuple[int, bytes]:
+            if data:
+                return XbusMessageId.ERROR, b"\x21"
+            return XbusMessageId.OUTPUT_CONFIGURATION_ACK, b""
 
     device = Refusing(tmp_path / "imu")
     async with powered(device):

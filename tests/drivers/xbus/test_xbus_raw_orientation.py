@@ -345,8 +345,8 @@ def test_a_simulated_sensor_feels_the_turn_it_made(
     before = rotation.normalize(np.array(start))
     after = rotation.multiply(before, rotation.exp(np.array(turn)))
     felt = InertialSignals()
-    felt.moved(0, tuple(before.tolist()))
-    felt.moved(10_000_000, tuple(after.tolist()))
+    felt.update(0, tuple(before.tolist()))
+    felt.update(10_000_000, tuple(after.tolist()))
     rate, force = felt.value(Item.RATE_OF_TURN), felt.value(Item.ACCELERATION)
     assert rate is not None
     assert force is not None
@@ -359,7 +359,7 @@ def test_simulated_readings_filtered_give_the_simulated_movement_back() -> None:
     for k in range(1500):
         q = rotation.exp(np.array([0.6 * sin(0.02 * k), 0.3 * sin(0.013 * k), 0.4 * sin(0.01 * k)]))
         truth.append(q)
-        felt.moved(k * 10_000_000, tuple(q.tolist()))
+        felt.update(k * 10_000_000, tuple(q.tolist()))
         kinds = (Item.RATE_OF_TURN, Item.ACCELERATION, Item.MAGNETIC_FIELD)
         wires.append(message(k, 100 * k, *((kind, felt.value(kind)) for kind in kinds)))
     said = orientations(decoded(wires, magnetometer=True))

@@ -96,5 +96,5 @@ class TestXcdiOnABusWithoutDescriptor(DriverContract):
         return XcdiImu(settings("virtual", str(folder)))
 
     # An in-process bus has no noise, and anything at all may share it.
-    test_noise_on_the_line_costs_only_what_it_hit = None  # type: ignore[assignment]
-    test_a_wrong_device_is_named_not_retried = None  # type: ignore[assignment]
+    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
+    test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]

@@ -18,7 +18,6 @@ from jointfit_drivers.xcdi import XcdiDecoder, XcdiIdSettings, XcdiImu, XcdiSett
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, host_corrupt, host_dropped, pack_frames
 from jointfit_protocols.xcdi import DataId, XcdiIds, id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
-from jointfit_simulators.devices._xcdi_device import interleaved
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -248,6 +247,16 @@ def test_two_sensors_that_speak_in_turn_frame_by_frame_are_found_out() -> None:
     found = decoded(tape)
     assert len(samples(found)) < 30
     assert len(of_kind(found, "warning")) == 1
+
+
+def interleaved(groups: list[list[CanFrame]], order: random.Random) -> list[CanFrame]:
+    """Return the frames of several groups in random order; each group retains its own order."""
+    left = [list(group) for group in groups if group]
+    mixed: list[CanFrame] = []
+    while left:
+        mixed.append(order.choice(left).pop(0))
+        left = [group for group in left if group]
+    return mixed
 
 
 def test_interleaved_groups_of_two_sensors_on_one_identifier_are_found_out() -> None:

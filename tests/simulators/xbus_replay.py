@@ -8,60 +8,43 @@ together with the previous message.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from jointfit_protocols.xbus import XbusCodec, XbusMessage, encode
 from jointfit_protocols.xbus.configuration import TICK_NS
 from jointfit_protocols.xbus.mtdata2 import Item, decode_item, split
-from jointfit_simulators.devices._xbus_device import XbusDevice
+from jointfit_simulators.devices import XbusDevice
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from jointfit_simulators.devices._xbus_device import XbusDeviceOptions
 
 _NS = 10**9
 _POLL_S = 0.005
 
 
-class _Recorded(NamedTuple):
-    due_ns: int
-    """After the first one."""
-    wire: bytes
-
-
 class XbusReplay(XbusDevice):
-    """Plays a capture into a pty, once.
+    """Device that sends a capture of whole MTData2 messages once.
 
     Parameters
     ----------
     link : Path
-        Where the host finds the port.
+        Symbolic link to the host's port.
     capture : bytes
-        What was recorded: whole MTData2 messages.
-    options : XbusDeviceOptions, optional
-        What it says of itself.
-
-    Raises
-    ------
-    ValueError
-        The capture holds no message with SampleTimeFine.
+        Recorded bytes.
     """
 
-    def __init__(
-        self, link: Path, capture: bytes, *, options: XbusDeviceOptions | None = None
-    ) -> None:
-        super().__init__(link, options=options)
+    def __init__(self, link: Path, capture: bytes) -> None:
+        super().__init__(link)
         self._recorded = _timed(capture)
 
     @property
     def messages(self) -> int:
-        """Messages in the capture."""
+        """Number of messages in the capture."""
         return len(self._recorded)
 
     async def play(self) -> None:
-        """Wait until the host wants data, then send all of it; return when it is sent."""
-        while not self.streaming:  # noqa: ASYNC110 - a device has a state, not an event
+        """Wait for measurement mode, then send all messages."""
+        while not self.streaming:
             await asyncio.sleep(_POLL_S)
         loop = asyncio.get_running_loop()
         began = loop.time()
@@ -70,8 +53,9 @@ class XbusReplay(XbusDevice):
             self.sent += self._line.write(wire)
 
 
-def _timed(capture: bytes) -> list[_Recorded]:
-    found: list[_Recorded] = []
+def _timed(capture: bytes) -> list[tuple[int, bytes]]:
+    """Return the messages of a capture, each with its time since the first one, ns."""
+    found: list[tuple[int, bytes]] = []
     first = newest = None
     for message in XbusCodec().feed(capture):
         if not isinstance(message, XbusMessage):
@@ -83,7 +67,6 @@ def _timed(capture: bytes) -> list[_Recorded]:
             first = ticks if first is None else first
             newest = ticks if newest is None else max(newest, ticks)
         due = 0 if first is None or newest is None else (newest - first) * TICK_NS
-        found.append(_Recorded(due, encode(message.mid, message.data, message.bid)))
-    if first is None:
-        raise ValueError("a capture of MTData2 messages with SampleTimeFine is needed")
+        found.append((due, encode(message.mid, message.data, message.bid)))
+    assert first is not None, "no message with SampleTimeFine"
     return found
