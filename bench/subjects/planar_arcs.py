@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation import circle_rms_bound
+from bench.baselines.circle_theory import circle_rms_bound
 from jointfit_daemon.center_of_rotation.planar import GATE, CircleMethod, ellipse_scale, fit_circles
 
 if TYPE_CHECKING:

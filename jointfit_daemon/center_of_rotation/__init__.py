@@ -1,6 +1,5 @@
 """Centers of rotation estimated from markers, body poses and joint angles."""
 
-from jointfit_daemon.center_of_rotation._bounds import circle_rms_bound
 from jointfit_daemon.center_of_rotation._fused_estimate import fuse_centers
 from jointfit_daemon.center_of_rotation._methods import METHODS, estimate_center
 from jointfit_daemon.center_of_rotation._movement import BodyPoses, Movement
@@ -11,7 +10,6 @@ __all__ = [
     "BodyPoses",
     "CenterEstimate",
     "Movement",
-    "circle_rms_bound",
     "estimate_center",
     "fuse_centers",
     "refusal",

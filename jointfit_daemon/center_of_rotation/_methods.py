@@ -13,6 +13,7 @@ import numpy as np
 
 from jointfit_daemon.center_of_rotation import _planar_methods
 from jointfit_daemon.center_of_rotation._movement import Movement
+from jointfit_daemon.center_of_rotation._planar_methods import each
 from jointfit_daemon.center_of_rotation._result import refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     NOISE_FACTOR,
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.center_of_rotation._movement import BodyPoses
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
+    from jointfit_daemon.center_of_rotation.planar import CircleMethod
 
 
 _ASK_EVERY = 50
@@ -50,7 +51,8 @@ class EstimationMethod:
     """Fields of `Movement` that must be given: ``points``, ``parent`` and ``child``, ``angles``."""
     planar: bool
     """Works in a plane: points in space are projected along `Movement.axis`."""
-    run: Callable[[Movement], CenterEstimate]
+    run: Callable[..., CenterEstimate]
+    """Called with the movement and then with its fields in `needs`."""
 
 
 def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterEstimate:
@@ -77,7 +79,10 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     if not isinstance(movement, Movement):
         movement = Movement(np.asarray(movement, dtype=np.float64))
     movement = _checked(movement)
-    chosen = METHODS.get(_auto(movement) if method == "auto" else method)
+    if method == "auto":
+        planar = movement.points is not None and movement.points.shape[-1] == 2
+        method = "geometric" if planar else "sphere" if movement.points is not None else "score"
+    chosen = METHODS.get(method)
     if chosen is None:
         raise ValueError(f"no method {method!r}; there are: {', '.join(sorted(METHODS))}")
     if missing := [name for name in chosen.needs if getattr(movement, name) is None]:
@@ -89,7 +94,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
         reason = "all markers are missing in every frame: check marker names, cameras and occlusion"
         return refusal(chosen.name, points.shape[-1], 0, reason)
 
-    return _beyond_parent(chosen.run(movement), movement.parent_markers)
+    given = [getattr(movement, name) for name in chosen.needs]
+    return _beyond_parent(chosen.run(movement, *given), movement.parent_markers)
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
@@ -119,26 +125,7 @@ def _checked(movement: Movement) -> Movement:
     return replace(movement, points=np.where(whole, points, np.nan))
 
 
-def _auto(movement: Movement) -> str:
-    if movement.points is None:
-        return "score"
-    return "geometric" if movement.points.shape[-1] == 2 else "sphere"
-
-
-def _points(movement: Movement) -> Array:
-    if movement.points is None:
-        raise ValueError("points are needed")
-    return movement.points
-
-
-def _bodies(movement: Movement) -> tuple[BodyPoses, BodyPoses]:
-    if movement.parent is None or movement.child is None:
-        raise ValueError("both bodies' poses are needed")
-    return movement.parent, movement.child
-
-
-def _stream(movement: Movement) -> CenterEstimate:
-    points = _points(movement)
+def _stream(movement: Movement, points: Array) -> CenterEstimate:
     limits = SphereLimits(min_direction=movement.least_turn)
     k, d = points.shape[1:]
     stream = RunningSphere(k, dimension=d, near=movement.near, limits=limits)
@@ -149,51 +136,53 @@ def _stream(movement: Movement) -> CenterEstimate:
     return stream.estimate()
 
 
-def _planar(
-    name: str, about: str, run: Callable[[Array, Movement], CenterEstimate], *more: str
-) -> EstimationMethod:
-    return EstimationMethod(
-        name, about, ("points", *more), True, _planar_methods.in_plane(run, name)
-    )
+def _planar(name: str, about: str, fit: _planar_methods.MarkerFit, *more: str) -> EstimationMethod:
+    def run(movement: Movement, points: Array, *_: Array) -> CenterEstimate:
+        return _planar_methods.fit_in_plane(name, fit, movement, points)
+
+    return EstimationMethod(name, about, ("points", *more), True, run)
+
+
+def _circle(name: CircleMethod, about: str) -> EstimationMethod:
+    return _planar(name, about, each(_planar_methods.circle(name)))
 
 
 _ALL = (
-    _planar("kasa", "linear circle fit; biased on short arcs", _planar_methods.circle("kasa")),
-    _planar(
-        "pratt", "algebraic circle fit; the center is hyper's", _planar_methods.circle("pratt")
-    ),
-    _planar("taubin", "algebraic circle fit, nearly unbiased", _planar_methods.circle("taubin")),
-    _planar(
-        "hyper", "algebraic circle fit without essential bias", _planar_methods.circle("hyper")
-    ),
+    _circle("kasa", "linear circle fit; biased on short arcs"),
+    _circle("pratt", "algebraic circle fit; the center is hyper's"),
+    _circle("taubin", "algebraic circle fit, nearly unbiased"),
+    _circle("hyper", "algebraic circle fit without essential bias"),
     _planar("geometric", "circles of all markers at once, robust", _planar_methods.geometric),
-    _planar("running_circle", "hyper, one frame at a time", _planar_methods.running),
+    _planar("running_circle", "hyper, one frame at a time", each(_planar_methods.running)),
     _planar(
-        "oriented", "circle and the child's measured angle", _planar_methods.oriented, "angles"
+        "oriented",
+        "circle and the child's measured angle",
+        each(_planar_methods.oriented),
+        "angles",
     ),
-    _planar("grid", "search on a grid: the published baseline", _planar_methods.grid),
-    _planar("three_frames", "closed form through three frames", _planar_methods.three_frames),
+    _planar("grid", "search on a grid: the published baseline", each(_planar_methods.grid)),
+    _planar("three_frames", "closed form through three frames", each(_planar_methods.three_frames)),
     EstimationMethod(
         "gamage_lasenby",
         "linear sphere fit; biased on short arcs",
         ("points",),
         False,
-        lambda m: gamage_lasenby(_points(m), m.least_turn),
+        lambda m, points: gamage_lasenby(points, m.least_turn),
     ),
     EstimationMethod(
         "halvorsen",
         "linear sphere fit, bias taken out",
         ("points",),
         False,
-        lambda m: halvorsen(_points(m), m.least_turn),
+        lambda m, points: halvorsen(points, m.least_turn),
     ),
     EstimationMethod(
         "sphere",
         "geometric sphere fit of all markers, robust; distinguishes a hinge from a ball joint",
         ("points",),
         False,
-        lambda m: fit_sphere(
-            _points(m),
+        lambda m, points: fit_sphere(
+            points,
             SphereOptions(start=m.near),
             SphereLimits(min_direction=m.least_turn),
             m.parent_markers,
@@ -211,14 +200,14 @@ _ALL = (
         "both bodies treated alike; needs three markers on each",
         ("parent", "child"),
         False,
-        lambda m: fit_score(*_bodies(m), near=m.near),
+        lambda m, parent, child: fit_score(parent, child, near=m.near),
     ),
     EstimationMethod(
         "sara",
         "axis of a hinge from both bodies",
         ("parent", "child"),
         False,
-        lambda m: fit_axis(*_bodies(m), near=m.near, toward=m.axis),
+        lambda m, parent, child: fit_axis(parent, child, near=m.near, toward=m.axis),
     ),
 )
 METHODS: dict[str, EstimationMethod] = {method.name: method for method in _ALL}

@@ -24,6 +24,40 @@ def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
     return min(rho, 0.99) if rho > 2.0 / sqrt(count) else 0.0
 
 
+def variance_inflation(rho: float) -> float:
+    r"""Return :math:`(1+\rho)/(1-\rho)`: by how much residuals that are alike widen a variance.
+
+    With a lag-one correlation ρ below 1, n frames are worth n over this.
+    """
+    return (1.0 + rho) / (1.0 - rho)
+
+
+def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
+    """Return radial residuals of k markers and their derivatives by the center.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n, k, d)
+        Points, m; finite.
+    m : ndarray, shape (d,)
+        Center, m.
+    w : ndarray, shape (n, k)
+        Weights of the mean distance; zero where a point was not seen.
+
+    Returns
+    -------
+    e, J : ndarray, shapes (n, k) and (n, k, d)
+        Distances minus their weighted means, m, and dimensionless derivatives.
+    """
+    d = v - m
+    u = np.linalg.norm(d, axis=-1)
+    total = np.maximum(w.sum(axis=0), 1e-12)
+    e = u - np.where(w > 0.0, w * u, 0.0).sum(axis=0) / total
+    direction = d / np.maximum(u, 1e-9)[..., None]
+    mean = np.where(w[..., None] > 0.0, w[..., None] * direction, 0.0).sum(axis=0) / total[:, None]
+    return e, mean - direction
+
+
 def arc_of_spread(spread: float) -> float:
     r"""Return the evenly covered arc, rad, whose points have this variance over R².
 

@@ -7,6 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.baselines.circle_theory import (
+    arbitrary_error,
+    circle_bound,
+    circle_rms_bound,
+    combine,
+    triangle_error,
+)
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SEEDED
 from bench.subjects.planar_arcs import (
@@ -15,19 +22,15 @@ from bench.subjects.planar_arcs import (
     share_covered,
     upper_rms,
 )
-from jointfit_daemon.center_of_rotation import circle_rms_bound
 from jointfit_daemon.center_of_rotation.planar import (
     CircleLimits,
     RunningCircle,
-    arbitrary_error,
     circle_estimate,
-    combine,
     equal_step_error,
     fit_circle,
     fit_circles,
     geometric_estimate,
     three_frame_center,
-    triangle_error,
 )
 
 if TYPE_CHECKING:
@@ -158,9 +161,7 @@ def several(_: Path) -> list[Result]:
     offsets, radii = np.array([0.0, 0.25, -0.3, 0.6]), np.array([0.30, 0.35, 0.20, 0.28])
     turned = t[:, None] + offsets
     truth = np.stack((radii * np.cos(turned), radii * np.sin(turned)), axis=-1)
-    information = [
-        np.linalg.inv(fit_bound) for fit_bound in (_bound(turned[:, k], 0.002) for k in range(4))
-    ]
+    information = [np.linalg.inv(circle_bound(turned[:, k], 0.002)) for k in range(4)]
     bound = float(np.sqrt(np.trace(np.linalg.inv(np.sum(information, axis=0)))))
     weighted, joint = [], []
     for _run in range(400):
@@ -172,11 +173,6 @@ def several(_: Path) -> list[Result]:
         Result("information-weighted", _rms(weighted) / bound, 1.2, unit="× bound"),
         Result("all at once", _rms(joint) / bound, 1.2, unit="× bound"),
     ]
-
-
-def _bound(angles: Array, noise: float) -> Array:
-    u = np.column_stack((np.cos(angles), np.sin(angles), np.ones_like(angles)))
-    return np.asarray(noise**2 * np.linalg.inv(u.T @ u)[:2, :2])
 
 
 def _rms(centers: list[Array]) -> float:

@@ -7,18 +7,14 @@ from jointfit_daemon.center_of_rotation.planar._circle_fit import (
     fit_circle,
     fit_circles,
 )
-from jointfit_daemon.center_of_rotation.planar._error_prediction import (
-    arbitrary_error,
-    equal_step_error,
-    triangle_error,
-)
-from jointfit_daemon.center_of_rotation.planar._geometric_fit import combine, geometric_estimate
+from jointfit_daemon.center_of_rotation.planar._geometric_fit import geometric_estimate
 from jointfit_daemon.center_of_rotation.planar._grid_search import Grid, grid_center
 from jointfit_daemon.center_of_rotation.planar._moments import GATE, ellipse_scale
 from jointfit_daemon.center_of_rotation.planar._oriented_fit import AngleNoise, oriented_estimate
 from jointfit_daemon.center_of_rotation.planar._plane import plane_of
 from jointfit_daemon.center_of_rotation.planar._running_circle import RunningCircle
 from jointfit_daemon.center_of_rotation.planar._three_frames import (
+    equal_step_error,
     three_frame_center,
     three_frame_estimate,
 )
@@ -31,9 +27,7 @@ __all__ = [
     "Circles",
     "Grid",
     "RunningCircle",
-    "arbitrary_error",
     "circle_estimate",
-    "combine",
     "ellipse_scale",
     "equal_step_error",
     "fit_circle",
@@ -44,5 +38,4 @@ __all__ = [
     "plane_of",
     "three_frame_center",
     "three_frame_estimate",
-    "triangle_error",
 ]

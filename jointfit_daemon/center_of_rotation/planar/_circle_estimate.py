@@ -5,14 +5,14 @@ A refused estimate names the cause and the remedy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees, inf, isfinite, pi, radians, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation._path_statistics import arc_of_spread
-from jointfit_daemon.center_of_rotation._result import CenterEstimate
+from jointfit_daemon.center_of_rotation._path_statistics import arc_of_spread, variance_inflation
+from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
 from jointfit_daemon.center_of_rotation.planar._circle_fit import (
     CircleMethod,
     circle_of,
@@ -22,7 +22,6 @@ from jointfit_daemon.center_of_rotation.planar._moments import (
     GATE,
     ROUNDING,
     CircleMoments,
-    CircleStatistics,
     arc_shows,
     circle_statistics,
     ellipse_scale,
@@ -132,21 +131,11 @@ def publish(
         reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
         return refused_circle(method, (m.x, m.y), frames, reason)
 
+    # the noise of neighbours that is alike makes their frames worth less
     judged = circle_statistics(m, *circle)
-    wider = _persistence(lagged(*circle), judged.residual)
-    return _accept_estimate(m, circle, judged, wider, method=method, frames=frames, limits=limits)
+    alike = lagged(*circle) / judged.residual if judged.residual > 0.0 else 0.0
+    wider = variance_inflation(min(max(alike, 0.0), 0.99) if isfinite(alike) else 0.0)
 
-
-def _accept_estimate(
-    m: CircleMoments[float],
-    circle: tuple[float, float, float],
-    judged: CircleStatistics[float],
-    wider: float,
-    *,
-    method: CircleMethod,
-    frames: int,
-    limits: CircleLimits,
-) -> CenterEstimate:
     a, b, square = circle
     cov = (wider * judged.xx, wider * judged.xy, wider * judged.yy)
     largest = wider * judged.largest
@@ -198,26 +187,15 @@ def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimi
     return None
 
 
-def refused_circle(
-    method: str, at: tuple[float, float], frames: int, reason: str, flags: tuple[str, ...] = ()
-) -> CenterEstimate:
-    """Return a refused estimate in which every direction is unseen."""
-    middle = np.array(at if isfinite(at[0]) and isfinite(at[1]) else (0.0, 0.0))
-    return CenterEstimate(
-        method=method,
-        center=middle,
-        covariance=np.zeros((2, 2)),
+def refused_circle(method: str, at: ArrayLike, frames: int, reason: str) -> CenterEstimate:
+    """Return a refused estimate at a point, shape (2,), in which every direction is unseen."""
+    middle = np.asarray(at, dtype=np.float64)
+    return replace(
+        refusal(method, 2, frames, reason),
+        center=middle if np.isfinite(middle).all() else np.zeros(2),
         noise=0.0,
         residual=0.0,
-        radii=np.zeros(0),
-        arc=0.0,
-        bound=inf,
-        conditioning=0.0,
-        frames=frames,
         effective_frames=float(frames),
-        unseen=np.eye(2),
-        flags=flags,
-        refused=reason,
     )
 
 
@@ -232,12 +210,6 @@ def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
     if m.xx * m.yy - m.xy**2 <= ROUNDING * spread**2:
         return "the points lie on a straight line, which has no center: rotate the joint"
     return None
-
-
-def _persistence(product: float, residual: float) -> float:
-    rho = product / residual if residual > 0.0 else 0.0
-    rho = min(max(rho, 0.0), 0.99) if isfinite(rho) else 0.0
-    return (1.0 + rho) / (1.0 - rho)
 
 
 def arc_about(points: Array, center: Array) -> float:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 CircleMethod = Literal["kasa", "pratt", "taubin", "hyper"]
 
 _STEPS = 20
-_SETTLED = 1e-14
 
 
 class Circles(NamedTuple):
@@ -168,7 +167,6 @@ def temper(
 
 def fit_circles(
     points: ArrayLike,
-    weights: ArrayLike | None = None,
     *,
     method: CircleMethod = "hyper",
     tempered: bool = True,
@@ -180,8 +178,6 @@ def fit_circles(
     ----------
     points : array_like, shape (..., n, 2)
         m; NaN where not seen.
-    weights : array_like, shape (..., n), optional
-        Not negative.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     tempered : bool
@@ -196,7 +192,7 @@ def fit_circles(
         `valid` is False, and center and radius NaN, for fewer than four points, points on a line,
         points at one place, and arcs that noise hides.
     """
-    m = moments_of(points, weights)
+    m = moments_of(points)
     with np.errstate(all="ignore"):  # sets without a circle are masked below
         eta = smallest_roots(m, method)
         a, b, square = circle_from_root(m, eta, method)
@@ -210,8 +206,9 @@ def fit_circles(
         conditioning = np.sqrt(square / (wider * judged.largest))
         if tempered:
             a, b, cov = temper(a, b, square, cov)
-        valid = usable(m, square) & arc_shows(m, judged.noise)
-        valid &= np.isfinite(a) & np.isfinite(b)
+        z = m.xx + m.yy
+        valid = (m.effective > 3.0) & ~(m.xx * m.yy - m.xy**2 <= ROUNDING * z**2) & (square > 0.0)
+        valid &= arc_shows(m, judged.noise) & np.isfinite(a) & np.isfinite(b)
 
     nan = np.nan
     center = np.where(valid[..., None], np.stack((m.x + a, m.y + b), axis=-1), nan)
@@ -267,10 +264,3 @@ def persistence(correlation: Array) -> Array:
     r"""Return :math:`(1+\rho)/(1-\rho)`, ρ held to 0 … 0.99: how much correlation widens."""
     rho = np.clip(np.nan_to_num(correlation), 0.0, 0.99)
     return np.asarray((1.0 + rho) / (1.0 - rho))
-
-
-def usable(m: CircleMoments[Array], square: Array) -> NDArray[np.bool_]:
-    """Return which moments define a circle: more than three points, not on a line."""
-    z = m.xx + m.yy
-    flat = m.xx * m.yy - m.xy**2 <= ROUNDING * z**2
-    return np.asarray((m.effective > 3.0) & ~flat & (square > 0.0))

@@ -1,7 +1,6 @@
 """Geometric circle fit: the maximum-likelihood estimate by Levenberg-Marquardt.
 
-On clean points it equals Hyper. It adds Huber's loss, several markers with one center, and known
-radii.
+On clean points it equals Hyper. It adds Huber's loss and several markers with one center.
 """
 
 from __future__ import annotations
@@ -11,7 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation._path_statistics import lag_one_correlation
+from jointfit_daemon.center_of_rotation._path_statistics import (
+    lag_one_correlation,
+    radial_residuals,
+    variance_inflation,
+)
 from jointfit_daemon.center_of_rotation._result import CenterEstimate
 from jointfit_daemon.center_of_rotation.planar._circle_estimate import (
     CircleLimits,
@@ -37,7 +40,6 @@ _PASSES = 60
 def geometric_estimate(
     points: ArrayLike,
     *,
-    radii: ArrayLike | None = None,
     robust: bool = True,
     start: ArrayLike | None = None,
     limits: CircleLimits | None = None,
@@ -46,7 +48,7 @@ def geometric_estimate(
 
     .. math:: \min_c \sum_{tk} \rho\left( |x_{tk} - c| - R_k \right)
 
-    with R_k the mean distance of marker k, or given. Several markers share the center; they gain
+    with R_k the mean distance of marker k. Several markers share the center; they gain
     much more than √k where they sit at different angles round the joint, because each one's weak
     direction points elsewhere. Residuals of neighboring frames that are alike (correlation r at one
     frame) widen the covariance by (1 + r)/(1 - r), as of the other circles.
@@ -55,8 +57,6 @@ def geometric_estimate(
     ----------
     points : array_like, shape (n, 2) or (n, k, 2)
         In the parent's coordinates, m; NaN where not seen.
-    radii : array_like, shape (k,), optional
-        Known distances, m.
     robust : bool
         Huber's loss at 1.5 standard deviations, taken from the median residual.
     start : array_like, shape (2,), optional
@@ -75,12 +75,11 @@ def geometric_estimate(
             "increase the range of motion"
         )
         middle = p[seen].mean(axis=0) if seen.any() else np.zeros(2)
-        return refused_circle(METHOD, (float(middle[0]), float(middle[1])), frames, reason)
+        return refused_circle(METHOD, middle, frames, reason)
 
-    known = None if radii is None else np.asarray(radii, dtype=np.float64)
     x = np.where(seen[..., None], p, 0.0)
-    c, weights = _descend(x, seen, begin, known, robust=robust)
-    return _accept_estimate(x, seen, c, weights, known=known, limits=limits or CircleLimits())
+    c, weights = _descend(x, seen, begin, robust=robust)
+    return _accept_estimate(x, seen, c, weights, limits or CircleLimits())
 
 
 def _begin(p: Array) -> Array | None:
@@ -90,33 +89,17 @@ def _begin(p: Array) -> Array | None:
     return found.center[best] if found.conditioning.size and found.valid[best] else None
 
 
-def _residual(x: Array, w: Array, c: Array, known: Array | None) -> tuple[Array, Array]:
-    """Return residuals (n, k), radii profiled out, and derivatives by the center (n, k, 2)."""
-    d = x - c
-    u = np.linalg.norm(d, axis=-1)
-    J = -d / np.maximum(u, 1e-9)[..., None]
-    if known is not None:
-        return u - known, J
-    total = np.maximum(w.sum(axis=0), 1e-12)
-    mean = (w * u).sum(axis=0) / total
-    return u - mean, J - (w[..., None] * J).sum(axis=0) / total[:, None]
-
-
-def _huber(e: Array, seen: NDArray[np.bool_]) -> Array:
-    scale = max(1.4826 * float(np.median(np.abs(e[seen]))), _LEAST_SCALE_M)
-    return np.where(seen, np.minimum(1.0, HUBER * scale / np.maximum(np.abs(e), 1e-12)), 0.0)
-
-
-def _descend(
-    x: Array, seen: NDArray[np.bool_], c: Array, known: Array | None, *, robust: bool
-) -> tuple[Array, Array]:
+def _descend(x: Array, seen: NDArray[np.bool_], c: Array, *, robust: bool) -> tuple[Array, Array]:
+    """Return the center and Huber's weights of the points, shape (n, k)."""
     weights: Array = seen.astype(np.float64)
     mu = 1e-3
     for _ in range(_PASSES):
-        e, J = _residual(x, weights, c, known)
+        e, J = radial_residuals(x, c, weights)
         if robust:
-            weights = _huber(e, seen)
-            e, J = _residual(x, weights, c, known)
+            scale = max(1.4826 * float(np.median(np.abs(e[seen]))), _LEAST_SCALE_M)
+            huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(e), 1e-12))
+            weights = np.where(seen, huber, 0.0)
+            e, J = radial_residuals(x, c, weights)
 
         H = np.einsum("tk,tka,tkb->ab", weights, J, J)
         g = np.einsum("tk,tka,tk->a", weights, J, e)
@@ -124,7 +107,7 @@ def _descend(
 
         for _ in range(12):
             step = -np.linalg.solve(H + mu * np.diag(np.diag(H)) + 1e-15 * np.eye(2), g)
-            tried = _residual(x, weights, c + step, known)[0]
+            tried, _ = radial_residuals(x, c + step, weights)
             if float((weights * tried**2).sum()) <= cost:
                 break
             mu *= 5.0
@@ -139,17 +122,11 @@ def _descend(
 
 
 def _accept_estimate(
-    x: Array,
-    seen: NDArray[np.bool_],
-    c: Array,
-    w: Array,
-    *,
-    known: Array | None,
-    limits: CircleLimits,
+    x: Array, seen: NDArray[np.bool_], c: Array, w: Array, limits: CircleLimits
 ) -> CenterEstimate:
-    e, J = _residual(x, w, c, known)
+    e, J = radial_residuals(x, c, w)
     count = int(seen.sum())
-    free = 2 + (x.shape[1] if known is None else 0)
+    free = 2 + x.shape[1]
 
     # Huber's variance: mean of squared pull over squared share of points that pull freely
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
@@ -166,9 +143,9 @@ def _accept_estimate(
     least, most = np.linalg.eigvalsh(H)
     if not least > ROUNDING * most:
         reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
-        return refused_circle(METHOD, (float(c[0]), float(c[1])), frames, reason)
+        return refused_circle(METHOD, c, frames, reason)
 
-    wider = _wider(lag_one_correlation(e, seen))
+    wider = variance_inflation(lag_one_correlation(e, seen))
     C = np.asarray(wider * variance * np.linalg.inv(H))
     distance = np.linalg.norm(x - c, axis=-1)
     R = np.array([float(distance[s, k].mean()) if s.any() else 0.0 for k, s in enumerate(seen.T)])
@@ -193,38 +170,3 @@ def _accept_estimate(
         within95=ellipse_scale(float(count), T),
         refused=objection(radius, max(shown), T, sd, limits),
     )
-
-
-def _wider(alike: float) -> float:
-    """Return the variance factor of a lag-one correlation of the residuals."""
-    return (1.0 + alike) / (1.0 - alike)
-
-
-def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
-    r"""Combine centers of several markers by information, at no cost worth mentioning.
-
-    .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
-
-    Parameters
-    ----------
-    estimates : list of CenterEstimate
-        Of independent markers, in a plane or in space; those with unseen directions are passed
-        over.
-
-    Returns
-    -------
-    center, covariance : ndarray, shapes (d,) and (d, d)
-        m and m².
-
-    Raises
-    ------
-    ValueError
-        None of them shows the center.
-    """
-    usable = [e for e in estimates if len(e.unseen) == 0]
-    if not usable:
-        raise ValueError("no marker shows the center: there is nothing to combine")
-    information = [np.linalg.inv(e.covariance) for e in usable]
-    C = np.linalg.inv(np.sum(information, axis=0))
-    pulls = [W @ e.center for W, e in zip(information, usable, strict=True)]
-    return np.asarray(C @ np.sum(pulls, axis=0)), np.asarray(C)

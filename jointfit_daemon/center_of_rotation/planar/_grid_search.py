@@ -63,7 +63,8 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
     flat = p.reshape(-1, *p.shape[-2:])
     nodes = grid.nodes()
     size = max(1, _AT_ONCE // max(len(nodes) * p.shape[-2], 1))
-    best = [_least(flat[i : i + size], nodes) for i in range(0, len(flat), size)]
+    parts = [flat[i : i + size] for i in range(0, len(flat), size)]
+    best = [nodes[np.argmin(grid_cost(part, nodes), axis=-1)] for part in parts]
 
     return np.concatenate(best).reshape(*p.shape[:-2], 2) if best else np.zeros((*p.shape[:-2], 2))
 
@@ -79,7 +80,3 @@ def grid_cost(points: ArrayLike, nodes: Array) -> Array:
         square += distance
         total += np.sqrt(distance, out=distance)
     return np.asarray(square - total**2 / frames)
-
-
-def _least(points: Array, nodes: Array) -> Array:
-    return np.asarray(nodes[np.argmin(grid_cost(points, nodes), axis=-1)])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf, radians, sqrt
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -60,22 +60,12 @@ class AngleNoise:
         )
 
 
-class _AidedCircle(NamedTuple):
-    """Circle fitted to path and angles together."""
-
-    center: Array
-    covariance: Array
-    radius: float
-    residual: float
-
-
 def oriented_estimate(
     points: ArrayLike,
     angles: ArrayLike,
     interval: float,
     *,
     noise: AngleNoise | None = None,
-    near: tuple[Array, float] | None = None,
     limits: CircleLimits | None = None,
 ) -> CenterEstimate:
     r"""Estimate the center of one marker whose segment's angle is measured, too.
@@ -108,8 +98,6 @@ def oriented_estimate(
         From frame to frame, s.
     noise : AngleNoise, optional
         Error model of the angles.
-    near : tuple of ndarray, shape (2,), and float, optional
-        A place the center is known to be near, m, and how near: standard deviation, m.
     limits : CircleLimits, optional
         Acceptance limits. T is the radius over the combined center's largest standard error.
 
@@ -137,20 +125,27 @@ def oriented_estimate(
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
     Sigma = (noise or AngleNoise()).covariance(times, _smooth(x, theta))
     try:
-        aided = _solve(x, theta, sigma, Sigma, near)
+        aided = _solve(x, theta, sigma, Sigma)
     except np.linalg.LinAlgError:  # no information in some direction at all
         aided = None
 
     if aided is None and alone.refused is None:
-        return replace(_path_alone(x, allowed), flags=("orientation_inconsistent",))
+        path_alone = circle_estimate(x, limits=allowed)
+        return replace(path_alone, method=METHOD, flags=("orientation_inconsistent",))
     if aided is None:
         reason = (
             "path and angles do not fit one center: check the axis or increase the range of motion"
         )
         return refused_circle(METHOD, (0.0, 0.0), len(x), reason)
 
-    held = guarded(aided.center, aided.covariance, fit_circles(x))
-    return _accept_estimate(x, held, aided, sigma=sigma, limits=allowed, alone=alone)
+    center, covariance, residual = aided
+    held = guarded(center, covariance, fit_circles(x))
+    return replace(
+        _accept_estimate(x, held, alone, allowed),
+        noise=sigma,
+        residual=residual,
+        bound=min(alone.bound, sqrt(float(np.trace(covariance)))),
+    )
 
 
 def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
@@ -204,10 +199,6 @@ def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array,
     return averaged[:, :2], averaged[:, 2], averaged[:, 3]
 
 
-def _path_alone(x: Array, limits: CircleLimits) -> CenterEstimate:
-    return replace(circle_estimate(x, limits=limits), method=METHOD)
-
-
 def _smooth(x: Array, theta: Array) -> Array:
     """Return the angles as the path explains them, to second order.
 
@@ -231,14 +222,17 @@ def _path_noise(x: Array) -> float:
     return float(np.std(across - terms @ np.linalg.lstsq(terms, across, rcond=None)[0]))
 
 
-def _solve(
-    x: Array, theta: Array, sigma: float, Sigma: Array, near: tuple[Array, float] | None
-) -> _AidedCircle | None:
-    """Minimize J by Gauss-Newton from plain least squares; None where it has no minimum."""
+def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, Array, float] | None:
+    """Minimize J by Gauss-Newton from plain least squares.
+
+    Returns
+    -------
+    center, covariance, residual or None
+        m, m² and the RMS radial residual, m; None where J has no minimum.
+    """
     z, start = _least_squares(x, theta), x.mean(axis=0)
     M: Array = np.eye(len(x))
     rho0 = -1.0
-    prior = 0.0 if near is None else near[1] ** -2
     H = np.eye(4)
 
     for _ in range(_PASSES):
@@ -249,10 +243,6 @@ def _solve(
             M = np.asarray(np.linalg.inv((sigma / rho0) ** 2 * np.eye(len(x)) + Sigma))
 
         H, g = _normal(x, theta, z, M, sigma=sigma, rho0=rho0)
-        if near is not None:
-            H[:2, :2] += prior * np.eye(2)
-            g[:2] += prior * (z[:2] - near[0])
-
         step = -np.linalg.solve(H, g)
         step *= min(1.0, 0.3 * z[2] / max(float(np.hypot(step[0], step[1])), 1e-12))
         z = z + step
@@ -263,7 +253,7 @@ def _solve(
     if not (np.linalg.eigvalsh(C)[0] > 0.0 and np.linalg.norm(z[:2] - start) <= _FAR_M):
         return None
     e = np.linalg.norm(x - z[:2], axis=1) - z[2]
-    return _AidedCircle(z[:2], C, float(z[2]), float(np.sqrt((e**2).mean())))
+    return z[:2], C, float(np.sqrt((e**2).mean()))
 
 
 def _least_squares(x: Array, theta: Array) -> Array:
@@ -297,14 +287,9 @@ def _normal(
 
 
 def _accept_estimate(
-    x: Array,
-    held: tuple[Array, Array, float],
-    aided: _AidedCircle,
-    *,
-    sigma: float,
-    limits: CircleLimits,
-    alone: CenterEstimate,
+    x: Array, held: tuple[Array, Array, float], alone: CenterEstimate, limits: CircleLimits
 ) -> CenterEstimate:
+    """Return the estimate of the path `alone` with the guarded center and its acceptance."""
     center, C, s2 = held
     radius = float(np.linalg.norm(x - center, axis=1).mean())
     largest = float(np.linalg.eigvalsh(C)[-1])
@@ -317,11 +302,8 @@ def _accept_estimate(
         method=METHOD,
         center=center,
         covariance=C,
-        noise=sigma,
-        residual=aided.residual,
         radii=np.array([radius]),
         arc=arc,
-        bound=min(alone.bound, sqrt(float(np.trace(aided.covariance)))),
         conditioning=T,
         unseen=np.zeros((0, 2)),
         flags=("orientation_inconsistent",) if s2 > INCONSISTENT else (),

@@ -84,6 +84,7 @@ class RunningCircle:
         self._squares = 0.0
         self._before: Kept = (0.0, 0.0, 0.0)
         self._kept.clear()
+        self._aged = 0
         self._circle: tuple[float, float, float] | None = None
         self._noise = 0.0
         self.frames = 0
@@ -100,7 +101,7 @@ class RunningCircle:
         if self._origin is None:
             self._origin = (x, y)
         if self._robust:
-            weight *= self._trust(x, y)
+            weight *= self._huber_weight(x, y)
         ox, oy = self._origin
         x, y = x - ox, y - oy
         if x * x + y * y > _FAR_M**2:
@@ -110,7 +111,7 @@ class RunningCircle:
         if self._window is not None:
             self._slide((x, y, weight))
         if self._robust and self.frames >= _SETTLED_FRAMES:
-            self._look()
+            self._update_circle()
 
     def _add(self, x: float, y: float, w: float) -> None:
         mu = self._forgetting
@@ -161,18 +162,12 @@ class RunningCircle:
         while kept and kept[0][2] == 0.0:
             kept.popleft()
         self._aged += 1
-        if self._aged >= _RESUM_FRAMES:
-            self._resum()
-
-    _aged = 0
-
-    def _resum(self) -> None:
-        kept, frames = list(self._kept), self.frames
+        if self._aged < _RESUM_FRAMES:
+            return
         self._sums = self._lagged = _NONE
         self._squares, self._before, self._aged = 0.0, (0.0, 0.0, 0.0), 0
         for x, y, w in kept:
             self._add(x, y, w)
-        self.frames = frames
 
     def _recenter(self, x: float, y: float) -> tuple[float, float]:
         """Move the origin to the mean where that is far: fourth powers lose digits there."""
@@ -261,7 +256,7 @@ class RunningCircle:
 
         return total / (4.0 * square * w)
 
-    def _trust(self, x: float, y: float) -> float:
+    def _huber_weight(self, x: float, y: float) -> float:
         if self._circle is None:
             return 1.0
         cx, cy, radius = self._circle
@@ -269,7 +264,7 @@ class RunningCircle:
         allowed = _HUBER * max(self._noise, _LEAST_NOISE_M)
         return 1.0 if off <= allowed else allowed / off
 
-    def _look(self) -> None:
+    def _update_circle(self) -> None:
         """Store circle and noise for weighting the next frame."""
         found = self.circle()
         if found is None:

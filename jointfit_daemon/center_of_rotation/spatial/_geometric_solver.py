@@ -12,7 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jointfit_daemon.center_of_rotation._path_statistics import arc_of, lag_one_correlation
+from jointfit_daemon.center_of_rotation._path_statistics import (
+    arc_of,
+    lag_one_correlation,
+    radial_residuals,
+)
 from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
 from jointfit_daemon.center_of_rotation.spatial._observability import MIN_CONDITIONING, SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import STRAIGHT, objection
@@ -152,17 +156,6 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
     # a millionth of the path keeps a plane from being singular
     least = max(options.hold**2, 1e-6 * float(np.trace(A)) / len(total))
     return np.asarray(start + np.linalg.solve(A + 2.0 * len(total) * least * np.eye(3), b))
-
-
-def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
-    """Return radial residuals (n, k) and their derivatives by the center (n, k, 3)."""
-    d = v - m
-    u = np.linalg.norm(d, axis=-1)
-    total = np.maximum(w.sum(axis=0), 1e-12)
-    e = u - np.where(w > 0.0, w * u, 0.0).sum(axis=0) / total
-    direction = d / np.maximum(u, 1e-9)[..., None]
-    mean = np.where(w[..., None] > 0.0, w[..., None] * direction, 0.0).sum(axis=0) / total[:, None]
-    return e, mean - direction
 
 
 def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:

@@ -114,8 +114,12 @@ def observe(
 
         spread, axes = np.linalg.eigh(found.information)
         if spread[0] > _hidden_by_noise(axes[:, 0], flat, found, limits):
-            if _filled(flat, found):
+            # Paths that fill an area as wide as it is long are a small movement seen face on. Its
+            # center lies before or behind it, too far for the bend to show; a circle is chance.
+            wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", flat.n / flat.n.sum(), flat.C))[-1]
+            if found.noise2 * float(np.median(found.relative)) > FILLED * wide:
                 return None
+
             left = _residuals(sums, basis, flat, found, limits)
             skin2 = found.noise2 + soft_tissue_variance(left, flat, found)
             shown = spread > MIN_CONDITIONING**2 * skin2 / float(np.median(found.radii2))
@@ -140,16 +144,6 @@ def _hidden_by_noise(
     floor = float(direction @ found.floor @ direction)
     chance = MIN_SIGNIFICANCE * floor * float(np.sqrt(2.0 / total))
     return max(enough, chance, limits.min_direction**2 * total, 0.0)
-
-
-def _filled(paths: MarkerPaths, found: ConcentricSpheres) -> bool:
-    """Return whether paths fill an area as wide as it is long: a small movement seen face on.
-
-    Its center lies before or behind it, too far for the bend to show; a circle in it is chance.
-    """
-    wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", paths.n / paths.n.sum(), paths.C))[-1]
-    noise2 = found.noise2 * float(np.median(found.relative))
-    return bool(noise2 > FILLED * wide)
 
 
 def soft_tissue_variance(

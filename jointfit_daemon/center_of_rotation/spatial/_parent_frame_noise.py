@@ -2,7 +2,7 @@ r"""Effect of the parent's marker noise on a point in the parent's coordinates.
 
 The parent's frame is itself a fit to noisy markers; a point a lever arm away is moved by the
 fit's turn. Close parent markers and long levers amplify noise, and all markers of the child share
-it. In a plane with two parent markers see `planar_reduction.parent_noise`.
+it.
 """
 
 from __future__ import annotations
@@ -74,36 +74,6 @@ def turn_noise(parent: Array, noise: float) -> float:
     return noise / stiff**0.5 if stiff > 0.0 else np.inf
 
 
-def planar_noise(points: Array, parent: Array, noise: float) -> Array:
-    r"""Return the same in a plane, for any number of parent markers.
-
-    .. math:: Σ_x = σ^2 \left[ \left(1 + \tfrac1m\right) I
-              + \frac{λ_⊥ λ_⊥^T}{\sum_j |d_j|^2} \right]
-
-    Parameters
-    ----------
-    points : ndarray, shape (..., 2)
-        In the parent, m.
-    parent : ndarray, shape (m, 2)
-        The parent's markers, m.
-    noise : float
-        Standard deviation of every coordinate, m.
-
-    Raises
-    ------
-    ValueError
-        Fewer than two markers, or all at one place.
-    """
-    middle = parent.mean(axis=0)
-    spread = float(((parent - middle) ** 2).sum())
-    if len(parent) < 2 or spread < 1e-12:
-        raise ValueError("a frame in a plane needs two markers apart from each other")
-    lever = np.asarray(points, dtype=np.float64) - middle
-    across = np.stack((-lever[..., 1], lever[..., 0]), axis=-1)
-    turned = across[..., :, None] * across[..., None, :] / spread
-    return np.asarray(noise**2 * ((1.0 + 1.0 / len(parent)) * np.eye(2) + turned))
-
-
 def relative(points: Array, parent: Array, center: Array) -> Array:
     r"""Return the shape of each marker's noise for `RunningSphere`: its radial part is one.
 
@@ -115,25 +85,25 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
 
     Parameters
     ----------
-    points : ndarray, shape (n, k, d)
+    points : ndarray, shape (n, k, 3)
         Markers in the parent, m; NaN where not seen.
-    parent : ndarray, shape (m, d)
+    parent : ndarray, shape (m, 3)
         The parent's markers, m.
-    center : ndarray, shape (d,)
+    center : ndarray, shape (3,)
         About where the center is, m.
 
     Returns
     -------
-    ndarray, shape (k, d, d)
+    ndarray, shape (k, 3, 3)
         The common shape for a marker never seen.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.float64)
-    S = (spatial_noise if len(center) == 3 else planar_noise)(center, parent, 1.0)
+    S = spatial_noise(center, parent, 1.0)
     spoke = np.where(seen[..., None] > 0.0, points, center + 1.0) - center
     spoke = spoke / np.maximum(np.linalg.norm(spoke, axis=-1, keepdims=True), 1e-9)
     radial = np.einsum("tja,ab,tjb->tj", spoke, S, spoke)
     total = seen.sum(axis=0)
     along = (seen * radial).sum(axis=0) / np.maximum(total, 1.0)
-    along = np.where(total > 0.0, along, np.trace(S) / len(center))
+    along = np.where(total > 0.0, along, np.trace(S) / 3)
 
     return np.asarray(S / np.maximum(along, 1e-300)[:, None, None])

@@ -32,6 +32,7 @@ HINGE_RATIO = 0.3
 """σ₆/σ₅ below which only an axis was observed (hips in squats 0.07 to 0.35; a ball joint moved in
 all directions 0.85 and more)."""
 MIN_FRAMES = 15
+FEW = f"fewer than {MIN_FRAMES} frames show both bodies: keep three markers of each body visible"
 MIN_TURN_RAD = 0.02
 """RMS turning about the second axis of the movement below which nothing was turned."""
 LEVER_M = 0.24
@@ -116,6 +117,7 @@ def solve_two_sided(
     noise2 = max(float((w[:, None] * gaps**2).sum()) / max(3.0 * n - rank, 1.0), _LEAST_M**2)
     inverse = (Vt[:rank].T / np.maximum(s[:rank], 1e-12) ** 2) @ Vt[:rank]
     soft_tissue2 = noise2 * float(w.sum()) * posture_share(_correlation(gaps, LAGS[1]), n)
+    rho = _correlation(gaps, LAGS[0])
 
     return TwoSidedSolution(
         parent_point=c[:3],
@@ -128,7 +130,7 @@ def solve_two_sided(
         gaps=gaps,
         covariance=noise2 * inverse,
         soft_tissue=soft_tissue2 * inverse,
-        persistence=_persistence(gaps),
+        persistence=min(rho, 0.99) if rho > 2.0 / sqrt(gaps.size) else 0.0,
         frames=n,
     )
 
@@ -144,11 +146,6 @@ def _solve(
     shown = (U.T @ (root * rhs).reshape(-1))[:rank] / np.maximum(s[:rank], 1e-12)
     c = Vt[:rank].T @ shown
     return c, N @ c - rhs, s, Vt, rank
-
-
-def _persistence(gaps: Array) -> float:
-    rho = _correlation(gaps, LAGS[0])
-    return min(rho, 0.99) if rho > 2.0 / sqrt(gaps.size) else 0.0
 
 
 def _correlation(gaps: Array, lag: int) -> float:
@@ -183,9 +180,6 @@ def fit_score(
     return two_sided_estimate(found, child, parent, "score", near)
 
 
-FEW = f"fewer than {MIN_FRAMES} frames show both bodies: keep three markers of each body visible"
-
-
 def two_sided_estimate(
     found: TwoSidedSolution, child: BodyPoses, parent: BodyPoses, method: str, near: Array | None
 ) -> CenterEstimate:
@@ -212,7 +206,11 @@ def two_sided_estimate(
         center, C = center + along * a, P @ C @ P
 
     noise = sqrt(float((found.gaps**2).mean()))
-    arc = _arc(parent, child)
+
+    # the mean rotation shortens the direction that turned most to its resultant
+    q = rotation.multiply(rotation.conjugate(parent.q), child.q)
+    R = rotation.to_matrix(q[np.isfinite(q).all(axis=1)])
+    arc = arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
     conditioning = LEVER_M / sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 1e-18))
     return CenterEstimate(
         method=method,
@@ -232,11 +230,3 @@ def two_sided_estimate(
         within95=within95(2 if hinge else 3, 3.0 * found.frames * (1 - rho) / (1 + rho) - 6.0),
         refused=objection(arc, LEVER_M, conditioning, SphereLimits()),
     )
-
-
-def _arc(parent: BodyPoses, child: BodyPoses) -> float:
-    """Return the arc of the direction that turned most, rad."""
-    q = rotation.multiply(rotation.conjugate(parent.q), child.q)
-    R = rotation.to_matrix(q[np.isfinite(q).all(axis=1)])
-    # the mean rotation shortens the direction that turned most to its resultant
-    return arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))

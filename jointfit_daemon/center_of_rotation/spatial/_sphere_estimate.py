@@ -135,6 +135,13 @@ def _answer(
     conditioning = radius / float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 1e-300)))
     relative, rho = found.relative, seen.left.persistence
     residual2 = np.maximum(np.diagonal(seen.left.together), 0.0)
+    loud = np.flatnonzero(relative > LOUD * np.median(relative))
+    flags = [
+        *(["hinge"] if len(unseen) else []),
+        *(["residuals_persist"] if rho > PERSISTENT else []),
+        *(["residuals_repeat"] if seen.left.posture > 0.0 else []),
+        *(f"noisy_marker:{j}" for j in loud),
+    ]
 
     return CenterEstimate(
         method="",
@@ -150,7 +157,7 @@ def _answer(
         effective_frames=float(paths.n.mean()) * (1 - rho) / (1 + rho),
         unseen=unseen,
         axis=unseen[0] if len(unseen) == 1 and len(basis) == 3 else None,
-        flags=_flags(seen, len(unseen)),
+        flags=tuple(flags),
         within95=seen.within95,
         refused=objection(arc, radius, conditioning, limits, soft_tissue=seen.left.posture > 0.0),
     )
@@ -177,16 +184,6 @@ def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:
     R2 = float(np.median(seen.found.radii2))
     S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)
     return middle + S @ (seen.found.center - middle), S @ seen.spread @ S.T
-
-
-def _flags(seen: ObservedCenter, unseen: int) -> tuple[str, ...]:
-    flags = ["hinge"] if unseen else []
-    if seen.left.persistence > PERSISTENT:
-        flags.append("residuals_persist")
-    if seen.left.posture > 0.0:
-        flags.append("residuals_repeat")
-    loud = np.flatnonzero(seen.found.relative > LOUD * np.median(seen.found.relative))
-    return (*flags, *(f"noisy_marker:{j}" for j in loud))
 
 
 def objection(

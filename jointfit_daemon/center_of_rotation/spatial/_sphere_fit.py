@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.center_of_rotation._path_statistics import radial_residuals
 from jointfit_daemon.center_of_rotation._result import refusal
 from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import paths_of
 from jointfit_daemon.center_of_rotation.spatial._geometric_solver import (
     SphereOptions,
-    radial_residuals,
     solve_sphere,
 )
 from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
@@ -33,6 +33,10 @@ OUTLIER = 3.0
 exceeds it, so that its variance is not underestimated."""
 STILL_M = 1e-6
 _HALVORSEN_STEPS = 20
+FLAT = (
+    "the markers moved about one axis or not at all, so this method finds no center: move in "
+    "more directions, or use sphere, which also finds a hinge"
+)
 
 
 def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
@@ -62,12 +66,6 @@ def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     Halvorsen 2003. Parameters as in `gamage_lasenby`.
     """
     return _linear(points, "halvorsen", _HALVORSEN_STEPS, min_direction)
-
-
-FLAT = (
-    "the markers moved about one axis or not at all, so this method finds no center: move in "
-    "more directions, or use sphere, which also finds a hinge"
-)
 
 
 def _linear(points: Array, method: str, steps: int, min_direction: float) -> CenterEstimate:

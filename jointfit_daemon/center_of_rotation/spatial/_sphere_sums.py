@@ -60,13 +60,6 @@ class SphereSums:
         return SphereSums(self.origin[pick], M, self.L[:, pick], self.squares[pick], self.frames)
 
 
-def raised(points: Array, origin: Array) -> Array:
-    """Return φ of points, shape (..., k, d), about `origin`, (k, d): shape (..., k, d + 2)."""
-    p = points - origin
-    square = (p * p).sum(axis=-1, keepdims=True)
-    return np.concatenate((square, p, np.ones_like(square)), axis=-1)
-
-
 def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     """Sum over all frames at once.
 
@@ -81,7 +74,10 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     w = np.where(seen, 1.0 if weights is None else weights, 0.0)
     known = np.where(seen[..., None], points, 0.0)
     origin = known.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
-    phi = np.sqrt(w)[..., None] * raised(np.where(seen[..., None], points, origin), origin)
+    p = np.where(seen[..., None], points, origin) - origin
+    square = (p * p).sum(axis=-1, keepdims=True)
+    raised = np.concatenate((square, p, np.ones_like(square)), axis=-1)
+    phi = np.sqrt(w)[..., None] * raised
     n, k, e = phi.shape
     flat = phi.reshape(n, k * e)
     M = (flat.T @ flat).reshape(k, e, k, e)
@@ -90,26 +86,20 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     return SphereSums(origin, M, L, (w * w).sum(axis=0), int(np.count_nonzero(seen.any(axis=1))))
 
 
-def shift(by: Array) -> Array:
-    """Return T, shape (k, e, e): φ about a point moved by `by`, shape (k, d), is T φ."""
-    k, d = by.shape
+def centered(sums: SphereSums) -> SphereSums:
+    r"""Return the sums about each marker's mean; markers never seen stay where they are.
+
+    About a point moved by b, :math:`\varphi' = T \varphi`, so that :math:`M' = T M T^T` and
+    :math:`L' = T L T^T`.
+    """
+    k, d = sums.origin.shape
+    by = np.einsum("jaj->ja", sums.M[:, 1:-1, :, -1])
+    by = by / np.maximum(sums.weights, 1e-300)[:, None]
+
     T = np.tile(np.eye(d + 2), (k, 1, 1))
     T[:, 0, 1:-1] = -2.0 * by
     T[:, 0, -1] = (by * by).sum(axis=-1)
     T[:, 1:-1, -1] = -by
-    return T
-
-
-def about(sums: SphereSums, by: Array) -> SphereSums:
-    """Return the same sums about fixed points moved by `by`, m, shape (k, d)."""
-    T = shift(by)
     M = np.einsum("jab,jblc,ldc->jald", T, sums.M, T)
     L = np.einsum("jab,gjbc,jdc->gjad", T, sums.L, T)
     return SphereSums(sums.origin + by, M, L, sums.squares, sums.frames)
-
-
-def centered(sums: SphereSums) -> SphereSums:
-    """Return the sums about each marker's mean; markers never seen stay where they are."""
-    e = sums.M.shape[1]
-    first = np.einsum("jaj->ja", sums.M[:, 1 : e - 1, :, e - 1])
-    return about(sums, first / np.maximum(sums.weights, 1e-300)[:, None])

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation._bounds import uniform_arc_rms
 from jointfit_daemon.center_of_rotation.planar import (
     GATE,
     Grid,
@@ -137,6 +136,35 @@ def run_study(
         found.append(PairMaps(name, rows, columns, maps, refused))
 
     return found
+
+
+def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool = False) -> float:
+    r"""Return `circle_rms_bound` for many points spread evenly over an arc, in closed form, m.
+
+    .. math:: E^2 = \frac{\sigma^2}{n} \left[ \frac{2}{1-c} + \frac{2}{1+c-2s^2} \right],
+              \quad s = \frac{\sin(\varphi/2)}{\varphi/2}, \quad c = \frac{\sin\varphi}{\varphi}
+
+    and without 2s² where the radius is known; about 26.8 σ/(√n φ²) on short arcs.
+
+    Parameters
+    ----------
+    arc : float
+        φ, rad, above zero.
+    frames : int
+        n.
+    noise : float
+        Standard deviation of each coordinate, m.
+    known_radius : bool
+        The radius need not be found.
+    """
+    s = float(np.sinc(arc / (2.0 * np.pi)))
+    c = float(np.sinc(arc / np.pi))
+    along = 1.0 + c - (0.0 if known_radius else 2.0 * s**2)
+    if not known_radius and arc < 0.05:
+        along = arc**4 / 360.0  # its series: the difference has no digits there
+    if c >= 1.0 or along <= 0.0 or frames <= 0:  # no arc, or one that is lost in rounding
+        return float("inf")
+    return float(noise * np.sqrt((2.0 / (1.0 - c) + 2.0 / along) / frames))
 
 
 def _line(

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from bench.baselines.circle_theory import combine
 from jointfit_daemon.center_of_rotation.planar import (
     AngleNoise,
     CircleLimits,
     circle_estimate,
-    combine,
     fit_circles,
     geometric_estimate,
     oriented_estimate,
@@ -74,15 +74,6 @@ def test_more_frames_than_needed_are_averaged() -> None:
     found = oriented_estimate(p, t, 0.01)
     assert found.refused is None
     assert np.linalg.norm(found.center) < 0.005
-
-
-def test_known_position_improves_oriented_fit() -> None:
-    p, t = arc(20.0, seed=3)
-    near = (np.zeros(2), 0.005)
-    found = oriented_estimate(p, t, 0.02, near=near, limits=WIDE)
-    far = oriented_estimate(p, t, 0.02, limits=WIDE)
-    assert np.linalg.norm(found.center) < 0.02
-    assert found.sd < far.sd
 
 
 def test_angle_noise_of_the_caller_sets_the_uncertainty() -> None:
@@ -176,14 +167,6 @@ def test_geometric_fit_equals_hyper_on_clean_points_and_resists_outliers() -> No
     assert np.linalg.norm(circle_estimate(p).center) > 0.01
 
 
-def test_a_known_radius_makes_a_short_arc_enough() -> None:
-    p, _ = arc(15.0, seed=2)
-    found = geometric_estimate(p, radii=[0.3], robust=False, start=(0.02, 0.0))
-    assert np.linalg.norm(found.center) < 0.008
-    assert found.sd < 0.005
-    assert found.refused is None
-
-
 def test_markers_round_the_joint_share_their_center() -> None:
     each = [arc(20.0, seed=k, at=a)[0] for k, a in enumerate((0.0, 0.25, -0.3, 0.6))]
     together = geometric_estimate(np.stack(each, axis=1), robust=False)
@@ -191,8 +174,3 @@ def test_markers_round_the_joint_share_their_center() -> None:
     assert np.linalg.norm(together.center) < 0.01
     assert np.linalg.norm(joined) < 0.012
     assert np.sqrt(np.trace(C)) == pytest.approx(together.sd, rel=0.3)
-
-
-def test_combine_rejects_estimates_without_information() -> None:
-    with pytest.raises(ValueError, match="nothing"):
-        combine([circle_estimate(np.ones((9, 2)))])

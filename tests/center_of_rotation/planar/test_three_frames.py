@@ -10,27 +10,22 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from jointfit_daemon.center_of_rotation import circle_rms_bound
-from jointfit_daemon.center_of_rotation._bounds import (
+from bench.baselines.circle_theory import (
+    arbitrary_error,
     circle_bound,
-    uniform_arc_rms,
+    circle_rms_bound,
+    triangle_error,
 )
 from jointfit_daemon.center_of_rotation.planar import (
     Grid,
-    arbitrary_error,
     equal_step_error,
     grid_center,
     plane_of,
     three_frame_center,
     three_frame_estimate,
-    triangle_error,
 )
 from jointfit_daemon.center_of_rotation.planar._grid_search import grid_cost
-from jointfit_daemon.center_of_rotation.planar._plane import (
-    in_segment_plane,
-)
-from jointfit_daemon.center_of_rotation.planar._three_frames import SegmentMarkers, chain_centers
-from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import planar_noise
+from jointfit_daemon.center_of_rotation.study._circle_study import uniform_arc_rms
 
 numbers = st.floats(-10.0, 10.0)
 anything = st.floats(allow_nan=True, allow_infinity=True)
@@ -116,30 +111,7 @@ def test_no_turn_and_half_turns_show_nothing() -> None:
     assert triangle_error([[0, 0], [1, 1], [2, 2]], 0.001) == inf
 
 
-def test_a_chain_is_found_joint_by_joint_in_its_parents_coordinates() -> None:
-    n, rng = 200, np.random.default_rng(2)
-    hip, knee = 0.4 * np.sin(np.linspace(0, 3, n)), np.linspace(0.1, 1.9, n)
-
-    def turn(angle: Any, at: Any) -> Any:
-        c, s = np.cos(angle), np.sin(angle)
-        return np.stack((c * at[0] - s * at[1], s * at[0] + c * at[1]), axis=-1)
-
-    joint = turn(hip, (0.4, 0.0))
-    thigh = SegmentMarkers(turn(hip, (0.1, 0.05)), turn(hip, (0.3, 0.05)))
-    shank = SegmentMarkers(joint + turn(hip + knee, (0.2, 0.0)), joint + turn(hip + knee, (0.3, 0)))
-    foot_joint = joint + turn(hip + knee, (0.45, 0.0))
-    foot = SegmentMarkers(foot_joint + turn(2 * knee, (0.1, 0)), foot_joint + turn(knee, (0.2, 0)))
-    shift = rng.normal(size=(n, 2))  # the whole body moves
-    moved = [SegmentMarkers(s.first + shift, s.second + shift) for s in (thigh, shank, foot)]
-    found = chain_centers(moved, 0.0005)
-    assert found[0].center == pytest.approx([0.2, -0.05], abs=1e-9)
-    assert found[1].center == pytest.approx([0.2, 0.0], abs=1e-9)
-    assert [f.refused for f in found] == [None, None]
-
-
-def test_a_parent_whose_markers_meet_has_no_plane_of_its_own() -> None:
-    here = np.zeros((1, 2))
-    assert np.isnan(in_segment_plane(here, here, np.ones((1, 2)))).all()
+def test_a_plane_needs_an_axis() -> None:
     with pytest.raises(ValueError, match="axis"):
         plane_of((0, 0, 0))
 
@@ -151,14 +123,6 @@ def test_a_plane_is_across_its_axis_and_right_handed(axis: Any) -> None:
     assert np.cross(first, second) == pytest.approx(n, abs=1e-12)
     assert np.abs(np.array(axis) @ plane_of(axis)).max() < 1e-12
     assert plane_of((1, 0, 0)) == pytest.approx(np.eye(3)[:, 1:])
-
-
-def test_the_parents_noise_is_turned_by_the_lever() -> None:
-    rng = np.random.default_rng(1)
-    n, noise, apart, at = 100_000, 0.001, 0.2, np.array([0.05, 0.3])
-    p, q, m = (v + rng.normal(0, noise, (n, 2)) for v in ((-apart / 2, 0), (apart / 2, 0), at))
-    expected = planar_noise(at, np.array([[-apart / 2, 0.0], [apart / 2, 0.0]]), noise)
-    assert np.cov(in_segment_plane(p, q, m).T) == pytest.approx(expected, rel=0.05, abs=2e-8)
 
 
 def test_a_grid_finds_the_node_an_arc_is_round_about() -> None:

@@ -28,7 +28,6 @@ from jointfit_daemon.center_of_rotation.spatial import (
     relative,
     spatial_noise,
 )
-from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import planar_noise
 
 ANYHOW = CircleLimits(gate=0.0, arc=0.0, sd=inf)
 
@@ -134,36 +133,10 @@ def test_a_shared_unseen_direction_stays_unseen() -> None:
     assert abs(fused.axis[0]) > 0.999
 
 
-def test_planar_noise_of_two_markers_is_the_published_form() -> None:
-    parent = np.array([[0.1, 0.0], [-0.1, 0.0]])
-    lever = np.array([0.05, -0.3])
-    across = np.array([0.3, 0.05])
-    expected = 2e-3**2 * (1.5 * np.eye(2) + 2.0 / 0.2**2 * np.outer(across, across))
-    assert np.allclose(planar_noise(lever, parent, 2e-3), expected)
-
-
-def test_planar_noise_agrees_with_simulation() -> None:
-    rng = np.random.default_rng(10)
-    parent = np.array([[0.1, 0.05], [-0.1, 0.0], [0.0, -0.08]])
-    middle, point, sd = parent.mean(axis=0), np.array([0.02, -0.3]), 1e-3
-    y = parent + rng.normal(0, sd, (40_000, 3, 2))
-    d, e = (parent - middle) @ [1, 1j], (y - y.mean(axis=1, keepdims=True)) @ [1, 1j]
-    turn = (e * d.conj()).sum(axis=1)
-    turn /= np.abs(turn)
-    x = point + rng.normal(0, sd, (40_000, 2)) - y.mean(axis=1)
-    local = (x @ [1, 1j]) * turn.conj()
-    found = np.cov(local.real, local.imag)
-    told = planar_noise(point, parent, sd)
-    assert np.trace(found) == pytest.approx(np.trace(told), rel=0.03)
-    assert np.abs(found - told).max() < 0.05 * np.trace(told)
-
-
 def test_parents_that_fix_no_frame_are_refused() -> None:
     line = np.linspace(0, 1, 4)[:, None] * np.ones(3)
     with pytest.raises(ValueError, match="not on a line"):
         spatial_noise(CHILD[0], line, 1e-3)
-    with pytest.raises(ValueError, match="apart"):
-        planar_noise(np.zeros(2), np.zeros((2, 2)), 1e-3)
 
 
 def test_knowing_the_shape_of_the_parents_noise_takes_some_bias_out() -> None:

@@ -1,0 +1,135 @@
+"""Theory of circle centers that experiments and tests compare with: bounds, three-frame errors.
+
+A bound depends on the movement and the noise only. It is infinite where the movement carries no
+information about the center.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation import CenterEstimate
+
+
+def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False) -> Array:
+    r"""Return the least covariance of a circle's center from points at these angles.
+
+    .. math:: C = \sigma^2 \Big[ \sum_i u_i u_i^T \Big]^{-1}_{xy},
+              \qquad u_i = (\cos\theta_i, \sin\theta_i, 1)
+
+    without the 1 where the radius is known.
+
+    Parameters
+    ----------
+    angles : array_like, shape (n,)
+        Directions of the points from the center, rad.
+    noise : float
+        Standard deviation of each coordinate, m.
+    known_radius : bool
+        The radius need not be found.
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        m²; inf on the diagonal where the points do not show a center.
+    """
+    t = np.asarray(angles, dtype=np.float64)
+    columns = [np.cos(t), np.sin(t)]
+    if not known_radius:
+        columns.append(np.ones_like(t))
+    u = np.column_stack(columns)
+    F = u.T @ u  # noqa: N806 - Fisher's information is a matrix
+    scale = float(np.trace(F))
+    if t.size == 0 or float(np.linalg.eigvalsh(F)[0]) <= 1e-15 * scale:
+        return np.diag([np.inf, np.inf])
+    return np.asarray(noise**2 * np.linalg.inv(F)[:2, :2])
+
+
+def circle_rms_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False) -> float:
+    """Return the least RMS error of a circle's center, m; parameters as in `circle_bound`."""
+    return float(np.sqrt(np.trace(circle_bound(angles, noise, known_radius=known_radius))))
+
+
+def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
+    r"""Predict the RMS error of a three-frame center for three angles.
+
+    .. math::
+        E^2 = \frac{2\sigma^2 (3 - \cos\theta_{12} - \cos\theta_{13} - \cos\theta_{23})}
+                   {(\sin\theta_{12} - \sin\theta_{13} + \sin\theta_{23})^2}
+
+    Source: Akbarifar et al. 2021, equation 14 with the sign of the last cosine corrected.
+
+    Parameters
+    ----------
+    angles : array_like, shape (..., 3)
+        Directions of the marker from the center in the three frames, rad.
+    noise : array_like, shape (...)
+        Standard deviation of each coordinate, m.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        RMS distance from the true center, m; inf where two angles coincide.
+    """
+    t = np.asarray(angles, dtype=np.float64)
+    d12, d13, d23 = t[..., 0] - t[..., 1], t[..., 0] - t[..., 2], t[..., 1] - t[..., 2]
+    across = np.sin(d12) - np.sin(d13) + np.sin(d23)
+
+    # 1 - cos by half angles: the difference of cosines has no digits on short arcs
+    square = 4.0 * (np.sin(d12 / 2) ** 2 + np.sin(d13 / 2) ** 2 + np.sin(d23 / 2) ** 2)
+    return _ratio(np.asarray(noise) * np.sqrt(square), np.abs(across))
+
+
+def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
+    r"""Predict the RMS error of a three-frame center from the measured triangle alone.
+
+    .. math:: E = \sigma \frac{R}{2A} \sqrt{a^2 + b^2 + c^2}, \qquad R = abc / 4A
+
+    with sides a, b, c and area A.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3, 2)
+        m.
+    noise : array_like, shape (...)
+        Standard deviation of each coordinate, m.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        RMS distance from the true center, m; inf where the points are on a line.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
+    sides = np.stack([(w**2).sum(axis=-1) for w in (u, v, u - v)], axis=-1)
+    area = np.abs(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]) / 2
+    error = np.asarray(noise) * np.sqrt(sides.prod(axis=-1) * sides.sum(axis=-1))
+    return _ratio(error, 8.0 * area**2)
+
+
+def _ratio(above: Array, below: Array) -> Array:
+    """Divide; no information is an infinite error, noise or not."""
+    lost = below <= 0.0
+    return np.where(lost, np.inf, above / np.where(lost, 1.0, below))
+
+
+def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
+    r"""Combine centers of independent markers by information, without outlier rejection.
+
+    .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
+
+    Returns
+    -------
+    center, covariance : ndarray, shapes (d,) and (d, d)
+        m and m².
+    """
+    information = [np.linalg.inv(e.covariance) for e in estimates]
+    covariance = np.linalg.inv(np.sum(information, axis=0))
+    pulls = [W @ e.center for W, e in zip(information, estimates, strict=True)]
+    return np.asarray(covariance @ np.sum(pulls, axis=0)), covariance
