@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.timing.alignment import FrameAligner, StreamSpec
+from jointfit_daemon.timing.alignment import FrameAligner
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
@@ -66,9 +66,7 @@ def _sensors(rig: Rig) -> tuple[str, ...]:
 
 def _aligner(rig: Rig, begin_ns: int | None) -> FrameAligner:
     streams = {
-        source.id: StreamSpec(round(_NS / source.rate_hz))
-        for source in rig.sources
-        if source.kind == "imu"
+        source.id: round(_NS / source.rate_hz) for source in rig.sources if source.kind == "imu"
     }
     period_ns = round(_NS / rig.output_rate_hz)
     return FrameAligner(streams, period_ns, mode=rig.align_mode, begin_ns=begin_ns)

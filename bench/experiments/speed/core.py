@@ -18,7 +18,7 @@ from jointfit_daemon.model import LimbState, TickClock
 from jointfit_daemon.outputs.payloads import encode_pose
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
-from jointfit_daemon.timing.alignment import FrameAligner, StreamSpec
+from jointfit_daemon.timing.alignment import FrameAligner
 from jointfit_daemon.timing.clock import DeviceClock
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.body import SENSORS
@@ -63,7 +63,7 @@ def align_rows(quick: bool) -> list[Result]:
     orientations = walking("S1", NS / period_ns, seconds)
 
     def work() -> Callable[[], object]:
-        aligner = FrameAligner({s: StreamSpec(period_ns) for s in SENSORS}, 10_000_000)
+        aligner = FrameAligner(dict.fromkeys(SENSORS, period_ns), 10_000_000)
         deadlines: list[int | None] = []
 
         def run() -> None:

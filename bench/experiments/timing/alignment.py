@@ -28,7 +28,6 @@ from jointfit_daemon.kinematics.rotation_scalar import (
 from jointfit_daemon.timing.alignment import (
     CURVATURE_SHARE,
     FrameAligner,
-    StreamSpec,
     extrapolate_orientation,
 )
 
@@ -67,7 +66,7 @@ def aligned(
     noise: Callable[[Quaternion], Quaternion] | None = None,
 ) -> list[AlignedFrame]:
     """Return the frames of one stream that arrives at once."""
-    aligner = FrameAligner({"S": StreamSpec(round(period_ns))}, frame_ns)
+    aligner = FrameAligner({"S": round(period_ns)}, frame_ns)
     frames: list[AlignedFrame] = []
     for k in range(round(SECONDS * NS / period_ns)):
         t_ns = BEGIN_NS + phase_ns + round(k * period_ns)
@@ -229,7 +228,7 @@ def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
         delay = least_ms * MS + dice.exponential(0.5 * MS, len(taken))
         arrived = np.maximum.accumulate(taken + delay.astype(np.int64))
         arrivals += [(at, name, t) for at, t in zip(arrived.tolist(), taken.tolist(), strict=True)]
-    aligner = FrameAligner({name: StreamSpec(FRAME_NS) for name in STREAMS}, FRAME_NS, mode=mode)
+    aligner = FrameAligner(dict.fromkeys(STREAMS, FRAME_NS), FRAME_NS, mode=mode)
     frames: list[AlignedFrame] = []
     for at_ns, name, t_ns in sorted(arrivals):
         while (due_ns := aligner.next_deadline_ns) is not None and due_ns < at_ns:

@@ -4,7 +4,6 @@ from jointfit_daemon.timing.alignment._frame_aligner import (
     AlignedFrame,
     FrameAligner,
     Mode,
-    StreamSpec,
 )
 from jointfit_daemon.timing.alignment._interpolation import CURVATURE_SHARE, extrapolate_orientation
 
@@ -13,6 +12,5 @@ __all__ = [
     "AlignedFrame",
     "FrameAligner",
     "Mode",
-    "StreamSpec",
     "extrapolate_orientation",
 ]

@@ -21,14 +21,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.timing.alignment._stream import SampleOutcome, Stream, StreamSpec
+from jointfit_daemon.timing.alignment._stream import SampleOutcome, Stream
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.model import Quaternion, Vector
 
-__all__ = ["AlignedFrame", "FrameAligner", "Mode", "SampleOutcome", "StreamSpec"]
+__all__ = ["AlignedFrame", "FrameAligner", "Mode", "SampleOutcome"]
 
 Mode = Literal["smooth", "fast"]
 """``smooth`` waits for samples and interpolates; ``fast`` extrapolates by at most one period."""
@@ -63,14 +63,12 @@ class FrameAligner:
 
     Parameters
     ----------
-    streams : mapping of str to StreamSpec
-        Streams by id, in the order of the output.
+    streams : mapping of str to int
+        Nominal sample period of each stream by id, ns, in the order of the output.
     period_ns : int
         Frame period, ns.
     mode : {"smooth", "fast"}
         Whether to wait for samples.
-    active : bool
-        While False, samples are counted as idle and no frames are emitted.
     begin_ns : int, optional
         Instant of the first frame, with or without samples, ns; default: that of the first sample.
 
@@ -82,20 +80,18 @@ class FrameAligner:
 
     def __init__(
         self,
-        streams: Mapping[str, StreamSpec],
+        streams: Mapping[str, int],
         period_ns: int,
         *,
         mode: Mode = "smooth",
-        active: bool = True,
         begin_ns: int | None = None,
     ) -> None:
-        if period_ns <= 0 or any(spec.period_ns <= 0 for spec in streams.values()):
+        if period_ns <= 0 or any(period <= 0 for period in streams.values()):
             raise ValueError("periods must be positive")
-        self._streams = {name: Stream(spec) for name, spec in streams.items()}
+        self._streams = {name: Stream(period) for name, period in streams.items()}
         self._items = tuple(self._streams.items())
         self._period_ns = period_ns
         self._fast = mode == "fast"
-        self._active = active
         self._next = None if begin_ns is None else -(-begin_ns // period_ns)
         """Number of the next frame; None until a stream begins."""
         self._served: int | None = None  # number of a frame some stream is known to serve
@@ -107,11 +103,8 @@ class FrameAligner:
         self._changed = True  # since `_deadline_ns` was worked out
         self._dues: dict[str, int] = {}
         """When each stream is ready for the next frame; empty until that is asked."""
-        self.emitted_frames = 0
         self.skipped_frames = 0
         """Number of skipped frames, see ``OWED_NS``."""
-        self.forced_frames = 0
-        """Number of frames emitted at their deadline."""
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -144,19 +137,17 @@ class FrameAligner:
             Measured angular rate at `t_ns` in the sensor's own frame, rad/s.
         """
         stream = self._streams[name]
-        if not self._active:
-            return stream.idle()
         self._changed = True
         if epoch != stream.epoch:  # the stream discards its samples
             self._served = None
 
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
-        verdict = stream.push(
+        outcome = stream.push(
             t_ns, arrival_ns, q, synced=synced, epoch=epoch, passed_ns=passed_ns, rate=rate
         )
         if self._dues:  # the other streams are unchanged
             self._dues[name] = self._due_of(stream)
-        return verdict
+        return outcome
 
     def counts(self, name: str) -> dict[str, int]:
         """Return the number of received samples by outcome, and of pending ones."""
@@ -168,7 +159,7 @@ class FrameAligner:
     def next_deadline_ns(self) -> int | None:
         """Time at which ``advance`` emits a frame without further samples, ns; or None."""
         if self._changed:
-            self._deadline_ns = self._due() if self._active else None
+            self._deadline_ns = self._due()
             self._changed = False
         return self._deadline_ns
 
@@ -218,14 +209,10 @@ class FrameAligner:
         return True
 
     def _find_servers(self) -> None:
-        """Determine whether a stream serves the next frame, or else from when on."""
-        starts = self._starts()
-        self._serves_ns = min(starts, default=None)
-        if self._next is None and self._serves_ns is not None:
-            self._next = self._served = -(-self._serves_ns // self._period_ns)
+        """Determine whether a stream serves the next frame, or else from when on.
 
-    def _starts(self) -> list[int]:
-        """Return the first instants that streams can serve; reset streams that have ended."""
+        Streams that have ended are reset.
+        """
         starts: list[int] = []
         t_next, served = self.next_ns, False
         for _, stream in self._items:
@@ -237,9 +224,12 @@ class FrameAligner:
             else:
                 starts.append(start)
                 served = served or start == t_next
+
+        self._serves_ns = min(starts, default=None)
         if served:
             self._served = self._next
-        return starts
+        elif self._next is None and self._serves_ns is not None:
+            self._next = self._served = -(-self._serves_ns // self._period_ns)
 
     def _due(self) -> int | None:
         """Return the time at which the next frame is complete, or its deadline, ns."""
@@ -269,7 +259,7 @@ class FrameAligner:
         orientations: dict[str, Quaternion] = {}
         extrapolated: list[str] = []
         missing: list[str] = []
-        synced, forced = True, False
+        synced = True
         for name, stream in self._items:
             q = stream.at(t_k)
             if q is None:
@@ -279,15 +269,12 @@ class FrameAligner:
             synced = synced and stream.synced
             if stream.extrapolated:
                 extrapolated.append(name)
-                forced = True
-        if (
-            not orientations
-        ):  # unchanged while no stream has ended: a pause does not unsettle clocks
+
+        # unchanged while no stream has ended: a pause does not unsettle clocks
+        if not orientations:
             synced = self._synced and any(stream.waited_for for _, stream in self._items)
 
         self._synced = synced
-        self.emitted_frames += 1
-        self.forced_frames += forced
         return AlignedFrame(
             t_k,
             completed_ns,
@@ -298,17 +285,6 @@ class FrameAligner:
         )
 
     # --- control -----------------------------------------------------------------------------
-
-    @property
-    def active(self) -> bool:
-        """Whether frames are wanted."""
-        return self._active
-
-    @active.setter
-    def active(self, wanted: bool) -> None:
-        if self._active and not wanted:
-            self.close()
-        self._active, self._changed, self._served = wanted, True, None
 
     def lose(self, name: str) -> None:
         """Mark a stream as ended; frames do not wait for it until it returns."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from enum import StrEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.timing.alignment import _interpolation
 
@@ -50,13 +50,6 @@ _BEHIND = 3
 """Number of samples at or before a frame that extrapolation needs."""
 
 
-class StreamSpec(NamedTuple):
-    """Configuration of a stream."""
-
-    period_ns: int
-    """Nominal sample period, ns."""
-
-
 class SampleOutcome(StrEnum):
     """Outcome of a sample."""
 
@@ -71,7 +64,7 @@ class SampleOutcome(StrEnum):
     DROPPED = "dropped"
     """Discarded: overflow, reset, close, or a timestamp in the future."""
     IDLE = "idle"
-    """Arrived while the aligner was inactive."""
+    """Not needed: motion capture outside of a calibration; never a sample of a stream."""
 
 
 class _Sample:
@@ -87,7 +80,7 @@ class _Sample:
 
 
 class Stream:
-    """Samples of one stream between their arrival and their verdict."""
+    """Samples of one stream between their arrival and their outcome."""
 
     __slots__ = (
         "_counts", "_crowded_ns", "_delay_ns", "_delay_step", "_gap_ns",
@@ -96,8 +89,8 @@ class Stream:
         "synced", "waited_for",
     )  # fmt: skip
 
-    def __init__(self, spec: StreamSpec) -> None:
-        period = self.period_ns = spec.period_ns
+    def __init__(self, period_ns: int) -> None:
+        period = self.period_ns = period_ns
         self._patience_ns = round(PATIENCE * period)
         self._reach_ns = round(REACH * period)
         self._gap_ns = round(GAP * period)
@@ -117,11 +110,6 @@ class Stream:
         """What the last ``at`` did, and whether the clock behind it had settled."""
 
     # --- samples -----------------------------------------------------------------------------
-
-    def idle(self) -> SampleOutcome:
-        """Count a sample that arrived while the aligner was inactive."""
-        self._received += 1
-        return self._count(SampleOutcome.IDLE)
 
     def push(
         self,
@@ -305,8 +293,8 @@ class Stream:
 
     def counts(self) -> dict[str, int]:
         """Return the number of received samples by outcome, and of pending ones."""
-        verdicts = {verdict.value: count for verdict, count in self._counts.items()}
-        return {"received": self._received, **verdicts, "pending": len(self._samples)}
+        outcomes = {outcome.value: count for outcome, count in self._counts.items()}
+        return {"received": self._received, **outcomes, "pending": len(self._samples)}
 
     def _leave(self, sample: _Sample, otherwise: SampleOutcome) -> None:
         if sample.used:
@@ -316,6 +304,6 @@ class Stream:
         else:
             self._count(otherwise)
 
-    def _count(self, verdict: SampleOutcome) -> SampleOutcome:
-        self._counts[verdict] += 1
-        return verdict
+    def _count(self, outcome: SampleOutcome) -> SampleOutcome:
+        self._counts[outcome] += 1
+        return outcome

@@ -283,14 +283,21 @@ class DeviceClock:
 
         if u is None or news is not None:
             self._begin(news)
-            u = self._afresh(ticks, counter, arrival_ns, tick_clock)
+            reader = self._reader_for(ticks, counter, tick_clock)
+            if reader is not None:
+                u = reader.feed(ticks, counter, arrival_ns, self._envelope)
+            u = arrival_ns if reader is None or u is None else u
         elif self._doubts.early:
             return self._by_arrival(arrival_ns)
 
         last_u = self._line.last_u
-        if last_u is not None and u <= last_u:
-            return self._past(u, last_u)
-        return self._stamp(u, arrival_ns)
+        if last_u is None or u > last_u:
+            return self._stamp(u, arrival_ns)
+
+        # a duplicate (u = last) or reordered sample, unused by the fit
+        last_t = last_u if self._line.last_t is None else self._line.last_t
+        sigma = inf if self.sigma_ns is None else self.sigma_ns
+        return Stamp(last_t - (last_u - u), sigma, self._synced, self.epoch, u == last_u)
 
     # --- source of device time ---------------------------------------------------------------
 
@@ -329,13 +336,6 @@ class DeviceClock:
         make = ArrivalTime if kind == _ARRIVAL else CounterTime
         self._reader = reader = make(self._period_ns)
         return reader
-
-    def _afresh(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, tick_clock: TickClock | None
-    ) -> int:
-        reader = self._reader_for(ticks, counter, tick_clock)
-        u = None if reader is None else reader.feed(ticks, counter, arrival_ns, self._envelope)
-        return arrival_ns if u is None else u
 
     # --- plausibility ------------------------------------------------------------------------
 
@@ -439,12 +439,6 @@ class DeviceClock:
         if warning is not None:
             self._warned = True
             self.news.append(warning)
-
-    def _past(self, u: int, last_u: int) -> Stamp:
-        """Return the timestamp of a duplicate (u = last) or reordered sample, unused by the fit."""
-        last_t = last_u if self._line.last_t is None else self._line.last_t
-        sigma = inf if self.sigma_ns is None else self.sigma_ns
-        return Stamp(last_t - (last_u - u), sigma, self._synced, self.epoch, u == last_u)
 
     def _by_arrival(self, arrival_ns: int) -> Stamp:
         """Return the timestamp of a sample without the device time its neighbours have."""

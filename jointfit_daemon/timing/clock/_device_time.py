@@ -8,7 +8,7 @@ restarted; a new reader must then read the sample again.
 from __future__ import annotations
 
 from math import log
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.timing.clock._clock_events import clock_event, clock_restart_event
 from jointfit_daemon.timing.clock._counter_wrap import unwrap
@@ -53,22 +53,6 @@ _LATE_LOG_CHANCE = -14.0
 """Log-probability of a run of late samples by chance: one in a million."""
 _SILENCE_NS = 2 * NS
 """Silence after which samples without device time cannot be numbered, ns."""
-
-
-class DeviceTime(Protocol):
-    """Reader of the time of one device between two restarts."""
-
-    @property
-    def turn_ns(self) -> int | None:
-        """Period of the readings, ns; 0 if they never repeat, None without readings."""
-
-    def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter
-    ) -> int | None:
-        """Return the device time, ns, or None for a restart."""
-
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:
-        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
 
 
 class TickTime:
@@ -118,7 +102,9 @@ class TickTime:
             elapsed = arrival_ns - self._arrival_ns
             ticks = unwrap(ticks, last, self._clock.modulus, elapsed, self._turn_ns)
             if ticks < last:
-                return self._past(ticks, last)
+                self._backward += 1
+                fell = self._backward >= BACKWARD_LIMIT or self.to_ns(last - ticks) > FALL_NS
+                return None if fell else self.to_ns(ticks)
             if self._contradicted(ticks - last, counter):
                 return None
         self._last, self._arrival_ns, self._backward = ticks, arrival_ns, 0
@@ -131,12 +117,6 @@ class TickTime:
         if modulus:
             before %= modulus
         return clock_restart_event(self.to_ns(before), self.to_ns(ticks or 0), elapsed_ns)
-
-    def _past(self, ticks: int, last: int) -> int | None:
-        self._backward += 1
-        if self._backward >= BACKWARD_LIMIT or self.to_ns(last - ticks) > FALL_NS:
-            return None
-        return self.to_ns(ticks)
 
     def _contradicted(self, step: int, counter: int | None) -> bool:
         """Return whether `step` ticks and the counter change contradict each other."""
@@ -259,7 +239,11 @@ class ArrivalTime:
         else:
             self._late_samples += 1
             self._least = min(self._least, late)
-            if self._decided(arrival_ns):
+            waited = arrival_ns - self._late_ns
+            share = min(max(self._late_share, _LATE_SHARE_LEAST), _LATE_SHARE_MOST)
+            if waited >= max(
+                _LATE_PERIODS * period, _LATE_LEAST_NS
+            ) and self._late_samples >= _LATE_LOG_CHANCE / log(share):
                 lost = round(self._least)
                 if abs(self._least - lost) > _DOUBTFUL:
                     return None
@@ -280,10 +264,9 @@ class ArrivalTime:
             "sample delay is not a multiple of the period; sample numbering restarted"
         )
 
-    def _decided(self, arrival_ns: int) -> bool:
-        waited = arrival_ns - self._late_ns
-        if waited < max(_LATE_PERIODS * self._period_ns, _LATE_LEAST_NS):
-            return False
 
-        share = min(max(self._late_share, _LATE_SHARE_LEAST), _LATE_SHARE_MOST)
-        return self._late_samples >= _LATE_LOG_CHANCE / log(share)
+DeviceTime = TickTime | CounterTime | ArrivalTime
+"""Reader of the time of one device between two restarts.
+
+`turn_ns` is the period of its readings, ns; 0 if they never repeat, None without readings.
+"""

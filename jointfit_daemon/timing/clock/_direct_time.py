@@ -65,23 +65,6 @@ class HostTime(Protocol):
         """Return the standard deviation of ``host_ns(u)``, ns."""
 
 
-class DirectTime(Protocol):
-    """A conversion from device to host time that does not use arrivals."""
-
-    @property
-    def slope(self) -> float:
-        """d(host - device) / d device."""
-
-    def usable(self, u: int) -> bool:
-        """Return whether the conversion is valid at device time `u`."""
-
-    def host_ns(self, u: int) -> int:
-        """Return the host time of device time `u`, ns."""
-
-    def sigma_at(self, u: int) -> float:
-        """Return the standard deviation of ``host_ns(u)``, ns."""
-
-
 class DeclaredOffset(NamedTuple):
     """A device clock that is the host's clock plus a known offset."""
 
@@ -130,11 +113,6 @@ class SyncEdgeFit:
         return self._line.slope + self.reference.slope
 
     @property
-    def pairs(self) -> int:
-        """Number of edges in the fit."""
-        return len(self._pairs)
-
-    @property
     def broken(self) -> bool:
         """Whether the reference restarted or several edges in a row were outliers."""
         return self._strays >= _STRAYS or self.reference.epoch != self._epoch
@@ -171,13 +149,14 @@ class SyncEdgeFit:
         """Return the host time of device time `u`, ns."""
         return self.reference.host_ns(self._reference_ns(u))
 
-    def tie_sigma_at(self, u: int) -> float:
-        """Return the standard deviation between device and reference at `u`, ns."""
-        return sqrt(self._line.variance_at(u - self._ref[0]))
-
     def sigma_at(self, u: int) -> float:
         """Return the standard deviation of ``host_ns(u)``, ns, the reference's included."""
-        return hypot(self.tie_sigma_at(u), self.reference.sigma_at(self._reference_ns(u)))
+        own = sqrt(self._line.variance_at(u - self._ref[0]))
+        return hypot(own, self.reference.sigma_at(self._reference_ns(u)))
+
+
+DirectTime = DeclaredOffset | SyncEdgeFit
+"""A conversion from device to host time that does not use arrivals."""
 
 
 def declared(clock: TickClock, unix_offset_ns: int | None) -> DeclaredOffset | None:

@@ -104,10 +104,12 @@ def mean_feasible_line(
     most = max(_PRIOR_TAIL * prior_sd, _WILDEST)
     edge = min(max((yb - ya) / (ub - ua), prior - most), prior + most)
 
-    # Scale of the heights above the edge, 1/G.
-    heights = [y - ya - edge * (at - ua) for at, y in points]
-    least_height = min(heights)
-    scale = _edge_scale([height - least_height for height in heights])
+    # Scale of the heights above the edge, 1/G. The median height is log(2) mean heights. The two
+    # points that define the edge carry no information, and the mean costs one degree of freedom.
+    heights = sorted(y - ya - edge * (at - ua) for at, y in points)
+    count = len(heights)
+    median = heights[(count + _SUPPORTS) // 2] - heights[0]
+    scale = max(median / log(2.0), _FINEST_NS) / max(1, count - _SUPPORTS - 1)
 
     # Range of slopes with relevant weight, limited by the prior.
     rows = [(float(at - ref), float(y - ya)) for at, y in hull]
@@ -164,15 +166,6 @@ def _height(point: Point, supports: Sequence[Point], near: float, far: float) ->
         if u <= right[0]:
             return y - left[1] - _slope(left, right) * (u - left[0])
     return y - supports[-1][1] - far * (u - supports[-1][0])
-
-
-def _edge_scale(rests: list[float]) -> float:
-    """Return 1/G, ns, from the heights of all points above the edge."""
-    rests.sort()
-    # The median height is log(2) mean heights. The two points that define the edge carry no
-    # information, and estimating the mean height costs one more degree of freedom.
-    median = rests[(len(rests) + _SUPPORTS) // 2]
-    return max(median / log(2.0), _FINEST_NS) / max(1, len(rests) - _SUPPORTS - 1)
 
 
 def _weighed(

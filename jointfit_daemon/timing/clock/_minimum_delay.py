@@ -140,17 +140,14 @@ class MinimumDelayFilter:
             self._c, self._ref = float(y), u
             self._variance = (inf, 0.0, self._prior_sd**2)
         elif self._span < YOUNG_NS or not self.settled or self._sealed % _OLD_REFIT_BUCKETS == 0:
-            self._refit(u)
+            if len(points) < _LINE_POINTS:
+                self._c += self.skew * (u - self._ref)
+            else:
+                line = mean_feasible_line(points, u, self._prior, self._prior_sd)
+                self._c, self.skew = line.height, line.slope
+                self._variance = (line.height_var, line.both, line.slope_var)
+            self._ref = u
 
         self.settled = enough and (self.settled or self.sigma_ns(u) <= TRUSTED_NS)
         self._best, self._best_key = (u, y), y - self.skew * (u - self._ref)
         self._bucket_end = u + BUCKET_NS
-
-    def _refit(self, u: int) -> None:
-        points = self._points
-        if len(points) < _LINE_POINTS:
-            self._c, self._ref = self._c + self.skew * (u - self._ref), u
-            return
-        line = mean_feasible_line(points, u, self._prior, self._prior_sd)
-        self._ref, self._c, self.skew = u, line.height, line.slope
-        self._variance = (line.height_var, line.both, line.slope_var)

@@ -65,21 +65,16 @@ class SyncLine:
         pairs: list[tuple[int, int]] = []
         while waiting and instants and waiting[0].t_ns < instants[-1].t_ns:
             edge = waiting.pop(0)
-            found = self._nearest(edge.t_ns)
-            if found is None:
+            after = bisect_left(instants, edge.t_ns, key=lambda instant: instant.t_ns)
+            if after == 0:
                 self.unmatched += 1
+                continue
+
+            left, right = instants[after - 1], instants[after]
+            near = left if edge.t_ns - left.t_ns < right.t_ns - edge.t_ns else right
+            reach = min(UNAMBIGUOUS * (right.t_ns - left.t_ns), FARTHEST_NS)
+            if abs(near.t_ns - edge.t_ns) <= reach:
+                pairs.append((edge.own_ns, near.own_ns))
             else:
-                pairs.append((edge.own_ns, found.own_ns))
+                self.unmatched += 1
         return pairs
-
-    def _nearest(self, t_ns: int) -> Edge | None:
-        instants = self._instants
-        after = bisect_left(instants, t_ns, key=lambda edge: edge.t_ns)
-        if after == 0:
-            return None
-
-        left, right = instants[after - 1], instants[after]
-        apart = right.t_ns - left.t_ns
-        near = left if t_ns - left.t_ns < right.t_ns - t_ns else right
-        off = abs(near.t_ns - t_ns)
-        return near if off <= min(UNAMBIGUOUS * apart, FARTHEST_NS) else None

@@ -158,15 +158,22 @@ def low_pass(rates: Rates, cutoff_hz: float) -> Rates:
 
 
 class Interpolant:
-    """Cubic Hermite interpolant of each run, with fourth-order slopes."""
+    """Cubic Hermite interpolant of each run.
+
+    Slopes are fourth-order central differences, second order near the ends of a run.
+    """
 
     def __init__(self, rates: Rates) -> None:
         self._t, self._w, self._run = rates.t_s, rates.w, rates.run
         self.slopes = np.zeros_like(rates.w)
         """Time derivative at the samples, rad/s², shape (n, 3)."""
         for run in rates.runs():
-            if run.stop - run.start > 1:
-                self.slopes[run] = _slopes(rates.t_s[run], rates.w[run])
+            t, w, slopes = rates.t_s[run], rates.w[run], self.slopes[run]
+            if t.size > 1:
+                slopes[:] = np.gradient(w, t, axis=0)
+            if t.size >= _STENCIL:
+                h = (t[4:] - t[:-4])[:, None] / 4.0
+                slopes[2:-2] = (w[:-4] - w[4:] + 8.0 * (w[3:-1] - w[1:-3])) / (12.0 * h)
 
     def locate(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Return the interval of each instant, and whether it is inside a run."""
@@ -191,13 +198,3 @@ class Interpolant:
         value = f0 + x * (d0 + x * (c2 + x * c3))
         slope = (d0 + x * (2.0 * c2 + 3.0 * x * c3)) / h
         return value, slope, inside
-
-
-def _slopes(t: Floats, w: Floats) -> Floats:
-    """Return dw/dt by fourth-order central differences, second order near the ends."""
-    slopes = np.empty_like(w)
-    slopes[:] = np.gradient(w, t, axis=0)
-    if t.size >= _STENCIL:
-        h = (t[4:] - t[:-4])[:, None] / 4.0
-        slopes[2:-2] = (w[:-4] - w[4:] + 8.0 * (w[3:-1] - w[1:-3])) / (12.0 * h)
-    return slopes

@@ -203,7 +203,12 @@ def estimate_in_steps(
         nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
     )
     if rate < settings.min_rate or acceleration < settings.min_acceleration:
-        return replace(seen, refused=_too_little(rate, acceleration, settings))
+        refused = (
+            f"too little motion: {np.degrees(rate):.1f} deg/s rms, {np.degrees(acceleration):.0f} "
+            f"deg/s² rms; at least {np.degrees(settings.min_rate):.0f} and "
+            f"{np.degrees(settings.min_acceleration):.0f} are needed: {IRREGULAR}"
+        )
+        return replace(seen, refused=refused)
     yield
 
     coarse, why = coarse_lags(imu, ref, settings)
@@ -258,14 +263,6 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
     others = [fit for fit in alike if abs(fit.tau_s - nearest.tau_s) > _SAME_S / 2]
     return nearest, min(
         others, key=lambda fit: (round(1e3 * abs(fit.tau_s - nearest.tau_s)), fit.tau_s < 0.0)
-    )
-
-
-def _too_little(rate: float, acceleration: float, settings: LagSettings) -> str:
-    return (
-        f"too little motion: {np.degrees(rate):.1f} deg/s rms, {np.degrees(acceleration):.0f} "
-        f"deg/s² rms; at least {np.degrees(settings.min_rate):.0f} and "
-        f"{np.degrees(settings.min_acceleration):.0f} are needed: {IRREGULAR}"
     )
 
 

@@ -107,20 +107,16 @@ def _widest(table: Floats, block: NDArray[np.int64], whole: Floats, free: float)
             return float(np.sqrt(max(variances)))
         table, block = np.add.reduceat(table, first, axis=0), block[first] // 2
         freedom = float(table[:, -1].sum() ** 2 / np.sum(table[:, -1] ** 2)) - 1.0
-        if freedom > _LEAST_FREEDOM:
-            variance = _jackknife(table, whole)
-            variances.append(variance if variances else max(variance, free) * _rarity(freedom) ** 2)
+        if freedom > _LEAST_FREEDOM and variances:
+            variances.append(_jackknife(table, whole))
+        elif freedom > _LEAST_FREEDOM:
+            # Student's quantile of the probability of `SIGMAS` by Wallace's approximation (1959),
+            # accurate to 1 % from three degrees of freedom on.
+            normal = SIGMAS * (8.0 * freedom + 3.0) / (8.0 * freedom + 1.0)
+            student = float(np.sqrt(freedom * np.expm1(normal**2 / freedom)))
+            variances.append(max(_jackknife(table, whole), free) * (student / SIGMAS) ** 2)
         elif not variances:
             return float("inf")
-
-
-def _rarity(freedom: float) -> float:
-    """Return Student's quantile of the probability of `SIGMAS`, divided by `SIGMAS`.
-
-    Wallace's approximation (1959), accurate to 1 % from three degrees of freedom on.
-    """
-    normal = SIGMAS * (8.0 * freedom + 3.0) / (8.0 * freedom + 1.0)
-    return float(np.sqrt(freedom * np.expm1(normal**2 / freedom))) / SIGMAS
 
 
 def _newey_west(score: Floats, lags: int) -> float:

@@ -64,8 +64,12 @@ class LagTracker:
         A rejected estimate only advances the time.
         """
         if self._t_ns is not None:
-            self._predict((t_ns - self._t_ns) * 1e-9)
-            self._t_ns = t_ns
+            dt, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
+            self._tau += dt * self._drift
+            self._tt += dt * (2.0 * self._pt + dt * self._pp)
+            self._pt += dt * self._pp
+            self._pp += DRIFT_NOISE**2 * max(dt, 0.0)
+
         if estimate.refused is not None:
             return self._now()
         tau, variance = estimate.lag_ns * 1e-9, self._inflate * (estimate.sigma_ns * 1e-9) ** 2
@@ -98,12 +102,6 @@ class LagTracker:
         self._t_ns, self._tau, self._drift = t_ns, tau, 0.0
         self._tt, self._pt, self._pp = variance, 0.0, DRIFT_SD**2
         self._refused = []
-
-    def _predict(self, dt: float) -> None:
-        self._tau += dt * self._drift
-        self._tt += dt * (2.0 * self._pt + dt * self._pp)
-        self._pt += dt * self._pp
-        self._pp += DRIFT_NOISE**2 * max(dt, 0.0)
 
     def _update(self, innovation: float, variance: float) -> None:
         total = self._tt + variance

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner, StreamSpec
+from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
 from jointfit_daemon.timing.alignment._frame_aligner import SampleOutcome
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ def play(aligner: FrameAligner, pushes: list[Push]) -> list[AlignedFrame]:
 
 
 def aligner(period: int = 10 * MS, mode: str = "smooth", **periods: int) -> FrameAligner:
-    specs = {name: StreamSpec(p) for name, p in periods.items()}
-    return FrameAligner(specs, period, mode="fast" if mode == "fast" else "smooth")
+    return FrameAligner(periods, period, mode="fast" if mode == "fast" else "smooth")
 
 
 def assert_accounted(of: FrameAligner, name: str) -> dict[str, int]:
@@ -114,7 +113,7 @@ def test_a_sample_period_that_is_not_quite_nominal_keeps_that_bound() -> None:
 def test_a_constantly_late_stream_does_not_force_frames() -> None:
     a = aligner(A=10 * MS, B=10 * MS)
     frames = play(a, stream("A", 10 * MS, 200) + stream("B", 10 * MS, 200, phase=MS, delay=48 * MS))
-    assert a.forced_frames == 0
+    assert not any(frame.extrapolated for frame in frames)
     assert len(frames) > 190
     assert not any(f.missing for f in frames[10:])
 
@@ -183,7 +182,7 @@ def test_a_stream_faster_than_the_frames_is_decimated() -> None:
 def test_a_slow_stream_is_interpolated_between_its_samples() -> None:
     a = aligner(A=10 * MS, B=40 * MS)
     frames = play(a, stream("A", 10 * MS, 100) + stream("B", 40 * MS, 25, phase=MS))
-    assert a.forced_frames == 0
+    assert not any(frame.extrapolated for frame in frames)
     for f in frames[10:90]:
         assert f.orientations["B"] == pytest.approx(turned(f.t_ns), abs=1e-12)
 
@@ -238,7 +237,7 @@ def test_frames_without_orientations_go_on_while_all_streams_are_silent() -> Non
 
 
 def test_frames_begin_before_any_stream_does() -> None:
-    a = FrameAligner({"A": StreamSpec(10 * MS)}, 10 * MS, begin_ns=T0 - 99 * MS)
+    a = FrameAligner({"A": 10 * MS}, 10 * MS, begin_ns=T0 - 99 * MS)
     frames = play(a, stream("A", 10 * MS, 20, phase=2 * MS))
     assert [f.t_ns for f in frames] == list(range(T0 - 90 * MS, frames[-1].t_ns + 1, 10 * MS))
     early = [f for f in frames if f.t_ns <= T0]
@@ -328,16 +327,6 @@ def test_a_stream_stamped_seconds_late_does_not_hold_up_the_others() -> None:
     assert max(f.completed_ns - f.t_ns for f in lively[60:]) < 300 * MS
 
 
-def test_an_inactive_aligner_counts_samples_as_idle() -> None:
-    a = aligner(A=10 * MS)
-    play(a, stream("A", 10 * MS, 10))
-    a.active = False
-    assert assert_accounted(a, "A")["pending"] == 0
-    assert a.push("A", T0 + 100 * MS, T0 + 100 * MS, IDENTITY) is SampleOutcome.IDLE
-    assert a.advance(T0 + 200 * MS) == []
-    assert a.next_deadline_ns is None
-
-
 def test_unfetched_samples_are_dropped_eventually() -> None:
     a = aligner(A=10 * MS)
     for k in range(5_000):
@@ -367,7 +356,7 @@ actions = st.one_of(
     samples,
     samples,
     samples,
-    st.sampled_from(["on", "off", "lose", "reset", "close"]),
+    st.sampled_from(["lose", "reset", "close"]),
 )
 
 
@@ -381,13 +370,10 @@ def test_frames_are_ordered_and_samples_accounted_for_any_input(
     frames: list[AlignedFrame] = []
     for action in script:
         if isinstance(action, str):
-            change = {"lose": a.lose, "reset": a.reset}.get(action)
-            if change is not None:
-                change("A")
-            elif action == "close":
+            if action == "close":
                 a.close()
             else:
-                a.active = action == "on"
+                {"lose": a.lose, "reset": a.reset}[action]("A")
         else:
             name, step, wait, epoch = action
             now += wait
