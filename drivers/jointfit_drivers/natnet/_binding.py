@@ -108,7 +108,9 @@ def bind_model(
     shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, BodyDescription)
     all_bodies, all_markers = _body_entries(model), _marker_entries(model)
     bodies_found = [e for e in all_bodies if e.owner or e.key not in shared_bodies]
-    markers_found = [e for e in all_markers if _model_of(e.key) not in shared]
+    markers_found = [
+        e for e in all_markers if not isinstance(e.key, int) or e.key >> _MEMBER_BITS not in shared
+    ]
 
     marker_columns = _columns("marker", markers_found, markers)
     body_columns = _columns("rigid body", bodies_found, bodies)
@@ -156,51 +158,40 @@ def _marker_entries(model: ModelDefinition) -> list[ModelEntry]:
     sets = {m.name: m.markers for m in model.descriptions if isinstance(m, MarkerSetDescription)}
     found: list[ModelEntry] = []
 
-    owners = {_EVERY}
     for item in model.descriptions:
         if isinstance(item, BodyDescription):
-            owners.add(item.name)
-            names = _member_names(item, sets.get(item.name, ()))
+            named = (item.markers, sets.get(item.name, ()))
+            names = [
+                next((n[i] for n in named if i < len(n) and n[i]), f"Marker{i + 1}")
+                for i in range(max(len(item.positions), len(named[1])))
+            ]
             found += _members(item.id, item.name, names)
         elif isinstance(item, SkeletonDescription):
-            owners.add(item.name)
             found += _members(item.id, item.name, sets.get(item.name, ()))
         elif isinstance(item, AssetDescription):
-            owners.add(item.name)
             found += [
                 ModelEntry(body_key(item.id, m.id), item.name, m.name, number)
                 for number, m in enumerate(item.markers, 1)
             ]
 
-    for name in sets.keys() - owners:
-        found += [ModelEntry((name, i), name, text, i + 1) for i, text in enumerate(sets[name])]
+    owners = {_EVERY, *(item.name for item in model.descriptions if isinstance(item, _MODELS))}
+    for name, texts in sets.items():
+        if name not in owners:
+            found += [ModelEntry((name, i), name, text, i + 1) for i, text in enumerate(texts)]
     return found
-
-
-def _member_names(body: BodyDescription, of_set: tuple[str, ...]) -> list[str]:
-    count = max(len(body.positions), len(of_set))
-    named = (body.markers, of_set)
-    return [
-        next((names[i] for names in named if i < len(names) and names[i]), f"Marker{i + 1}")
-        for i in range(count)
-    ]
 
 
 def _members(model: int, owner: str, names: Iterable[str]) -> list[ModelEntry]:
     return [ModelEntry(body_key(model, i), owner, name, i) for i, name in enumerate(names, 1)]
 
 
-def _shared_ids(model: ModelDefinition, kinds: type | UnionType) -> dict[Key | None, list[str]]:
+def _shared_ids(model: ModelDefinition, kinds: type | UnionType) -> dict[Key, list[str]]:
     """Return the ids that several models of these kinds have, and the names of the models."""
-    names: defaultdict[Key | None, list[str]] = defaultdict(list)
+    names: defaultdict[Key, list[str]] = defaultdict(list)
     for item in model.descriptions:
         if isinstance(item, kinds) and isinstance(item, _MODELS):
             names[item.id].append(item.name)
     return {number: found for number, found in names.items() if len(found) > 1}
-
-
-def _model_of(key: Key) -> int | None:
-    return key >> _MEMBER_BITS if isinstance(key, int) else None
 
 
 # --- names of the columns ---------------------------------------------------------------------
@@ -258,7 +249,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
 
 def _problem(name: str, fitting: list[ModelEntry], plain: Mapping[str, list[ModelEntry]]) -> str:
     if fitting:
-        choices = [repr(e.aliases[0]) if e.owner else repr(e.name) for e in fitting[:_MOST_NAMED]]
+        choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:_MOST_NAMED]]
         return f"is ambiguous: write {' or '.join(choices)}"
     hint = did_you_mean(name, islice(plain, _MOST_COMPARED))
     return "; ".join(filter(None, ("is not in the stream", hint)))

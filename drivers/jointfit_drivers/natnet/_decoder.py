@@ -10,7 +10,7 @@ Invariant: a function of the chunks fed; no clock, no socket.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
 from jointfit_drivers.natnet._binding import bind_model
@@ -36,8 +36,6 @@ from jointfit_protocols.natnet import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.natnet._binding import Binding
     from jointfit_drivers.natnet._settings import NatNetSettings
@@ -93,13 +91,6 @@ class NatNetDecoder:
         """Markers and bodies dropped because the model has no such id."""
         self.suspicious = 0
         """Poses, stamps and echoes rejected because their numbers are implausible."""
-        self._handlers: dict[type, Callable[[Chunk, Message], list[Decoded]]] = {
-            ServerInfo: self._server,
-            ModelDefinition: self._model,
-            EchoRequest: self._echo_request,
-            EchoResponse: self._echo,
-            CommandResponse: self._response,
-        }
 
     @property
     def tick_clock(self) -> TickClock | None:
@@ -136,38 +127,69 @@ class NatNetDecoder:
         before = self._bitstream.version
         message = self._bitstream.decode(chunk.data)
         if isinstance(message, CorruptBytes):
-            return self._unreadable(chunk, message)
+            if not self._bitstream.known and is_versioned(chunk.data):
+                self._messages += 1
+                self.unpublished += chunk.data.startswith(_FRAME)
+                return []
+            self._discarded += message.discarded
+            return [Corrupt(message.discarded, message.reason)]
 
         self._messages += 1
-        adopted = [] if self._bitstream.version == before else self._adopted()
-        if type(message) is FrameOfData:
-            return adopted + self._frame(chunk, message)
-        handler = self._handlers.get(type(message))
-        return adopted if handler is None else adopted + handler(chunk, message)
+        out: list[Decoded] = []
+        if self._bitstream.version != before:
+            name = "{}.{}".format(*self._bitstream.version)
+            out.append(DeviceEvent("setting", f"bitstream changed to {name}", {"bitstream": name}))
+
+        self._take(chunk, message, out)
+        return out
 
     def flush(self) -> list[Decoded]:
         """Return nothing: datagrams are complete."""
         return []
 
-    def _unreadable(self, chunk: Chunk, corrupt: CorruptBytes) -> list[Decoded]:
-        """Count a datagram as corrupt, unless the bitstream is not known yet."""
-        if not self._bitstream.known and is_versioned(chunk.data):
-            self._messages += 1
-            self.unpublished += chunk.data.startswith(_FRAME)
-            return []
-        self._discarded += corrupt.discarded
-        return [Corrupt(corrupt.discarded, corrupt.reason)]
+    def _take(self, chunk: Chunk, message: Message, out: list[Decoded]) -> None:
+        """Append the content of one message; those of other clients have none."""
+        match message:
+            case FrameOfData():
+                self._frame(chunk, message, out)
+            case ServerInfo() if message != self._info:
+                self._server(message, out)
+            case ModelDefinition():
+                self._model(message, out)
+            case EchoRequest(stamp):  # of a recorded client: the time at which it was sent
+                if len(self._asked) >= _PENDING_ECHOES:
+                    del self._asked[next(iter(self._asked))]
+                self._asked[stamp] = chunk.t_ns
+            case EchoResponse():
+                self._echo(chunk, message, out)
+            case CommandResponse():
+                version = bitstream_response(message.text)
+                if version is not None:
+                    self._bitstream.confirm(version)
 
-    # --- who and what -------------------------------------------------------------------------
+    # --- server and model ---------------------------------------------------------------------
 
-    def _server(self, _: Chunk, message: Message) -> list[Decoded]:
-        info, before = cast("ServerInfo", message), self._info
-        if info == before:
-            return []
-
+    def _server(self, info: ServerInfo, out: list[Decoded]) -> None:
+        """Append the description of a new or changed server."""
+        before = self._info
         # An implausible frequency would make every stamp of the frames wrong.
         self._info, self._hz = info, usable_hz(info)
-        out: list[Decoded] = [_server_event(info, self._hz)]
+
+        firmware = ".".join(map(str, info.application_version))
+        natnet = ".".join(map(str, info.natnet_version))
+        transport = "multicast" if info.multicast else "unicast"
+        data: dict[str, object] = {
+            "model": info.application,
+            "firmware": firmware,
+            "natnet": natnet,
+            "transport": transport,
+            "clock_hz": self._hz,
+            "data_port": info.data_port,
+            "group": info.group,
+        }
+        text = f"{info.application} {firmware}, NatNet {natnet}, {transport}"
+        out.append(DeviceEvent("info", text, data))
+
         if before is None or same_instance(info, before):
             self._bitstream.announce(info.bitstream)
         else:
@@ -180,93 +202,75 @@ class NatNetDecoder:
             name = "{}.{}".format(*info.bitstream)
             text = f"the server uses NatNet {name}, 3.0 or newer is required"
             out.append(DeviceEvent("error", text, {"bitstream": name}))
-        return out
 
-    def _adopted(self) -> list[Decoded]:
-        name = "{}.{}".format(*self._bitstream.version)
-        return [DeviceEvent("setting", f"bitstream changed to {name}", {"bitstream": name})]
-
-    def _response(self, _: Chunk, message: Message) -> list[Decoded]:
-        """Process the answer to ``Bitstream,x.y``; other answers are ignored."""
-        version = bitstream_response(cast("CommandResponse", message).text)
-        if version is not None:
-            self._bitstream.confirm(version)
-        return []
-
-    def _model(self, _: Chunk, message: Message) -> list[Decoded]:
-        model = cast("ModelDefinition", message)
+    def _model(self, model: ModelDefinition, out: list[Decoded]) -> None:
+        """Bind the columns to a model; append its changes and the warnings about it."""
         binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
-        before, self._binding = self._binding, binding
+        before = self._binding
         if before is not None and before.layout == binding.layout:
-            self._binding = binding = _share_layout(binding, before)
-        if before is not None and before.warnings == binding.warnings:
-            warnings: tuple[str, ...] = ()
-        else:
-            warnings = binding.warnings
+            binding = replace(binding, layout=before.layout)
+        self._binding = binding
+        self._named_unknown.clear()
 
-        out: list[Decoded] = []
-        if before is None or before.layout is not binding.layout:
-            out.append(_model_event(binding, self.unpublished))
+        layout = binding.layout
+        listed = list(layout.markers[:_MOST_LISTED])
+        if before is None or before.layout is not layout:
+            text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
+            bodies = list(layout.bodies[:_MOST_LISTED])
+            data = {"markers": listed, "bodies": bodies, "unpublished": self.unpublished}
+            out.append(DeviceEvent("info", text, data))
 
         if not model.complete:
-            out.append(
-                DeviceEvent("warning", "the model list ends at a description of unknown type")
-            )
-        unknown = {
-            "unknown": list(binding.unknown),
-            "known": list(binding.layout.markers[:_MOST_LISTED]),
-        }
-        self._named_unknown.clear()
-        return out + [DeviceEvent("warning", text, unknown) for text in warnings]
+            text = "the model list ends at a description of unknown type"
+            out.append(DeviceEvent("warning", text))
+
+        if before is None or before.warnings != binding.warnings:
+            unknown = {"unknown": list(binding.unknown), "known": listed}
+            out += [DeviceEvent("warning", text, unknown) for text in binding.warnings]
 
     # --- time ---------------------------------------------------------------------------------
 
-    def _echo_request(self, chunk: Chunk, message: Message) -> list[Decoded]:
-        """Store the sending time of a recorded client's request."""
-        if len(self._asked) >= _PENDING_ECHOES:
-            del self._asked[next(iter(self._asked))]
-        self._asked[cast("EchoRequest", message).stamp] = chunk.t_ns
-        return []
-
-    def _echo(self, chunk: Chunk, message: Message) -> list[Decoded]:
-        stamp, ticks = cast("EchoResponse", message)
-        sent_ns = self._asked.pop(stamp, stamp)
+    def _echo(self, chunk: Chunk, echo: EchoResponse, out: list[Decoded]) -> None:
+        """Append a plausible echo, for clocks that no PTP disciplines."""
+        sent_ns = self._asked.pop(echo.stamp, echo.stamp)
         if self._time.precise or not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
-            return []
-        if self._hz is not None and ticks > _MOST_SECONDS * self._hz:
+            return
+        if self._hz is not None and echo.ticks > _MOST_SECONDS * self._hz:
             self.suspicious += 1
-            return []
-        return [ClockEcho(sent_ns, chunk.t_ns, ticks)]
+        else:
+            out.append(ClockEcho(sent_ns, chunk.t_ns, echo.ticks))
 
     # --- frames -------------------------------------------------------------------------------
 
-    def _frame(self, chunk: Chunk, frame: FrameOfData) -> list[Decoded]:
+    def _frame(self, chunk: Chunk, frame: FrameOfData, out: list[Decoded]) -> None:
+        """Append the frame in the columns of the model, after the events that it causes."""
         step = self._continuity.frame(frame.number, frame.transmit, chunk.t_ns)
         if not step.use:
-            return []
-        out: list[Decoded] = []
+            return
 
         if step.restarted:
             out.append(DeviceEvent("restart", f"frame numbers restarted at {frame.number}"))
         elif step.lost:
             out.append(DeviceEvent("gap", f"{step.lost} frames lost", {"lost": step.lost}))
         if frame.params != self._announced:
-            out += self._announce(frame.params)
+            self._announce(frame.params, out)
 
         binding = self._binding
         if binding is None:
             self.unpublished += 1
-            return out
+            return
 
         self._time.report_timecode(frame, out)
         found = self._poses.columns(frame, binding)
-        if found.suspicious or found.unknown:
-            out += self._unknown_id_warning(found.suspicious, found.unknown)
+        self.suspicious += found.suspicious
+        if found.unknown:
+            self._warn_of_unknown(found.unknown, out)
+        ticks = self._exposure_ticks(frame, out)
         out.append(
             MocapFrame(
                 chunk.t_ns,
                 frame.number,
-                self._instant(frame, out),
+                ticks,
                 binding.layout,
                 found.markers,
                 found.body_positions,
@@ -274,83 +278,44 @@ class NatNetDecoder:
                 self._live,
             )
         )
-        return out
 
-    def _instant(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the exposure in ticks of the clock in use."""
+    def _exposure_ticks(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
+        """Return the exposure in ticks of the clock in use.
+
+        It is computed from the configured latency where the cameras do not stamp it.
+        """
+        hz = self._hz
         if self._time.precise:
             return self._time.unix_ns(frame, out)
-        if self._hz is not None and max(frame.exposure, frame.transmit) > _MOST_SECONDS * self._hz:
+        if hz is not None and max(frame.exposure, frame.transmit) > _MOST_SECONDS * hz:
             self.suspicious += 1
             return None
-        return frame.exposure or self._exposure(frame, out)
+        if frame.exposure or hz is None or not frame.transmit:
+            return frame.exposure or None
 
-    def _exposure(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the exposure from the configured latency, where the cameras do not stamp it."""
-        hz = self._hz
-        if hz is None or not frame.transmit:
-            return None
         if self._stamped:
             self._stamped = False
             text = f"no exposure stamps (USB cameras?): {self._latency_ms:g} ms before transmission"
             out.append(DeviceEvent("warning", text, {"latency_ms": self._latency_ms}))
         return max(0, frame.transmit - round(self._latency_ms * hz / 1000))
 
-    def _announce(self, params: int) -> list[Decoded]:
-        """Return events for newly set flags of the frame."""
+    def _announce(self, params: int, out: list[Decoded]) -> None:
+        """Append events for newly set flags of the frame."""
         risen, self._announced = params & ~self._announced, params
-        events: list[Decoded] = [
-            DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit
-        ]
+        out += [DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit]
 
         live = not params & FRAME_EDIT_MODE
         if live != self._live:
             self._live = live
             text = "live again" if live else "edit mode: the frames are a recording"
-            events.append(DeviceEvent("setting", text, {"live": live}))
-        return events
+            out.append(DeviceEvent("setting", text, {"live": live}))
 
-    def _unknown_id_warning(self, suspicious: int, unknown: tuple[int, ...]) -> list[Decoded]:
-        self.suspicious += suspicious
+    def _warn_of_unknown(self, unknown: tuple[int, ...], out: list[Decoded]) -> None:
+        """Append a warning that lists ids for the first time."""
         self.unknown_ids += len(unknown)
         new = [i for i in unknown if i not in self._named_unknown]
-        if not new or len(self._named_unknown) >= _NAMED_UNKNOWN:
-            return []
-
-        self._named_unknown.update(new)
-        names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
-        text = f"ids that are not in the model list are dropped: {names}"
-        return [DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]})]
-
-
-def _share_layout(binding: Binding, before: Binding) -> Binding:
-    """Return `binding` with the equal layout object of `before`."""
-    return replace(binding, layout=before.layout)
-
-
-def _server_event(info: ServerInfo, hz: int | None) -> DeviceEvent:
-    firmware = ".".join(map(str, info.application_version))
-    natnet = ".".join(map(str, info.natnet_version))
-    transport = "multicast" if info.multicast else "unicast"
-    text = f"{info.application} {firmware}, NatNet {natnet}, {transport}"
-    data = {
-        "model": info.application,
-        "firmware": firmware,
-        "natnet": natnet,
-        "transport": transport,
-        "clock_hz": hz,
-        "data_port": info.data_port,
-        "group": info.group,
-    }
-    return DeviceEvent("info", text, data)
-
-
-def _model_event(binding: Binding, unpublished: int) -> DeviceEvent:
-    layout = binding.layout
-    text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
-    data = {
-        "markers": list(layout.markers[:_MOST_LISTED]),
-        "bodies": list(layout.bodies[:_MOST_LISTED]),
-        "unpublished": unpublished,
-    }
-    return DeviceEvent("info", text, data)
+        if new and len(self._named_unknown) < _NAMED_UNKNOWN:
+            self._named_unknown.update(new)
+            names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
+            text = f"ids that are not in the model list are dropped: {names}"
+            out.append(DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]}))

@@ -46,27 +46,20 @@ class NatNetMocap:
             The host is no NatNet server, its bitstream is not supported, or the network card is
             unknown.
         """
-        host = await self._resolve()
-        await NatNetSession(self._settings, host, self._local(host), emit).run()
-
-    async def _resolve(self) -> str:
-        """Return the numeric address of the server."""
-        name = self._settings.server
+        name, interface = self._settings.server, self._settings.interface
         loop = asyncio.get_running_loop()
         try:
             found = await loop.getaddrinfo(name, None, family=socket.AF_INET)
         except (OSError, UnicodeError) as error:
             raise DeviceLostError(f"NatNet server {name}: no such host: {error}") from error
-        return str(found[0][4][0])
+        host = str(found[0][4][0])
 
-    def _local(self, host: str) -> str:
-        """Return the address of the network card to use."""
-        interface = self._settings.interface
         try:
-            return local_address(host, interface)
+            local = local_address(host, interface)
         except OSError as error:
             if interface is None:
                 raise DeviceLostError(f"NatNet server {host}: {error.strerror or error}") from error
             raise DeviceMisconfiguredError(
                 f"mocap.interface = {interface!r}: no network card with this name or IPv4 address"
             ) from error
+        await NatNetSession(self._settings, host, local, emit).run()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError
@@ -21,10 +22,8 @@ from jointfit_protocols.natnet import NatNetMessageId, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
     from typing import Self
 
-    from jointfit_drivers.ports.udp_socket import Datagram
     from jointfit_protocols.natnet import Message
 
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
@@ -63,12 +62,7 @@ class NatNetLink:
         self._command = self._open(UdpSocket(self._local, 0, sender=self._server[0]))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for opened in self._sockets:
             self._loop.remove_reader(opened)
             opened.close()
@@ -98,11 +92,9 @@ class NatNetLink:
     async def pause(self, seconds: float) -> None:
         """Wait for a message, at most `seconds`; raise errors of the callbacks."""
         if seconds > 0:
-            try:
+            with suppress(TimeoutError):
                 async with asyncio.timeout(seconds):
                     await self._arrived.wait()
-            except TimeoutError:
-                pass
 
         self._arrived.clear()
         if self._failure is not None:
@@ -130,16 +122,13 @@ class NatNetLink:
             raise self._lost(error) from error
 
         for arrival in arrivals:
-            frame = arrival.data.startswith(_FRAME)
-            if arrival.host != self._server[0] or not (frame or self._commands(source, arrival)):
+            is_command = source is self._command and arrival.port == self._server[1]
+            is_accepted = is_command or arrival.data.startswith(_FRAME)
+            if arrival.host != self._server[0] or not is_accepted:
                 self.foreign += 1
                 continue
             self._received_ns = arrival.t_ns
             self._take(Chunk(arrival.t_ns, arrival.data))
-
-    def _commands(self, source: UdpSocket, arrival: Datagram) -> bool:
-        """Return whether a datagram may carry a control message."""
-        return source is self._command and arrival.port == self._server[1]
 
     def _forged(self, error: OSError) -> bool:
         """Return whether an ICMP refusal contradicts datagrams that have just arrived."""

@@ -70,7 +70,13 @@ class OpenRequests:
         """
         kind = int.from_bytes(datagram[:2], "little") if len(datagram) >= HEADER.size else None
         if kind == NatNetMessageId.ECHORESPONSE:
-            accepted = self._accept_echo(datagram, now_ns)
+            # Each stamp is accepted once: a duplicate with other ticks would distort the clock.
+            echo = decode(datagram, (0, 0))
+            accepted = True  # malformed: counted as corrupt by the decoder
+            if isinstance(echo, EchoResponse):
+                known = echo.stamp in self._echoes
+                self._echoes.pop(echo.stamp, None)
+                accepted = known and 0 <= now_ns - echo.stamp <= ECHO_NS
         elif kind in _REQUEST_OF_ANSWER:
             asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[NatNetMessageId(kind)], None)
             accepted = asked_ns is not None and now_ns - asked_ns <= ANSWER_NS
@@ -79,12 +85,3 @@ class OpenRequests:
 
         self.unsolicited += not accepted
         return accepted
-
-    def _accept_echo(self, datagram: bytes, now_ns: int) -> bool:
-        """Accept each stamp once: a duplicate with other ticks would distort the clock."""
-        echo = decode(datagram, (0, 0))
-        if not isinstance(echo, EchoResponse):
-            return True  # malformed: counted as corrupt by the decoder
-        known = echo.stamp in self._echoes
-        self._echoes.pop(echo.stamp, None)
-        return known and 0 <= now_ns - echo.stamp <= ECHO_NS

@@ -16,13 +16,13 @@ from jointfit_drivers.natnet._binding import body_key
 from jointfit_protocols.natnet import BODY_TRACKED, MARKER_OCCLUDED, MARKER_POINT_CLOUD_SOLVED
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
     from jointfit_daemon.model import Quaternion, Vector
     from jointfit_drivers.natnet._binding import Binding, Key
-    from jointfit_protocols.natnet import Body, FrameOfData, LabeledMarker
+    from jointfit_protocols.natnet import FrameOfData, LabeledMarker
 
 _HALF = math.sqrt(0.5)
 _NO_POSITION: Vector = (math.nan, math.nan, math.nan)
@@ -79,11 +79,18 @@ class PoseConverter:
     def _markers(
         self, frame: FrameOfData, binding: Binding, unknown: list[int]
     ) -> dict[Key, Vector]:
+        place = self._place
         seen = self._labeled(frame.markers, binding.known, unknown)
-        if frame.assets:
-            self._asset_markers(frame, seen)
-        if binding.loose_sets:
-            self._set_markers(frame, binding.loose_sets, seen)
+        for asset in frame.assets:
+            for number, x, y, z, _, params, _ in asset.markers:
+                if params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
+                    seen.setdefault(body_key(asset.id, number), place(x, y, z))
+
+        for marker_set in frame.marker_sets:
+            if marker_set.name in binding.loose_sets:
+                for i, (x, y, z) in enumerate(marker_set.positions):
+                    if (x or y or z) and _near(x, y, z):
+                        seen[marker_set.name, i] = place(x, y, z)
         return seen
 
     def _labeled(
@@ -105,57 +112,35 @@ class PoseConverter:
             del seen[number]
         return seen
 
-    def _asset_markers(self, frame: FrameOfData, seen: dict[Key, Vector]) -> None:
-        for asset in frame.assets:
-            for marker in asset.markers:
-                if _usable(marker):
-                    key = body_key(asset.id, marker.id)
-                    seen.setdefault(key, self._place(marker.x, marker.y, marker.z))
-
-    def _set_markers(
-        self, frame: FrameOfData, loose: frozenset[str], seen: dict[Key, Vector]
-    ) -> None:
-        for marker_set in frame.marker_sets:
-            if marker_set.name in loose:
-                for i, (x, y, z) in enumerate(marker_set.positions):
-                    if (x or y or z) and _near(x, y, z):
-                        seen[marker_set.name, i] = self._place(x, y, z)
-
     def _bodies(
         self, frame: FrameOfData, binding: Binding, unknown: list[int]
     ) -> tuple[dict[Key, tuple[Vector, Quaternion]], int]:
         seen: dict[Key, tuple[Vector, Quaternion]] = {}
         met: set[int] = set()
         suspicious = 0
-        for key, body in _all_bodies(frame):
+        found = [(body.id, body) for body in frame.bodies]
+        for skeleton in frame.skeletons:
+            found += [(body_key(skeleton.id, bone.id), bone) for bone in skeleton.bones]
+        for asset in frame.assets:
+            found += [(body_key(asset.id, body.id), body) for body in asset.bodies]
+
+        for key, (_, x, y, z, qx, qy, qz, qw, _, params) in found:
             if key not in binding.known:
                 unknown.append(key)
             elif key in met:
                 seen.pop(key, None)  # two bodies with one id cannot be distinguished
-            elif body.params & BODY_TRACKED:
-                pose = self._pose(body)
-                if pose is None:
-                    suspicious += 1
+            elif params & BODY_TRACKED:
+                norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+                if abs(norm - 1.0) <= _NORM_TOLERANCE and _near(x, y, z):
+                    turned = self._turn(qw / norm, qx / norm, qy / norm, qz / norm)
+                    seen[key] = (self._place(x, y, z), turned)
                 else:
-                    seen[key] = pose
+                    suspicious += 1
             met.add(key)
         return seen, suspicious
 
-    def _pose(self, body: Body) -> tuple[Vector, Quaternion] | None:
-        _, x, y, z, qx, qy, qz, qw, _, _ = body
-        norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-        if not (abs(norm - 1.0) <= _NORM_TOLERANCE and _near(x, y, z)):
-            return None
-        turned = self._turn(qw / norm, qx / norm, qy / norm, qz / norm)
-        return self._place(x, y, z), turned
-
 
 _ABSENT = (_NO_POSITION, _NO_ORIENTATION)
-
-
-def _usable(marker: LabeledMarker) -> bool:
-    solved = marker.params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED
-    return solved and _near(marker.x, marker.y, marker.z)
 
 
 def _near(x: float, y: float, z: float) -> bool:
@@ -163,44 +148,8 @@ def _near(x: float, y: float, z: float) -> bool:
     return abs(x) <= _FARTHEST_M and abs(y) <= _FARTHEST_M and abs(z) <= _FARTHEST_M
 
 
-def _all_bodies(frame: FrameOfData) -> Iterable[tuple[int, Body]]:
-    found = [(body.id, body) for body in frame.bodies]
-    for skeleton in frame.skeletons:
-        found += [(body_key(skeleton.id, bone.id), bone) for bone in skeleton.bones]
-    for asset in frame.assets:
-        found += [(body_key(asset.id, body.id), body) for body in asset.bodies]
-    return found
-
-
 def _array(rows: list[Vector] | list[Quaternion], width: int) -> NDArray[np.float64]:
     return np.array(rows, dtype=np.float64).reshape(len(rows), width)
-
-
-# --- worlds -----------------------------------------------------------------------------------
-
-
-def _place_x(x: float, y: float, z: float) -> Vector:
-    return -z, y, x
-
-
-def _place_y(x: float, y: float, z: float) -> Vector:
-    return x, -z, y
-
-
-def _place_z(x: float, y: float, z: float) -> Vector:
-    return x, y, z
-
-
-def _turn_x(w: float, x: float, y: float, z: float) -> Quaternion:
-    return _HALF * (w + y), _HALF * (x - z), _HALF * (y - w), _HALF * (z + x)
-
-
-def _turn_y(w: float, x: float, y: float, z: float) -> Quaternion:
-    return _HALF * (w - x), _HALF * (x + w), _HALF * (y - z), _HALF * (z + y)
-
-
-def _turn_z(w: float, x: float, y: float, z: float) -> Quaternion:
-    return w, x, y, z
 
 
 _WORLDS: dict[
@@ -208,7 +157,17 @@ _WORLDS: dict[
     tuple[
         Callable[[float, float, float], Vector], Callable[[float, float, float, float], Quaternion]
     ],
-] = {"x": (_place_x, _turn_x), "y": (_place_y, _turn_y), "z": (_place_z, _turn_z)}
+] = {
+    "x": (
+        lambda x, y, z: (-z, y, x),
+        lambda w, x, y, z: (_HALF * (w + y), _HALF * (x - z), _HALF * (y - w), _HALF * (z + x)),
+    ),
+    "y": (
+        lambda x, y, z: (x, -z, y),
+        lambda w, x, y, z: (_HALF * (w - x), _HALF * (x + w), _HALF * (y - z), _HALF * (z + y)),
+    ),
+    "z": (lambda x, y, z: (x, y, z), lambda w, x, y, z: (w, x, y, z)),
+}
 """Rotation of the world that makes z up, for each up axis: -90 deg about y for x, +90 deg about x
 for y; applied to positions, and from the left to quaternions.
 """

@@ -104,14 +104,6 @@ def check_group(name: str, info: ServerInfo, port: int) -> None:
         )
 
 
-def not_natnet_text(name: str) -> str:
-    """Return the message for a port where a program other than a NatNet server answers."""
-    return (
-        f"{name}: the program that answers is not a NatNet server: check server and command_port"
-        " (Motive: Streaming pane, command port, 1510 unless changed)"
-    )
-
-
 def same_instance(a: ServerInfo, b: ServerInfo) -> bool:
     """Return whether two answers are from the same server, its bitstream aside."""
     return a._replace(natnet_version=b.natnet_version) == b

@@ -31,7 +31,6 @@ from jointfit_drivers.natnet._server_checks import (
     check_server,
     connect_request,
     is_unicast,
-    not_natnet_text,
     same_instance,
 )
 from jointfit_protocols.corrupt import CorruptBytes
@@ -119,14 +118,26 @@ class NatNetSession:
             try:
                 if not unicast:
                     self._join(info)
-                await self._choose_bitstream()
-                await self._first_echoes()
-                await self._request_model()
+
+                # The server's own bitstream is used if it refuses another one.
+                if self._settings.wanted_version is not None:
+                    asked = CommandRequest(f"Bitstream,{self._settings.bitstream}")
+                    await self._request(asked, RETRY_S, lambda: self._confirmed)
+
+                for _ in range(FIRST_ECHOES):
+                    next_at = time.monotonic() + FIRST_ECHO_S
+                    self._send(EchoRequest(time.monotonic_ns()))
+                    while (left := next_at - time.monotonic()) > 0:
+                        await link.pause(left)
+
+                model = Bare(NatNetMessageId.REQUEST_MODELDEF)
+                await self._request(model, MODEL_S, lambda: self._known is not None)
+                if self._known is None:
+                    raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
                 await self._stream(info, unicast)
             finally:
-                with contextlib.suppress(
-                    DeviceLostError
-                ):  # keep the exception that ended the connection
+                # Keep the exception that ended the connection.
+                with contextlib.suppress(DeviceLostError):
                     link.send(Bare(NatNetMessageId.DISCONNECT))
 
     # --- received messages --------------------------------------------------------------------
@@ -152,14 +163,12 @@ class NatNetSession:
         if isinstance(frame, FrameOfData):
             self._misfits, self._frame_ns = 0, chunk.t_ns
             self._next_check_ns = chunk.t_ns + int(EVERY_S * 1e9)
-            self._check_ids(frame)
+            known = self._known
+            if known is not None and any(body.id not in known for body in frame.bodies):
+                self._model_wanted = True
         else:
             self._misfits += 1
             self._info_wanted |= self._misfits >= MISFITS
-
-    def _check_ids(self, frame: FrameOfData) -> None:
-        if self._known is not None and any(body.id not in self._known for body in frame.bodies):
-            self._model_wanted = True
 
     def _message(self, chunk: Chunk) -> None:
         match self._bitstream.decode(chunk.data):
@@ -210,7 +219,10 @@ class NatNetSession:
         if self._info is not None:
             return self._info
         if self._foreign_answers:
-            raise DeviceMisconfiguredError(not_natnet_text(self._name))
+            raise DeviceMisconfiguredError(
+                f"{self._name}: the program that answers is not a NatNet server: check server and "
+                "command_port (Motive: Streaming pane, command port, 1510 unless changed)"
+            )
         raise DeviceLostError(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
 
     def _join(self, info: ServerInfo) -> None:
@@ -222,29 +234,6 @@ class NatNetSession:
             text = f"cannot join {info.group}:{port}: {error.strerror or error}"
             raise DeviceLostError(f"{self._name}: {text}") from error
 
-    async def _choose_bitstream(self) -> None:
-        """Request another bitstream than the server's own; continue without it if refused."""
-        wanted = self._settings.wanted_version
-        if wanted is not None:
-            asked = CommandRequest(f"Bitstream,{self._settings.bitstream}")
-            await self._request(asked, RETRY_S, lambda: self._confirmed)
-
-    async def _first_echoes(self) -> None:
-        for _ in range(FIRST_ECHOES):
-            next_at = time.monotonic() + FIRST_ECHO_S
-            self._request_echo()
-            while (left := next_at - time.monotonic()) > 0:
-                await self._link.pause(left)
-
-    def _request_echo(self) -> None:
-        self._send(EchoRequest(time.monotonic_ns()))
-
-    async def _request_model(self) -> None:
-        asked = Bare(NatNetMessageId.REQUEST_MODELDEF)
-        await self._request(asked, MODEL_S, lambda: self._known is not None)
-        if self._known is None:
-            raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
-
     async def _stream(self, info: ServerInfo, unicast: bool) -> None:
         began_ns = time.monotonic_ns()
         echo_at = alive_at = ask_at = 0.0
@@ -253,7 +242,7 @@ class NatNetSession:
             self._check_alive(info, unicast, max(self._frame_ns, began_ns))
 
             if now >= echo_at:
-                self._request_echo()
+                self._send(EchoRequest(time.monotonic_ns()))
                 echo_at = now + random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
 
             if unicast and now >= alive_at:
@@ -262,17 +251,13 @@ class NatNetSession:
 
             if now >= ask_at and (self._model_wanted or self._info_wanted):
                 ask_at = now + EVERY_S
-                self._request_again()
+                if self._info_wanted:
+                    self._send(connect_request(self._settings))
+                if self._model_wanted:
+                    self._send(Bare(NatNetMessageId.REQUEST_MODELDEF))
 
             due = [echo_at, now + self._settings.silence_s / 4]
             await self._link.pause(min(due + [alive_at] * unicast) - now)
-
-    def _request_again(self) -> None:
-        """Request data that a frame has announced or made doubtful, until answered."""
-        if self._info_wanted:
-            self._send(connect_request(self._settings))
-        if self._model_wanted:
-            self._send(Bare(NatNetMessageId.REQUEST_MODELDEF))
 
     def _check_alive(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
         """Raise DeviceLostError without decodable frames, or if another server answers."""
