@@ -166,7 +166,6 @@ class GatewayOrientation:
         steps = max(1, round(passed_ns / self.period_ns))
 
         followed = steps <= 1 + MOST_MISSING
-
         if followed:
             self._passed_ns += passed_ns
             self._steps += steps
@@ -177,7 +176,10 @@ class GatewayOrientation:
             first = (self._update(last),)
 
         if not followed:
-            self._restart(reading.t_ns)
+            # A new inclination, and the same gyroscope bias.
+            bias, sd = self._filter.getBiasEstimate()
+            self._start(self._period_ns, reading.t_ns)
+            self._filter.setBiasEstimate(bias, sd)
             return self._step((self._update(reading, follows=False),), reading, steps - 1, True)
 
         for k in range(1, steps):
@@ -206,12 +208,6 @@ class GatewayOrientation:
         self._started_ns = t_ns if self._settle_ns else None
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
 
-    def _restart(self, t_ns: int) -> None:
-        """Restart with a new inclination and the same gyroscope bias."""
-        bias, sd = self._filter.getBiasEstimate()
-        self._start(self._period_ns, t_ns)
-        self._filter.setBiasEstimate(bias, sd)
-
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
         """Update with one reading; after a gap, continue with the same heading."""
         # w_fed = w T_mean / T_s: every step turns by the true angle
@@ -230,17 +226,14 @@ class GatewayOrientation:
         w, i, j, k = (vqf.getQuat9D() if self._magnetic else vqf.getQuat6D()).tolist()
         if not follows and not self._magnetic:
             self._turn = _heading_between((w, i, j, k), self._q)
+        # The rotation about the vertical: (c, 0, 0, s) ⊗ q.
         c, s = self._turn[0], self._turn[3]
-        self._q = (w, i, j, k) if s == 0.0 else _turned(c, s, (w, i, j, k))
+        self._q = (w, i, j, k)
+        if s != 0.0:
+            self._q = (c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)
 
         bx, by, bz = vqf.getBiasEstimate()[0].tolist()
         return FilterOutput(self._q, (x - bx, y - by, z - bz))
-
-
-def _turned(c: float, s: float, q: Quaternion) -> Quaternion:
-    """Return (c, 0, 0, s) ⊗ q: a rotation about the vertical."""
-    w, x, y, z = q
-    return (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
 
 
 def _heading_between(q_from: Quaternion, q_to: Quaternion) -> Quaternion:
@@ -255,11 +248,8 @@ def _interpolate(before: RawReading, after: RawReading, share: float) -> RawRead
     """Return the linear interpolation at `share` of the interval."""
 
     def mix(a: Vector, b: Vector) -> Vector:
-        return (
-            a[0] + share * (b[0] - a[0]),
-            a[1] + share * (b[1] - a[1]),
-            a[2] + share * (b[2] - a[2]),
-        )
+        x, y, z = (p + share * (q - p) for p, q in zip(a, b, strict=True))
+        return x, y, z
 
     field = None
     if before.magnetic is not None and after.magnetic is not None:

@@ -128,7 +128,7 @@ async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanW
             task.cancel()
     for each, base in zip(heard, bases.values(), strict=True):
         assert [sample.counter for sample in each.samples] == list(range(base, base + 50))
-        assert each.decoder.foreign == each.decoder.incomplete == each.decoder.discarded_bytes == 0
+        assert each.decoder._xcdi.foreign == each.decoder._xcdi.incomplete == each.decoder.discarded_bytes == 0
         assert not [
             event for event in each.events if isinstance(event, DeviceEvent) and event.kind == "gap"
         ]
@@ -145,7 +145,7 @@ async def test_the_kernel_passes_only_what_the_devices_want(wire: PythonCanWire)
         identity(device, 20, first=1)
         await heard.wait_for(21)
         assert bus.foreign == 0
-        assert heard.decoder.foreign == 0
+        assert heard.decoder._xcdi.foreign == 0
 
 
 async def test_29_bit_identifiers_are_not_taken_for_11_bit_ones(wire: PythonCanWire) -> None:

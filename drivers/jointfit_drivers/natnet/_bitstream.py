@@ -12,12 +12,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet import decode, is_versioned, supported
+from jointfit_protocols.natnet import NatNetMessageId, decode, is_versioned, supported
 
 if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message, Version
 
 UNKNOWN: Version = (0, 0)
+FRAME_START = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
+"""First bytes of a datagram with a frame, in every bitstream."""
 
 
 class BitstreamTracker:

@@ -57,29 +57,26 @@ class NatNetContinuity:
         arrival_ns : int
             Host time of its arrival, ns.
         """
-        step = self._classify(number, ticks, arrival_ns)
-        if step.use:
-            self._arrival_ns = arrival_ns
-            self._number, self._ticks, self._late_run = number, ticks, 0
+        step = _NEXT
+        if self._number is not None:
+            ahead = number - self._number
+            if ahead == 0:
+                self.duplicates += 1
+                return _DROP
+
+            if ahead > 0:
+                elapsed_ns = max(0, arrival_ns - self._arrival_ns)
+                if ticks < self._ticks or ahead > _BURST + elapsed_ns * _FASTEST_HZ // 10**9:
+                    step = _RESTART
+                elif ahead > 1:
+                    step = NatNetStep(lost=ahead - 1)
+            else:
+                self._late_run += 1
+                if ahead > -_REORDERED and self._late_run < _LATE_RUN:
+                    self.late += 1
+                    return _DROP
+                step = _RESTART
+
+        self._arrival_ns = arrival_ns
+        self._number, self._ticks, self._late_run = number, ticks, 0
         return step
-
-    def _classify(self, number: int, ticks: int, arrival_ns: int) -> NatNetStep:
-        if self._number is None:
-            return _NEXT
-
-        ahead = number - self._number
-        if ahead > 0:
-            elapsed_ns = max(0, arrival_ns - self._arrival_ns)
-            if ticks < self._ticks or ahead > _BURST + elapsed_ns * _FASTEST_HZ // 10**9:
-                return _RESTART
-            return _NEXT if ahead == 1 else NatNetStep(lost=ahead - 1)
-
-        if ahead == 0:
-            self.duplicates += 1
-            return _DROP
-
-        self._late_run += 1
-        if ahead <= -_REORDERED or self._late_run >= _LATE_RUN:
-            return _RESTART
-        self.late += 1
-        return _DROP

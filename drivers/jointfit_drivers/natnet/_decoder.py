@@ -14,32 +14,18 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
 from jointfit_drivers.natnet._binding import bind_model
-from jointfit_drivers.natnet._bitstream import BitstreamTracker
+from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
 from jointfit_drivers.natnet._continuity import NatNetContinuity
 from jointfit_drivers.natnet._frame_time import FrameTime
 from jointfit_drivers.natnet._poses import PoseConverter
 from jointfit_drivers.natnet._server_checks import bitstream_response, same_instance, usable_hz
+from jointfit_protocols import natnet
 from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet import (
-    FRAME_BITSTREAM_CHANGED,
-    FRAME_EDIT_MODE,
-    FRAME_MODEL_CHANGED,
-    CommandResponse,
-    EchoRequest,
-    EchoResponse,
-    FrameOfData,
-    ModelDefinition,
-    NatNetMessageId,
-    ServerInfo,
-    is_versioned,
-    supported,
-)
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.natnet._binding import Binding
     from jointfit_drivers.natnet._settings import NatNetSettings
-    from jointfit_protocols.natnet import Message
 
 _ECHO_LIMIT_NS = 10**9
 """Age of an echo answer, ns, after which it is useless for the clock."""
@@ -50,10 +36,9 @@ _MOST_SECONDS = 2**63 // 10**9
 """Largest plausible stamp, s: its nanoseconds still fit 64 bits."""
 _MOST_LISTED = 200
 """Names of markers or bodies that an event lists; the count in its text is exact."""
-_FRAME = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 _ANNOUNCED = {
-    FRAME_MODEL_CHANGED: "the model list changed",
-    FRAME_BITSTREAM_CHANGED: "the bitstream version changed",
+    natnet.FRAME_MODEL_CHANGED: "the model list changed",
+    natnet.FRAME_BITSTREAM_CHANGED: "the bitstream version changed",
 }
 
 
@@ -77,14 +62,17 @@ class NatNetDecoder:
         self._wanted_bodies = bodies | ({settings.plate: "plate"} if settings.plate else {})
         self._poses = PoseConverter(settings.up_axis)
         self._continuity = NatNetContinuity()
-        self._info: ServerInfo | None = None
+        self._info: natnet.ServerInfo | None = None
         self._hz: int | None = None
         self._binding: Binding | None = None
         self._asked: dict[int, int] = {}
         self._announced = 0
         self._live = self._stamped = True
         self._named_unknown: set[int] = set()
-        self._messages = self._discarded = 0
+        self.messages = 0
+        """Well-formed messages of any kind so far."""
+        self.discarded_bytes = 0
+        """Bytes of datagrams that contained no message."""
         self.unpublished = 0
         """Frames that arrived before the model or the server's version was known."""
         self.unknown_ids = 0
@@ -103,16 +91,6 @@ class NatNetDecoder:
         return TickClock(0, None, self._hz) if self._hz else None
 
     @property
-    def messages(self) -> int:
-        """Well-formed messages of any kind so far."""
-        return self._messages
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes of datagrams that contained no message."""
-        return self._discarded
-
-    @property
     def duplicates(self) -> int:
         """Frames dropped because their number was that of the last one."""
         return self._continuity.duplicates
@@ -127,14 +105,14 @@ class NatNetDecoder:
         before = self._bitstream.version
         message = self._bitstream.decode(chunk.data)
         if isinstance(message, CorruptBytes):
-            if not self._bitstream.known and is_versioned(chunk.data):
-                self._messages += 1
-                self.unpublished += chunk.data.startswith(_FRAME)
+            if not self._bitstream.known and natnet.is_versioned(chunk.data):
+                self.messages += 1
+                self.unpublished += chunk.data.startswith(FRAME_START)
                 return []
-            self._discarded += message.discarded
+            self.discarded_bytes += message.discarded
             return [Corrupt(message.discarded, message.reason)]
 
-        self._messages += 1
+        self.messages += 1
         out: list[Decoded] = []
         if self._bitstream.version != before:
             name = "{}.{}".format(*self._bitstream.version)
@@ -147,47 +125,47 @@ class NatNetDecoder:
         """Return nothing: datagrams are complete."""
         return []
 
-    def _take(self, chunk: Chunk, message: Message, out: list[Decoded]) -> None:
+    def _take(self, chunk: Chunk, message: natnet.Message, out: list[Decoded]) -> None:
         """Append the content of one message; those of other clients have none."""
         match message:
-            case FrameOfData():
+            case natnet.FrameOfData():
                 self._frame(chunk, message, out)
-            case ServerInfo() if message != self._info:
+            case natnet.ServerInfo() if message != self._info:
                 self._server(message, out)
-            case ModelDefinition():
+            case natnet.ModelDefinition():
                 self._model(message, out)
-            case EchoRequest(stamp):  # of a recorded client: the time at which it was sent
+            case natnet.EchoRequest(stamp):  # of a recorded client: the time at which it was sent
                 if len(self._asked) >= _PENDING_ECHOES:
                     del self._asked[next(iter(self._asked))]
                 self._asked[stamp] = chunk.t_ns
-            case EchoResponse():
+            case natnet.EchoResponse():
                 self._echo(chunk, message, out)
-            case CommandResponse():
+            case natnet.CommandResponse():
                 version = bitstream_response(message.text)
                 if version is not None:
                     self._bitstream.confirm(version)
 
     # --- server and model ---------------------------------------------------------------------
 
-    def _server(self, info: ServerInfo, out: list[Decoded]) -> None:
+    def _server(self, info: natnet.ServerInfo, out: list[Decoded]) -> None:
         """Append the description of a new or changed server."""
         before = self._info
         # An implausible frequency would make every stamp of the frames wrong.
         self._info, self._hz = info, usable_hz(info)
 
         firmware = ".".join(map(str, info.application_version))
-        natnet = ".".join(map(str, info.natnet_version))
+        version = ".".join(map(str, info.natnet_version))
         transport = "multicast" if info.multicast else "unicast"
         data: dict[str, object] = {
             "model": info.application,
             "firmware": firmware,
-            "natnet": natnet,
+            "natnet": version,
             "transport": transport,
             "clock_hz": self._hz,
             "data_port": info.data_port,
             "group": info.group,
         }
-        text = f"{info.application} {firmware}, NatNet {natnet}, {transport}"
+        text = f"{info.application} {firmware}, NatNet {version}, {transport}"
         out.append(DeviceEvent("info", text, data))
 
         if before is None or same_instance(info, before):
@@ -198,12 +176,12 @@ class NatNetDecoder:
             self._continuity.forget()
             out.append(DeviceEvent("restart", f"another server answers: {info.application}"))
 
-        if not supported(info.bitstream):
+        if not natnet.supported(info.bitstream):
             name = "{}.{}".format(*info.bitstream)
             text = f"the server uses NatNet {name}, 3.0 or newer is required"
             out.append(DeviceEvent("error", text, {"bitstream": name}))
 
-    def _model(self, model: ModelDefinition, out: list[Decoded]) -> None:
+    def _model(self, model: natnet.ModelDefinition, out: list[Decoded]) -> None:
         """Bind the columns to a model; append its changes and the warnings about it."""
         binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
         before = self._binding
@@ -230,7 +208,7 @@ class NatNetDecoder:
 
     # --- time ---------------------------------------------------------------------------------
 
-    def _echo(self, chunk: Chunk, echo: EchoResponse, out: list[Decoded]) -> None:
+    def _echo(self, chunk: Chunk, echo: natnet.EchoResponse, out: list[Decoded]) -> None:
         """Append a plausible echo, for clocks that no PTP disciplines."""
         sent_ns = self._asked.pop(echo.stamp, echo.stamp)
         if self._time.precise or not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
@@ -242,7 +220,7 @@ class NatNetDecoder:
 
     # --- frames -------------------------------------------------------------------------------
 
-    def _frame(self, chunk: Chunk, frame: FrameOfData, out: list[Decoded]) -> None:
+    def _frame(self, chunk: Chunk, frame: natnet.FrameOfData, out: list[Decoded]) -> None:
         """Append the frame in the columns of the model, after the events that it causes."""
         step = self._continuity.frame(frame.number, frame.transmit, chunk.t_ns)
         if not step.use:
@@ -279,7 +257,7 @@ class NatNetDecoder:
             )
         )
 
-    def _exposure_ticks(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
+    def _exposure_ticks(self, frame: natnet.FrameOfData, out: list[Decoded]) -> int | None:
         """Return the exposure in ticks of the clock in use.
 
         It is computed from the configured latency where the cameras do not stamp it.
@@ -304,7 +282,7 @@ class NatNetDecoder:
         risen, self._announced = params & ~self._announced, params
         out += [DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit]
 
-        live = not params & FRAME_EDIT_MODE
+        live = not params & natnet.FRAME_EDIT_MODE
         if live != self._live:
             self._live = live
             text = "live again" if live else "edit mode: the frames are a recording"

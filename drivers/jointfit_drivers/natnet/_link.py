@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import Chunk
+from jointfit_drivers.natnet._bitstream import FRAME_START
 from jointfit_drivers.ports.udp_socket import UdpSocket
-from jointfit_protocols.natnet import NatNetMessageId, encode
+from jointfit_protocols.natnet import encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,7 +31,6 @@ _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
 """Errors that concern one datagram and not the connection."""
 _FORGED_NS = 100_000_000
 """Interval, ns, after a datagram of the server in which an ICMP refusal is forged or stale."""
-_FRAME = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
 class NatNetLink:
@@ -123,7 +123,7 @@ class NatNetLink:
 
         for arrival in arrivals:
             is_command = source is self._command and arrival.port == self._server[1]
-            is_accepted = is_command or arrival.data.startswith(_FRAME)
+            is_accepted = is_command or arrival.data.startswith(FRAME_START)
             if arrival.host != self._server[0] or not is_accepted:
                 self.foreign += 1
                 continue

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Quaternion, Vector
     from jointfit_drivers.natnet._binding import Binding, Key
-    from jointfit_protocols.natnet import FrameOfData, LabeledMarker
+    from jointfit_protocols.natnet import FrameOfData
 
 _HALF = math.sqrt(0.5)
 _NO_POSITION: Vector = (math.nan, math.nan, math.nan)
@@ -80,7 +80,7 @@ class PoseConverter:
         self, frame: FrameOfData, binding: Binding, unknown: list[int]
     ) -> dict[Key, Vector]:
         place = self._place
-        seen = self._labeled(frame.markers, binding.known, unknown)
+        seen = self._labeled(frame, binding.known, unknown)
         for asset in frame.assets:
             for number, x, y, z, _, params, _ in asset.markers:
                 if params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
@@ -94,12 +94,12 @@ class PoseConverter:
         return seen
 
     def _labeled(
-        self, markers: tuple[LabeledMarker, ...], known: frozenset[Key], unknown: list[int]
+        self, frame: FrameOfData, known: frozenset[Key], unknown: list[int]
     ) -> dict[Key, Vector]:
+        place = self._place
         seen: dict[Key, Vector] = {}
         twice: set[int] = set()
-        place = self._place
-        for number, x, y, z, _, params, _ in markers:
+        for number, x, y, z, _, params, _ in frame.markers:
             if number not in known:
                 if number >> 16:  # model 0: a marker without a model
                     unknown.append(number)

@@ -22,7 +22,7 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_drivers.natnet._bitstream import BitstreamTracker
+from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
 from jointfit_drivers.natnet._link import NatNetLink
 from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.natnet._server_checks import (
@@ -33,22 +33,9 @@ from jointfit_drivers.natnet._server_checks import (
     is_unicast,
     same_instance,
 )
+from jointfit_protocols import natnet
 from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet import (
-    FRAME_BITSTREAM_CHANGED,
-    FRAME_MODEL_CHANGED,
-    Bare,
-    BodyDescription,
-    CommandRequest,
-    CommandResponse,
-    Connect,
-    EchoRequest,
-    EchoResponse,
-    FrameOfData,
-    ModelDefinition,
-    NatNetMessageId,
-    ServerInfo,
-)
+from jointfit_protocols.natnet import NatNetMessageId
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -56,7 +43,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
     from jointfit_daemon.model import Chunk
     from jointfit_drivers.natnet._settings import NatNetSettings
-    from jointfit_protocols.natnet import Message
 
 RETRY_S = 0.5
 """Interval between requests, s."""
@@ -76,7 +62,6 @@ _PARAMS = struct.Struct("<h")
 _PARAMS_FROM_END = 6
 """Place of the flags: they and the end tag close every frame, in every bitstream."""
 _SHORTEST_FRAME = 4 + 78
-_FRAME = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 
 
 class NatNetSession:
@@ -98,12 +83,11 @@ class NatNetSession:
         self._emit = emit
         self._link = NatNetLink(host, settings.command_port, local, self._take)
         self._open_requests = OpenRequests()
-        self._info: ServerInfo | None = None
+        self._info: natnet.ServerInfo | None = None
         self._bitstream = BitstreamTracker(settings.wanted_version)
         self._confirmed = False
         self._known: frozenset[int] | None = None
         self._foreign_answers = 0
-        self._echoed = 0
         self._model_wanted = self._info_wanted = False
         self._misfits = 0
         self._next_check_ns = self._frame_ns = 0
@@ -121,16 +105,16 @@ class NatNetSession:
 
                 # The server's own bitstream is used if it refuses another one.
                 if self._settings.wanted_version is not None:
-                    asked = CommandRequest(f"Bitstream,{self._settings.bitstream}")
+                    asked = natnet.CommandRequest(f"Bitstream,{self._settings.bitstream}")
                     await self._request(asked, RETRY_S, lambda: self._confirmed)
 
                 for _ in range(FIRST_ECHOES):
                     next_at = time.monotonic() + FIRST_ECHO_S
-                    self._send(EchoRequest(time.monotonic_ns()))
+                    self._send(natnet.EchoRequest(time.monotonic_ns()))
                     while (left := next_at - time.monotonic()) > 0:
                         await link.pause(left)
 
-                model = Bare(NatNetMessageId.REQUEST_MODELDEF)
+                model = natnet.Bare(NatNetMessageId.REQUEST_MODELDEF)
                 await self._request(model, MODEL_S, lambda: self._known is not None)
                 if self._known is None:
                     raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
@@ -138,12 +122,12 @@ class NatNetSession:
             finally:
                 # Keep the exception that ended the connection.
                 with contextlib.suppress(DeviceLostError):
-                    link.send(Bare(NatNetMessageId.DISCONNECT))
+                    link.send(natnet.Bare(NatNetMessageId.DISCONNECT))
 
     # --- received messages --------------------------------------------------------------------
 
     def _take(self, chunk: Chunk) -> None:
-        if chunk.data.startswith(_FRAME):
+        if chunk.data.startswith(FRAME_START):
             self._emit(chunk)
             self._frame(chunk)
         elif self._open_requests.accept(chunk.data, chunk.t_ns):
@@ -153,14 +137,14 @@ class NatNetSession:
     def _frame(self, chunk: Chunk) -> None:
         if len(chunk.data) >= _SHORTEST_FRAME:
             (params,) = _PARAMS.unpack_from(chunk.data, len(chunk.data) - _PARAMS_FROM_END)
-            self._model_wanted |= bool(params & FRAME_MODEL_CHANGED)
-            self._info_wanted |= bool(params & FRAME_BITSTREAM_CHANGED)
+            self._model_wanted |= bool(params & natnet.FRAME_MODEL_CHANGED)
+            self._info_wanted |= bool(params & natnet.FRAME_BITSTREAM_CHANGED)
         if chunk.t_ns < self._next_check_ns or not self._bitstream.known:
             self._frame_ns = chunk.t_ns
             return
 
         frame = self._bitstream.decode(chunk.data)
-        if isinstance(frame, FrameOfData):
+        if isinstance(frame, natnet.FrameOfData):
             self._misfits, self._frame_ns = 0, chunk.t_ns
             self._next_check_ns = chunk.t_ns + int(EVERY_S * 1e9)
             known = self._known
@@ -172,24 +156,23 @@ class NatNetSession:
 
     def _message(self, chunk: Chunk) -> None:
         match self._bitstream.decode(chunk.data):
-            case ServerInfo() as info:
+            case natnet.ServerInfo() as info:
                 self._model_wanted |= self._info not in (None, info)
                 self._info = info
                 self._bitstream.announce(info.bitstream)
                 self._info_wanted = False
-            case ModelDefinition() as model:
-                self._known = frozenset(
-                    item.id for item in model.descriptions if isinstance(item, BodyDescription)
-                )
+            case natnet.ModelDefinition() as model:
+                bodies = (d for d in model.descriptions if isinstance(d, natnet.BodyDescription))
+                self._known = frozenset(body.id for body in bodies)
                 self._model_wanted = False
-            case EchoResponse(stamp, _):
-                self._echoed = stamp
-            case CommandResponse() as response:
+            case natnet.EchoResponse():
+                pass
+            case natnet.CommandResponse() as response:
                 version = bitstream_response(response.text)
                 if version is not None and version == self._settings.wanted_version:
                     self._bitstream.confirm(version)
                     self._confirmed = True
-            case CorruptBytes() | Connect():
+            case CorruptBytes() | natnet.Connect():
                 self._foreign_answers += 1
             case _:
                 return
@@ -198,7 +181,7 @@ class NatNetSession:
     # --- requests -----------------------------------------------------------------------------
 
     async def _request(
-        self, message: Message, within_s: float, answered: Callable[[], bool]
+        self, message: natnet.Message, within_s: float, answered: Callable[[], bool]
     ) -> None:
         """Send `message` every half second until it is answered, at most for `within_s`."""
         until = time.monotonic() + within_s
@@ -208,11 +191,11 @@ class NatNetSession:
             while not answered() and (left := retry_at - time.monotonic()) > 0:
                 await self._link.pause(left)
 
-    def _send(self, message: Message) -> None:
+    def _send(self, message: natnet.Message) -> None:
         self._open_requests.register(message, time.monotonic_ns())
         self._link.send(message)
 
-    async def _connect(self) -> ServerInfo:
+    async def _connect(self) -> natnet.ServerInfo:
         await self._request(
             connect_request(self._settings), CONNECT_S, lambda: self._info is not None
         )
@@ -225,7 +208,7 @@ class NatNetSession:
             )
         raise DeviceLostError(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
 
-    def _join(self, info: ServerInfo) -> None:
+    def _join(self, info: natnet.ServerInfo) -> None:
         port = self._settings.data_port or info.data_port
         check_group(self._name, info, port)
         try:
@@ -234,7 +217,7 @@ class NatNetSession:
             text = f"cannot join {info.group}:{port}: {error.strerror or error}"
             raise DeviceLostError(f"{self._name}: {text}") from error
 
-    async def _stream(self, info: ServerInfo, unicast: bool) -> None:
+    async def _stream(self, info: natnet.ServerInfo, unicast: bool) -> None:
         began_ns = time.monotonic_ns()
         echo_at = alive_at = ask_at = 0.0
         while True:
@@ -242,11 +225,11 @@ class NatNetSession:
             self._check_alive(info, unicast, max(self._frame_ns, began_ns))
 
             if now >= echo_at:
-                self._send(EchoRequest(time.monotonic_ns()))
+                self._send(natnet.EchoRequest(time.monotonic_ns()))
                 echo_at = now + random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
 
             if unicast and now >= alive_at:
-                self._link.send(Bare(NatNetMessageId.KEEPALIVE))
+                self._link.send(natnet.Bare(NatNetMessageId.KEEPALIVE))
                 alive_at = now + EVERY_S
 
             if now >= ask_at and (self._model_wanted or self._info_wanted):
@@ -254,12 +237,12 @@ class NatNetSession:
                 if self._info_wanted:
                     self._send(connect_request(self._settings))
                 if self._model_wanted:
-                    self._send(Bare(NatNetMessageId.REQUEST_MODELDEF))
+                    self._send(natnet.Bare(NatNetMessageId.REQUEST_MODELDEF))
 
             due = [echo_at, now + self._settings.silence_s / 4]
             await self._link.pause(min(due + [alive_at] * unicast) - now)
 
-    def _check_alive(self, info: ServerInfo, unicast: bool, heard_ns: int) -> None:
+    def _check_alive(self, info: natnet.ServerInfo, unicast: bool, heard_ns: int) -> None:
         """Raise DeviceLostError without decodable frames, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 
 
-class KernelStamps:
+class KernelStamps(WallClock):
     """Converts the stamps of one bus; call `pair` at every wake-up.
 
     Parameters
@@ -34,18 +34,8 @@ class KernelStamps:
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._wall = WallClock(monotonic_ns, unix_ns)
+        super().__init__(monotonic_ns, unix_ns)
         self._bit_ns = _NS / bitrate
-        self._monotonic_ns = monotonic_ns
-
-    @property
-    def unusable(self) -> int:
-        """Stamps that fitted neither clock difference and were replaced by the time of the read."""
-        return self._wall.replaced
-
-    def pair(self) -> int:
-        """Read both clocks; return the monotonic one, ns."""
-        return self._wall.pair()
 
     def start_ns(self, unix_s: float, size: int, extended: bool) -> int:
         """Return the start, ns, of a frame of `size` bytes from its kernel stamp `unix_s`.
@@ -56,5 +46,5 @@ class KernelStamps:
         """
         # The present time, not that of the wake-up: otherwise frames that arrive while this process
         # is delayed would be stamped too early.
-        end = self._wall.monotonic(round(unix_s * _NS), self._monotonic_ns())
+        end = self.monotonic(round(unix_s * _NS), self._monotonic_ns())
         return end - round(frame_bits(size, extended) * self._bit_ns)

@@ -19,6 +19,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import can
+from can.typechecking import CanFilter
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.nearest_name import unknown_name
@@ -91,8 +92,12 @@ class PythonCanBus:
             )
             return
 
-        if self._kernel:
-            self._enlarge_buffer(bus)
+        if self._kernel:  # enlarge the receive buffer: a full queue drops frames without notice
+            sock = _socket(bus)
+            try:
+                sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BYTES)
+            except OSError:  # not privileged: the kernel cuts this one to net.core.rmem_max
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
 
         loop, fd = asyncio.get_running_loop(), self._fd
 
@@ -100,9 +105,7 @@ class PythonCanBus:
             try:
                 self._drain(bus, deliver)
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
-                loop.remove_reader(
-                    fd
-                )  # errors are reported once: reading on would wait without end
+                loop.remove_reader(fd)  # reported once: reading on would wait without end
                 failed(self._receive_error(error))
 
         loop.add_reader(fd, readable)
@@ -111,19 +114,19 @@ class PythonCanBus:
         """Filter in the kernel (or in python-can, where the backend has no filter)."""
         if self._bus is None:
             return
-        with suppress(
-            can.CanError, OSError
-        ):  # the filter only saves work: frames are also selected here
-            self._bus.set_filters(
-                None
-                if ids is None
-                else [
-                    {"can_id": number, "can_mask": EXTENDED_MAX, "extended": True}
-                    if extended
-                    else {"can_id": number, "can_mask": STANDARD_MAX, "extended": False}
-                    for number, extended in ids
-                ]
-            )
+        filters: list[CanFilter] | None = None
+        if ids is not None:
+            filters = [
+                CanFilter(
+                    can_id=number,
+                    can_mask=EXTENDED_MAX if extended else STANDARD_MAX,
+                    extended=extended,
+                )
+                for number, extended in ids
+            ]
+        # The filter only saves work: frames are also selected here.
+        with suppress(can.CanError, OSError):
+            self._bus.set_filters(filters)
 
     async def close(self) -> None:
         """Stop reading and close the bus."""
@@ -144,16 +147,14 @@ class PythonCanBus:
         try:
             if self._kernel:
                 _require_interface(self._settings.channel)  # otherwise python-can leaks a socket
-                return self._make()
-            if self._settings.interface == "virtual":
+            if self._kernel or self._settings.interface == "virtual":
                 return self._make()
             making = asyncio.create_task(asyncio.to_thread(self._make), name="open CAN bus")
             try:
                 return await asyncio.shield(making)
             except asyncio.CancelledError:
-                making.add_done_callback(
-                    _close_late
-                )  # the thread cannot be cancelled: close its bus
+                # The thread cannot be cancelled: close its bus when it is open.
+                making.add_done_callback(_close_late)
                 raise
         except Exception as error:  # a missing vendor library gives even NameError
             raise self._opening_error(error) from error
@@ -162,26 +163,8 @@ class PythonCanBus:
         settings = self._settings
         if settings.interface not in can.VALID_INTERFACES:
             raise can.CanInterfaceNotImplementedError(settings.interface)
-        extras: dict[str, Any] = dict(settings.model_extra or {})
-        return can.Bus(
-            interface=settings.interface,
-            channel=settings.channel,
-            bitrate=settings.bitrate,
-            ignore_config=True,
-            **extras,
-        )
-
-    def _enlarge_buffer(self, bus: can.BusABC) -> None:
-        """Enlarge the receive buffer, because a full queue drops frames without notice."""
-        sock = self._socket(bus)
-        try:
-            sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BYTES)
-        except OSError:  # not privileged: the kernel cuts this one to net.core.rmem_max
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-
-    def _socket(self, bus: can.BusABC) -> socket.socket:
-        sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketCAN's own
-        return sock
+        keys: dict[str, Any] = settings.model_dump(exclude={"baud", "transport"})
+        return can.Bus(**keys, ignore_config=True)
 
     def _drain(self, bus: can.BusABC, deliver: Callable[[int, list[CanFrame]], None]) -> None:
         """Read up to 64 frames and deliver them, also those before an error."""
@@ -198,16 +181,12 @@ class PythonCanBus:
             now = time.monotonic_ns()  # not before the reads: see `_convert_frame`
             if self._kernel and now - self._drops_read_ns > _DROPS_EVERY_NS:
                 self._drops_read_ns = now
-                frames += self._drop_notes(bus, now)
+                raw = _socket(bus).getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+                before, self._drops = self._drops, _MEMINFO.unpack(raw)[_DROPS]
+                if self._drops != before:
+                    frames.append(host_dropped(now, (self._drops - before) % 2**32))
             if frames:
                 deliver(now, frames)
-
-    def _drop_notes(self, bus: can.BusABC, now: int) -> list[CanFrame]:
-        """Return a note with the number of frames that the kernel dropped since the last one."""
-        raw = self._socket(bus).getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
-        drops = _MEMINFO.unpack(raw)[_DROPS]
-        lost, self._drops = (drops - self._drops) % 2**32, drops
-        return [host_dropped(now, lost)] if lost else []
 
     def _convert_frame(self, message: can.Message) -> CanFrame:
         """Convert the frame just read, stamped by the kernel or with the present time.
@@ -232,9 +211,8 @@ class PythonCanBus:
         """Return the error for a bus that cannot be opened, with its remedy."""
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
-            return DeviceMisconfiguredError(
-                f"{channel}: {unknown_kind(kind) or _not_loadable(kind, error)}"
-            )
+            reason = unknown_kind(kind) or f"interface {kind!r} cannot be loaded: {error}"
+            return DeviceMisconfiguredError(f"{channel}: {reason}")
         if isinstance(error, (can.CanError, OSError)):
             return self._error_by_number(error)
         reason = f"{type(error).__name__}: {error}"
@@ -271,6 +249,11 @@ class PythonCanBus:
         return DeviceLostError(f"{channel} ({self._settings.interface}): {error}")
 
 
+def _socket(bus: can.BusABC) -> socket.socket:
+    sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketCAN's own
+    return sock
+
+
 def _require_interface(name: str) -> None:
     """Raise the OSError that binding a socket to `name` would raise."""
     socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -278,11 +261,6 @@ def _require_interface(name: str) -> None:
         socket.if_nametoindex(name)  # not if_nameindex: that asks netlink, which the unit refuses
     except OSError as error:  # CPython gives it no number
         raise OSError(errno.ENODEV, "no such interface") from error
-
-
-def _not_loadable(kind: str, error: Exception) -> str:
-    """Return the reason why an interface of a known kind failed."""
-    return f"interface {kind!r} cannot be loaded: {error}"
 
 
 def unknown_kind(kind: str) -> str | None:
@@ -310,9 +288,8 @@ class _Pump:
     ) -> None:
         self._bus, self._convert, self._deliver, self._failed = bus, convert, deliver, failed
         self._loop = asyncio.get_running_loop()
-        self._room = threading.Semaphore(
-            _WAITING
-        )  # while the loop stalls, frames stay in the backend
+        # While the loop stalls, frames stay in the backend.
+        self._room = threading.Semaphore(_WAITING)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="can pump", daemon=True)
         self._thread.start()
@@ -326,23 +303,22 @@ class _Pump:
         try:
             while not self._stopped.is_set():
                 message = self._bus.recv(_PUMP_S)
-                if message is not None:
-                    self._read_batch(message)
+                if message is None:
+                    continue
+
+                frames: list[CanFrame] = []
+                while message is not None:
+                    if not message.is_fd:
+                        frames.append(self._convert(message))
+                    message = self._bus.recv(0) if len(frames) < _BATCH else None
+                now = time.monotonic_ns()
+                while not self._room.acquire(timeout=_PUMP_S):
+                    if self._stopped.is_set():
+                        return
+                self._call_in_loop(self._accept, now, frames)
         except Exception as error:  # noqa: BLE001 - handed to whoever awaits the bus
             if not self._stopped.is_set():
                 self._call_in_loop(self._failed, error)
-
-    def _read_batch(self, message: can.Message | None) -> None:
-        frames: list[CanFrame] = []
-        while message is not None:
-            if not message.is_fd:
-                frames.append(self._convert(message))
-            message = self._bus.recv(0) if len(frames) < _BATCH else None
-        now = time.monotonic_ns()
-        while not self._room.acquire(timeout=_PUMP_S):
-            if self._stopped.is_set():
-                return
-        self._call_in_loop(self._accept, now, frames)
 
     def _accept(self, now: int, frames: list[CanFrame]) -> None:
         self._room.release()

@@ -96,6 +96,7 @@ class SlcanBus:
         if reading is not None:
             reading.cancel()
             await asyncio.wait({reading})
+
         if not self._is_open:
             return
         try:
@@ -157,7 +158,13 @@ class SlcanBus:
             )
 
         answer = await self._ask(b"O\r")
-        self._check_is_slcan()
+        lost = self._decoder.discarded_bytes
+        if lost > _NOT_SLCAN and not self._understood:
+            raise DeviceMisconfiguredError(
+                f"{settings.channel}: no SLCAN adapter found at {settings.baud} baud "
+                f"({lost} bytes received, none of them SLCAN): set `channel` to the adapter's port "
+                "and `baud` to its speed"
+            )
         if answer == "\a":
             raise DeviceLostError(f"{settings.channel}: the adapter refuses to open its bus")
         if answer is None:
@@ -188,13 +195,3 @@ class SlcanBus:
         self._understood += len(frames)
         self._understood += sum(line.letter != "" for line in lines)
         return lines
-
-    def _check_is_slcan(self) -> None:
-        """Refuse a device whose output contains no SLCAN line."""
-        lost = self._decoder.discarded_bytes
-        if lost > _NOT_SLCAN and not self._understood:
-            raise DeviceMisconfiguredError(
-                f"{self._settings.channel}: no SLCAN adapter found at {self._settings.baud} baud "
-                f"({lost} bytes received, none of them SLCAN): set `channel` to the adapter's port "
-                "and `baud` to its speed"
-            )

@@ -129,32 +129,30 @@ class SharedBus:
         self._others = 0  # frames delivered to devices of the rig
         self._seen: dict[CanKey, deque[bytes]] = {}  # last data of unclaimed identifiers
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
-        self._users = 0
+        self.users = 0
+        """Devices that use the bus."""
         self._subscribers: list[_Subscriber] = []
         self._routes: dict[CanKey, _Subscriber] = {}
 
-    @property
-    def in_use(self) -> bool:
-        """Whether a device uses the bus."""
-        return self._users > 0
-
     async def enter(self) -> None:
         """Register a user; the first one opens the bus."""
-        self._users += 1
+        self.users += 1
         async with self._lock:
             if self._backend is None:
-                backend = (SlcanBus if self._settings.interface == "slcan" else PythonCanBus)(
-                    self._settings
-                )
+                kind = SlcanBus if self._settings.interface == "slcan" else PythonCanBus
+                backend = kind(self._settings)
                 await backend.open(self._deliver, self._fail)
                 self._backend = backend
 
     async def leave(self) -> None:
         """Unregister a user; the last one closes the bus."""
-        self._users -= 1
+        self.users -= 1
         async with self._lock:
-            if not self._users or self._failed is not None:
-                await self._close()
+            if self.users and self._failed is None:
+                return
+            backend, self._backend, self._failed = self._backend, None, None
+            if backend is not None:
+                await backend.close()
 
     async def pump(
         self,
@@ -194,7 +192,15 @@ class SharedBus:
         DeviceMisconfiguredError
             Another device of the rig uses one of the identifiers.
         """
-        self._refuse_taken(name, ids)
+        for key, carries in ids.items():
+            other = self._routes.get(key)
+            if other is not None:
+                raise DeviceMisconfiguredError(
+                    f"{name} ({self.channel}): CAN identifier {_hex(key)} ({carries}) is also "
+                    f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
+                    "(over UART, Xsens MT Manager) and set `ids` of both"
+                )
+
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         limit = asyncio.timeout(silence_s)
         subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s, needed, self._others)
@@ -231,9 +237,7 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        if (
-            subscriber.is_complete and not others
-        ):  # its settings are right: all identifiers arrived before
+        if subscriber.is_complete and not others:  # its settings are right: all arrived before
             return (
                 f"{subscriber.name} ({self.channel}): silent for {subscriber.silence_s:g} s: "
                 "check its power and wiring"
@@ -261,16 +265,6 @@ class SharedBus:
         if self._others > subscriber.others:
             return f"{text}, while other sensors send: check its power and wiring, and `ids`"
         return f"{text}, and nothing else on the bus: check power, wiring and bit rate"
-
-    def _refuse_taken(self, name: str, ids: Mapping[CanKey, str]) -> None:
-        for key, carries in ids.items():
-            other = self._routes.get(key)
-            if other is not None:
-                raise DeviceMisconfiguredError(
-                    f"{name} ({self.channel}): CAN identifier {_hex(key)} ({carries}) is also "
-                    f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
-                    "(over UART, Xsens MT Manager) and set `ids` of both"
-                )
 
     def _route(self) -> None:
         self._routes = {key: each for each in self._subscribers for key in each.ids}
@@ -305,18 +299,21 @@ class SharedBus:
         shares: dict[_Subscriber, list[CanFrame]] = {}
         for frame in frames:
             if frame.error:
-                everyone = self._subscribers[: 1 if frame.can_id == HOST_CORRUPT else None]
-                for each in everyone:
+                for each in self._subscribers[: 1 if frame.can_id == HOST_CORRUPT else None]:
                     shares.setdefault(each, []).append(frame)
                 continue
 
-            subscriber = self._routes.get((frame.can_id, frame.extended))
-            if subscriber is None or frame.remote:
-                self.foreign += 1
-                self._unclaimed.append((t_ns, frame))
-                self._remember(frame)
-            else:
+            key = (frame.can_id, frame.extended)
+            subscriber = self._routes.get(key)
+            if subscriber is not None and not frame.remote:
                 shares.setdefault(subscriber, []).append(frame)
+                continue
+
+            # For subscribers to come, and for messages.
+            self.foreign += 1
+            self._unclaimed.append((t_ns, frame))
+            if key in self._seen or len(self._seen) < _SEEN:
+                self._seen.setdefault(key, deque(maxlen=_SAMPLES)).append(frame.data)
 
         for subscriber, mine in shares.items():
             self._others += len(mine)
@@ -325,16 +322,6 @@ class SharedBus:
             if subscriber.is_complete != was_complete:
                 self._filter()
 
-    def _remember(self, frame: CanFrame) -> None:
-        """Store the last data of an unclaimed identifier, for messages."""
-        key = (frame.can_id, frame.extended)
-        seen = self._seen.get(key)
-        if seen is None:
-            if len(self._seen) >= _SEEN:
-                return
-            seen = self._seen[key] = deque(maxlen=_SAMPLES)
-        seen.append(frame.data)
-
     def _fail(self, error: Exception) -> None:
         """End every device's pump; the first device to leave closes the bus."""
         self._failed = error
@@ -342,11 +329,6 @@ class SharedBus:
             if not each.ended.done():
                 lost = isinstance(error, DeviceLostError)
                 each.ended.set_exception(DeviceLostError(str(error)) if lost else error)
-
-    async def _close(self) -> None:
-        backend, self._backend, self._failed = self._backend, None, None
-        if backend is not None:
-            await backend.close()
 
 
 def _hex(key: CanKey) -> str:
@@ -376,5 +358,5 @@ async def shared_bus(settings: CanBusSettings) -> AsyncIterator[SharedBus]:
         yield bus
     finally:
         await bus.leave()
-        if not bus.in_use and buses.get(key) is bus:
+        if not bus.users and buses.get(key) is bus:
             del buses[key]

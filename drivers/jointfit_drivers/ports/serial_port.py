@@ -25,12 +25,13 @@ from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
 log = logging.getLogger(__name__)
 
 _READ_BYTES = 65536
 """Bytes per read. A tty buffer holds at most 4095 bytes, so one read empties it."""
+_PORT_ERRORS = (serial.SerialException, termios.error, OSError, ValueError)
+"""Exceptions with which pyserial refuses a port or a speed."""
 _WRITE_TIMEOUT_S = 2.0
 """Longest wait for a full port, s. At 9600 baud, 100 bytes take 0.1 s."""
 
@@ -82,7 +83,11 @@ class SerialPort:
         self._port: serial.Serial | None = None
 
     def __enter__(self) -> Self:
-        self._port = _open(self.path, self._baud)
+        try:
+            self._port = serial.Serial(self.path, self._baud, timeout=0, exclusive=True)
+        except _PORT_ERRORS as error:
+            raise _device_error(self.path, self._baud, error) from error
+
         os.set_blocking(self._fd, False)
         try:
             self._port.set_low_latency_mode(True)
@@ -90,13 +95,7 @@ class SerialPort:
             log.debug("%s: no low-latency mode: %s", self.path, error)  # ptys, some adapters
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-
+    def __exit__(self, *_: object) -> None:
         port, self._port = self._port, None
         if port is None:
             return
@@ -105,11 +104,6 @@ class SerialPort:
             termios.tcflush(port.fileno(), termios.TCOFLUSH)
         with suppress(OSError):
             port.close()
-
-    @property
-    def baud(self) -> int:
-        """Line speed, bit/s."""
-        return self._baud
 
     @property
     def _fd(self) -> int:
@@ -131,7 +125,7 @@ class SerialPort:
             raise ValueError(f"{self.path}: is not open: use it inside its `with` block")
         try:
             self._port.baudrate = baud
-        except (serial.SerialException, termios.error, OSError, ValueError) as error:
+        except _PORT_ERRORS as error:
             raise _device_error(self.path, baud, error) from error
         self._baud = baud
 
@@ -237,29 +231,25 @@ class SerialPort:
         DeviceLostError
             The port was unplugged, or accepted no byte for 2 s.
         """
+        loop = asyncio.get_running_loop()
         fd, rest = self._fd, memoryview(data)
         while rest:
             try:
                 rest = rest[os.write(fd, rest) :]
             except BlockingIOError:
-                await self._writable(fd)
+                ready = asyncio.Event()
+                loop.add_writer(fd, ready.set)
+                try:
+                    async with asyncio.timeout(_WRITE_TIMEOUT_S):
+                        await ready.wait()
+                except TimeoutError as error:
+                    raise DeviceLostError(
+                        f"{self.path}: accepted no byte for {_WRITE_TIMEOUT_S:g} s"
+                    ) from error
+                finally:
+                    loop.remove_writer(fd)
             except OSError as error:
                 raise DeviceLostError(f"{self.path}: unplugged ({error.strerror})") from error
-
-    async def _writable(self, fd: int) -> None:
-        """Wait until the port accepts bytes again."""
-        loop = asyncio.get_running_loop()
-        ready = asyncio.Event()
-        loop.add_writer(fd, ready.set)
-        try:
-            async with asyncio.timeout(_WRITE_TIMEOUT_S):
-                await ready.wait()
-        except TimeoutError as error:
-            raise DeviceLostError(
-                f"{self.path}: accepted no byte for {_WRITE_TIMEOUT_S:g} s"
-            ) from error
-        finally:
-            loop.remove_writer(fd)
 
     def _read(self, fd: int) -> bytes | None:
         """Return the available bytes; None if there are none.
@@ -278,14 +268,6 @@ class SerialPort:
         if not data:
             raise DeviceLostError(f"{self.path}: unplugged (hang-up)")
         return data
-
-
-def _open(path: str, baud: int) -> serial.Serial:
-    """Open `path` and convert pyserial's errors."""
-    try:
-        return serial.Serial(path, baud, timeout=0, exclusive=True)
-    except (serial.SerialException, termios.error, OSError, ValueError) as error:
-        raise _device_error(path, baud, error) from error
 
 
 def _device_error(

@@ -131,10 +131,8 @@ class UdpSocket:
 
     def send(self, data: bytes, address: tuple[str, int]) -> None:
         """Send one datagram; it is dropped if the queue of the network card is full."""
-        try:
+        with contextlib.suppress(BlockingIOError):
             self._socket.sendto(data, address)
-        except BlockingIOError:
-            return
 
     def receive(self) -> list[Datagram]:
         """Return the available datagrams, at most `DRAIN`.

@@ -122,7 +122,13 @@ class XbusContinuity:
         if held is None or not self._follows(held, point):
             self._held = point
             return _HELD
-        return self._confirm(last, held, point)
+
+        # `held` and `point` follow each other and not `last`: accept both.
+        trusted, self._held = self._trusted, None
+        step = self._classify(last, held) if trusted else _CONTINUES
+        if step.restarted or not trusted:
+            self._sum_ticks = self._sum_counts = 0
+        return step._replace(confirmed=True, lost_since=self._accept(held, point).lost)
 
     def forget(self) -> None:
         """Start again with the next message: the device reported a restart."""
@@ -140,15 +146,6 @@ class XbusContinuity:
             self._sum_counts += counts
         lost = _lost(last, point)
         return XbusStep(lost) if lost else _CONTINUES
-
-    def _confirm(self, last: _Point, held: _Point, point: _Point) -> XbusStep:
-        """Accept `held` and `point`, which follow each other and not `last`."""
-        trusted, self._held = self._trusted, None
-        step = self._classify(last, held) if trusted else _CONTINUES
-        if step.restarted or not trusted:
-            self._sum_ticks = self._sum_counts = 0
-        since = self._accept(held, point).lost
-        return step._replace(confirmed=True, lost_since=since)
 
     def _classify(self, last: _Point, held: _Point) -> XbusStep:
         """Return the step between two points that do not follow."""

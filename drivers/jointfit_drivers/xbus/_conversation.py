@@ -128,9 +128,8 @@ class XbusConversation:
 
             reply = await self.receive(wanted, wait_s)
             if reply is not None and reply.mid == XbusMessageId.WAKE_UP:
-                await self.send(
-                    XbusMessageId.WAKE_UP_ACK
-                )  # the device has just started and waits for this answer
+                # The device has just started and waits for this answer.
+                await self.send(XbusMessageId.WAKE_UP_ACK)
                 await self.send(XbusMessageId.GOTO_CONFIG)
                 reply = await self.receive({XbusMessageId.GOTO_CONFIG_ACK}, wait_s)
             if reply is not None:
@@ -145,33 +144,28 @@ class XbusConversation:
         until = loop.time() + wait_s
         while (left := until - loop.time()) > 0:
             chunk = await self._port.receive(min(left, _QUIET_S))
-            if chunk is not None:
-                self._take(chunk)
-                found = self._decoder.feed(chunk.data)
-            else:
+            if chunk is None:
                 found = self._decoder.flush() if self._decoder.pending else []
+            else:
+                self.received += len(chunk.data)
+                if self._emitting:
+                    self._emit(chunk)
+                else:
+                    self._t_ns = chunk.t_ns
+                    self._recent = (self._recent + chunk.data)[-_KEPT:]
+                found = self._decoder.feed(chunk.data)
 
             messages = [event for event in found if isinstance(event, XbusMessage)]
             self.understood += sum(map(_is_certain, messages))
             for message in messages:
                 if message.mid in mids and _is_certain(message):
-                    self._start_emitting(message)
+                    if message.mid == XbusMessageId.GOTO_CONFIG_ACK and not self._emitting:
+                        self._start_emitting(message)
                     return message
         return None
 
-    def _take(self, chunk: Chunk) -> None:
-        self.received += len(chunk.data)
-        if self._emitting:
-            self._emit(chunk)
-        else:
-            self._t_ns = chunk.t_ns
-            self._recent = (self._recent + chunk.data)[-_KEPT:]
-
     def _start_emitting(self, message: XbusMessage) -> None:
         """Start emitting with the acknowledgement of configuration mode."""
-        if self._emitting or message.mid != XbusMessageId.GOTO_CONFIG_ACK:
-            return
-
         after = self._decoder.fed - message.end
         rest = self._recent[len(self._recent) - after :]
         self._emitting, self._recent = True, b""

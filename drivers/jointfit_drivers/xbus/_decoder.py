@@ -132,13 +132,12 @@ class XbusDecoder:
     def _take(self, found: list[XbusMessage | CorruptBytes]) -> list[Decoded]:
         out: list[Decoded] = []
         for event in found:
-            if isinstance(event, XbusMessage):
-                if event.mid == XbusMessageId.MT_DATA2:
-                    out += self._decode_measurement(event)
-                else:
-                    out += self._device_events(event)
-            else:
+            if not isinstance(event, XbusMessage):
                 out.append(Corrupt(event.discarded, event.reason))
+            elif event.mid == XbusMessageId.MT_DATA2:
+                out += self._decode_measurement(event)
+            else:
+                out += self._device_events(event)
         return out
 
     def _arrival_of(self, message: XbusMessage) -> int:
@@ -181,16 +180,20 @@ class XbusDecoder:
         self, message: XbusMessage, values: Mapping[int, Any], world_id: int
     ) -> list[Decoded]:
         """Return the content of an MTData2 after the check of its counter and time."""
-        raw = self._raw
-        pulses = self._pulses(message, values) if self._wires else []
+        pulses: list[Decoded] = []
+        for item, wire in self._wires.items():
+            edge = values.get(item)
+            if isinstance(edge, Trigger):
+                at_ns = self._arrival_of(message)
+                pulses.append(SyncPulse(at_ns, edge.time, wire, edge.frame))
 
         ticks: int | None = values.get(_TIME)
-        if raw is None:
+        if self._raw is None:
             is_orientation = _QUATERNION in values
-        else:  # a message of a GNSS receiver has neither
-            is_orientation = ticks is not None and raw.is_complete(values)
+        else:
+            is_orientation = ticks is not None and self._raw.is_complete(values)
 
-        if not is_orientation:
+        if not is_orientation:  # as from a GNSS receiver
             self._continuity.other()
             return pulses
 
@@ -202,15 +205,12 @@ class XbusDecoder:
 
     def _continue(self, step: XbusStep, orientation: _Orientation) -> list[Decoded]:
         """Return `orientation` after the orientation that was held for it, if confirmed."""
-        held, self._held = self._held, orientation if step.held else None
-        out: list[Decoded] = []
-        if held is not None and not step.confirmed:
-            out.append(
-                self._refuse(held.message, "counter and time disagree with the other messages")
-            )
-
+        held = self._held
+        out = [] if step.confirmed else self._drop_held()
+        self._held = orientation if step.held else None
         if step.held:
             return out
+
         if step.restarted and held is not None:
             self._forget_orientation()
             text = f"device clock restarted at {held.values.get(_TIME)} ticks"
@@ -233,55 +233,36 @@ class XbusDecoder:
         counter: int | None = values.get(_COUNTER)
 
         if self._raw is not None and ticks is not None:
-            return pulses + self._raw_samples(orientation, ticks, self._raw)
+            fields = RawMessage(arrived_ns, ticks, counter, values.get(_STATUS_WORD))
+            modulus = self.tick_clock.modulus or setup.WRAP_32_BIT
+            found = self._raw.samples(fields, values, modulus)
+            if found is None:
+                return [*pulses, self._refuse(message, "raw measurements out of range")]
+            return pulses + found
+
         native: Quaternion = values[_QUATERNION]
         status: int | None = values.get(_STATUS_WORD, values.get(_STATUS_BYTE))
         out = pulses
-
         world = world_of(world_id) or "ENU"
         q = self._gate.admit(native if world == "ENU" else canonical(native, world))
         if q is None:
             out.append(self._refuse(message, "quaternion norm is not 1"))
         else:
             out.append(ImuSample(arrived_ns, q, native, ticks, counter, status))
+
+        # Warn once if hardly any quaternion has norm 1.
         if not self._norm_checked:
-            out += self._norm_warning()
+            self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
+            if norm is not None:
+                text = f"median quaternion norm is {norm:.4g}, expected 1"
+                text += ": byte order or scale is wrong"
+                out.append(DeviceEvent("warning", text, {"median_norm": norm}))
         return out
-
-    def _raw_samples(
-        self, orientation: _Orientation, ticks: int, raw: RawOrientation
-    ) -> list[Decoded]:
-        """Return the samples of raw measurements."""
-        values = orientation.values
-        message_fields = RawMessage(
-            orientation.arrived_ns, ticks, values.get(_COUNTER), values.get(_STATUS_WORD)
-        )
-        found = raw.samples(message_fields, values, self.tick_clock.modulus or setup.WRAP_32_BIT)
-        if found is None:
-            return [self._refuse(orientation.message, "raw measurements out of range")]
-        return found
-
-    def _pulses(self, message: XbusMessage, values: Mapping[int, object]) -> list[Decoded]:
-        """Return the sync edges that a message reports."""
-        found = [(wire, values.get(item)) for item, wire in self._wires.items()]
-        return [
-            SyncPulse(self._arrival_of(message), edge.time, wire, edge.frame)
-            for wire, edge in found
-            if isinstance(edge, Trigger)
-        ]
 
     def _forget_orientation(self) -> None:
         self._gate.forget()
         if self._raw is not None:
             self._raw.forget()
-
-    def _norm_warning(self) -> list[Decoded]:
-        """Return one warning if hardly any quaternion has norm 1."""
-        self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
-        if norm is None:
-            return []
-        text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
-        return [DeviceEvent("warning", text, {"median_norm": norm})]
 
     def _refuse(self, message: XbusMessage, reason: str) -> Corrupt:
         self._refused += 1

@@ -79,16 +79,6 @@ class XbusHandshake:
             The speed is another, the device is of another kind, or the output configuration
             differs and may not be written.
         """
-        self._check_line_capacity()
-        self._conversation.reset()
-        if not await self._ensure_config():
-            await self._explain_silence()
-        await self._read_identity()
-        await self._ensure_outputs()
-        await self._ensure_sync()
-        await self._start()
-
-    def _check_line_capacity(self) -> None:
         settings = self._settings
         needs = settings.rate_hz * message_bytes(self._needs) * _BITS
         if needs > settings.baud:
@@ -96,6 +86,15 @@ class XbusHandshake:
                 f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
                 f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
             )
+
+        self._conversation.reset()
+        if not await self._ensure_config():
+            await self._explain_silence()
+        await self._read_identity()
+        await self._ensure_outputs()
+        await self._ensure_sync()
+        reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
+        self._refuse_error(reply, "refuses to start measuring")
 
     async def _ensure_config(self) -> bool:
         """Return whether the device is in configuration mode."""
@@ -115,9 +114,8 @@ class XbusHandshake:
             XbusMessageId.REQ_FIRMWARE,
             XbusMessageId.FILTER_PROFILE,
         ):
-            reply = await self._conversation.request(
-                mid
-            )  # the reply is emitted; older devices refuse some
+            # The reply is emitted. Older devices refuse some requests.
+            reply = await self._conversation.request(mid)
             if reply is not None and reply.mid == XbusMessageId.PRODUCT_CODE:
                 self._product_code = setup.decode_text(reply.data)
         for frame in _FRAMES:
@@ -141,14 +139,14 @@ class XbusHandshake:
         self._refuse_to_write(faults, _rate_hint(found, self._needs))
         log.warning("%s: writing its output configuration: %s", self._who, "; ".join(faults))
 
+        # Raw measurements are in sensor axes: only an orientation has a world.
+        world: World = self._settings.world if self._needs is ORIENTATION else "ENU"
+        counters = (Item.PACKET_COUNTER, Item.SAMPLE_TIME_FINE, Item.STATUS_WORD)
         wanted = (
-            (Item.PACKET_COUNTER, setup.MAX_RATE),
-            (Item.SAMPLE_TIME_FINE, setup.MAX_RATE),
-            (Item.STATUS_WORD, setup.MAX_RATE),
-            *((real_id(need.items[0], world=self._world(need)), rate) for need in self._needs),
+            *((item, setup.MAX_RATE) for item in counters),
+            *((real_id(need.items[0], world=world), rate) for need in self._needs),
             *((item, setup.MAX_RATE) for item in self._triggers),
         )
-
         reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(wanted))
 
         asked = ", ".join(need.many for need in self._needs)
@@ -160,10 +158,6 @@ class XbusHandshake:
             raise DeviceMisconfiguredError(
                 f"{self._who}: does not accept the requested outputs: {'; '.join(left)}{hint}"
             )
-
-    def _world(self, need: RequiredOutput) -> World:
-        """Return the world of an item; raw measurements are in sensor axes."""
-        return self._settings.world if need.items[0] == Item.QUATERNION else "ENU"
 
     def _refuse_to_write(self, faults: list[str], hint: str = "") -> None:
         """Raise with the necessary changes unless ``persist`` allows them."""
@@ -201,10 +195,6 @@ class XbusHandshake:
         entries = setup.decode_sync(reply.data) or ()
         return tuple(entry for entry in entries if entry.polarity)  # without entries that are off
 
-    async def _start(self) -> None:
-        reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
-        self._refuse_error(reply, "refuses to start measuring")
-
     def _refuse_error(
         self, reply: XbusMessage, what: str, change: str = "`rate_hz` or `baud`"
     ) -> None:
@@ -224,11 +214,9 @@ class XbusHandshake:
             )
 
         speed = await self._other_speed() if self._hunt or received else None
-        if speed is not None and await self._listen_at(
-            self._settings.baud
-        ):  # USB ignores the speed
-            raise DeviceLostError(f"{self._who}: the answer came too late; trying again")
         if speed is not None:
+            if await self._listen_at(self._settings.baud):  # USB ignores the speed
+                raise DeviceLostError(f"{self._who}: the answer came too late; trying again")
             raise DeviceMisconfiguredError(
                 f"{self._who}: {self._settings.baud} baud, but no message can be decoded; "
                 f"the device answers at {speed}: set baud = {speed}"

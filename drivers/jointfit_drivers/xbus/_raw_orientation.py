@@ -86,9 +86,8 @@ class RawOrientation:
 
     def is_complete(self, values: Mapping[int, object]) -> bool:
         """Return whether a message contains an angular rate and a specific force."""
-        return (RATES[0] in values or RATES[1] in values) and (
-            FORCES[0] in values or FORCES[1] in values
-        )
+        has_rate = RATES[0] in values or RATES[1] in values
+        return has_rate and (FORCES[0] in values or FORCES[1] in values)
 
     def samples(
         self, message: RawMessage, values: Mapping[int, object], modulus: int
@@ -122,12 +121,9 @@ class RawOrientation:
             force = _scaled(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
 
         field = values.get(FIELD) if self._made[1] else None
-        return RawReading(
-            self._t_ns + passed * TICK_NS,
-            cast("Vector", rate),
-            cast("Vector", force),
-            cast("Vector | None", field),
-        )
+        t_ns = self._t_ns + passed * TICK_NS
+        vectors = (cast("Vector", rate), cast("Vector", force), cast("Vector | None", field))
+        return RawReading(t_ns, *vectors)
 
     def _warnings(
         self, message: RawMessage, values: Mapping[int, object], *, restarted: bool, missing: int
@@ -140,32 +136,26 @@ class RawOrientation:
             )
             out.append(DeviceEvent("warning", text, {"missing": missing}))
 
-        clipped = message.status is not None and bool(message.status & CLIPPING)
-        clipped |= self._saturated(values)
+        # Devices need not send their status word. Noise makes two equal rates improbable: a fast
+        # one that repeats bit by bit is at the end of its range.
+        before, rate = self._rate, cast("Vector | None", values.get(RATES[0]))
+        self._rate = rate or (0.0, 0.0, 0.0)
+        pairs = zip(self._rate, before, strict=True)
+        clipped = any(now == then and abs(now) > FAST for now, then in pairs)
+        clipped |= message.status is not None and bool(message.status & CLIPPING)
         if clipped and self._t_ns - self._clipped_ns >= _REPORT_NS:
             self._clipped_ns = self._t_ns
             text = "a measurement was out of range: heading is uncertain until the next static pose"
             out.append(DeviceEvent("warning", text, {"status": message.status}))
         return out
 
-    def _saturated(self, values: Mapping[int, object]) -> bool:
-        """Return whether a fast rate repeats bit by bit, at the end of its range.
-
-        Devices need not send their status word, and noise makes two equal rates improbable.
-        """
-        before, rate = self._rate, cast("Vector | None", values.get(RATES[0]))
-        self._rate = rate or (0.0, 0.0, 0.0)
-        return any(
-            now == then and abs(now) > FAST for now, then in zip(self._rate, before, strict=True)
-        )
-
     def _state_events(self) -> list[Decoded]:
         """Return the filter's state where it is due."""
         out: list[Decoded] = []
-        if not self._started:
-            self._started = True
-            if not self._made[1]:
-                out.append(DeviceEvent("warning", _NEW_HEADING))
+        if not self._started and not self._made[1]:
+            out.append(DeviceEvent("warning", _NEW_HEADING))
+        self._started = True
+
         since_ns = self._t_ns - self._reported_ns
         if since_ns < _SOON_NS:
             return out

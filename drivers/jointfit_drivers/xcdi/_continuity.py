@@ -212,26 +212,12 @@ class _Track:
         if ticks is not None and self._ticks is not None:
             d = (ticks - self._ticks) % TICKS_MODULUS
             if not self.settled:
-                self._learn(d, self._groups if self._counted else None)
+                self._steps.append(d / self._groups if self._counted and self._groups else d)
+                self.period = median(self._steps) or None
+                self.settled = len(self._steps) >= _LEARNED
             if count is None and self.settled and self.period:
                 lost = max(round(d / self.period) - 1, 0)
-        self._remember(ticks, counter, lost)
-        return lost
 
-    def _count(self, counter: int | None) -> int | None:
-        """Return the step of the counter; None where one of the groups has none."""
-        if counter is None or self._counter is None:
-            return None
-        return (counter - self._counter) % COUNTER_MODULUS
-
-    def _learn(self, d: int, groups: int | None) -> None:
-        self._steps.append(d / groups if groups else d)
-        self.period = median(self._steps) or None
-        if len(self._steps) >= _LEARNED:
-            self.settled = True
-            self._steps.clear()
-
-    def _remember(self, ticks: int | None, counter: int | None, lost: int) -> None:
         if counter is None:
             self._uncounted += 1 + lost  # its next step includes them
         else:
@@ -239,3 +225,10 @@ class _Track:
         if ticks is not None:
             self._ticks, self._groups = ticks, 0
             self._counted = counter is not None
+        return lost
+
+    def _count(self, counter: int | None) -> int | None:
+        """Return the step of the counter; None where one of the groups has none."""
+        if counter is None or self._counter is None:
+            return None
+        return (counter - self._counter) % COUNTER_MODULUS

@@ -67,45 +67,22 @@ class XcdiDecoder:
         self._gate = OrientationGate()
         self._unit = TickUnit()
         self._configured = TICK_NS.get(unit)
-        self._tick_clock = (
-            None if self._configured is None else TickClock(self._configured, TICKS_MODULUS)
-        )
+        self.tick_clock: TickClock | None = None
+        """Unit of SampleTime; None until it is determined."""
+        if self._configured is not None:
+            self.tick_clock = TickClock(self._configured, TICKS_MODULUS)
         self._measured = self._has_time = self._has_counter = False
         self._incomplete = self._timed = self._reported_at_ns = 0
         self._refused = 0
-        self._discarded = 0
+        self.discarded_bytes = 0
+        """Bytes of rejected records, and of lost lines of an adapter."""
         self._reported_topics: set[str] = set()
         self._error_text = ""
-
-    @property
-    def tick_clock(self) -> TickClock | None:
-        """Unit of SampleTime; None until it is determined."""
-        return self._tick_clock
 
     @property
     def messages(self) -> int:
         """Well-formed frames of this sensor so far."""
         return self._xcdi.messages - self._refused
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes of rejected records, and of lost lines of an adapter."""
-        return self._discarded
-
-    @property
-    def incomplete(self) -> int:
-        """Groups without a quaternion."""
-        return self._xcdi.incomplete
-
-    @property
-    def ungrouped(self) -> int:
-        """Quaternions without device time."""
-        return self._xcdi.ungrouped
-
-    @property
-    def foreign(self) -> int:
-        """Frames of other devices."""
-        return self._xcdi.foreign
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
@@ -117,13 +94,13 @@ class XcdiDecoder:
                 out += self._error_frame_events(item)
             else:
                 message = self._xcdi.feed(item)
-                if message is None:
-                    continue
                 if isinstance(message, XcdiGroup):
                     self._group(message, out)
                 elif isinstance(message, XcdiError):
-                    out += self._device_error_events(message)
-                else:
+                    known = message.code == OVERFLOW
+                    text = _OVERFLOWED if known else f"device reports error {message.code}"
+                    out += self._limited("error", text, message.t_ns)
+                elif message is not None:
                     out.append(self._lose(RECORD_BYTES, message.reason))
         return out
 
@@ -191,7 +168,8 @@ class XcdiDecoder:
             return
 
         if ticks is None:
-            self._timeless(out)
+            if self._xcdi.ungrouped == _TIMELESS and not self._timed:
+                out += self._once("warning", "timeless", _NO_TIME)
         elif not self._measured:
             self._measure(ticks, group.t_ns, out)
         out.append(ImuSample(group.t_ns, q, native, ticks, group.counter, group.status))
@@ -216,17 +194,9 @@ class XcdiDecoder:
             out += self._once("warning", "unit", text)
             return
 
-        self._tick_clock = TickClock(tick_ns, TICKS_MODULUS)
+        self.tick_clock = TickClock(tick_ns, TICKS_MODULUS)
         data = {"sample_time_unit": name, "ticks_per_s": rate}
         out.append(DeviceEvent("info", f"SampleTime counts in {name}", data))
-
-    def _timeless(self, out: list[Decoded]) -> None:
-        if self._xcdi.ungrouped == _TIMELESS and not self._timed:
-            text = (
-                f"{_TIMELESS} quaternions, and no SampleTime: samples are stamped on arrival; set "
-                "`ids.sample_time`, or switch the output on (over UART, Xsens MT Manager)"
-            )
-            out += self._once("warning", "timeless", text)
 
     def _check_norm(self, out: list[Decoded]) -> None:
         norm = self._gate.misconfigured_norm
@@ -245,13 +215,6 @@ class XcdiDecoder:
 
         text, serious = describe_error(frame)
         return self._limited("error" if serious else "warning", text, frame.t_ns)
-
-    def _device_error_events(self, error: XcdiError) -> list[Decoded]:
-        known = (
-            "its output buffer overflowed, frames are lost: lower its rate or raise the bit rate"
-        )
-        text = known if error.code == OVERFLOW else f"device reports error {error.code}"
-        return self._limited("error", text, error.t_ns)
 
     def _limited(self, kind: str, text: str, t_ns: int) -> list[Decoded]:
         """Return the event unless the same one was reported within a second."""
@@ -274,7 +237,7 @@ class XcdiDecoder:
         out.append(self._lose(RECORD_BYTES, reason))
 
     def _lose(self, count: int, reason: str) -> Corrupt:
-        self._discarded += count
+        self.discarded_bytes += count
         return Corrupt(count, reason)
 
 
@@ -284,6 +247,11 @@ def _native(group: XcdiGroup) -> Quaternion:
     return (a * s, b * s, c * s, d * s)
 
 
+_NO_TIME = (
+    f"{_TIMELESS} quaternions, and no SampleTime: samples are stamped on arrival; set "
+    "`ids.sample_time`, or switch the output on (over UART, Xsens MT Manager)"
+)
+_OVERFLOWED = "its output buffer overflowed, frames are lost: lower its rate or raise the bit rate"
 _SHARED = (
     "counters and times contradict each other: two sensors use the same CAN identifiers, so "
     "none of their samples is used: give each sensor its own block (over UART, Xsens MT Manager) "

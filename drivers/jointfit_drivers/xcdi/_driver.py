@@ -163,26 +163,21 @@ class XcdiImu:
             self._silent_s = settings.silence_s
             emit(chunk)
 
+        def resembles(data: bytes) -> bool:
+            """Whether `data` could be a quaternion: four integers of norm 1."""
+            counts = decode(DataId.QUATERNION, data, settings.byte_order)
+            if isinstance(counts, CorruptBytes):
+                return False
+            w, x, y, z = (count * QUATERNION_SCALE for count in counts)
+            return OrientationGate().admit((w, x, y, z)) is not None
+
         silence_s = self._silent_s
         self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
-
+        emit_logged = self._logged(emit_sample)
         async with shared_bus(settings.can) as bus:
             await bus.pump(
-                settings.id,
-                ids,
-                self._logged(emit_sample),
-                silence_s,
-                needed=needed,
-                resembles=self._resembles,
+                settings.id, ids, emit_logged, silence_s, needed=needed, resembles=resembles
             )
-
-    def _resembles(self, data: bytes) -> bool:
-        """Whether `data` could be a quaternion: four integers of norm 1."""
-        counts = decode(DataId.QUATERNION, data, self._settings.byte_order)
-        if isinstance(counts, CorruptBytes):
-            return False
-        w, x, y, z = (count * QUATERNION_SCALE for count in counts)
-        return OrientationGate().admit((w, x, y, z)) is not None
 
     def _logged(self, emit: Emit) -> Emit:
         """Return `emit`, which also logs the first frames at debug level."""

@@ -115,7 +115,8 @@ class XbusCodec:
 
     def __init__(self) -> None:
         self._pending = b""  # under one message between calls: MAX_MESSAGE bounds it
-        self._fed = 0
+        self.fed = 0
+        """Bytes fed so far."""
         self._run = 0
         self._reason = ""
         self.messages = 0
@@ -130,11 +131,6 @@ class XbusCodec:
         """Bytes of an incomplete message."""
         return len(self._pending)
 
-    @property
-    def fed(self) -> int:
-        """Bytes fed so far."""
-        return self._fed
-
     def feed(self, data: bytes) -> list[XbusMessage | CorruptBytes]:
         """Return the messages that `data` completed, in wire order; never raises."""
         return self._scan(data, final=False)
@@ -147,8 +143,8 @@ class XbusCodec:
 
     def _scan(self, data: bytes, *, final: bool) -> list[XbusMessage | CorruptBytes]:
         buffer = self._pending + data if self._pending else bytes(data)
-        base = self._fed - len(self._pending)
-        self._fed += len(data)
+        base = self.fed - len(self._pending)
+        self.fed += len(data)
         found: list[XbusMessage | CorruptBytes] = []
 
         at, end = 0, len(buffer)

@@ -116,7 +116,7 @@ async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> 
             await run.wait_for(50)
         assert [each.counter for each in runs[0].samples] == list(range(50))
         assert [each.counter for each in runs[1].samples] == list(range(1000, 1050))
-        assert [run.decoder.foreign for run in runs] == [0, 0]
+        assert [run.decoder._xcdi.foreign for run in runs] == [0, 0]
         await runs[0].cancel()
         assert adapter.is_open, "the bus stays open for the other"
         await runs[1].cancel()

@@ -47,7 +47,7 @@ def test_a_stepped_wall_clock_moves_no_frame(step_s: float) -> None:
     if abs(step_s) > 2:  # a small one cannot be told for frames that waited
         assert stamped(clocks, stamps, 500_000, before) == pytest.approx(500_000, abs=300)
     assert stamped(clocks, stamps, 200_000) == pytest.approx(200_000, abs=300)
-    assert stamps.unusable == 0
+    assert stamps.replaced == 0
 
 
 def test_an_absurd_stamp_is_replaced_by_now_and_counted() -> None:
@@ -55,4 +55,4 @@ def test_an_absurd_stamp_is_replaced_by_now_and_counted() -> None:
     stamps = KernelStamps(1_000_000, clocks.monotonic_ns, clocks.unix_ns)
     stamps.pair()
     assert stamped(clocks, stamps, 500 * S) == 0
-    assert stamps.unusable == 1
+    assert stamps.replaced == 1

@@ -151,7 +151,7 @@ def test_a_lost_quaternion_is_a_gap_of_one() -> None:
     decoder = events()
     found = decoded(tape, decoder)
     assert [gap.data["lost"] for gap in of_kind(found, "gap")] == [1]
-    assert decoder.incomplete == 1
+    assert decoder._xcdi.incomplete == 1
 
 
 def test_a_lost_sample_time_costs_the_time_and_not_the_sample() -> None:
@@ -345,7 +345,7 @@ data_frames = st.builds(
 def test_messages_and_losses_add_up(frames: list[CanFrame]) -> None:
     decoder = events("auto")
     decoder.feed(Chunk(0, pack_frames(frames)))
-    used = (decoder.messages + decoder.foreign) * RECORD_BYTES
+    used = (decoder.messages + decoder._xcdi.foreign) * RECORD_BYTES
     assert used + decoder.discarded_bytes == len(frames) * RECORD_BYTES
 
 
