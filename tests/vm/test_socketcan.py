@@ -128,7 +128,8 @@ async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanW
             task.cancel()
     for each, base in zip(heard, bases.values(), strict=True):
         assert [sample.counter for sample in each.samples] == list(range(base, base + 50))
-        assert each.decoder._xcdi.foreign == each.decoder._xcdi.incomplete == each.decoder.discarded_bytes == 0
+        codec = each.decoder._xcdi
+        assert codec.foreign == codec.incomplete == each.decoder.discarded_bytes == 0
         assert not [
             event for event in each.events if isinstance(event, DeviceEvent) and event.kind == "gap"
         ]
