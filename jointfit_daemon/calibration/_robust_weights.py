@@ -1,4 +1,4 @@
-"""Robust statistics of residuals: scale, Huber weights and effective sample count."""
+"""Statistics of residuals: RMS, robust scale, Huber weights and effective sample count."""
 
 from __future__ import annotations
 
@@ -18,6 +18,12 @@ SETTLED = 1e-7
 """Largest change of a weight at which the iteration has converged."""
 
 _MEDIAN_TO_SD = 1.4826
+
+
+def rms(values: NDArray[np.float64], empty: float = np.nan) -> float:
+    """Return the RMS of the finite values; `empty` if there are none."""
+    good = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(good**2))) if good.size else empty
 
 
 def robust_scale(magnitudes: NDArray[np.float64], floor: float = 1e-6) -> float:

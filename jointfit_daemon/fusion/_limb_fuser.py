@@ -22,7 +22,7 @@ from jointfit_daemon.fusion._heading_uncertainty import (
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
 from jointfit_daemon.fusion.faults import ConsistencyMonitor, SensorMonitor
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
-from jointfit_daemon.limb_model import flexion_sign, neighbor
+from jointfit_daemon.limb_model import configured_length, flexion_sign, neighbor
 from jointfit_daemon.model import (
     FrameFlag,
     FusionMode,
@@ -93,10 +93,9 @@ class LimbFuser:
         for i, segment in enumerate(chain.segments):
             stored = calibration.segment[segment]
             self._fusers.append(SegmentFuser(segment, chain.sensors[i], stored))
-            length, sd = stored.length, stored.length_sd
-            if i < len(chain.lengths) and chain.lengths[i] is not None:
-                length = chain.lengths[i]  # rig.toml overrides the calibration
-            self._lengths.append(SegmentLength(length, sd or 0.0))
+            length = configured_length(chain, i)  # rig.toml overrides the calibration
+            length = stored.length if length is None else length
+            self._lengths.append(SegmentLength(length, stored.length_sd or 0.0))
         self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._use_correlations(calibration)

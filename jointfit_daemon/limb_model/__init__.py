@@ -13,7 +13,12 @@ from jointfit_daemon.limb_model._calibration import (
     SensorCalibration,
     model_key,
 )
-from jointfit_daemon.limb_model._chain_conventions import body_parts, flexion_sign, neighbor
+from jointfit_daemon.limb_model._chain_conventions import (
+    body_parts,
+    configured_length,
+    flexion_sign,
+    neighbor,
+)
 from jointfit_daemon.limb_model._kernel_expert import KernelExpert, as_rows
 from jointfit_daemon.limb_model._kernel_features import TILTS, bumps, smooth_terms, widths_of
 from jointfit_daemon.limb_model._kernel_model import KernelModel, mix_corrections, model_inputs
@@ -86,6 +91,7 @@ __all__ = [
     "body_parts",
     "bumps",
     "cluster_record",
+    "configured_length",
     "equal_weights",
     "flexion_sign",
     "fuse",

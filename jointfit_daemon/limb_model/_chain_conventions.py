@@ -17,6 +17,11 @@ def body_parts(chain: Chain) -> list[str | None]:
     return [chain.proximal, *chain.segments, chain.distal]
 
 
+def configured_length(chain: Chain, i: int) -> float | None:
+    """Return the configured length of segment i, m; None if calibration estimates it."""
+    return chain.lengths[i] if i < len(chain.lengths) else None
+
+
 def flexion_sign(joint: str) -> float:
     """Return +1 if flexion moves the distal segment forward, -1 for knees and unknown names."""
     return 1.0 if any(word in joint.casefold() for word in FLEXES_FORWARD) else -1.0

@@ -28,7 +28,7 @@ def on_the_plate(_: Path) -> list[Result]:
     settings = bench_rig().calibration
     lags, sigmas, refused = [], [], 0
     for seed in SEEDS:
-        for found in fit_plate_alignment(phases(seed).align, settings).sensors.values():
+        for found in fit_plate_alignment(phases(seed).align, settings).quality.values():
             if found.lag_ns is None or not found.lag_sigma_ns:
                 refused += 1
                 continue

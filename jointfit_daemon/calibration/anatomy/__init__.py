@@ -5,6 +5,7 @@ from jointfit_daemon.calibration.anatomy._joint_center import (
 )
 from jointfit_daemon.calibration.anatomy._marker_clusters import (
     ClusterTrack,
+    body_column,
     columns,
     marked_parts,
     moving_template,
@@ -13,6 +14,7 @@ from jointfit_daemon.calibration.anatomy._marker_clusters import (
     track_clusters,
 )
 from jointfit_daemon.calibration.anatomy._segment_frames import (
+    CONFIGURED_SD_M,
     SKIN_SD_M,
     Anatomy,
     JointCenter,
@@ -23,12 +25,14 @@ from jointfit_daemon.calibration.anatomy._segment_frames import (
 from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
 
 __all__ = [
+    "CONFIGURED_SD_M",
     "MIN_DIRECTION_RAD",
     "SKIN_SD_M",
     "Anatomy",
     "ClusterTrack",
     "JointCenter",
     "apply_standing_prior",
+    "body_column",
     "columns",
     "find_anatomy",
     "marked_parts",

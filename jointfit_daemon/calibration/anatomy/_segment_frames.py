@@ -25,7 +25,7 @@ from jointfit_daemon.calibration.anatomy._joint_center import (
 )
 from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import body_parts, flexion_sign, visible
+from jointfit_daemon.limb_model import body_parts, configured_length, flexion_sign, visible
 from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
@@ -252,7 +252,7 @@ def _with_lengths(
     joints = dict(fits)
     order = [*range(len(chain.segments)), *reversed(range(len(chain.segments)))]
     for i in order:
-        length = chain.lengths[i] if i < len(chain.lengths) else None
+        length = configured_length(chain, i)
         top, bottom = chain.joints[i], chain.joints[i + 1]
         if length is None:
             continue
@@ -352,7 +352,7 @@ def _frame(segment: str, x: Array, z: Array) -> Array:
 def _length(
     chain: Chain, i: int, top: JointCenter | None, bottom: JointCenter | None
 ) -> tuple[tuple[float | None, float | None], str]:
-    configured = chain.lengths[i] if i < len(chain.lengths) else None
+    configured = configured_length(chain, i)
     if configured is not None:
         return (configured, CONFIGURED_SD_M), "configured"
     if top is None or bottom is None:

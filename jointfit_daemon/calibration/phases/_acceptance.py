@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from jointfit_daemon.limb_model import Calibration
 
 SLACK = 1.15
@@ -38,11 +36,8 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
     """
     if old is None:
         return CalibrationComparison(True, "there was no calibration")
-    if (new.joints, new.segments, new.chain_sensors) != (
-        old.joints,
-        old.segments,
-        old.chain_sensors,
-    ):
+    chains = [(one.joints, one.segments, one.chain_sensors) for one in (new, old)]
+    if chains[0] != chains[1]:
         return CalibrationComparison(True, "the old one belongs to another chain or other sensors")
 
     had, has = "holdout" in old.quality, "holdout" in new.quality
@@ -59,11 +54,7 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
         )
 
     worse = [*_worse_angles(new, old), *_worse_joints(new, old)] if has else []
-    return (
-        CalibrationComparison(False, "; ".join(worse))
-        if worse
-        else CalibrationComparison(True, "no figure is worse")
-    )
+    return CalibrationComparison(not worse, "; ".join(worse) or "no figure is worse")
 
 
 def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
@@ -72,8 +63,8 @@ def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
         before = old.quality["holdout"].get(kind, {})
         after = new.quality["holdout"].get(kind, {})
         for name in before:
-            was, now = _figure(before, name, old.method), _figure(after, name, new.method)
-            if was is None or now is None:
+            was, now = before[name].get(old.method), after.get(name, {}).get(new.method)
+            if not (isinstance(was, int | float) and isinstance(now, int | float)):
                 continue
             if now > SLACK * was + SLACK_RAD:
                 quantity = "orientation" if kind == "segments" else "flexion"
@@ -81,11 +72,6 @@ def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
                     f"{name}: {quantity} error {np.rad2deg(now):.1f} deg, was {np.rad2deg(was):.1f}"
                 )
     return found
-
-
-def _figure(figures: Mapping[str, Any], name: str, method: str) -> float | None:
-    value = figures.get(name, {}).get(method)
-    return float(value) if isinstance(value, int | float) else None
 
 
 def _worse_joints(new: Calibration, old: Calibration) -> list[str]:

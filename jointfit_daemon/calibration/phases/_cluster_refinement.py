@@ -15,11 +15,13 @@ error there is unchanged.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.calibration._quality import MarkerQuality, PartQuality
+from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.calibration.marker_refinement import (
     MotionTrial,
     RefinementError,
@@ -49,10 +51,9 @@ class RefinedClusters:
     """Body parts after refinement, with quality figures."""
 
     clusters: Mapping[str, MarkerCluster]
-    figures: Mapping[str, Any] | None
-    """``parts``: RMS residual of each part before and after on the held-out part of the trial, and
-    whether the refinement is used; ``moved_m`` of each marker. None if nothing was refined."""
-    notes: tuple[str, ...] = field(default=())
+    figures: MarkerQuality | None
+    """None if nothing was refined."""
+    notes: tuple[str, ...] = ()
 
 
 def refine_clusters(
@@ -118,13 +119,13 @@ def _judged(
     notes: list[str] = []
     for i, (name, cluster) in enumerate(marked.items()):
         mine = model.marker_segments == i
-        before, after = _rms(judge.before.by_marker[mine]), _rms(judge.after.by_marker[mine])
+        before, after = (rms(one.by_marker[mine], 0.0) for one in (judge.before, judge.after))
         other = fit_shape_to_pose(cluster, found.model.positions[mine])
         shift = other.template + other.origin - cluster.template - cluster.origin
         lengths = np.linalg.norm(shift, axis=1)
         far = int(lengths.argmax())
         better = bool(after < before and lengths[far] < FARTHEST_M)
-        parts[name] = {"before_m": before, "after_m": after, "refined": better}
+        parts[name] = PartQuality(before, after, better)
 
         if better:
             used[name] = other
@@ -134,12 +135,7 @@ def _judged(
                 f"{name}: markers not refined: {cluster.markers[far]} would move by "
                 f"{1000 * lengths[far]:.0f} mm; check the labels of {', '.join(cluster.markers)}"
             )
-    return RefinedClusters(used, {"parts": parts, "moved_m": moved}, tuple(notes))
-
-
-def _rms(by_marker: Array) -> float:
-    seen = by_marker[np.isfinite(by_marker)]
-    return float(np.sqrt((seen**2).mean())) if seen.size else 0.0
+    return RefinedClusters(used, MarkerQuality(parts, moved), tuple(notes))
 
 
 def fit_shape_to_pose(cluster: MarkerCluster, shape: Array) -> MarkerCluster:

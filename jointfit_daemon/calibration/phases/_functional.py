@@ -6,11 +6,12 @@ reference, not from bones. All reasons for a rejection are reported at once, wit
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration._quality import CalibrationQuality, quality_table
 from jointfit_daemon.calibration.anatomy import (
     SKIN_SD_M,
     Anatomy,
@@ -20,6 +21,11 @@ from jointfit_daemon.calibration.anatomy import (
     track_clusters,
 )
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
+from jointfit_daemon.calibration.phases._quality_figures import (
+    anatomy_quality,
+    lag_notes,
+    lag_quality,
+)
 from jointfit_daemon.calibration.phases._static_pose import (
     StaticPose,
     fit_static,
@@ -39,11 +45,11 @@ from jointfit_daemon.calibration.registration import (
 )
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
+    evaluate_methods,
     evenly,
     fit_links,
     fit_models,
     joint_error_correlations,
-    judge,
     pack,
 )
 from jointfit_daemon.kinematics import rotation
@@ -78,11 +84,6 @@ STORED_SD_NS = 3e6
 skin."""
 MISALIGNED = np.deg2rad(25.0)
 """Heading difference that soft tissue does not explain, rad."""
-MEANING = (
-    "RMS distance from the optical reference on the last part of the trial, after a fit to the"
-    " first part; the stored models were then fitted to all of it"
-)
-"""Explanation of the hold-out figures, published with them."""
 
 
 def fit_calibration(
@@ -94,7 +95,6 @@ def fit_calibration(
     *,
     previous: Calibration | None = None,
     software: str = "",
-    created_utc: str = "",
     lag_ns: Mapping[str, int] | None = None,
     tracked: Mapping[str, tuple[float, float]] | None = None,
 ) -> Calibration:
@@ -124,51 +124,47 @@ def fit_calibration(
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 
     # Reference: body parts, joint centers and segment axes.
-    refined, tracks = _refined(_tracks(pose, functional, chain), pose, functional, settings)
+    refined, tracks = refined_tracks(_tracks(pose, functional, chain), pose, functional, settings)
     anatomy = find_anatomy(chain, tracks)
+    joints = {name: _joint(found) for name, found in anatomy.joints.items()}
 
     # Lags and mounts of the sensors.
-    lags = _lags(chain, functional, tracks, lag_ns or {})
-    used = _chosen_lags(chain, lags, alignment, _earlier(previous, tracked or {}), lag_ns or {})
-    used_ns = {name: item.lag_ns for name, item in used.items()}
-    sensors = _sensors(chain, pose, alignment, anatomy, used_ns)
+    moving = _lags(chain, functional, tracks, lag_ns or {})
+    earlier = _earlier_lags(previous, tracked or {})
+    lags = _lags_in_use(chain, moving, alignment, earlier, lag_ns or {})
+    sensors = _sensors(chain, pose, alignment, anatomy, lags)
 
     # Segment models.
-    training, raw, training_notes = limb_training(chain, functional, tracks, anatomy, sensors)
+    training, raw, missing = limb_training(chain, functional, tracks, anatomy, sensors)
     models = fit_models(chain, training, settings.method)
     headings = _heading_notes(chain, raw, training) if alignment is None else []
-    notes = (*refined.notes, *anatomy.notes, *_lag_notes(lags, used_ns), *training_notes, *headings)
+    assumed = [FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else []
+    quality = CalibrationQuality(
+        static=pose.quality,
+        alignment=None if alignment is None else alignment.quality,
+        lag={name: lag_quality(moving.get(name), lags.get(name, NO_LAG)) for name in sensors},
+        markers=refined.figures,
+        anatomy=anatomy_quality(anatomy, joints),
+        holdout=evaluate_methods(chain, training, settings.method, settings.holdout_share),
+    )
     return Calibration(
         method=settings.method,
         joints=chain.joints,
         segments=chain.segments,
         chain_sensors=chain.sensors,
         sensor=sensors,
-        segment={name: _segment(name, anatomy, models[name]) for name in chain.segments},
-        joint={name: _joint(found) for name, found in anatomy.joints.items()},
+        segment=_segments(anatomy, models),
+        joint=joints,
         clusters={name: cluster_record(cluster) for name, cluster in refined.clusters.items()},
-        flags=(*anatomy.flags, *([FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else [])),
-        notes=notes,
-        quality={
-            "static": pose.quality,
-            "alignment": None if alignment is None else alignment.quality,
-            "lag": {n: _lag_figures(lags.get(n), used.get(n, NO_LAG)) for n in sensors},
-            **({} if refined.figures is None else {"markers": refined.figures}),
-            "anatomy": _anatomy_figures(anatomy),
-            "holdout": _holdout(chain, training, settings),
-        },
+        flags=(*anatomy.flags, *assumed),
+        notes=(*refined.notes, *anatomy.notes, *lag_notes(moving, lags), *missing, *headings),
+        quality=quality_table(quality),
         digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
         software=software,
-        created_utc=created_utc,
         links=fit_links(chain, training.sensors, anatomy.q_static),
         correlations=joint_error_correlations(chain, training, settings.method),
         memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
     )
-
-
-def _holdout(chain: Chain, training: LimbTraining, settings: CalibrationSettings) -> dict[str, Any]:
-    figures = judge(chain, training, settings.holdout_share)
-    return {"method": settings.method, **figures, "meaning": MEANING}
 
 
 def _tracks(
@@ -205,7 +201,7 @@ def _tracks(
     return tracks
 
 
-def _refined(
+def refined_tracks(
     tracks: dict[str, ClusterTrack],
     pose: StaticPose,
     functional: CalibrationTrial,
@@ -234,35 +230,7 @@ def _lags(
     return out
 
 
-def _chosen_lags(
-    chain: Chain,
-    moving: Mapping[str, LagEstimate],
-    alignment: PlateAlignment | None,
-    earlier: Mapping[str, SensorLag],
-    known: Mapping[str, int],
-) -> dict[str, SensorLag]:
-    """Return configured lags, else lags from movement and plate combined, else earlier lags."""
-    lags = dict(earlier)
-    plate = {} if alignment is None else alignment.sensors
-
-    prior = {
-        name: (
-            item.lag_ns,
-            item.lag_sigma_ns or (STORED_SD_NS if item.kind == "stored" else PLATE_SD_NS),
-        )
-        for name, item in plate.items()
-        if item.lag_ns is not None
-    }
-
-    for group in chain.sensors:
-        lags |= segment_lags(
-            {name: moving[name] for name in group if name in moving},
-            {name: prior[name] for name in group if name in prior},
-        )
-    return lags | {name: configured_lag(lag) for name, lag in known.items()}
-
-
-def _earlier(
+def _earlier_lags(
     previous: Calibration | None, tracked: Mapping[str, tuple[float, float]]
 ) -> dict[str, SensorLag]:
     """Return earlier lags: the stored ones, or the tracked ones if more certain."""
@@ -276,13 +244,31 @@ def _earlier(
     return seen | kept
 
 
-def _lag_notes(lags: Mapping[str, LagEstimate], used_ns: Mapping[str, int]) -> list[str]:
-    return [
-        f"{name}: no lag from this movement ({lag.refused}); "
-        f"{used_ns.get(name, 0) / 1e6:.1f} ms used"
-        for name, lag in lags.items()
-        if lag.refused is not None
-    ]
+def _lags_in_use(
+    chain: Chain,
+    moving: Mapping[str, LagEstimate],
+    alignment: PlateAlignment | None,
+    earlier: Mapping[str, SensorLag],
+    known: Mapping[str, int],
+) -> dict[str, SensorLag]:
+    """Return configured lags, else lags from movement and plate combined, else earlier lags."""
+    plate = {} if alignment is None else alignment.quality
+    prior = {
+        name: (
+            item.lag_ns,
+            item.lag_sigma_ns or (STORED_SD_NS if item.kind == "stored" else PLATE_SD_NS),
+        )
+        for name, item in plate.items()
+        if item.lag_ns is not None
+    }
+
+    lags = dict(earlier)
+    for group in chain.sensors:
+        lags |= segment_lags(
+            {name: moving[name] for name in group if name in moving},
+            {name: prior[name] for name in group if name in prior},
+        )
+    return lags | {name: configured_lag(lag) for name, lag in known.items()}
 
 
 def _sensors(
@@ -290,14 +276,15 @@ def _sensors(
     pose: StaticPose,
     alignment: PlateAlignment | None,
     anatomy: Anatomy,
-    lag_ns: Mapping[str, int],
+    lags: Mapping[str, SensorLag],
 ) -> dict[str, SensorCalibration]:
     out = {}
     for segment, group in zip(chain.segments, chain.sensors, strict=True):
         q_static = as_quaternion(anatomy.q_static[segment])
         for s in group:
             world: Quaternion = (1.0, 0.0, 0.0, 0.0) if alignment is None else alignment.world(s)
-            out[s] = sensor_calibration(pose.sensors[s], world, q_static, lag_ns.get(s, 0))
+            lag_ns = lags.get(s, NO_LAG).lag_ns
+            out[s] = sensor_calibration(pose.sensors[s], world, q_static, lag_ns)
     return out
 
 
@@ -316,9 +303,13 @@ def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTrainin
     return notes
 
 
-def _segment(name: str, anatomy: Anatomy, models: Mapping[str, SegmentModel]) -> SegmentCalibration:
-    q_static = as_quaternion(anatomy.q_static[name])
-    return SegmentCalibration(q_static, *anatomy.lengths[name], models)
+def _segments(
+    anatomy: Anatomy, models: Mapping[str, Mapping[str, SegmentModel]]
+) -> dict[str, SegmentCalibration]:
+    return {
+        name: SegmentCalibration(as_quaternion(q), *anatomy.lengths[name], models[name])
+        for name, q in anatomy.q_static.items()
+    }
 
 
 def _joint(found: JointCenter | None) -> JointCalibration:
@@ -327,47 +318,3 @@ def _joint(found: JointCenter | None) -> JointCalibration:
     sd = float(np.sqrt(np.trace(found.covariance) / 3.0 + SKIN_SD_M**2))
     residual = None if found.fit is None else found.fit.residual
     return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
-
-
-def _lag_figures(moving: LagEstimate | None, used: SensorLag) -> dict[str, Any]:
-    """Return the lag in use and the lag of this movement alone."""
-    figures: dict[str, Any] = {"source": used.source}
-    if used.source != "none":
-        figures["lag_ns"] = used.lag_ns
-    if used.sigma_ns is not None:
-        figures["sigma_ns"] = round(used.sigma_ns)
-    if moving is not None and moving.refused is not None:
-        return figures | {"refused": moving.refused}
-    if moving is not None:
-        measured = {
-            "lag_ns": round(moving.lag_ns),
-            "sigma_ns": round(moving.sigma_ns),
-            "r2": moving.r2,
-        }
-        figures["movement"] = measured
-    return figures
-
-
-def _anatomy_figures(anatomy: Anatomy) -> dict[str, Any]:
-    return {
-        "joints": {
-            name: {
-                "source": "unknown" if found is None else found.source_text,
-                "sd_m": _joint(found).sd,
-                "residual_rms_m": _joint(found).residual_rms,
-                "gap_rms_m": None if found is None else found.gap_rms,
-                "arc_rad": None if found is None or found.fit is None else found.fit.arc,
-                "unseen_directions": 0
-                if found is None or found.fit is None
-                else len(found.fit.unseen),
-            }
-            for name, found in anatomy.joints.items()
-        },
-        "lengths_m": {name: length for name, (length, _) in anatomy.lengths.items()},
-        "length_sd_m": {name: sd for name, (_, sd) in anatomy.lengths.items()},
-        "length_sources": dict(anatomy.length_sources),
-        "flexion_axes": {
-            name: {"rms_rad": axis.rms, "off_plane_rad": axis.off}
-            for name, axis in anatomy.axes.items()
-        },
-    }

@@ -17,6 +17,7 @@ from jointfit_daemon.calibration._jobs import (
     RefitJob,
     StaticJob,
 )
+from jointfit_daemon.calibration._quality import WorldQuality, quality_table
 from jointfit_daemon.calibration.phases._acceptance import compare_calibrations
 from jointfit_daemon.calibration.phases._functional import fit_calibration
 from jointfit_daemon.calibration.phases._online import refit_models
@@ -61,7 +62,7 @@ def _align(job: AlignJob) -> FitResult:
             *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
         )
     found = fit_plate_alignment(job.trial, job.settings, lag_ns=job.lag_ns)
-    return FitResult(found.quality, alignment=found.to_dict())
+    return FitResult(quality_table(found.quality), alignment=found.to_dict())
 
 
 def _static(job: StaticJob) -> FitResult:
@@ -69,10 +70,10 @@ def _static(job: StaticJob) -> FitResult:
     pose = fit_static(job.static, settings, chain)
     if previous is None:
         if settings.markers or settings.rigid_bodies:
-            return FitResult(pose.quality)
+            return FitResult(quality_table(pose.quality))
         # Without cameras the static pose is the whole calibration.
         found = fit_static_only(pose, _alignment(job), chain, software=__version__)
-        return FitResult(pose.quality, calibration=found)
+        return FitResult(quality_table(pose.quality), calibration=found)
 
     # An alignment of this session applies if the models of `previous` refer to aligned worlds.
     alignment = None
@@ -85,7 +86,7 @@ def _static(job: StaticJob) -> FitResult:
     )
     groups = dict(zip(chain.segments, chain.sensors, strict=True))
     notes = tuple(redonning_notes(before, after, groups))
-    return FitResult(pose.quality, calibration=found, notes=notes)
+    return FitResult(quality_table(pose.quality), calibration=found, notes=notes)
 
 
 def _functional(job: FunctionalJob) -> FitResult:
@@ -131,7 +132,9 @@ def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
     # The worlds do not depend on how the sensors are worn: they outlive a calibration.
     return PlateAlignment(
         {
-            name: AlignedSensor(item.q_optical_world, "stored", 0.0, 0.0, 0.0, item.lag_ns)
+            name: AlignedSensor(
+                item.q_optical_world, WorldQuality("stored", 0.0, 0.0, 0.0, item.lag_ns, None)
+            )
             for name, item in previous.sensor.items()
         }
     )

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.calibration.registration import RobustMean, static_mount
 from jointfit_daemon.calibration.soft_tissue import (
     FEWEST_FRAMES,
     METHODS,
     LimbTraining,
+    fit_all_sensors,
     fit_links,
     fit_models,
     joint_error_correlations,
@@ -285,7 +287,12 @@ class _Fold:
         return self._judged(
             method,
             {
-                segment: predict_all_sensors(self.chain, i, method, self.training, self.aligned)
+                segment: predict_all_sensors(
+                    self.chain,
+                    i,
+                    fit_all_sensors(self.chain, i, method, self.training),
+                    self.aligned,
+                )
                 for i, segment in enumerate(self.chain.segments)
             },
         )
@@ -320,8 +327,8 @@ class _Fold:
             self.test.name,
             method,
             self.frames,
-            {s: _rms(rotation.angle_between(estimates[s], reference[s])) for s in chain.segments},
-            {j: _rms(np.arctan2(np.sin(angle), np.cos(angle))) for j, angle in off.items()},
+            {s: rms(rotation.angle_between(estimates[s], reference[s])) for s in chain.segments},
+            {j: rms(np.arctan2(np.sin(angle), np.cos(angle))) for j, angle in off.items()},
             flexion,
         )
 
@@ -333,8 +340,3 @@ def _inner(chain: Chain) -> Iterable[tuple[str, str, str]]:
 def _flexion(above: Array, below: Array, axis: Array) -> Array:
     angle: Array = swing_twist(joint_rotation(above, below), axis)[1]
     return angle
-
-
-def _rms(values: Array) -> float:
-    good = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(good**2))) if good.size else float("nan")

@@ -10,35 +10,37 @@ sensors are inconsistent.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
 from jointfit_daemon.calibration._jobs import FitResult
+from jointfit_daemon.calibration._quality import OnlineQuality, quality_table
+from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
     evenly,
+    fit_all_sensors,
     fit_models,
-    fit_segment,
-    flexion,
+    flexion_error,
     joined,
     joint_error_correlations,
-    mean_of,
     pack,
+    predict_all_sensors,
     unpack,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import model_key, neighbor, restore_cluster, rigid_fit
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration._trial import OnlineFrames
-    from jointfit_daemon.limb_model import Calibration, Method
+    from jointfit_daemon.limb_model import Calibration, SegmentModel
     from jointfit_daemon.model import Chain
 
+    Models = dict[str, SegmentModel]
 
 FEWEST = 200
 """Smallest number of new frames."""
@@ -98,35 +100,33 @@ def refit_models(
 
     new = _without_heading_drift(calibration, _reference(calibration, frames, chain), chain)
     cut = round(len(new) * (1.0 - HELD))
-    older, newest = new.part(slice(None, cut)), new.part(slice(cut, None))
+    older, newest = new.rows(slice(None, cut)), new.rows(slice(cut, None))
 
     # Candidate without the newest frames, evaluated on them and on the earlier frames.
-    candidate = _all_alive(chain, joined(known, evenly(chain, older)), calibration.method)
+    training = joined(known, evenly(chain, older))
     in_force = _in_force(calibration, chain)
-    before, after = _figures(chain, in_force, newest), _figures(chain, candidate, newest)
-    known_before, known_after = _figures(chain, in_force, known), _figures(chain, candidate, known)
-    figures: dict[str, Any] = {
-        "frames": len(new),
-        "judged": len(newest),
-        "before_rad": before,
-        "after_rad": after,
-        "known_before_rad": known_before,
-        "known_after_rad": known_after,
+    candidate = {
+        name: fit_all_sensors(chain, i, calibration.method, training)
+        for i, name in enumerate(chain.segments)
     }
-
-    kept = (
-        _not_better(before, after)
-        or _forgotten(known_before, known_after)
-        or _too_far(chain, in_force, candidate, known)
+    figures = OnlineQuality(
+        len(new),
+        len(newest),
+        before_rad=_figures(chain, in_force, newest),
+        after_rad=_figures(chain, candidate, newest),
+        known_before_rad=_figures(chain, in_force, known),
+        known_after_rad=_figures(chain, candidate, known),
     )
+
+    kept = _rejection(figures) or _too_far(chain, in_force, candidate, known)
     if kept is not None:
-        return FitResult({"online": figures}, kept=kept)
+        return FitResult({"online": quality_table(figures)}, kept=kept)
 
     # Accepted: fit all sets of sensors to all frames.
     whole = evenly(chain, joined(known, new))
     models = fit_models(chain, whole, calibration.method)
     rounds = int(calibration.quality.get("online", {}).get("rounds", 0)) + 1
-    figures |= {"rounds": rounds, "software": software, "taught": calibration.digest}
+    figures = replace(figures, rounds=rounds, software=software, taught=calibration.digest)
 
     segments = {
         name: replace(item, models=models[name]) for name, item in calibration.segment.items()
@@ -136,7 +136,7 @@ def refit_models(
         segment=segments,
         correlations=joint_error_correlations(chain, whole, calibration.method),
         memory=pack(chain, whole),
-        quality={**calibration.quality, "online": figures},
+        quality={**calibration.quality, "online": quality_table(figures)},
     )
     return FitResult(found.quality, calibration=found)
 
@@ -179,7 +179,12 @@ def _without_heading_drift(
     estimates = _predictions(chain, _in_force(calibration, chain), new)
     reference = {}
     for name in chain.segments:
-        q = _remove_heading_drift(new.reference[name], estimates[name])
+        q = new.reference[name].copy()
+        off = rotation.log(rotation.multiply(q, rotation.conjugate(estimates[name])))
+        for rows in np.array_split(np.arange(len(q)), max(len(q) // TURN_FRAMES, 1)):
+            turn = rotation.heading(np.array(-float(np.median(off[rows, 2]))))
+            q[rows] = rotation.multiply(turn, q[rows])
+
         off = rotation.log(rotation.multiply(rotation.conjugate(estimates[name]), q))
         apart = float(np.median(np.linalg.norm(off, axis=1)))
         shift = float(np.linalg.norm(np.median(off, axis=0)))
@@ -193,18 +198,7 @@ def _without_heading_drift(
     return LimbTraining(new.sensors, reference)
 
 
-def _remove_heading_drift(reference: Array, estimates: Array) -> Array:
-    off = rotation.log(rotation.multiply(reference, rotation.conjugate(estimates)))
-    out = reference.copy()
-    for rows in np.array_split(np.arange(len(out)), max(len(out) // TURN_FRAMES, 1)):
-        turn = rotation.heading(np.array(-float(np.median(off[rows, 2]))))
-        out[rows] = rotation.multiply(turn, reference[rows])
-    return out
-
-
 # --- models and their evaluation --------------------------------------------------------------
-
-Models = dict[str, Any]
 
 
 def _in_force(calibration: Calibration, chain: Chain) -> Models:
@@ -215,56 +209,36 @@ def _in_force(calibration: Calibration, chain: Chain) -> Models:
     return found
 
 
-def _all_alive(chain: Chain, training: LimbTraining, method: Method) -> Models:
-    found = {}
-    for i, name in enumerate(chain.segments):
-        near = neighbor(chain, i)
-        found[name] = fit_segment(
-            method,
-            [training.sensors[s] for s in chain.sensors[i]],
-            mean_of(training, near) if near else None,
-            training.reference[name],
-            training.trials,
-        )
-    return found
-
-
 def _predictions(chain: Chain, models: Models, frames: LimbTraining) -> dict[str, Array]:
-    out = {}
-    for i, name in enumerate(chain.segments):
-        near = neighbor(chain, i)
-        sensors = [frames.sensors[s] for s in chain.sensors[i]]
-        out[name] = models[name].predict(sensors, mean_of(frames, near) if near else None)
-    return out
+    return {
+        name: predict_all_sensors(chain, i, models[name], frames)
+        for i, name in enumerate(chain.segments)
+    }
 
 
 def _figures(chain: Chain, models: Models, frames: LimbTraining) -> dict[str, float]:
     """Return the RMS error of every segment and of the flexion of every inner joint, rad."""
     estimates, truth = _predictions(chain, models, frames), frames.reference
-    found = {n: _rms(rotation.angle_between(estimates[n], truth[n])) for n in chain.segments}
-    for i, joint in enumerate(chain.joints[1:-1]):
-        above, below = chain.segments[i], chain.segments[i + 1]
-        off = flexion(estimates[above], estimates[below]) - flexion(truth[above], truth[below])
-        found[joint] = _rms(np.arctan2(np.sin(off), np.cos(off)))
+    found = {n: rms(rotation.angle_between(estimates[n], truth[n])) for n in chain.segments}
+    for joint, (above, below) in zip(chain.joints[1:-1], pairwise(chain.segments), strict=True):
+        found[joint] = flexion_error(
+            (estimates[above], estimates[below]), (truth[above], truth[below])
+        )
     return found
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _not_better(before: Mapping[str, float], after: Mapping[str, float]) -> str | None:
+def _rejection(figures: OnlineQuality) -> str | None:
+    """Return why the errors of the candidate do not justify its use; None if they do."""
+    before, after = figures.before_rad, figures.after_rad
     was, now = (float(np.mean([x**2 for x in f.values()])) ** 0.5 for f in (before, after))
     if now > min(GAIN * was, was - GAIN_RAD):
         return f"no improvement on the newest frames: {_deg(now)}, was {_deg(was)}"
     for name, figure in after.items():
         if figure > before[name]:
             return f"{name}: worse on the newest frames: {_deg(figure)}, was {_deg(before[name])}"
-    return None
 
-
-def _forgotten(before: Mapping[str, float], after: Mapping[str, float]) -> str | None:
-    for name, figure in after.items():
+    before = figures.known_before_rad
+    for name, figure in figures.known_after_rad.items():
         if figure > WORSE * before[name] + WORSE_RAD:
             return (
                 f"{name}: larger error on earlier frames: {_deg(figure)}, was {_deg(before[name])}"

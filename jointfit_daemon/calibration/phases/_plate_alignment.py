@@ -6,14 +6,15 @@ skin-mounted sensors. Parameters that the movement did not excite are rejected w
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration._errors import CalibrationError, unknown_name
+from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration._quality import WorldQuality, quality_table
 from jointfit_daemon.calibration._trial import PLATE
-from jointfit_daemon.calibration.anatomy import columns, moving_template
+from jointfit_daemon.calibration.anatomy import body_column, columns, moving_template
 from jointfit_daemon.calibration.registration import (
     fit_observable_alignment,
     sensor_at,
@@ -50,18 +51,7 @@ class AlignedSensor:
     """World of one sensor relative to the optical world."""
 
     q_optical_world: Quaternion
-    kind: str
-    """``full`` | ``heading`` (both verticals assumed correct)."""
-    kappa: float
-    """1 if world and mount are indistinguishable."""
-    error: float
-    """Standard error of the weakest direction, rad."""
-    rms: float
-    """RMS angle between plate and model, rad."""
-    lag_ns: int | None = None
-    """Sensor minus optical time stamp of the same event; None if not observable."""
-    lag_sigma_ns: float | None = None
-    """Standard deviation of the lag, ns; None if unknown."""
+    quality: WorldQuality
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +59,7 @@ class PlateAlignment:
     """Worlds of all sensors relative to the optical world."""
 
     sensors: Mapping[str, AlignedSensor]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     def world(self, sensor: str) -> Quaternion:
         """Return q_optical_world of a sensor.
@@ -86,25 +76,18 @@ class PlateAlignment:
         return self.sensors[sensor].q_optical_world
 
     @property
-    def quality(self) -> dict[str, Any]:
-        """Quality figures of every sensor, angles in rad."""
-        return {
-            name: {
-                "kind": item.kind,
-                "kappa": item.kappa,
-                "error_rad": item.error,
-                "rms_rad": item.rms,
-                "lag_ns": item.lag_ns,
-                "lag_sigma_ns": item.lag_sigma_ns,
-            }
-            for name, item in self.sensors.items()
-        }
+    def quality(self) -> dict[str, WorldQuality]:
+        """Quality figures of every sensor."""
+        return {name: item.quality for name, item in self.sensors.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
         return {
             "sensors": {
-                name: {"q_optical_world": list(item.q_optical_world), **self.quality[name]}
+                name: {
+                    "q_optical_world": list(item.q_optical_world),
+                    **quality_table(item.quality),
+                }
                 for name, item in self.sensors.items()
             },
             "notes": list(self.notes),
@@ -117,12 +100,7 @@ class PlateAlignment:
             {
                 name: AlignedSensor(
                     as_quaternion(item["q_optical_world"]),
-                    item["kind"],
-                    item["kappa"],
-                    item["error_rad"],
-                    item["rms_rad"],
-                    item["lag_ns"],
-                    item.get("lag_sigma_ns"),
+                    WorldQuality(*(item[field.name] for field in fields(WorldQuality))),
                 )
                 for name, item in data["sensors"].items()
             },
@@ -166,9 +144,8 @@ def fit_plate_alignment(
     found: dict[str, AlignedSensor] = {}
     for name, track in trial.sensors.items():
         try:
-            aligned = _align_one(name, track, (t_ns, q_plate), lags.get(name))
-            sigma = turning[name].sigma_ns if name in turning and name in lags else None
-            found[name] = replace(aligned, lag_sigma_ns=sigma)
+            sigma_ns = turning[name].sigma_ns if name in turning and name in lags else None
+            found[name] = _align_one(name, track, (t_ns, q_plate), lags.get(name), sigma_ns)
         except CalibrationError as refusal:
             reasons += refusal.reasons
     if reasons:
@@ -177,7 +154,7 @@ def fit_plate_alignment(
     notes = [
         f"{name}: only the heading was aligned; rotate the plate about more axes"
         for name, item in found.items()
-        if item.kind == "heading"
+        if item.quality.kind == "heading"
     ]
     return PlateAlignment(found, tuple(notes))
 
@@ -193,10 +170,7 @@ def plate_track(
         rig.toml names no plate, or the stream does not have it or hardly shows it.
     """
     if settings.plate is not None:
-        if settings.plate not in optical.bodies:
-            name = unknown_name("rigid body", settings.plate, optical.bodies)
-            raise CalibrationError(f"plate: {name}")
-        column = optical.bodies.index(settings.plate)
+        column = body_column(optical, "plate", settings.plate)
         q = rotation.normalize(optical.body_orientations[:, column])
     elif PLATE in settings.markers:
         positions = optical.positions[:, columns(optical, PLATE, settings)]
@@ -218,6 +192,7 @@ def _align_one(
     track: SensorTrack,
     plate: tuple[NDArray[np.int64], NDArray[np.float64]],
     lag_ns: int | None,
+    lag_sigma_ns: float | None,
 ) -> AlignedSensor:
     t_ns, q_plate = plate
     q_sensor = sensor_at(track, t_ns, lag_ns or 0)
@@ -237,6 +212,7 @@ def _align_one(
             f"{name}: moves {np.rad2deg(fit.residual_scale):.1f} deg relative to the plate; fix the"
             " sensor to the plate and check that all plate markers belong to it"
         )
-    return AlignedSensor(
-        as_quaternion(fit.q_world), fit.kind, fit.kappa, fit.weak_error, fit.residual_rms, lag_ns
+    quality = WorldQuality(
+        fit.kind, fit.kappa, fit.weak_error, fit.residual_rms, lag_ns, lag_sigma_ns
     )
+    return AlignedSensor(as_quaternion(fit.q_world), quality)

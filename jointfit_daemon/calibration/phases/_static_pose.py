@@ -7,12 +7,13 @@ the pose defines its own world, in which all segments are upright and face +y.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
-from jointfit_daemon.calibration.anatomy import marked_parts, static_cluster
+from jointfit_daemon.calibration._quality import StaticQuality, quality_table
+from jointfit_daemon.calibration.anatomy import CONFIGURED_SD_M, marked_parts, static_cluster
 from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
     RobustMean,
@@ -28,8 +29,9 @@ from jointfit_daemon.limb_model import (
     JointCalibration,
     MeanModel,
     SegmentCalibration,
-    SegmentModel,
     SensorCalibration,
+    configured_length,
+    equal_weights,
     model_key,
     rigid_fit,
 )
@@ -47,7 +49,6 @@ if TYPE_CHECKING:
 
 MAX_TEMPLATE_RMS_M = 0.02
 """RMS residual of a cluster relative to the earlier pose above which markers were moved, m."""
-_NS = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +63,10 @@ class StaticPose:
     digest: str = ""
 
     @property
-    def quality(self) -> dict[str, Any]:
-        """Duration, scatter of every sensor in rad, and visible body parts."""
-        return {
-            "still_s": self.still_s,
-            "spread_rad": {name: mean.spread for name, mean in self.sensors.items()},
-            "body_parts": sorted(self.clusters),
-        }
+    def quality(self) -> StaticQuality:
+        """Duration, scatter of every sensor, and visible body parts."""
+        spread_rad = {name: mean.spread for name, mean in self.sensors.items()}
+        return StaticQuality(self.still_s, spread_rad, tuple(sorted(self.clusters)))
 
 
 def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Chain) -> StaticPose:
@@ -81,16 +79,17 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
         hidden or on a line; all reasons at once.
     """
     wanted = [sensor for group in chain.sensors for sensor in group]
+    present = [s for s in wanted if s in trial.sensors and len(trial.sensors[s].t_ns) >= 2]
     reasons = [
         f"{sensor}: no data in the static pose; switch it on, or remove it from rig.toml"
         for sensor in wanted
-        if sensor not in trial.sensors or len(trial.sensors[sensor].t_ns) < 2
+        if sensor not in present
     ]
-    present = [s for s in wanted if s in trial.sensors and len(trial.sensors[s].t_ns) >= 2]
 
     means = {s: robust_mean(trial.sensors[s].q_world_sensor) for s in present}
-    spans = [_span_s(trial.sensors[s].t_ns) for s in present]
-    still_s = min(spans, default=0.0)
+    stamps = [trial.sensors[s].t_ns for s in present]
+    still_s = min((float(t_ns[-1] - t_ns[0]) / 1e9 for t_ns in stamps), default=0.0)
+
     # rig.toml may configure a pose shorter than three seconds. A tenth less is accepted, because
     # the samples span less than the pose.
     limits = StaticLimits(still_s=0.9 * min(StaticLimits().still_s, settings.static_s))
@@ -111,10 +110,6 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
     return StaticPose(means, still_s, clusters, trials_digest(trial))
 
 
-def _span_s(t_ns: NDArray[np.int64]) -> float:
-    return float(t_ns[-1] - t_ns[0]) / _NS
-
-
 def sensor_calibration(
     mean: RobustMean, q_optical_world: Quaternion, q_static: Quaternion, lag_ns: int = 0
 ) -> SensorCalibration:
@@ -125,12 +120,7 @@ def sensor_calibration(
 
 
 def fit_static_only(
-    pose: StaticPose,
-    alignment: PlateAlignment | None,
-    chain: Chain,
-    *,
-    software: str = "",
-    created_utc: str = "",
+    pose: StaticPose, alignment: PlateAlignment | None, chain: Chain, *, software: str = ""
 ) -> Calibration:
     """Calibrate without cameras: all segments upright in the pose, plain mean of the sensors.
 
@@ -139,12 +129,22 @@ def fit_static_only(
     ``headings_from_static``.
     """
     upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    flags = (
-        [FrameFlag.FACING_UNKNOWN] if alignment is not None else [FrameFlag.HEADINGS_FROM_STATIC]
-    )
-    worlds = {
-        name: upright if alignment is None else alignment.world(name) for name in pose.sensors
-    }
+    flag = FrameFlag.FACING_UNKNOWN
+    worlds = dict.fromkeys(pose.sensors, upright)
+    if alignment is None:
+        flag = FrameFlag.HEADINGS_FROM_STATIC
+    else:
+        worlds = {name: alignment.world(name) for name in pose.sensors}
+
+    # Equal-weight means of all sensors of a segment, and each sensor alone.
+    models = [
+        {
+            model_key(alive, None): MeanModel(equal_weights(len(alive)), UNREFERENCED_SD)
+            for alive in sorted({group, *((sensor,) for sensor in group)})
+        }
+        for group in chain.sensors
+    ]
+    lengths = [configured_length(chain, i) for i in range(len(chain.segments))]
     return Calibration(
         method="mean",
         joints=chain.joints,
@@ -156,30 +156,17 @@ def fit_static_only(
         },
         segment={
             name: SegmentCalibration(
-                upright,
-                chain.lengths[i] if i < len(chain.lengths) else None,
-                0.01 if i < len(chain.lengths) and chain.lengths[i] is not None else None,
-                models=_plain_means(chain.sensors[i]),
+                upright, length, None if length is None else CONFIGURED_SD_M, own
             )
-            for i, name in enumerate(chain.segments)
+            for name, length, own in zip(chain.segments, lengths, models, strict=True)
         },
         joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
-        flags=tuple(flags),
+        flags=(flag,),
         notes=("no cameras: angles are relative to the static pose; standard deviation assumed",),
-        quality={"static": pose.quality, "functional": None},
+        quality={"static": quality_table(pose.quality), "functional": None},
         digest=pose.digest,
         software=software,
-        created_utc=created_utc,
     )
-
-
-def _plain_means(sensors: tuple[str, ...]) -> dict[str, SegmentModel]:
-    """Return equal-weight means of all sensors and of each alone."""
-    sets = {sensors, *((sensor,) for sensor in sensors)}
-    return {
-        model_key(alive, None): MeanModel((1.0 / len(alive),) * len(alive), UNREFERENCED_SD)
-        for alive in sorted(sets)
-    }
 
 
 def with_new_static(
@@ -217,23 +204,24 @@ def with_new_static(
 
     # Mounts from the new means; worlds and lags from a newer alignment.
     owner = {
-        s: n
-        for n, g in zip(calibration.segments, calibration.chain_sensors, strict=True)
-        for s in g
+        sensor: segment
+        for segment, group in zip(calibration.segments, calibration.chain_sensors, strict=True)
+        for sensor in group
     }
     sensors = {}
     for name, old in calibration.sensor.items():
         world, lag_ns = old.q_optical_world, old.lag_ns
         if alignment is not None:
-            world, found_ns = alignment.world(name), alignment.sensors[name].lag_ns
+            world, found_ns = alignment.world(name), alignment.quality[name].lag_ns
             lag_ns = lag_ns if found_ns is None else found_ns
         sensors[name] = sensor_calibration(pose.sensors[name], world, q_now[owner[name]], lag_ns)
 
-    flags = [flag for flag in calibration.flags if flag != FrameFlag.SAME_POSE_ASSUMED]
-    flags += [FrameFlag.SAME_POSE_ASSUMED] if assumed else []
-    quality = {**calibration.quality, "static": pose.quality}
+    same_pose = FrameFlag.SAME_POSE_ASSUMED
+    flags = [flag for flag in calibration.flags if flag != same_pose]
+    flags += [same_pose] if assumed else []
+    quality = {**calibration.quality, "static": quality_table(pose.quality)}
     if alignment is not None:
-        quality["alignment"] = alignment.quality
+        quality["alignment"] = quality_table(alignment.quality)
     return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)
 
 

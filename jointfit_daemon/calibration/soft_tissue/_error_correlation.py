@@ -22,7 +22,6 @@ from jointfit_daemon.limb_model import neighbor
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.soft_tissue._limb_fit import LimbTraining
     from jointfit_daemon.limb_model import Method
     from jointfit_daemon.model import Chain
@@ -42,7 +41,15 @@ def joint_error_correlations(
         return {}
     found = {}
     for i, joint in enumerate(chain.joints[1:-1]):
-        columns = [_columns(chain, training, k) for k in (i, i + 1)]
+        # Sensors of each segment, mean of its neighbor, and its reference.
+        columns = [
+            [
+                *(training.sensors[name] for name in chain.sensors[k]),
+                mean_of(training, neighbor(chain, k)),
+                training.reference[chain.segments[k]],
+            ]
+            for k in (i, i + 1)
+        ]
         whole = np.all([np.isfinite(q).all(axis=1) for q in (*columns[0], *columns[1])], axis=0)
         if np.count_nonzero(whole) < FEWEST_FRAMES:
             continue
@@ -61,10 +68,3 @@ def error_correlation(first: SegmentTraining, second: SegmentTraining) -> float:
     a, b = (fit_kernel_with_residuals(training)[1][:, 0] for training in (first, second))
     size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
     return 0.0 if size == 0.0 else min(max(float(np.sum(a * b)) / size, -MOST), MOST)
-
-
-def _columns(chain: Chain, training: LimbTraining, i: int) -> list[Array]:
-    """Return the sensors of segment i, the mean of its neighbor, and its reference."""
-    sensors = [training.sensors[name] for name in chain.sensors[i]]
-    near = mean_of(training, neighbor(chain, i))
-    return [*sensors, near, training.reference[chain.segments[i]]]

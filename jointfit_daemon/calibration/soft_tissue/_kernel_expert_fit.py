@@ -17,10 +17,6 @@ from jointfit_daemon.limb_model import KernelExpert, as_rows, bumps, smooth_term
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.arrays import Array
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
@@ -30,6 +26,13 @@ if TYPE_CHECKING:
 
 HULL_QUANTILE = 0.995
 """Quantile of the training leverage that defines the training range."""
+WIDTHS = (0.35, 0.5, 0.8)
+"""Candidate kernel widths, rad: the distance over which joint rotations and tilts are
+correlated."""
+MOST_CENTERS = 24
+"""Largest number of bump centers."""
+NEAREST_CENTERS = 0.01
+"""Squared distance between centers, in kernel widths, below which they are redundant."""
 
 
 class Fitted(NamedTuple):
@@ -90,17 +93,6 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
 
     unseen = tuple(rho - each.residuals for each in held)
     return Fitted(expert, unseen, tuple(ratios(smooth, groups) for groups in ways))
-
-
-WIDTHS = (0.35, 0.5, 0.8)
-"""Candidate kernel widths, rad: the distance over which joint rotations and tilts are
-correlated."""
-
-MOST_CENTERS = 24
-"""Largest number of bump centers."""
-
-NEAREST_CENTERS = 0.01
-"""Squared distance between centers, in kernel widths, below which they are redundant."""
 
 
 def spread_centers(x: Array) -> Array:

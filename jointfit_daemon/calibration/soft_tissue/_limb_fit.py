@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, get_args
+from math import isfinite
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
+from jointfit_daemon.calibration._quality import HoldoutQuality, MethodErrors
+from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.calibration.soft_tissue._segment_fit import fit_segment
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import Method, flexion_sign, fuse, model_key, neighbor
+from jointfit_daemon.limb_model import Method, equal_weights, fuse, model_key, neighbor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -42,10 +45,6 @@ class LimbTraining:
     """q_optical_segment from optical markers, shape (n, 4)."""
     trials: NDArray[np.int64] | None = None
     """Movement label of each frame, shape (n,); None if there is one movement."""
-
-    def part(self, chosen: slice) -> LimbTraining:
-        """Return a contiguous part."""
-        return self.rows(chosen)
 
     def rows(self, chosen: slice | NDArray[np.int64] | NDArray[np.bool_]) -> LimbTraining:
         """Return selected frames."""
@@ -91,97 +90,92 @@ def fit_models(
     return out
 
 
-def judge(chain: Chain, training: LimbTraining, share: float) -> dict[str, Any]:
+def evaluate_methods(
+    chain: Chain, training: LimbTraining, method: Method, share: float
+) -> HoldoutQuality:
     """Evaluate every method and every single sensor on the last `share` of the trial.
 
-    Returns
-    -------
-    dict
-        ``frames``, ``share``; ``segments``: RMS orientation error of each segment and method, rad,
-        and of each sensor under ``sensors``; ``flexion``: the same for each inner joint.
+    Parameters
+    ----------
+    method : Method
+        Method of the calibration; it is named in the result.
     """
     cut = round(len(training) * (1.0 - share))
-    first, last = training.part(slice(None, cut)), training.part(slice(cut, None))
-
-    estimates: dict[str, dict[str, Array]] = {}
-    for method in METHODS:
-        estimates[method] = {
-            segment: predict_all_sensors(chain, i, method, first, last)
-            for i, segment in enumerate(chain.segments)
-        }
-    return {
-        "share": share,
-        "frames": len(last),
-        "segments": {
-            segment: {
-                **{m: _rms_angle(estimates[m][segment], last.reference[segment]) for m in METHODS},
-                "sensors": {
-                    s: _rms_angle(last.sensors[s], last.reference[segment])
-                    for s in chain.sensors[i]
-                },
-            }
-            for i, segment in enumerate(chain.segments)
-        },
-        "flexion": _flexions(chain, estimates, last),
+    first, last = training.rows(slice(None, cut)), training.rows(slice(cut, None))
+    truth = [last.reference[segment] for segment in chain.segments]
+    estimates = {
+        m: [
+            predict_all_sensors(chain, i, fit_all_sensors(chain, i, m, first), last)
+            for i in range(len(chain.segments))
+        ]
+        for m in METHODS
     }
 
+    def orientation_error(i: int, q: Array) -> float | None:
+        return _finite(rms(rotation.angle_between(q, truth[i])))
 
-def predict_all_sensors(
-    chain: Chain, i: int, method: Method, first: LimbTraining, last: LimbTraining
-) -> Array:
-    """Return one segment in `last` by a model of all its sensors, fitted to `first`."""
-    segment, sensors = chain.segments[i], chain.sensors[i]
-    near = neighbor(chain, i)
+    def joint_error(i: int, above: Array, below: Array) -> float | None:
+        return _finite(flexion_error((above, below), (truth[i], truth[i + 1])))
 
-    model = fit_segment(
+    segments = {
+        segment: MethodErrors(
+            **{m: orientation_error(i, q[i]) for m, q in estimates.items()},
+            sensors={s: orientation_error(i, last.sensors[s]) for s in chain.sensors[i]},
+        )
+        for i, segment in enumerate(chain.segments)
+    }
+    joints = {
+        joint: MethodErrors(
+            **{m: joint_error(i, q[i], q[i + 1]) for m, q in estimates.items()},
+            sensors={
+                f"{a}+{b}": joint_error(i, last.sensors[a], last.sensors[b])
+                for a, b in zip(chain.sensors[i], chain.sensors[i + 1], strict=False)
+            },
+        )
+        for i, joint in enumerate(chain.joints[1:-1])
+    }
+    return HoldoutQuality(method, share, len(last), segments, joints)
+
+
+def fit_all_sensors(chain: Chain, i: int, method: Method, training: LimbTraining) -> SegmentModel:
+    """Return the model of segment i for all its sensors and those of its neighbor."""
+    return fit_segment(
         method,
-        [first.sensors[s] for s in sensors],
-        mean_of(first, near) if near else None,
-        first.reference[segment],
-        first.trials,
+        [training.sensors[s] for s in chain.sensors[i]],
+        _neighbor_mean(chain, i, training),
+        training.reference[chain.segments[i]],
+        training.trials,
     )
-    return model.predict([last.sensors[s] for s in sensors], mean_of(last, near) if near else None)
+
+
+def predict_all_sensors(chain: Chain, i: int, model: SegmentModel, frames: LimbTraining) -> Array:
+    """Return the orientation of segment i by such a model, shape (n, 4)."""
+    sensors = [frames.sensors[s] for s in chain.sensors[i]]
+    return model.predict(sensors, _neighbor_mean(chain, i, frames))
+
+
+def _neighbor_mean(chain: Chain, i: int, frames: LimbTraining) -> Array | None:
+    near = neighbor(chain, i)
+    return mean_of(frames, near) if near else None
 
 
 def mean_of(training: LimbTraining, sensors: Sequence[str]) -> Array:
     """Return the mean of sensors of one segment, shape (n, 4)."""
-    return fuse([training.sensors[s] for s in sensors], (1.0 / len(sensors),) * len(sensors))
+    return fuse([training.sensors[s] for s in sensors], equal_weights(len(sensors)))
 
 
-def _flexions(
-    chain: Chain, estimates: Mapping[str, Mapping[str, Array]], last: LimbTraining
-) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for i, joint in enumerate(chain.joints[1:-1]):
-        above, below = chain.segments[i], chain.segments[i + 1]
-        sign = flexion_sign(joint)
-        truth = sign * flexion(last.reference[above], last.reference[below])
-        out[joint] = {
-            m: _rms_wrapped(sign * flexion(estimates[m][above], estimates[m][below]) - truth)
-            for m in METHODS
-        }
-        out[joint]["sensors"] = {
-            f"{a}+{b}": _rms_wrapped(sign * flexion(last.sensors[a], last.sensors[b]) - truth)
-            for a, b in zip(chain.sensors[i], chain.sensors[i + 1], strict=False)
-        }
-    return out
+def flexion_error(estimate: tuple[Array, Array], truth: tuple[Array, Array]) -> float:
+    """Return the RMS flexion error of a joint, rad, from its proximal and distal segments."""
+    off = _flexion(*estimate) - _flexion(*truth)
+    return rms(np.arctan2(np.sin(off), np.cos(off)))
 
 
-def flexion(q_above: Array, q_below: Array) -> Array:
+def _flexion(q_above: Array, q_below: Array) -> Array:
     """Return phi of R = Rx(phi) Ry(theta) Rz(psi), rad, shape (n,); knee flexion is negative."""
     w, x, y, z = rotation.multiply(rotation.conjugate(q_above), q_below).T
     phi: Array = np.arctan2(2.0 * (w * x - y * z), 1.0 - 2.0 * (x * x + y * y))
     return phi
 
 
-def _rms_angle(q: Array, reference: Array) -> float | None:
-    return _rms(rotation.angle_between(q, reference))
-
-
-def _rms_wrapped(angle: Array) -> float | None:
-    return _rms(np.arctan2(np.sin(angle), np.cos(angle)))
-
-
-def _rms(values: Array) -> float | None:
-    good = values[np.isfinite(values)]
-    return float(np.sqrt((good**2).mean())) if good.size else None
+def _finite(error: float) -> float | None:
+    return error if isfinite(error) else None

@@ -11,19 +11,14 @@ from jointfit_daemon.calibration.soft_tissue._segment_training import (
     held_out_sd,
 )
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import MeanModel, fuse
+from jointfit_daemon.limb_model import MeanModel, equal_weights, fuse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from jointfit_daemon.arrays import Array
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
-    from jointfit_daemon.arrays import Array
-
-
-_SMALLEST_VARIANCE = 1e-12  # rad^2; a sensor that is its own reference still gets a finite weight
+_SMALLEST_VARIANCE = 1e-12
 """Lower bound of an error variance, rad²: a sensor equal to the reference gets a finite weight."""
 
 
@@ -48,7 +43,7 @@ def fusion_weights(sensors: Sequence[Array], q_reference: Array) -> Array:
 
 def plain_mean(training: SegmentTraining) -> MeanModel:
     """Return the mean with equal weights, with its RMS error in training: a baseline."""
-    weights = (1.0 / len(training.sensors),) * len(training.sensors)
+    weights = equal_weights(len(training.sensors))
     mean = fuse(training.sensors, weights)
     angles = rotation.angle_between(mean, training.q_reference)
     return MeanModel(weights, float(np.sqrt(np.mean(angles**2) / 3.0)))

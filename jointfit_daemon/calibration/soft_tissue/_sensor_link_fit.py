@@ -14,6 +14,7 @@ from jointfit_daemon.limb_model import (
     LinkKind,
     SensorLink,
     level_axis,
+    neighbor,
     posture_one,
     up_one,
 )
@@ -64,7 +65,7 @@ def fit_links(
     """
     links = []
     for i, group in enumerate(chain.sensors):
-        near = _near(chain, i)
+        near = neighbor(chain, i) or group
         links += [_fit("pair", (a, b), near, sensors) for a, b in combinations(group, 2)]
         if i + 1 < len(chain.sensors):
             q_a, q_b = (q_static[chain.segments[k]] for k in (i, i + 1))
@@ -74,13 +75,6 @@ def fit_links(
                 for a, b in product(group, chain.sensors[i + 1])
             ]
     return tuple(link for link in links if link is not None)
-
-
-def _near(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the neighboring segment, or of the only segment itself."""
-    if len(chain.sensors) == 1:
-        return chain.sensors[0]
-    return chain.sensors[i + 1 if i + 1 < len(chain.sensors) else i - 1]
 
 
 def _fit(
@@ -95,9 +89,11 @@ def _fit(
     if kind == "pair":
         wanted = rotation.log(rotation.multiply(rotation.conjugate(q_a), q_b))
     else:
-        wanted = _wrapped(_axis_headings(q_a, q_b) - standing)[:, None]
+        angle = _axis_headings(q_a, q_b) - standing
+        wanted = np.arctan2(np.sin(angle), np.cos(angle))[:, None]
 
-    shown = _postures(q_a, q_near)
+    u, v = (np.stack(up_one(tuple(q.T)), axis=0) for q in (q_a, q_near))
+    shown = np.stack(posture_one(tuple(u), tuple(v)), axis=1)
     known = np.isfinite(wanted).all(axis=1) & np.isfinite(shown).all(axis=1)
     shown, wanted = shown[known], wanted[known]
     if len(shown) < FEWEST_FRAMES:
@@ -133,19 +129,9 @@ def _ridge(shown: Array, wanted: Array) -> Array:
     return found
 
 
-def _postures(q_a: Array, q_near: Array) -> Array:
-    u, v = (np.stack(up_one(tuple(q.T)), axis=0) for q in (q_a, q_near))
-    return np.stack(posture_one(tuple(u), tuple(v)), axis=1)
-
-
 def _axis_headings(q_a: Array, q_b: Array) -> Array:
     ax, ay = level_axis(tuple(q_a.T))
     bx, by = level_axis(tuple(q_b.T))
     steep = (ax**2 + ay**2 < LEAST_LEVEL) | (bx**2 + by**2 < LEAST_LEVEL)
     found: Array = np.where(steep, np.nan, np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
     return found
-
-
-def _wrapped(angle: Array) -> Array:
-    wrapped: Array = np.arctan2(np.sin(angle), np.cos(angle))
-    return wrapped

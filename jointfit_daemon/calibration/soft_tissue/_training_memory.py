@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.soft_tissue._limb_fit import LimbTraining
+from jointfit_daemon.calibration.soft_tissue._limb_fit import LimbTraining, mean_of
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import fuse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -98,10 +97,7 @@ def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraini
 
 def postures(chain: Chain, training: LimbTraining) -> NDArray[np.int64]:
     """Return the posture cell of every frame: direction of gravity and joint rotations."""
-    means = [
-        fuse([training.sensors[s] for s in group], (1.0 / len(group),) * len(group))
-        for group in chain.sensors
-    ]
+    means = [mean_of(training, group) for group in chain.sensors]
     seen = [rotation.rotate(rotation.conjugate(means[0]), np.array([0.0, 0.0, 1.0]))]
     seen += [
         rotation.log(rotation.multiply(rotation.conjugate(above), below))

@@ -15,7 +15,7 @@ from jointfit_daemon.calibration import FunctionalJob
 from jointfit_daemon.calibration.anatomy import track_clusters
 from jointfit_daemon.calibration.phases import StaticPose, fit_static, run_job
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
-from jointfit_daemon.calibration.phases._functional import _refined
+from jointfit_daemon.calibration.phases._functional import refined_tracks
 from jointfit_daemon.limb_model import Calibration, cluster_record
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from jointfit_daemon.tools.calibrate import report
@@ -85,7 +85,7 @@ def bias_deg(cluster: MarkerCluster) -> float:
 def test_a_knocked_marker_is_found_and_no_longer_turns_its_segment() -> None:
     found = refined()
     assert found.figures is not None
-    moved = found.figures["moved_m"]
+    moved = found.figures.moved_m
     assert max(moved, key=lambda name: moved[name]) == KNOCKED
     assert moved[KNOCKED] == pytest.approx(np.linalg.norm(KNOCK), abs=0.005)
     assert bias_deg(found.clusters["thigh"]) < 0.6 * bias_deg(pose().clusters["thigh"])
@@ -94,11 +94,11 @@ def test_a_knocked_marker_is_found_and_no_longer_turns_its_segment() -> None:
 def test_the_error_falls_on_the_part_that_was_not_learned_from() -> None:
     found = refined()
     assert found.figures is not None
-    parts = found.figures["parts"]
+    parts = found.figures.parts
     assert set(parts) == set(MARKERS)
-    assert parts["thigh"]["refined"]
-    assert parts["thigh"]["after_m"] < 0.6 * parts["thigh"]["before_m"]
-    assert all(part["after_m"] < part["before_m"] for part in parts.values() if part["refined"])
+    assert parts["thigh"].refined
+    assert parts["thigh"].after_m < 0.6 * parts["thigh"].before_m
+    assert all(part.after_m < part.before_m for part in parts.values() if part.refined)
     assert found.notes == ()
 
 
@@ -108,7 +108,7 @@ def test_markers_that_stayed_are_left_where_they_are() -> None:
     clusters = fit_static(static, SETTINGS, CHAIN).clusters
     found = refine_clusters(clusters, track_clusters(optical_of(functional), clusters), 0.4)
     assert found.figures is not None
-    assert max(found.figures["moved_m"].values(), default=0.0) < 0.001
+    assert max(found.figures.moved_m.values(), default=0.0) < 0.001
     for name, cluster in clusters.items():
         used = found.clusters[name]
         np.testing.assert_allclose(used.template.mean(axis=0), 0.0, atol=1e-12)
@@ -129,9 +129,9 @@ def test_a_part_that_unseen_movement_does_not_like_better_stays() -> None:
     tracks = track_clusters(replace(optical, positions=positions), pose().clusters)
     found = refine_clusters(pose().clusters, tracks, 0.4)
     assert found.figures is not None
-    assert not found.figures["parts"]["thigh"]["refined"]
+    assert not found.figures.parts["thigh"].refined
     assert found.clusters["thigh"] is pose().clusters["thigh"]
-    assert KNOCKED not in found.figures["moved_m"]
+    assert KNOCKED not in found.figures.moved_m
 
 
 def test_a_marker_that_is_never_seen_while_moving_stays_in_its_place() -> None:
@@ -141,7 +141,7 @@ def test_a_marker_that_is_never_seen_while_moving_stays_in_its_place() -> None:
     tracks = track_clusters(replace(optical, positions=positions), pose().clusters)
     found = refine_clusters(pose().clusters, tracks, 0.4)
     assert found.figures is not None
-    assert found.figures["moved_m"].get("shank2", 0.0) < 0.004
+    assert found.figures.moved_m.get("shank2", 0.0) < 0.004
     assert np.isfinite(found.clusters["shank"].template).all()
 
 
@@ -190,7 +190,7 @@ def test_the_worker_stores_and_tells_what_refining_did() -> None:
 def test_turned_off_it_leaves_markers_and_tracks_as_they_were() -> None:
     tracks = track_clusters(optical_of(trials()[1]), pose().clusters)
     plain = replace(SETTINGS, refine_markers=False)
-    found, same = _refined(tracks, pose(), trials()[1], plain)
+    found, same = refined_tracks(tracks, pose(), trials()[1], plain)
     assert same is tracks
     assert found == RefinedClusters(pose().clusters, None)
 

@@ -51,9 +51,8 @@ def clean() -> tuple[Subject, Calibration]:
     subject = Subject(11)
     static, functional, _ = static_and_functional(subject, 24.0)
     alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
-    return subject, fit_calibration(
-        static, functional, alignment, SETTINGS, CHAIN, software="1.2", created_utc="2026-01-01"
-    )
+    found = fit_calibration(static, functional, alignment, SETTINGS, CHAIN, software="1.2")
+    return subject, replace(found, created_utc="2026-01-01")
 
 
 def errors_deg(subject: Subject, calibration: Calibration, sensor: str) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from jointfit_daemon.calibration import (
     SensorTrack,
     StaticJob,
 )
+from jointfit_daemon.calibration._quality import WorldQuality
 from jointfit_daemon.calibration.phases import PlateAlignment, fit_static, run_job
 from jointfit_daemon.calibration.phases._plate_alignment import AlignedSensor
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
@@ -43,7 +44,10 @@ def worlds(angles: dict[str, float]) -> PlateAlignment:
     """Return an alignment in which every world is turned by its angle about the vertical."""
     return PlateAlignment(
         {
-            name: AlignedSensor(as_quaternion(about_z(angle)), "full", 0.1, 0.01, 0.01, 4_000_000)
+            name: AlignedSensor(
+                as_quaternion(about_z(angle)),
+                WorldQuality("full", 0.1, 0.01, 0.01, 4_000_000, None),
+            )
             for name, angle in angles.items()
         }
     )

@@ -38,9 +38,9 @@ def test_worlds_up_to_90_degrees_apart_are_aligned_in_spite_of_a_lag() -> None:
     found = fit_plate_alignment(plate_trial(subject), SETTINGS)
     assert max(errors_deg(found, subject)) < 0.3
     for item in found.sensors.values():
-        assert item.kind == "full"
-        assert item.kappa < 0.95
-        assert item.lag_ns == pytest.approx(20e6, abs=2e6)
+        assert item.quality.kind == "full"
+        assert item.quality.kappa < 0.95
+        assert item.quality.lag_ns == pytest.approx(20e6, abs=2e6)
 
 
 def test_a_lag_handed_in_is_believed() -> None:
@@ -67,7 +67,7 @@ def test_a_plate_of_markers_serves_as_well() -> None:
 def test_turning_about_one_horizontal_axis_gives_the_heading_and_says_so() -> None:
     subject = Subject(7)
     found = fit_plate_alignment(plate_trial(subject, axes=1), SETTINGS)
-    assert {item.kind for item in found.sensors.values()} == {"heading"}
+    assert {item.quality.kind for item in found.sensors.values()} == {"heading"}
     assert max(errors_deg(found, subject)) < 1.0
     assert any("only the heading was aligned" in note for note in found.notes)
 

@@ -11,6 +11,7 @@ from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
     SegmentTraining,
     error_correlation,
+    fit_all_sensors,
     joint_error_correlations,
     predict_all_sensors,
 )
@@ -50,7 +51,8 @@ def test_what_is_found_on_held_out_frames_holds_on_later_ones(alike: float) -> N
     assert found.keys() == {"knee"}
     left = []
     for i, segment in enumerate(CHAIN.segments):
-        said = predict_all_sensors(CHAIN, i, "anchored", training, later)
+        model = fit_all_sensors(CHAIN, i, "anchored", training)
+        said = predict_all_sensors(CHAIN, i, model, later)
         left.append(rot.log(rot.multiply(rot.conjugate(said), later.reference[segment]))[:, 0])
     actual = np.corrcoef(np.stack(left))
     assert abs(found["knee"] - float(np.asarray(actual)[0, 1])) < 0.15

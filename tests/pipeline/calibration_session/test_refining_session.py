@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from jointfit_daemon.calibration import FitResult, FunctionalJob
+from jointfit_daemon.calibration._quality import quality_table
 from jointfit_daemon.calibration.phases import fit_static, run_job
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
@@ -56,7 +57,7 @@ def test_status_contains_the_quality_of_refined_markers() -> None:
     one = CalibrationSession(CHAIN, REFINING, mocap=True, calibration=None)
     job = asked(one, 0, "static")
     pose = fit_static(static, REFINING, CHAIN)
-    one.finish_job(JobFinished(30 * S, job.job, FitResult(pose.quality), None))
+    one.finish_job(JobFinished(30 * S, job.job, FitResult(quality_table(pose.quality)), None))
     one._static = static  # the recording of this test has no markers
     job = asked(one, 40 * S, "functional")
     assert isinstance(job.work, FunctionalJob)

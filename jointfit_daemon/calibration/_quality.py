@@ -1,0 +1,188 @@
+"""Quality figures of a calibration, which are stored and published with it as JSON tables.
+
+The names of the fields are the keys of the tables. Names of quantities end in their SI unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class StaticQuality:
+    """The static pose."""
+
+    still_s: float
+    spread_rad: Mapping[str, float]
+    """Robust scatter of each sensor."""
+    body_parts: tuple[str, ...]
+    """Body parts that are visible to cameras."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorldQuality:
+    """Alignment of the world of one sensor with the optical world."""
+
+    kind: str
+    """``full`` | ``heading`` (both verticals assumed correct) | ``stored``."""
+    kappa: float
+    """1 if world and mount are indistinguishable."""
+    error_rad: float
+    """Standard error of the weakest direction."""
+    rms_rad: float
+    """RMS angle between plate and model."""
+    lag_ns: int | None
+    """Sensor minus optical time stamp of the same event; None if not observable."""
+    lag_sigma_ns: float | None
+    """Standard deviation of the lag; None if unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredLag:
+    """Lag of one sensor from the functional movement alone."""
+
+    lag_ns: int
+    sigma_ns: int
+    r2: float
+
+
+@dataclass(frozen=True, slots=True)
+class LagQuality:
+    """The lag in use of one sensor, and the lag of the functional movement alone."""
+
+    source: str
+    """See `SensorLag`."""
+    lag_ns: int | None = None
+    sigma_ns: int | None = None
+    refused: str | None = None
+    """Reason why the movement gave no lag."""
+    movement: MeasuredLag | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PartQuality:
+    """RMS marker residual of one body part on held-out frames before and after refinement."""
+
+    before_m: float
+    after_m: float
+    refined: bool
+    """Whether the refined markers are used."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerQuality:
+    """Refinement of the markers."""
+
+    parts: Mapping[str, PartQuality]
+    moved_m: Mapping[str, float]
+    """Displacement of each refined marker."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointQuality:
+    """One joint center."""
+
+    source: str
+    sd_m: float | None
+    residual_rms_m: float | None
+    gap_rms_m: float | None
+    arc_rad: float | None
+    unseen_directions: int
+
+
+@dataclass(frozen=True, slots=True)
+class AxisQuality:
+    """One flexion axis."""
+
+    rms_rad: float
+    off_plane_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class AnatomyQuality:
+    """Joint centers, segment lengths and flexion axes."""
+
+    joints: Mapping[str, JointQuality]
+    lengths_m: Mapping[str, float | None]
+    length_sd_m: Mapping[str, float | None]
+    length_sources: Mapping[str, str]
+    flexion_axes: Mapping[str, AxisQuality]
+
+
+@dataclass(frozen=True, slots=True)
+class MethodErrors:
+    """RMS error of every method, rad; None without a finite error."""
+
+    anchored: float | None
+    patent12: float | None
+    patent6: float | None
+    markley: float | None
+    mean: float | None
+    single: float | None
+    sensors: Mapping[str, float | None]
+    """Error of each sensor, or pair of sensors, without a model."""
+
+
+@dataclass(frozen=True, slots=True)
+class HoldoutQuality:
+    """Errors on the last part of the trial, after a fit to the first part."""
+
+    method: str
+    share: float
+    frames: int
+    segments: Mapping[str, MethodErrors]
+    """Orientation of each segment."""
+    flexion: Mapping[str, MethodErrors]
+    """Flexion of each inner joint."""
+    meaning: str = (
+        "RMS distance from the optical reference on the last part of the trial, after a fit to the"
+        " first part; the stored models were then fitted to all of it"
+    )
+    """Explanation for readers of the published table."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnlineQuality:
+    """RMS errors of every segment, and of the flexion of every inner joint, in a refit."""
+
+    frames: int
+    judged: int
+    """Number of held-out frames."""
+    before_rad: Mapping[str, float]
+    after_rad: Mapping[str, float]
+    known_before_rad: Mapping[str, float]
+    """On the training frames of the calibration."""
+    known_after_rad: Mapping[str, float]
+    rounds: int | None = None
+    """Number of accepted refits since the functional calibration."""
+    software: str | None = None
+    taught: str | None = None
+    """Digest of the trials of the functional calibration."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationQuality:
+    """All figures of a functional calibration."""
+
+    static: StaticQuality
+    alignment: Mapping[str, WorldQuality] | None
+    lag: Mapping[str, LagQuality]
+    markers: MarkerQuality | None = None
+    anatomy: AnatomyQuality
+    holdout: HoldoutQuality
+
+
+def quality_table(value: Any) -> Any:
+    """Return the JSON form of figures; a field that is optional is omitted while it is None."""
+    if is_dataclass(value):
+        found = ((field, getattr(value, field.name)) for field in fields(value))
+        return {
+            field.name: quality_table(figure)
+            for field, figure in found
+            if figure is not None or field.default is MISSING
+        }
+    if isinstance(value, Mapping):
+        return {key: quality_table(figure) for key, figure in value.items()}
+    return list(value) if isinstance(value, tuple) else value
