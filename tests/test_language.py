@@ -17,6 +17,7 @@ PACKAGES = (
     "jointfit_daemon",
     "drivers/jointfit_drivers",
     "protocols/jointfit_protocols",
+    "bench",
 )
 """The simulators are not rewritten yet."""
 PAGES = ("docs", "README.md", "CONVENTIONS.md")

@@ -1,1 +1,1 @@
-"""Estimators that only comparisons need."""
+"""Estimators that serve as baselines only."""

@@ -1,7 +1,7 @@
-"""Hips and knees of real trials by the estimators, beside those of the models.
+"""Hip and knee centers of recorded trials, estimated and compared with those of a model.
 
-Law: the estimators see markers of two neighbouring segments and nothing else: no static trial, no
-regression, no model. Distances are taken in the parent's coordinates, where both centers rest.
+Invariant: the estimators receive the markers of two neighbouring segments only: no static trial, no
+regression, no model. Distances are in parent coordinates, in which both centers are constant.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _GAIT = ("Upper", "Front", "Rear")
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """A joint to find: the model's name for it, and the markers of its two segments."""
+    """Joint to estimate: its name in the model and the markers of its two segments."""
 
     name: str
     model: str
@@ -44,29 +44,30 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """An estimate beside the model's center."""
+    """Estimates of one joint and the center of the model."""
 
     joint: Joint
     reduced: ParentFrameMotion
     model: NDArray[np.float64]
-    """The model's center in the parent's coordinates, mean over its frames, m."""
+    """Mean center of the model in parent coordinates over its frames, m."""
     wander: float
-    """RMS distance of the model's center from that mean: it is not at rest under the skin, m."""
+    """RMS distance of the model's center from its mean, caused by soft-tissue artefact, m."""
     estimates: dict[str, CenterEstimate]
-    """By method."""
+    """Estimate by method."""
 
     def off(self, method: str) -> float:
-        """Return the distance from estimate to model, m."""
+        """Return the distance between estimate and model, m."""
         return float(np.linalg.norm(self.estimates[method].center - self.model))
 
     def off_axis(self, method: str) -> float:
-        """Return the same across the joint's axis, m: along it a hinge shows no center."""
+        """Return the distance perpendicular to the joint axis, m; along the axis of a hinge the
+        center is undetermined."""
         gap = self.estimates[method].center - self.model
         axis = hinge(self.reduced)
         return float(np.linalg.norm(gap - axis * (gap @ axis)))
 
     def told_across(self, method: str) -> float:
-        """Return the RMS error across the axis that the estimate tells, m."""
+        """Return the RMS error perpendicular to the axis that the estimate predicts, m."""
         axis = hinge(self.reduced)
         across = np.eye(3) - np.outer(axis, axis)
         spread = across @ self.estimates[method].covariance @ across
@@ -74,12 +75,12 @@ class Judged:
 
 
 def hinge(reduced: ParentFrameMotion) -> NDArray[np.float64]:
-    """Return the direction about which the child turned most, in the parent's coordinates."""
+    """Return the main axis of rotation of the child, in parent coordinates."""
     points = reduced.movement.points
     assert points is not None
     whole = points[np.isfinite(points).all(axis=(1, 2))]
     steps = whole - whole.mean(axis=0)
-    # every marker of a hinge stays in a plane across the axis: least spread of all movement
+    # The markers of a hinge move in planes across its axis: the direction of least variance.
     _, vectors = np.linalg.eigh(np.einsum("tki,tkj->ij", steps, steps))
     return np.asarray(vectors[:, 0])
 
@@ -109,7 +110,7 @@ def gait_joints() -> tuple[Joint, ...]:
 
 @cache
 def judged(data: Path, trial: str, methods: tuple[str, ...]) -> tuple[Judged, ...]:
-    """Estimate all joints of a trial; ``gait2354`` or one of `OPENCAP`."""
+    """Estimate all joints of a trial: ``gait2354`` or one of `OPENCAP`."""
     if trial == "gait2354":
         model, joints = gait2354(data), gait_joints()
     else:

@@ -1,7 +1,7 @@
-"""All ways of fusing the sensors of a knee, side by side, under one name each.
+"""All methods that fuse the sensors of a knee, by name.
 
-Law: every way is fitted to the same frames and sees the same sensors. All are the program's own but
-``linear``, the ridge of an earlier version, which stays as a baseline of the default.
+Invariant: every method is fitted to the same frames and uses the same sensors. All belong to the
+program except ``linear``, a ridge regression that serves as a baseline.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ METHODS = ("single", "mean", "markley", "patent6", "patent12", "linear", "anchor
 
 
 class Segment(NamedTuple):
-    """What one segment's model is given, from a trial."""
+    """Inputs of one segment's model."""
 
     sensors: list[Array]
     other: Array
@@ -37,14 +37,14 @@ class Segment(NamedTuple):
 
 
 def segments(trial: KneeTrial) -> tuple[Segment, Segment]:
-    """Return thigh and shank; each sees the mean of its neighbour's sensors."""
+    """Return the inputs of thigh and shank; each uses the mean of its neighbour's sensors."""
     a, b, c, d = trial.sensors
     thigh, shank = fuse([a, b], (0.5, 0.5)), fuse([c, d], (0.5, 0.5))
     return Segment([a, b], shank, trial.thigh), Segment([c, d], thigh, trial.shank)
 
 
 def fit(method: str, trials: Sequence[KneeTrial]) -> Predict:
-    """Return the method, trained; what it returns gives both orientations, shape (n, 4) each."""
+    """Fit a method; return a function from a trial to both orientations, shape (n, 4) each."""
     first, second = models(trials, method)
 
     def predict(trial: KneeTrial) -> tuple[Array, Array]:
@@ -60,12 +60,12 @@ def models(trials: Sequence[KneeTrial], method: str = "anchored") -> tuple[Segme
 
 
 def correlation(trials: Sequence[KneeTrial]) -> float:
-    """Return how far the default's errors of thigh and shank about their x are alike."""
+    """Return the correlation of the default method's errors of thigh and shank about x."""
     return error_correlation(*_training(trials))
 
 
 def _training(trials: Sequence[KneeTrial]) -> Iterator[SegmentTraining]:
-    """Give thigh's and shank's frames of all trials, one trial after the other."""
+    """Yield the training frames of thigh and of shank, concatenated over the trials."""
     labels = np.repeat(np.arange(len(trials)), [len(trial) for trial in trials])
     for parts in zip(*(segments(trial) for trial in trials), strict=True):
         sensors = [np.concatenate([part.sensors[i] for part in parts]) for i in (0, 1)]
@@ -75,7 +75,7 @@ def _training(trials: Sequence[KneeTrial]) -> Iterator[SegmentTraining]:
 
 
 def axis_deviations(model: SegmentModel, segment: Segment) -> Array:
-    """Return claimed standard deviations about x, y and z of the segment, rad, shape (n, 3)."""
+    """Return predicted standard deviations about x, y and z of the segment, rad, shape (n, 3)."""
     rows = []
     for i, other in enumerate(segment.other):
         sensors = [as_quaternion(q[i].tolist()) for q in segment.sensors]

@@ -39,44 +39,46 @@ if TYPE_CHECKING:
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Ridge penalties compared on held-out blocks."""
 LARGEST = 0.4
-"""No component of a correction exceeds this, rad."""
+"""Largest component of a correction, rad."""
 HULL = 10.0
-"""The correction fades where the leverage exceeds this many times the training's 0.995 quantile."""
+"""The correction fades above this multiple of the 0.995 quantile of the training leverage."""
 OUTSIDE = 3.0
-"""And the frame is called extrapolating where it exceeds this many times."""
+"""Above this multiple of the quantile the frame is flagged as extrapolating."""
 
 
 @dataclass(frozen=True)
 class LinearCorrection(SegmentModel):
-    """Weighted mean and its correction by relative rotations."""
+    """Weighted mean of the sensors, corrected by relative rotations."""
 
     kind: ClassVar[str] = "linear"
 
     weights: tuple[float, ...]
-    """One a sensor, sum 1."""
+    """One weight a sensor, sum 1."""
     coefficients: tuple[tuple[float, ...], ...]
     """C^T: three rows, rad per unit of each feature."""
     leverage: tuple[tuple[float, ...], ...]
-    """Square: ``phi @ leverage @ phi`` tells how far a frame lies outside training."""
+    """Square matrix L: the leverage ``phi @ L @ phi`` is the distance of a frame from the training
+    range."""
     scales: tuple[float, ...]
-    """RMS of each feature in training; what a recursive fit goes on with."""
+    """RMS of each feature in training, the scale of a recursive fit."""
     hull_leverage: float
-    """0.995 quantile of the leverage over training."""
+    """0.995 quantile of the leverage in training."""
     mean_leverage: float
     ratio_offset: float
-    """Mean over held-out frames of leverage ratio + 3: makes the mean claimed variance right."""
+    """Mean of leverage ratio + 3 over held-out frames: makes the mean predicted variance unbiased.
+    """
     covariance: tuple[tuple[float, ...], ...]
     """Mean outer product of held-out residuals, rad^2, 3x3, segment axes."""
     residual_sd: float
     mean_sd: float
-    """Of the uncorrected mean on the training frames, rad per axis: when the neighbour is lost."""
+    """RMS error of the uncorrected mean in training, rad per axis, used without a neighbour."""
     penalty: float
     movements: int
-    """Kinds of movement in training."""
+    """Movements in training."""
     _arrays: tuple[Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Keep the tables as arrays beside: the frame loop multiplies by them."""
+        """Store the tables as arrays for the loop over frames."""
         arrays = (np.array(self.coefficients), np.array(self.leverage))
         object.__setattr__(self, "_arrays", arrays)
 
@@ -98,7 +100,7 @@ class LinearCorrection(SegmentModel):
     def predict_one(
         self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
     ) -> Prediction:
-        """Return the corrected mean of one frame, its standard deviation by its leverage."""
+        """Return the corrected mean of one frame and its standard deviation."""
         mean = fuse_one(sensors, self.weights)
         if q_other is None:
             return Prediction(mean, self.mean_sd, False)
@@ -117,23 +119,23 @@ class LinearCorrection(SegmentModel):
 
     @override
     def to_dict(self) -> dict[str, Any]:
-        """A baseline is never stored."""
+        """Not supported: a baseline is never stored."""
         raise NotImplementedError
 
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> LinearCorrection:
-        """A baseline is never stored."""
+        """Not supported: a baseline is never stored."""
         raise NotImplementedError
 
 
 def fit_linear_correction(training: SegmentTraining) -> LinearCorrection:
-    """Fit the correction; its penalty and its claimed variance come from held-out blocks.
+    """Fit the correction; choose penalty and predicted variance on held-out blocks.
 
     Raises
     ------
     ValueError
-        There is no neighbouring segment to look at.
+        The trial has no neighbouring segment.
     """
     if training.q_other is None:
         raise ValueError("the linear correction needs a sensor of the neighbouring segment")
@@ -174,8 +176,8 @@ def features(sensors: Sequence[Array], q_other: Array) -> Array:
 
     .. math:: \varphi = [k,\ d_2 \dots d_m,\ |k| \circ k,\ k_1 k_2,\ k_1 k_3,\ k_2 k_3,\ \sin 2k]
 
-    with :math:`k = \log(x^* \otimes o)` the joint rotation seen by the first sensor and
-    :math:`d_j = \log(x^* \otimes y_j)` its disagreement with each further one, all rad.
+    with :math:`k = \log(x^* \otimes o)` the joint rotation measured by the first sensor and
+    :math:`d_j = \log(x^* \otimes y_j)` its deviation from each further sensor, all in rad.
 
     Parameters
     ----------
@@ -192,7 +194,7 @@ def features(sensors: Sequence[Array], q_other: Array) -> Array:
 
 
 def features_one(sensors: Sequence[Quaternion], q_other: Quaternion) -> list[float]:
-    """Return the same of one frame."""
+    """Return the regressors of one frame."""
     first = sensors[0]
     a, b, c = log_one(between_one(first, q_other))
     found = [a, b, c]
@@ -205,7 +207,7 @@ def features_one(sensors: Sequence[Quaternion], q_other: Quaternion) -> list[flo
 
 @dataclass(frozen=True, slots=True)
 class CrossValidated:
-    """Held-out behaviour of a fit, all blocks together."""
+    """Errors of a fit on held-out blocks."""
 
     residuals: Array
     """rho minus prediction, rad, shape (n, 3)."""
@@ -221,7 +223,7 @@ class CrossValidated:
 def cross_validate(
     phi: Array, rho: Array, penalty: float, folds: Iterable[NDArray[np.bool_]]
 ) -> CrossValidated:
-    """Fit without each fold in turn and look at that fold."""
+    """Fit without each fold in turn; evaluate on that fold."""
     residuals, ratios = [], []
     for held in folds:
         fit = fit_ridge(phi[~held], rho[~held], penalty)
@@ -233,7 +235,7 @@ def cross_validate(
 def best_penalty(
     phi: Array, rho: Array, folds: Iterable[NDArray[np.bool_]]
 ) -> tuple[float, CrossValidated]:
-    """Return the penalty with the smallest held-out score, and how it did."""
+    """Return the penalty with the smallest held-out score, and its errors."""
     blocks = list(folds)
     tried = [(penalty, cross_validate(phi, rho, penalty, blocks)) for penalty in PENALTIES]
     return min(tried, key=lambda pair: pair[1].score)

@@ -43,7 +43,7 @@ _LAST_STEP = 3e-3
 _DAMPING = 1e-2
 _RIDGE = 1e-9
 _ROUNDING = 1e-9
-_OPEN_SLACK = 1e-2  # the hold may cost the markers a little
+_OPEN_SLACK = 1e-2  # the regularization may raise the marker cost slightly
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _STRAIGHTEN = 32
@@ -73,7 +73,7 @@ class LivePose:
     """Chain at one instant."""
 
     state: ChainState
-    """Of length one."""
+    """Quaternion, unit norm."""
     rotations: Array
     """R_world_segment, shape (S, 3, 3)."""
     origins: Array
@@ -138,7 +138,7 @@ class LiveInverseKinematics:
         return self._pose(place, seen, restarted=restarted)
 
     def _found(self, given: Array, measured: Array, weights: Array) -> tuple[_Place, bool]:
-        """Return where the chain is, and whether it was found anew."""
+        """Return the state of the chain and whether it was restarted from the markers alone."""
         if self._state is None:
             start = self._anew(given)
             return self._follow(start, np.zeros(self._model.nq), measured, weights), True
@@ -159,10 +159,10 @@ class LiveInverseKinematics:
         return place.cost > float(place.at.weighted[..., 3, :].sum()) * self._options.lost_m**2
 
     def _follow(self, last: ChainState, lead: Array, measured: Array, weights: Array) -> _Place:
-        """Take the steps of one instant, from the last one's state led on by `lead`.
+        """Take the steps of one instant, starting from the last state extrapolated by `lead`.
 
-        The factor that goes with the result is that of the last step's beginning: it differs by the
-        turn of that step, which is far below what a covariance is good for.
+        The returned Cholesky factor is that of the start of the last step. The difference to the
+        final state is far below the accuracy of a covariance.
         """
         place = self._moved(last, lead, measured, weights)
         travelled, equations = lead, None
@@ -193,7 +193,8 @@ class LiveInverseKinematics:
         return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
 
     def _equations(self, place: _Place, reference: ChainState) -> _Equations:
-        """Return normal matrix and gradient, held to `reference` if the markers leave one open."""
+        """Return normal matrix and gradient, regularized toward `reference` where markers leave a
+        degree of freedom undetermined."""
         lower, gradient = lower_equations(self._slots, place.at)
         H, g = lower[0], gradient[0]
         diagonal = H.ravel()[:: len(g) + 1]
@@ -211,7 +212,7 @@ class LiveInverseKinematics:
     def _one_step(
         self, place: _Place, equations: _Equations, measured: Array, weights: Array
     ) -> tuple[Array, _Place]:
-        """Return a step that does not raise the cost, and where it leads."""
+        """Return a step that does not raise the cost, and the state it leads to."""
         factor, damping = equations.factor, 0.0
         most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
         for _ in range(_TRIES):
@@ -251,10 +252,10 @@ _ZERO = np.zeros(1)
 
 
 class _Equations(NamedTuple):
-    """What a step is computed from."""
+    """Quantities of one step."""
 
     H: Array
-    """Its lower triangle, shape (nq, nq)."""
+    """Lower triangle of H, shape (nq, nq)."""
     g: Array
     factor: Array
     """Lower Cholesky factor of H."""
@@ -263,7 +264,7 @@ class _Equations(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where the chain may be."""
+    """State from which an instant may start."""
 
     state: ChainState
     at: MarkerFit
@@ -271,11 +272,11 @@ class _Place:
     moved: Array = field(default_factory=lambda: _ZERO)
     """Step from the last instant."""
     equations: _Equations | None = None
-    """Those of the last step."""
+    """Values of the last step."""
 
     @property
     def factor(self) -> Array:
-        """Lower Cholesky factor of the normal matrix; of the unit matrix before any step."""
+        """Lower Cholesky factor of the normal matrix; identity before the first step."""
         return np.eye(len(self.moved)) if self.equations is None else self.equations.factor
 
     @property
@@ -284,6 +285,6 @@ class _Place:
 
 
 def _straightened(state: ChainState) -> ChainState:
-    """Return the state with what rounding bent taken out: one Newton step to A^T A = 1."""
+    """Return the state with orthonormal rotations: one Newton step to A^T A = 1."""
     A = state.rotations
     return replace(state, rotations=1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)))

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 EXCITATION = 1e-3
-"""Below this g^T P g a sample teaches nothing; with forgetting it would only wind P up."""
+"""Samples with g^T P g below this value do not excite the fit, and forgetting would only inflate P.
+"""
 IDLE_SAMPLES = 100
-"""Even then one sample in so many is taken: about one a second at 100 Hz."""
+"""Interval at which such samples are used anyway: about one a second at 100 Hz."""
 SYMMETRIZE_EVERY = 1000
 
 
@@ -30,8 +31,8 @@ class RecursiveLeastSquares:
               \Theta \leftarrow \Theta + K (y^T - g^T \Theta),\quad
               P \leftarrow (P - K g^T P) / \mu, \qquad P_0 = I / \lambda_0
 
-    Guarded against wind-up: samples that excite nothing are mostly passed over, and tr P never
-    exceeds what it began with.
+    Two guards prevent wind-up: most samples without excitation are skipped, and tr P never exceeds
+    its initial value.
 
     Parameters
     ----------
@@ -40,7 +41,7 @@ class RecursiveLeastSquares:
     ridge : float
         lambda_0, the weight of the prior Theta = 0.
     forgetting : float
-        mu in (0, 1]; 1 forgets nothing, and then no sample is passed over.
+        mu in (0, 1]; with 1 there is no forgetting, and no sample is skipped.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class RecursiveLeastSquares:
         self._samples = self._passed_over = 0
 
     def feed(self, g: ArrayLike, y: ArrayLike, weight: float = 1.0) -> bool:
-        """Take regressors g (p,) and target y (m,); return False if the sample was passed over."""
+        """Add regressors g (p,) and target y (m,); return False if the sample was skipped."""
         g = np.asarray(g, dtype=np.float64)
         Pg = self._P @ g
         excitation = float(g @ Pg)
@@ -80,7 +81,7 @@ class RecursiveLeastSquares:
 
 
 class InformationForm:
-    r"""The same least squares from its sums; the coefficients are solved for on demand.
+    r"""Least squares from accumulated sums; the coefficients are solved for on demand.
 
     .. math:: A \leftarrow \mu A + w g g^T,\quad B \leftarrow \mu B + w g y^T,\quad
               \Theta = A^{-1} B
@@ -94,7 +95,7 @@ class InformationForm:
         self._forgetting = forgetting
 
     def feed(self, g: ArrayLike, y: ArrayLike, weight: float = 1.0) -> None:
-        """Take regressors g (p,) and target y (m,)."""
+        """Add regressors g (p,) and target y (m,)."""
         g = np.asarray(g, dtype=np.float64)
         self._A = self._forgetting * self._A + weight * np.outer(g, g)
         self._B = self._forgetting * self._B + weight * np.outer(g, np.asarray(y))

@@ -69,7 +69,7 @@ class Experiment:
     """Lower-case words joined by hyphens."""
     title: str
     run: Callable[[Path], list[Result]]
-    """Measure, given the folder of recordings."""
+    """Function that measures, given the folder of recordings."""
     material: Material
     """Subjects and reference of the experiment."""
     recordings: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Subjects and references that experiments share, in the words of the generated pages."""
+"""Subjects and references shared by experiments, as printed on the generated pages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Material(NamedTuple):
-    """What an experiment measures, and against what."""
+    """Subjects of an experiment and the reference of its errors."""
 
     subjects: str
     reference: str

@@ -1,8 +1,8 @@
 """Measurement of CPU time: paired runs, medians, and ratios to a fixed loop.
 
-Invariant: a time is a median over repeats, and also a ratio to a fixed loop of plain Python of the
-same run, because machines differ and are noisy. The target is what the project wants; the threshold
-is a multiple of it, which only a regression exceeds.
+Invariant: a time is a median over repeats. It is also given as a ratio to a fixed loop of plain
+Python in the same run, because machines differ. The threshold is a multiple of the target, so that
+only a regression exceeds it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def timed_result(
     ratio: float | None = None,
     note: str = "",
 ) -> Result:
-    """Return a time or a size, of which less is better."""
+    """Return a result for a time or a size, where less is better."""
     maximum = float("inf") if threshold is None else threshold
     return Result(name, value, maximum, unit=unit, target=target, ratio=ratio, note=note)
 
@@ -44,7 +44,7 @@ def speed_experiment(
     title: str,
     measure: Callable[[bool], list[Result]],
 ) -> Experiment:
-    """Return an experiment of ``bench.experiments.speed``; `measure` is given whether to hurry."""
+    """Return an experiment of ``bench.experiments.speed``; `measure` receives `quick`."""
     return Experiment(
         id,
         title,
@@ -56,7 +56,7 @@ def speed_experiment(
 
 
 def fixed_loop() -> int:
-    """Some integer arithmetic and attribute-free Python: what a time is compared with."""
+    """Fixed loop of integer arithmetic, the reference of all times."""
     total = 0
     for k in range(2000):
         total = (total * 31 + k) & 0xFFFF
@@ -64,7 +64,7 @@ def fixed_loop() -> int:
 
 
 def cpu_s(work: Callable[[], object]) -> float:
-    """Return the CPU time of this thread that `work` takes, s: what others do does not count."""
+    """Return the CPU time of `work` in this thread, s, independent of other processes."""
     began = time.thread_time()
     work()
     return time.thread_time() - began
@@ -76,7 +76,7 @@ def loop_s(repeats: int = 9) -> float:
 
 
 def repeats(quick: bool) -> int:
-    """Return how often a short piece of work is timed."""
+    """Return the number of repeats for short work."""
     return 3 if quick else 25
 
 
@@ -90,12 +90,12 @@ def per_item(
     slack: float = 4.0,
     note: str = "",
 ) -> Result:
-    """Median CPU time per item over paired repeats; `prepare` makes fresh work for each."""
+    """Return the median CPU time per item of paired repeats; `prepare` makes new work for each."""
     prepare()()  # warm up
     times, ratios = [], []
     for _ in range(repeats(quick)):
         work = prepare()
-        gc.collect()  # what others left is not this work's
+        gc.collect()  # garbage of earlier work must not count
         loop = cpu_s(fixed_loop)
         took = cpu_s(work) / items
         times.append(took)

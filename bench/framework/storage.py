@@ -1,7 +1,7 @@
-"""Results as JSON files in ``bench/results``, one a experiment.
+"""Results as JSON files in ``bench/results``, one per experiment.
 
-The files are committed; the pages of docs are generated from them. They hold no date and no path,
-and values with the digits that the pages show, so that a repeated run changes nothing but times.
+The files are committed, and the pages of docs are generated from them. They contain no date and no
+path. Values have the digits that the pages show, so that a repeated run changes times only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MACHINE = "machine"
 
 
 def shown(value: float) -> float:
-    """Return the value with the digits that tables show: three decimals, or three digits."""
+    """Return the value with the digits of the tables: three decimals, or three digits."""
     value = float(value)
     if 0.0 < abs(value) < 0.01:
         return float(f"{value:.3g}")
@@ -32,7 +32,8 @@ def shown(value: float) -> float:
 
 
 def to_json(experiment: Experiment, results: Sequence[Result]) -> dict[str, Any]:
-    """Return experiment and results as JSON values; infinite values are strings, no limit null."""
+    """Return experiment and results as JSON values; infinite values are strings, absent limits
+    null."""
     return {
         "experiment": experiment.id,
         "topic": experiment.topic,

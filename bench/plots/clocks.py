@@ -1,4 +1,4 @@
-"""Pictures of one run: clocks, delays, alignment, lags. Law: draws what ``trace`` found, as PNG."""
+"""Plots of one run as PNG: clocks, delays, alignment, lags."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 
 NS, NS_PER_MS, NS_PER_US = 1e9, 1e6, 1e3
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-"""Okabe and Ito's: told apart by everybody."""
+"""Palette of Okabe and Ito, distinguishable with color blindness."""
 GAP_PERIODS = 1.5
 _DPI = 110
 
 
 def run(directory: Path, recorded: Path | None) -> list[Path]:
-    """Draw the run of an event log, or a simulated one; return the files written.
+    """Plot a recorded run, or a simulated one; return the files written.
 
     Raises
     ------
     ValueError
-        The file is no event log, or holds no sample.
+        The file is no event log, or contains no sample.
     OSError
-        It cannot be read, or the pictures cannot be written.
+        The file cannot be read, or the plots cannot be written.
     """
     if recorded is None:
         drawn = simulated()
@@ -59,11 +59,11 @@ def run(directory: Path, recorded: Path | None) -> list[Path]:
     return written
 
 
-# --- what all pictures have -------------------------------------------------------------------
+# --- common parts ------------------------------------------------------------------------------
 
 
 def _figure(title: str, panels: Sequence[str], about: Run, *, height: float = 2.0) -> Figure:
-    """Return a figure with one panel below the other, time in common."""
+    """Return a figure with panels one below the other and a common time axis."""
     figure = Figure(figsize=(11, 1.1 + height * len(panels)), layout="constrained")
     figure.suptitle(f"{title}\n{about.title}", fontsize=11, x=0.01, ha="left")
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -97,7 +97,7 @@ def _legend(figure: Figure, colors: dict[str, str], axis: Axes) -> None:
     figure.legend(loc="upper right", ncols=len(colors), frameon=False, fontsize=9)
 
 
-# --- pictures ---------------------------------------------------------------------------------
+# --- plots -------------------------------------------------------------------------------------
 
 
 def clocks(trace: Trace, about: Run) -> Figure:
@@ -132,13 +132,13 @@ def _of(looks: Sequence[Look], what: str) -> Floats:
 def _from_first(
     values: Floats,
 ) -> Floats:
-    """Count from the first known value anew after every jump of more than 10 ms (a restart)."""
+    """Subtract the first known value, again after every jump of more than 10 ms (a restart)."""
     known = np.flatnonzero(np.isfinite(values))
     found = values.copy()
     for part in np.split(known, np.flatnonzero(np.abs(np.diff(values[known])) > 1e7) + 1):
         if part.size:
             found[part] -= values[part[0]]
-            found[part[0]] = np.nan  # the line is broken where a new epoch begins
+            found[part[0]] = np.nan  # the line is interrupted where a new epoch begins
     return found
 
 
@@ -149,7 +149,7 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
     counts, _ = np.histogram(t_s, edges)
     rate.step(edges[:-1], counts, where="post", color=color, lw=1.1)
     steps = np.diff(t_ns)
-    # the usual step, not the configured rate: cameras have a rate of their own
+    # the median step instead of the configured rate: cameras have their own rate
     periods = steps / np.median(steps)
     row = sorted(trace.looks).index(name)
     for i in np.flatnonzero(periods > GAP_PERIODS):
@@ -159,14 +159,14 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
 
 
 def delays(trace: Trace, about: Run) -> Figure:
-    """Arrival minus stamp: the delay beyond the envelope (beyond exposure, with echoes)."""
+    """Arrival minus stamp: the delay beyond the minimum delay (beyond exposure, with echoes)."""
     names = sorted(trace.stamps)
     figure = Figure(figsize=(11, 1.1 + 1.5 * len(names)), layout="constrained")
     title = f"Delay beyond the fastest sample\n{about.title}"
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     axes = figure.subplots(
         len(names), 2, squeeze=False, sharey="row", width_ratios=(4, 1)
-    )  # each its own scale: a camera system is milliseconds late, a UART microseconds
+    )  # one scale per panel: camera delays are milliseconds, UART delays microseconds
     for (over_time, spread), name in zip(axes, names, strict=True):
         color = _colors(names)[name]
         rows = trace.stamps[name]
@@ -190,7 +190,7 @@ def delays(trace: Trace, about: Run) -> Figure:
 
 
 def alignment(trace: Trace, about: Run) -> Figure:
-    """Error of the stamps against truth, where truth is known; what frames waited for."""
+    """Error of the stamps where truth is known; waiting time of the frames."""
     errors = true_errors(trace, about.taken_ns, about.unseen_ns) if about.taken_ns else {}
     panels = [f"{name}: error, ms" for name in sorted(errors)]
     note = " (error less the smallest delay, which only the lag tells)" if errors else ""
@@ -233,7 +233,7 @@ def _latency(axis: Axes, trace: Trace) -> None:
 
 
 def lags(trace: Trace, about: Run) -> Figure:
-    """Lag windows of every sensor with their sigmas; refused ones are crosses below."""
+    """Lag windows of every sensor with their sigmas; rejected windows are crosses at the bottom."""
     names = sorted(trace.lags)
     figure = _figure("IMU later than cameras, windows of 10 s, ± 2 sigma",
                      [f"{name}, ms" for name in names] or ["no optical bodies"], about)  # fmt: skip

@@ -1,7 +1,7 @@
-"""Real trials drawn: marker paths, estimated centers, the models' centers.
+"""Plots of recorded trials: marker paths, estimated centers, centers of the models.
 
-Law: two views of every joint in the parent's coordinates, across the axis about which it turned
-most and along it; equal scales; what was refused is drawn faint, with its reason.
+Two views of every joint in parent coordinates, across the main axis of rotation and along it, with
+equal scales. Rejected estimates are drawn faint, with the reason.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _COLORS = ("tab:blue", "tab:orange")
 
 
 def draw(folder: Path) -> Iterator[Path]:
-    """Write one PNG a trial; yield their paths."""
+    """Write one PNG per trial; yield their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     for trial in TRIALS:
         joints = judged(DATA, trial, METHODS)
@@ -66,7 +66,7 @@ def _title(found: Judged) -> str:
 
 
 def _panel(axes: Any, found: Judged, view: NDArray[np.float64], labels: tuple[str, str]) -> None:
-    """Draw one view: `view` takes the parent's coordinates to the panel's, shape (3, 2)."""
+    """Draw one view: `view` maps parent coordinates to those of the panel, shape (3, 2)."""
     points = found.reduced.movement.points
     assert points is not None
     origin = found.model @ view

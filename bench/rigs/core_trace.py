@@ -1,6 +1,6 @@
-"""What the clocks of a run did: every stamp, every frame, every clock once a second, every lag.
+"""Trace of the clocks of a run: every stamp, every frame, every clock once a second, every lag.
 
-Law: the events go through the core that the daemon runs; here is only written down what it does.
+Invariant: the events pass through the core of the daemon, which is only observed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 NS = 1_000_000_000
 LOOK_NS = NS // 2
-"""Time between two looks at the clocks."""
+"""Interval at which the clocks are recorded."""
 WINDOW_S, HOP_S = 10.0, 2.5
 
 
@@ -48,7 +48,7 @@ class Stamping(NamedTuple):
 
 
 class Look(NamedTuple):
-    """One clock at one instant; None is not known yet."""
+    """One clock at one instant; None is unknown."""
 
     at_ns: int
     offset_ns: float | None
@@ -68,7 +68,7 @@ class Frame(NamedTuple):
 
 
 class LagWindow(NamedTuple):
-    """One window of a sensor against the body it is fixed to."""
+    """One lag window of a sensor and the body to which it is attached."""
 
     at_ns: int
     body: str
@@ -77,11 +77,11 @@ class LagWindow(NamedTuple):
 
 @dataclass
 class Trace:
-    """All of a run."""
+    """All records of a run."""
 
     begin_ns: int = 0
     latency_ns: dict[str, int] = field(default_factory=dict)
-    """What the clocks take for the least delay of their transports, and subtract."""
+    """Least delay of each transport that the clock assumes and subtracts."""
     stamps: dict[str, list[Stamping]] = field(default_factory=dict)
     looks: dict[str, list[Look]] = field(default_factory=dict)
     frames: list[Frame] = field(default_factory=list)
@@ -91,7 +91,7 @@ class Trace:
 
 
 class TracingCore(Core):
-    """The core, writing down what its clocks say."""
+    """Core that records the state of its clocks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -157,12 +157,12 @@ def _look(at_ns: int, clock: DeviceClock) -> Look:
 
 
 def traced(events: Iterable[Event]) -> Trace:
-    """Feed `events` to a fresh core and return what happened.
+    """Feed `events` to a new core and return the trace.
 
     Raises
     ------
     ValueError
-        There was not one sample in them.
+        The events contain no sample.
     """
     core = TracingCore()
     for event in events:
@@ -180,7 +180,7 @@ def traced(events: Iterable[Event]) -> Trace:
 
 
 def _lags(trace: Trace) -> dict[str, list[LagWindow]]:
-    """Return the windows of every sensor against the body it moves with best."""
+    """Return the lag windows of every sensor and the body with the best fit."""
     tracks = {name: _track(turns) for name, turns in trace.turns.items()}
     bodies = {name: track for name, track in tracks.items() if "/" in name}
     found: dict[str, list[LagWindow]] = {}
@@ -226,12 +226,12 @@ def _cut(
 def true_errors(
     trace: Trace, taken_ns: Mapping[tuple[str, int], int], unseen_ns: Mapping[str, int]
 ) -> dict[str, tuple[Floats, Floats, NDArray[np.bool_]]]:
-    """Return, by stream: time since the beginning (s), error of the stamp (ms), and synced."""
+    """Return by stream: time since the beginning (s), error of the stamp (ms), and synced."""
     errors = {}
     for name, rows in trace.stamps.items():
         known = [row for row in rows if (name, row.ticks) in taken_ns and row.ticks is not None]
         unseen = unseen_ns.get(name, 0)
-        if unseen:  # part of it was guessed from the transport and is in the stamps already
+        if unseen:  # the assumed part of the delay is already subtracted from the stamps
             unseen -= trace.latency_ns[name]
         t_s = np.array([(row.arrival_ns - trace.begin_ns) / NS for row in known])
         error = [(row.t_ns - unseen - taken_ns[name, row.ticks or 0]) / 1e6 for row in known]

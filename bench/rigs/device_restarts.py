@@ -1,9 +1,9 @@
-"""A live rig whose clocks drift apart and begin anew, judged stamp by stamp.
+"""Live rig with drifting clocks and device restarts; the error of every stamp.
 
-Law: three processes that know nothing of each other but bytes: virtual hardware with NatNet, two
-IMUs on UARTs and two on CAN, the daemon, a broker. Devices reboot one after the other, the next
-when all have recovered. Nothing is calibrated, so the constant that no clock can see, the least
-delay of each transport, is known from the simulator and taken off.
+Invariant: three processes exchange only bytes: simulated devices (NatNet, two IMUs on UARTs, two on
+CAN), the daemon, and a broker. Devices reboot one after the other, each once all have recovered.
+Without calibration no clock can estimate the least delay of its transport, so the simulator's value
+is subtracted.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 
 SKEWS_PPM = {"S1": 50, "S2": -50, "S3": 31, "S4": -23, OPTICAL: 42}
 DELAY_MS = {"S1": 2.0, "S2": 1.0, "S3": 2.0, "S4": 1.0}
-"""What the simulator's transports take at least; cameras answer echoes and need none."""
+"""Least delay of the simulated transports, ms; cameras answer echoes and need none."""
 EVERY = {*SENSORS, OPTICAL}
 PATIENCE_S = 40.0
-"""For what takes three seconds where nothing else runs."""
+"""Time limit for a step that takes three seconds on an idle machine, s."""
 
 
 class Outcome(NamedTuple):
-    """What became of one run."""
+    """Results of one run."""
 
     core: WatchedCore
     replayed: bool
-    """The event log gave the limb states of the live run byte for byte."""
+    """The event log replays to byte-identical limb states."""
 
     def errors_ns(self, source: str, method: str = "") -> list[int]:
-        """Return the errors of all stamps that called themselves synced (and came about so)."""
+        """Return the errors of all synced stamps of a source, optionally of one method only."""
         return [
             sample.error_ns
             for sample in self.core.samples
@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
         ]
 
     def unexcused_ns(self, source: str) -> list[int]:
-        """Return what a machine short of time does not excuse of those errors."""
+        """Return the part of those errors that delays of a loaded machine do not explain."""
         return [
             unexcused(sample.error_ns, sample.excused_ns)
             for sample in self.core.samples
@@ -55,18 +55,18 @@ class Outcome(NamedTuple):
 
     @property
     def unknown(self) -> float:
-        """Share of samples the simulator knows nothing of."""
+        """Share of samples that the simulator did not record."""
         samples = self.core.samples
         return sum(sample.error_ns is None for sample in samples) / max(1, len(samples))
 
     @property
     def frame_errors_ns(self) -> list[float]:
-        """The largest error of each frame that called itself synced."""
+        """Largest error of each synced frame."""
         return [frame.worst_ns for frame in self.core.frames if frame.synced]
 
 
 def locked(listener: Listener) -> bool:
-    """Tell whether the newest pose calls itself synced and no clock is settling."""
+    """Return whether the newest pose is synced and no clock is settling."""
     devices = listener.latest.get("bridge/health", {}).get("devices", {})
     settled = [device.get("clock") != "settling" for device in devices.values()]
     return (
@@ -78,7 +78,7 @@ def locked(listener: Listener) -> bool:
 
 
 async def recovers(listener: Listener, name: str) -> None:
-    """Wait until a loss is seen, the device is there again, and everything is locked."""
+    """Wait until the loss is detected, the device is online again, and everything is synced."""
     await listener.until(lambda: not locked(listener) or name not in listener.online, PATIENCE_S)
     before = listener.healths
     await listener.until(
@@ -90,18 +90,18 @@ async def recovers(listener: Listener, name: str) -> None:
 async def live(
     folder: Path, port: int, reboots: Sequence[str], rest_s: float, more: Sequence[str] = ()
 ) -> Outcome:
-    """Run a rig; reboot devices one by one; judge what was recorded.
+    """Run a rig, reboot devices one by one, and evaluate the recorded stamps.
 
     Parameters
     ----------
     folder, port
-        An empty folder; the broker's port.
+        Empty folder; port of the broker.
     reboots
         Sensors, or `mocap`, in order.
     rest_s
-        How long the rig runs well before each reboot and at the end.
+        Time without a fault before each reboot and at the end, s.
     more
-        Further words for the simulator.
+        Further options of the simulator.
     """
     clocks = [word for name, ppm in SKEWS_PPM.items() for word in ("--clock", f"{name}={ppm}")]
     options = ("--sample-log", "--programme", "walk", *clocks, *more)

@@ -1,8 +1,8 @@
-"""The real daemon between virtual hardware and a broker, timed as a subscriber sees it.
+"""The daemon between simulated devices and a broker, timed at a subscriber.
 
-Law: four processes that know nothing of each other but bytes: ``jointfit-sim`` (two IMUs on ptys,
-two on an SLCAN adapter on a pty, a NatNet server), jointfitd, a broker, and this one, which only
-subscribes. The daemon is calibrated: a stored calibration of the simulator's wearer is in force.
+Invariant: four processes exchange only bytes: ``jointfit-sim`` (two IMUs on ptys, two on an SLCAN
+adapter on a pty, a NatNet server), jointfitd, a broker, and this process, which only subscribes.
+The daemon uses a stored calibration of the simulated wearer.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.child_processes import Simulator
 
 SETTLE_S = 4.0
-"""Clocks settle meanwhile; not measured."""
+"""Time in which the clocks settle, not measured, s."""
 CONNECT_S, END_S = 40.0, 20.0
 FLOOD_START_S = 0.5
-"""The flooding process imports and connects meanwhile; not measured."""
+"""Time in which the flooding process imports and connects, not measured, s."""
 ROOT = Path(__file__).resolve().parents[2]
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
 TOPICS = ("pose", "bridge/health", "bridge/state", "device/+/availability")
@@ -46,21 +46,21 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What the hardware sends."""
+    """Samples that the simulated devices send."""
 
     rate_hz: float
     mocap_hz: float = 100.0
 
     @property
     def options(self) -> list[str]:
-        """Words for ``jointfit-sim``."""
+        """Options of ``jointfit-sim``."""
         knobs = ("--set", f"mocap_hz={self.mocap_hz:g}")
         return ["--rate", f"{self.rate_hz:g}", "--programme", "walk", *knobs]
 
 
 @dataclass(slots=True)
 class Heard:
-    """What the subscriber heard."""
+    """Messages that the subscriber received."""
 
     latencies_ms: list[float] = field(default_factory=list)
     online: set[str] = field(default_factory=set)
@@ -68,7 +68,7 @@ class Heard:
     pose: dict[str, Any] = field(default_factory=dict)
     first_pose_s: float | None = None
     running_s: float | None = None
-    """When the daemon said on ``bridge/state`` that it is there, and its first pose: monotonic."""
+    """Monotonic times of ``online`` on ``bridge/state`` and of the first pose."""
 
     async def listen(self, client: MqttClient) -> None:
         async for topic, payload in client.messages():
@@ -88,7 +88,7 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What one run showed."""
+    """Results of one run."""
 
     latencies_ms: list[float]
     """Receipt minus arrival of the sample that completed the frame, of every frame."""
@@ -96,21 +96,21 @@ class Figures:
     cpu_s: float
     """CPU time of the daemon in these seconds."""
     loop_s: float
-    """CPU time of the fixed loop, measured meanwhile."""
+    """CPU time of the fixed loop during the run."""
     waited_s: float
-    """How long the daemon was ready to run meanwhile and had no core: the machine's doing."""
+    """Time in which the daemon was runnable without a core, caused by the load of the machine."""
     rss_mb: float
     unaccounted: int
-    """Samples sent and not received, or without a verdict, or dropped."""
+    """Samples sent and not received, without an outcome, or dropped."""
     received: int
     running_s: float
     first_pose_s: float
-    """From exec to ``online`` at the broker, and to the first pose."""
+    """Time from exec to ``online`` at the broker, and to the first pose."""
 
 
 @cache
 def calibration() -> Calibration:
-    """Return the calibration of the simulator's wearer (seed 1)."""
+    """Return the calibration of the simulated wearer (seed 1)."""
     return fitted(bench_rig())
 
 
@@ -133,17 +133,17 @@ class FloodFigures:
 
 @dataclass(frozen=True, slots=True)
 class _Gateway:
-    """Running hardware and daemon, and their subscriber."""
+    """Running devices and daemon, and their subscriber."""
 
     hardware: Simulator
     pid: int
     heard: Heard
     began_s: float
-    """When the daemon was started, monotonic."""
+    """Monotonic start time of the daemon."""
 
 
 async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
-    """Start everything, settle, measure for `seconds`, stop the hardware, account for samples."""
+    """Start everything, settle, measure for `seconds`, stop the devices, count all samples."""
     async with _gateway(folder, port, load) as gateway:
         heard = gateway.heard
         measured = await _measure(gateway.pid, heard, seconds)
@@ -159,7 +159,7 @@ async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
 
 
 async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
-    """Start everything, settle, measure without requests and then under a flood of them."""
+    """Start everything, settle, measure without requests and then under a flood of requests."""
     async with _gateway(folder, port, load) as gateway:
         heard, pid = gateway.heard, gateway.pid
         quiet_ms, _, quiet_cpu, *_ = await _measure(pid, heard, SECONDS)
@@ -178,7 +178,7 @@ async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
 
 @asynccontextmanager
 async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio.Task[int]]:
-    """Run a process that floods the daemon; yield a task that returns how many requests it sent."""
+    """Run a process that floods the daemon; yield a task that returns its number of requests."""
     words = ("-m", "bench.rigs.request_flood", str(port), base, "--seconds", str(seconds))
     process = await asyncio.create_subprocess_exec(
         sys.executable, *words, cwd=ROOT, stdout=asyncio.subprocess.PIPE
@@ -202,7 +202,7 @@ async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio
 
 @asynccontextmanager
 async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gateway]:
-    """Start hardware, subscriber and daemon; ready when all sources are online and settled."""
+    """Start devices, subscriber and daemon; ready when all sources are online and settled."""
     base = f"jointfit/{folder.name}"
     CalibrationStore(folder / "state" / "calibrations", "demo").save(calibration())
     async with simulator(folder, port, base, load.options) as hardware:
@@ -224,7 +224,7 @@ async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gatewa
 
 @asynccontextmanager
 async def subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
-    """Yield what a subscriber receives from the daemon, until the block ends."""
+    """Collect the messages of the daemon until the block ends; yield them."""
     heard = Heard()
     async with MqttClient(settings) as client:
         await client.subscribe(*TOPICS)
@@ -240,7 +240,7 @@ async def _measure(
     pid: int, heard: Heard, seconds: float
 ) -> tuple[list[float], float, float, float, float, float]:
     gc.collect()
-    gc.freeze()  # pauses of this process would look like the daemon's
+    gc.freeze()  # garbage collection here would be measured as latency of the daemon
     heard.latencies_ms.clear()
     began_s, began_cpu, began_wait = time.monotonic(), cpu_s(pid), waited_s(pid)
     await asyncio.sleep(seconds)
@@ -252,7 +252,7 @@ async def _measure(
 
 
 async def _last_health(heard: Heard) -> dict[str, Any]:
-    """Wait for the health that knows every source to be gone: no sample is on its way then."""
+    """Wait for a health message with all sources offline: no sample is in transit then."""
     async with asyncio.timeout(END_S):
         while any(  # noqa: ASYNC110 - it hangs on what a message says, not on its coming
             device["online"] for device in heard.health["devices"].values()
@@ -271,22 +271,22 @@ def _unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> in
 
 
 def cpu_s(pid: int) -> float:
-    """Return the CPU time, user and system, that a process has used, s."""
+    """Return the CPU time of a process, user and system, s."""
     text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
     fields = text.rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
 
 def waited_s(pid: int) -> float:
-    """Return how long the main thread of a process was ready and had no core so far, s."""
+    """Return the time in which the main thread of a process was runnable without a core, s."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="utf-8").split()[1]) / 1e9
-    except OSError:  # a kernel without it
+    except OSError:  # the kernel lacks it
         return float("nan")
 
 
 def rss_mb(pid: int) -> float:
-    """Return the memory of a process that is in RAM, MB."""
+    """Return the resident memory of a process, MB."""
     for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) * 1024 / 1e6

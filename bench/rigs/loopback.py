@@ -1,7 +1,7 @@
-"""How far a datagram's arrival stamp is from its sending while the reader's loop is busy.
+"""Difference of arrival stamp and sending time of datagrams while the loop of the reader is busy.
 
-Law: the sender is a process of its own and writes its clock into every datagram as the last thing
-before the system call; both read CLOCK_MONOTONIC, so the difference needs no model.
+Invariant: the sender is a separate process and writes CLOCK_MONOTONIC into each datagram directly
+before the system call. The reader stamps with the same clock, so the difference needs no model.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ for _ in range(count):
 
 
 def delays_ns(count: int, blocked_s: float = 0.004) -> tuple[list[int], list[int]]:
-    """Return, for every datagram, stamp and reading less sending, ns.
+    """Return stamp minus sending and reading minus sending of every datagram, ns.
 
     Parameters
     ----------
     count
-        Datagrams, one every 2 ms.
+        Number of datagrams, one every 2 ms.
     blocked_s
-        The loop that reads is blocked for so long at a time, with short pauses.
+        Time for which the reading loop is blocked, with short pauses in between, s.
     """
     return asyncio.run(_measure(count, blocked_s))
 

@@ -1,9 +1,9 @@
-"""A recorded trial as bytes through the real daemon, judged by what arrives over MQTT.
+"""Recorded trial replayed as bytes through the daemon, evaluated from its MQTT messages.
 
-Law: three processes that know nothing of each other but bytes: `jointfit-sim play --trial`, the
-daemon with a rig.toml, mosquitto. What is judged are the `pose` messages; the reference is the
-simulator's truth at the very instants of the poses. The calibration is the daemon's own: a static
-pose, then the first 60 % of the squats; judged live on the last 40 %.
+Invariant: three processes exchange only bytes: `jointfit-sim play --trial`, the daemon, and a
+broker. The `pose` messages are compared with the simulator's ground truth at the instants of the
+poses. The daemon calibrates itself on a static pose and the first 60 % of the squats; the last 40 %
+are evaluated.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ if TYPE_CHECKING:
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
 SETTLE_S, STATIC_S = 3.0, 3.5
 BLEND_S = 1.0
-"""From standing to the first frame of the trial, made up; cameras see no bones meanwhile."""
+"""Interpolation from standing to the first frame of the trial, without optical bodies, s."""
 POLL_S = 0.05
 SPARE_S = 1.0
-"""How much longer than its motion a phase is: cameras see nothing more, and late bytes arrive."""
+"""Time by which a phase is longer than its motion, for late bytes; the cameras see no bodies, s."""
 SQUATS_HZ, WALKING_HZ = 50.0, 100.0
 SEGMENTS = ("thigh", "shank")
 TRUTH_NS, MATCH_NS = 10_000_000, 1_000_000
-"""Truth and poses are true for whole hundredths of a second of one clock; the rest is rounding."""
+"""Truth and poses refer to multiples of 10 ms of one clock; the rest is rounding."""
 CONNECT_S = PATIENCE_S = 40.0
 ENDS = {"static": "posed", "functional": "calibrated"}
-"""Phases, and the state that ends each well."""
+"""State that ends each phase successfully."""
 
 
 @dataclass(slots=True)
 class Gateway:
-    """One scene and one daemon at work, and what the daemon says."""
+    """Simulated scene, daemon, and the messages of the daemon."""
 
     folder: Path
     sim: Simulator
@@ -82,7 +82,7 @@ class Gateway:
 
     async def phase(self, name: str, seconds: float) -> None:
         """Run one phase of a calibration to its end."""
-        while not self._phases.empty():  # what was said before is no answer
+        while not self._phases.empty():  # earlier messages do not belong to this phase
             self._phases.get_nowait()
         answer = await self.client.request("calibrate", {"phase": name, "seconds": seconds})
         if answer["status"] != "accepted":
@@ -93,7 +93,7 @@ class Gateway:
                     raise RuntimeError(f"{name}: {status['text']}")
 
     async def play(self, motion: str) -> None:
-        """Begin a motion; return when its blend is on, in which cameras see no bones."""
+        """Start a motion; return in its interpolation, in which the cameras see no bodies."""
         await self.sim.say(f"play {motion}")
         async with asyncio.timeout(PATIENCE_S):
             while True:
@@ -103,13 +103,13 @@ class Gateway:
                 await asyncio.sleep(POLL_S)
 
     async def live(self, motion: str, seconds: float) -> None:
-        """Play a motion of so many seconds and keep what is said meanwhile."""
+        """Play a motion of `seconds` and record the messages."""
         self.poses.clear()
         await self.play(motion)
         await asyncio.sleep(BLEND_S + seconds + SPARE_S)
 
     def calibration(self) -> Calibration:
-        """Return what the daemon stored."""
+        """Return the calibration stored by the daemon."""
         stored = CalibrationStore(self.folder / "state" / "calibrations", "demo").latest()
         if stored is None:
             raise RuntimeError("no calibration was stored")
@@ -118,7 +118,7 @@ class Gateway:
 
 @asynccontextmanager
 async def gateway(folder: Path, port: int, options: Sequence[str]) -> AsyncIterator[Gateway]:
-    """Start virtual hardware and the daemon; stop both at the end."""
+    """Start simulator and daemon; stop both at the end."""
     base = f"jointfit/{folder.name}"
     settings = MqttSettings(host="127.0.0.1", port=port, base=base)
     async with (
@@ -138,11 +138,11 @@ async def gateway(folder: Path, port: int, options: Sequence[str]) -> AsyncItera
             await asyncio.wait([listening])
 
 
-# --- what is played ---------------------------------------------------------------------------
+# --- trials ------------------------------------------------------------------------------------
 
 
 def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]:
-    """Return the words for a scene without imperfections but those of the recording itself."""
+    """Return the options of a scene whose only errors are those of the recording."""
     knobs = {
         "mocap_hz": rate_hz,
         "transition_s": BLEND_S,
@@ -160,7 +160,7 @@ def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]
 
 
 async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
-    """Calibrate on the first 60 % of the squats, go live on the rest."""
+    """Calibrate on the first 60 % of the squats, evaluate the rest live."""
     files = [data / FOLDER / name for name in ("squats1.npz", "static_bias.json")]
     whole = load(data, "squats1")
     cut, last = training_frames(whole), len(whole) - 1
@@ -174,33 +174,33 @@ async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
 
 
 async def walking(data: Path, folder: Path, port: int, method: Method) -> Played:
-    """Start anew with the calibration that the squats left in `folder`; walk live."""
+    """Restart with the calibration of the squats in `folder`; walk live."""
     files = [data / FOLDER / name for name in ("walking1.npz", "static_bias.json")]
     async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
-        await running.connected(2 * SETTLE_S)  # a millisecond is half a degree at this speed
+        await running.connected(2 * SETTLE_S)  # 1 ms corresponds to half a degree at this speed
         await running.live("trial", 1.3)
     return _judged(running, data)
 
 
-# --- judgement --------------------------------------------------------------------------------
+# --- evaluation --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One live part, as the daemon told it."""
+    """Results of one live part."""
 
     frames: int
-    """Poses judged."""
+    """Number of evaluated poses."""
     truth: tuple[Array, Array]
     """Recorded thigh and shank at their instants, q_world_bone, shape (frames, 4)."""
     errors: tuple[float, float, float]
-    """RMS degrees of thigh, shank and knee flexion."""
+    """RMS errors of thigh, shank and knee flexion, deg."""
     calibration: Calibration
     health: dict[str, Any]
-    """The daemon's last account of its devices."""
+    """Devices of the daemon's last health message."""
 
     def of(self, recorded: KneeTrial) -> KneeTrial:
-        """Return the frames of the recording that were judged: those nearest in posture."""
+        """Return the evaluated frames of the recording: those with the nearest posture."""
         femur, tibia = (q[:, None] for q in self.truth)
         apart = rotation.angle_between(femur, recorded.thigh)
         apart = apart + rotation.angle_between(tibia, recorded.shank)
@@ -214,7 +214,7 @@ class Played:
 
 
 def _judged(running: Gateway, data: Path) -> Played:
-    """Judge the poses for whose instant the truth is a recorded one, in the bones' own frames."""
+    """Evaluate poses at instants of recorded truth, in the frames of the bones."""
     truth = _recorded_truth(running.folder / "truth.jsonl")
     unix_ns = time.time_ns() - time.monotonic_ns()
     rows = []
@@ -223,13 +223,15 @@ def _judged(running: Gateway, data: Path) -> Played:
         at = round(t_ns / TRUTH_NS) * TRUTH_NS
         said = [pose["segments"][name]["q"] for name in SEGMENTS]
         everyone = all(len(pose["segments"][name]["used"]) == 2 for name in SEGMENTS)
-        everyone &= "extrapolating" not in pose["flags"]  # this host was late, not the method wrong
+        everyone &= (
+            "extrapolating" not in pose["flags"]
+        )  # a late frame of this host is no error of the method
         if at in truth and abs(at - t_ns) < MATCH_NS and everyone:
             rows.append([*said, *truth[at]])
     calibration = running.calibration()
     columns = np.array(rows).swapaxes(0, 1)
     femur, tibia = columns[2:]
-    # what turned the bones' frames into the calibration's is constant, and is undone here
+    # the rotation from bone frames to those of the calibration is constant and is removed here
     frames = [np.array(calibration.segment[name].q_static) for name in SEGMENTS]
     thigh, shank = (
         rotation.multiply(q, rotation.conjugate(frame))
@@ -242,7 +244,8 @@ def _judged(running: Gateway, data: Path) -> Played:
 
 
 def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
-    """Return thigh and shank by instant, ns; what was made up has no positions and is left out."""
+    """Return thigh and shank by instant, ns; interpolated instants have no positions and are
+    omitted."""
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines()[1:]:
         row = json.loads(line)
@@ -251,7 +254,7 @@ def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
     return found
 
 
-# --- all of it --------------------------------------------------------------------------------
+# --- complete runs -----------------------------------------------------------------------------
 
 
 async def _everything(
@@ -280,9 +283,10 @@ async def _everything(
 def run(
     data: Path, methods: Sequence[Method], walkers: Sequence[Method] = ()
 ) -> dict[tuple[str, Method], Played]:
-    """Play the squats by every method at once, each on hardware and a daemon of its own.
+    """Play the squats with all methods in parallel, each with its own simulator and daemon.
 
-    `walkers` then walk. Takes about 35 s, and 10 s more for walking: trials run in real time.
+    `walkers` then walk. The run takes about 35 s, and 10 s more for walking, because trials run in
+    real time.
     """
     with tempfile.TemporaryDirectory() as folder:
         return asyncio.run(_everything(data, Path(folder), methods, walkers))

@@ -1,7 +1,7 @@
-"""MalformedError and ill-sized requests at 1 kHz: `python -m bench.rigs.request_flood PORT BASE`.
+"""Malformed and oversized requests at 1 kHz: `python -m bench.rigs.request_flood PORT BASE`.
 
-Invariant: none of them is a request that the daemon may run. The process is one MQTT 5 client, as
-an attacker would have it, and prints how many requests it sent and in which time.
+Invariant: none of them is a valid request. The process is one MQTT 5 client, like an attacker, and
+prints the number of requests sent and the time taken.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from paho.mqtt.properties import Properties
 
 RATE_HZ, SECONDS = 1000, 10.0
 _TURN_S = 0.005
-"""The requests of so long are sent at once."""
+"""Interval whose requests are sent in one burst."""
 
 
-_Properties: Any = Properties  # its constructor is not annotated
+_Properties: Any = Properties  # its constructor has no annotations
 
 
 def _properties(**values: Any) -> Any:
@@ -33,7 +33,7 @@ def _properties(**values: Any) -> Any:
 
 
 def kinds(base: str) -> list[tuple[str, bytes, Any]]:
-    """Return topic, payload and properties of each kind of request, none of them valid."""
+    """Return topic, payload and properties of each kind of invalid request."""
     root = f"{base}/bridge/request"
     topic = f"{root}/calibrate"
     return [
@@ -45,7 +45,7 @@ def kinds(base: str) -> list[tuple[str, bytes, Any]]:
         (topic, b'{"phase":"static","seconds":"long"}', None),
         (topic, b" " * 4097, None),
         (topic, b"[" * 32_000, None),
-        (topic, bytes(40_000), None),  # over the limit of a packet
+        (topic, bytes(40_000), None),  # over the size limit of a packet
         (topic, b'{"phase":"static"}', _properties(ResponseTopic=f"{base}/pose")),
         (topic, b'{"phase":"static"}', _properties(ResponseTopic=root, CorrelationData=bytes(999))),
         (topic, b"[]", _properties(UserProperty=[("name", "x" * 50)] * 20)),
@@ -72,7 +72,7 @@ def main() -> None:
     ):
         if (early := began + number / RATE_HZ - time.monotonic()) > _TURN_S:
             time.sleep(early)
-        # The number of kinds is odd: each is sent at both levels of service.
+        # The number of kinds is odd, so each is sent at both QoS levels.
         client.publish(topic, payload, number % 2, properties=properties)
     client.publish(f"{options.base}/bridge/request/last", b"[]", 1).wait_for_publish(SECONDS)
     print(json.dumps({"sent": count, "seconds": time.monotonic() - began}))

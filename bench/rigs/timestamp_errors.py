@@ -1,14 +1,14 @@
-"""Stamps of a real daemon against the instants at which its samples were truly taken.
+"""Errors of the daemon's stamps, compared with the instants at which samples were taken.
 
-Law: the daemon's event log, fed to the same core again, gives every stamp that the live run gave;
-the simulator's sample log says when each sample was taken. Their difference is the error, but for
-the constant that no arrival can tell: where a stamp rests on arrivals, the transport's true least
-delay takes the place of the one the daemon assumed. With a lag in force, or edges of a sync line,
-nothing is taken off.
+Invariant: the event log replays to every stamp of the live run, and the simulator's sample log
+contains the instant of each sample. Their difference is the error, except for a constant that
+arrival times cannot reveal: where a stamp is based on arrivals, the true least delay of the
+transport replaces the assumed one. With a lag in use or with edges of a sync line, nothing is
+replaced.
 
-On a machine that is short of time samples come later still, and before a quick one has come no
-clock can know. How much of an error that explains is told apart (`excused_ns`): what the quickest
-sample since the clock began took beyond the least delay, slewed down as stamps are.
+On a loaded machine samples arrive later, and without a fast sample no clock can estimate the delay.
+The part of an error that this explains is reported separately (`excused_ns`): the additional delay
+of the fastest sample since the clock started, slewed like the stamps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _NS_PER_MS = 1e6
 OPTICAL = "mocap"
 MOST_NS = 2_000_000_000
-"""A sample is on its way for less than this."""
+"""Upper limit of the transport delay of a sample."""
 
 
 class Judged(NamedTuple):
@@ -48,36 +48,36 @@ class Judged(NamedTuple):
     source: str
     arrival_ns: int
     t_ns: int
-    """As it went into frames: its stamp less the lag in force."""
+    """Stamp used in frames: the clock's stamp less the lag in use."""
     synced: bool
     method: str
-    """How its clock told time: `passive`, `echo`, `direct` …"""
+    """Clock method: `passive`, `echo`, `direct` …"""
     error_ns: int | None
-    """None: the simulator knows of no such sample."""
+    """None: the simulator has no such sample."""
     excused_ns: int
-    """How late every sample of this clock has been so far, beyond the least delay."""
+    """Smallest delay of the samples of this clock so far, beyond the least delay."""
 
 
 class JudgedFrame(NamedTuple):
-    """One frame that was published."""
+    """One published frame."""
 
     t_ns: int
     completed_ns: int
     synced: bool
     worst_ns: float
-    """Largest error among the samples next to it, of every sensor in it; 0 if none is known."""
+    """Largest error among the samples used for it, over all sensors; 0 if none is known."""
     sensors: int
     unexcused_ns: float = 0.0
-    """The same, but for what is excused."""
+    """The same without the excused part."""
 
 
 class Truth:
-    """True instants by device and number.
+    """True instants by device and sample number.
 
     Parameters
     ----------
     path
-        The simulator's ``samples.jsonl``.
+        ``samples.jsonl`` of the simulator.
     """
 
     def __init__(self, path: Path) -> None:
@@ -88,7 +88,7 @@ class Truth:
                 self._taken[sample["id"], sample["number"]].append(sample["host_ns"])
 
     def taken_ns(self, source: str, number: int, arrival_ns: int) -> int | None:
-        """Return when the sample of this number that came at `arrival_ns` was taken."""
+        """Return the true instant of the sample with this number that arrived at `arrival_ns`."""
         instants = self._taken.get((source, number), [])
         at = bisect_right(instants, arrival_ns)
         if at == 0 or arrival_ns - instants[at - 1] > MOST_NS:
@@ -98,17 +98,17 @@ class Truth:
 
 @dataclass(slots=True)
 class _Recent:
-    """Stamps and errors of one source's samples, in order of arrival."""
+    """Stamps and errors of the samples of one source, in order of arrival."""
 
     t_ns: list[int] = field(default_factory=list)
     error_ns: list[int | None] = field(default_factory=list)
     excused_ns: list[int] = field(default_factory=list)
     epoch: int = -1
     least_ns: int = 0
-    """How late the quickest sample of this epoch was."""
+    """Delay of the fastest sample of this epoch beyond the least delay."""
 
     def excuse(self, late_ns: int | None, stamp: Stamp) -> int:
-        """Take how late a sample was; return how late nobody can blame the clock for being."""
+        """Add the delay of a sample; return the part of its error that the delays explain."""
         if stamp.epoch != self.epoch:
             self.epoch, self.least_ns = stamp.epoch, MOST_NS
         if late_ns is not None:
@@ -120,14 +120,14 @@ class _Recent:
 
 
 class WatchedCore(Core):
-    """The core, with somebody who notes every stamp and every frame.
+    """Core whose stamps and frames are recorded.
 
     Parameters
     ----------
     truth
-        When samples were taken.
+        Instants at which samples were taken.
     delay_ns
-        Least delay of each source's transport; 0 where it is not given.
+        Least delay of the transport by source; 0 if missing.
     """
 
     def __init__(self, truth: Truth, delay_ns: Mapping[str, int]) -> None:
@@ -154,7 +154,7 @@ class WatchedCore(Core):
         number = measured.counter if isinstance(measured, ImuSample) else measured.number
         lag_ns = self._lag_ns.get(source, 0)
         t_ns = stamp.t_ns - lag_ns
-        arrival_ns = self._now_ns  # a sample's own is back-dated, and may be before its time
+        arrival_ns = self._now_ns  # a back-dated sample has an earlier event time
         taken_ns = None if number is None else self._truth.taken_ns(source, number, arrival_ns)
         known = lag_ns or state.clock.state not in {"passive", "settling", "arrival"}
         unseen_ns = 0 if known else self._delay_ns.get(source, 0) - state.clock.latency_ns
@@ -181,10 +181,8 @@ class WatchedCore(Core):
         return super()._fuse(frame)
 
     def _error_at(self, source: str, t_ns: int) -> tuple[float, float]:
-        """Return the larger error of the samples that an orientation at `t_ns` is made of.
-
-        And the larger of what is not excused of them.
-        """
+        """Return the larger error of the two samples around `t_ns`, complete and without the
+        excused part."""
         recent = self._recent[source]
         begin = max(0, len(recent.t_ns) - 512)
         after = bisect_left(recent.t_ns, t_ns, lo=begin)
@@ -198,14 +196,14 @@ class WatchedCore(Core):
 
 
 def unexcused(error_ns: int, excused_ns: int) -> int:
-    """Return the size of an error but for what is excused of it: being late, never being early."""
+    """Return the magnitude of an error without its excused part; only late stamps are excused."""
     return max(-error_ns, error_ns - excused_ns, 0)
 
 
 def judge(
     events: Iterable[Event], samples: Path, delay_ms: Mapping[str, float]
 ) -> tuple[WatchedCore, list[LimbState]]:
-    """Return the watched core after all events, and the limb states it gave."""
+    """Return the observed core after all events, and its limb states."""
     delays = {name: round(delay * _NS_PER_MS) for name, delay in delay_ms.items()}
     core = WatchedCore(Truth(samples), delays)
     states: list[LimbState] = []

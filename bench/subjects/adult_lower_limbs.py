@@ -1,8 +1,8 @@
-"""The lower limbs of one recorded adult as a chain: seven segments, 20 degrees of freedom.
+"""Lower limbs of one recorded adult as a chain: seven segments, 20 degrees of freedom.
 
-Built from the standing trial alone: joint centers between the markers on either side of a joint
-(at the hip the computed center of the recording), axes from those centers, markers where they
-stood. Virtual markers are not tracked. Shared by tests and benches.
+Built from the standing trial alone. Joint centers lie between the markers on either side of a
+joint; the hip center is the computed one of the recording. Axes follow from the centers, and
+markers have their positions in stance. Virtual markers are not tracked.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FOOT = ("calc", "5meta", "toe")
 
 @cache
 def trial(data: Path, name: str) -> MarkerTrial:
-    """Return a trial, z up."""
+    """Return a trial with z up."""
     return read_marker_trial(data / FOLDER / "trc" / f"{name}.trc")
 
 

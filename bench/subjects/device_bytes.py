@@ -1,6 +1,6 @@
-"""Bytes as simulated devices would send them, made by our own encoders, ahead of any measurement.
+"""Bytes of simulated devices, made by the project's encoders before the measurement.
 
-Law: every function here is deterministic and returns chunks in order of arrival.
+Invariant: every function is deterministic and returns chunks in order of arrival.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SERVER = ServerInfo("Motive", (2, 3, 0, 0), (3, 1, 0, 0), 10_000_000)
 
 
 def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[bytes]:
-    """Counter, time, status and quaternion: what a configured MTi sends."""
+    """Counter, time, status and quaternion: the outputs of a configured MTi."""
     quaternion = mtdata2.real_id(mtdata2.Item.QUATERNION)
     return [
         xbus.encode(
@@ -55,7 +55,7 @@ def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[by
 def xcdi_frames(
     orientations: Sequence[Quaternion], period_ns: int, ids: xcdi.XcdiIds, start_ns: int = 0
 ) -> list[list[CanFrame]]:
-    """Three frames a sample: time, counter, quaternion."""
+    """Three frames per sample: time, counter, quaternion."""
     return [
         [
             CanFrame(start_ns + k * period_ns, can_id, xcdi.encode(data_id, counts))
@@ -73,7 +73,7 @@ def xcdi_frames(
 def xbus_chunks(
     orientations: Sequence[Quaternion], period_ns: int, start_ns: int = 0
 ) -> list[Chunk]:
-    """One chunk a sample."""
+    """One chunk per sample."""
     messages = xbus_messages(orientations, period_ns)
     return [Chunk(start_ns + k * period_ns, data) for k, data in enumerate(messages)]
 
@@ -81,23 +81,23 @@ def xbus_chunks(
 def xcdi_chunks(
     orientations: Sequence[Quaternion], period_ns: int, ids: xcdi.XcdiIds, start_ns: int = 0
 ) -> list[Chunk]:
-    """One chunk of three records a sample."""
+    """One chunk of three records per sample."""
     groups = xcdi_frames(orientations, period_ns, ids, start_ns)
     return [Chunk(start_ns + k * period_ns, pack_frames(group)) for k, group in enumerate(groups)]
 
 
 def slcan_lines(groups: Sequence[Sequence[CanFrame]]) -> list[bytes]:
-    """The frames of each sample as an SLCAN adapter writes them."""
+    """Frames of each sample in the format of an SLCAN adapter."""
     return [b"".join(slcan.encode_frame(frame) for frame in group) for group in groups]
 
 
 def natnet_opening() -> list[bytes]:
-    """What a server says before frames mean anything."""
+    """Messages of a server before its first frame."""
     return [encode(_SERVER), encode(model_definition(_bodies(), BITSTREAM), BITSTREAM)]
 
 
 def natnet_datagrams(count: int, period_ns: int) -> list[bytes]:
-    """Frames of a leg: every marker seen, every body tracked."""
+    """Frames of a leg: every marker visible, every body tracked."""
     stage = NatNetFrameBuilder(_bodies(), "y", "missing")
     found = []
     for k in range(count):

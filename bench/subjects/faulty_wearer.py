@@ -1,6 +1,6 @@
-"""A worn leg whose sensors fail: what they say with faults put in, and what fusion says then.
+"""Simulated subjects with faulty sensors, and the fused result.
 
-Law: simulated people with known bones; the calibration is the daemon's own, made before the fault.
+Invariant: the bones are known; the calibration is that of the daemon, made before the fault.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
 
 BEGIN_S = 100.0
-"""Errors and skin wander with time: the live part is later than all of the calibration."""
+"""Errors and soft-tissue artefact change with time: the live part is later than the calibration."""
 MOVES = ("walk", "squat", "sit_to_stand", "stand")
 MOVE_S = 15.0
 SEGMENTS = ("thigh", "shank")
 PULL_S, STAY_S = 5.0, 30.0
-"""A magnetic disturbance: how long it takes to come and to go, and how long it lasts."""
+"""Rise and fall time of a magnetic disturbance, and its duration, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Worn:
-    """One person in motion."""
+    """One subject in motion."""
 
     t_s: Array
-    """From 0, shape (n,)."""
+    """Time from 0, shape (n,), s."""
     said: Mapping[str, Array]
-    """q_world_sensor by sensor, shape (n, 4); NaN: nothing said."""
+    """q_world_sensor by sensor, shape (n, 4); NaN: no sample."""
     bones: Mapping[str, Array]
     """q_optical_segment, shape (n, 4)."""
     flexion: Array
-    """Of the knee, rad."""
+    """Knee flexion, rad."""
 
     def spoilt(self, name: str, q: Array) -> Worn:
-        """Return the same with what one sensor says replaced."""
+        """Return the same with the samples of one sensor replaced."""
         return Worn(self.t_s, {**self.said, name: q}, self.bones, self.flexion)
 
 
 @cache
 def calibrated(seed: int) -> Calibration | None:
-    """Return the calibration of one person; None where the daemon would ask for another pose."""
+    """Return the calibration of one subject; None if the daemon would request another pose."""
     rig, trials = bench_rig(), phases(seed)
     alignment = fit_plate_alignment(trials.align, rig.calibration)
     try:
@@ -69,7 +69,7 @@ def calibrated(seed: int) -> Calibration | None:
 
 @cache
 def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) -> Worn:
-    """Return a person who walks, squats, sits down and up and stands, in turn."""
+    """Return a subject who walks, squats, sits down, stands up and stands, in turn."""
     knobs = Knobs(seed=seed)
     count = -(-int(seconds) // int(MOVE_S))
     steps = [Step(MOVES[k % len(MOVES)], MOVE_S) for k in range(count)]
@@ -86,20 +86,20 @@ def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) ->
 
 
 def stuck(person: Worn, name: str, at_s: float) -> Worn:
-    """Return the person with a sensor that repeats its last orientation for ever."""
+    """Return the subject with a sensor that repeats its last orientation."""
     q = person.said[name]
     first = int(np.searchsorted(person.t_s, at_s))
     return person.spoilt(name, np.where(np.arange(len(q))[:, None] < first, q, q[first]))
 
 
 def silent(person: Worn, name: str, at_s: float) -> Worn:
-    """Return the person with a sensor that says nothing more."""
+    """Return the subject with a sensor that becomes silent."""
     q = np.where(person.t_s[:, None] < at_s, person.said[name], np.nan)
     return person.spoilt(name, q)
 
 
 def slipped(person: Worn, name: str, at_s: float, angle_rad: float, seed: int) -> Worn:
-    """Return the person with a sensor that slides on the skin within 0.3 s, any way."""
+    """Return the subject with a sensor that slips in a random direction within 0.3 s."""
     axis = np.random.default_rng(seed).normal(size=3)
     axis /= np.linalg.norm(axis)
     share = np.clip((person.t_s - at_s) / 0.3, 0.0, 1.0)
@@ -108,7 +108,7 @@ def slipped(person: Worn, name: str, at_s: float, angle_rad: float, seed: int) -
 
 
 def drifting(person: Worn, names: Sequence[str], rate_rad_s: float) -> Worn:
-    """Return the person with sensors whose worlds turn about the vertical."""
+    """Return the subject with sensors whose worlds rotate about the vertical."""
     for name in names:
         turn = rotation.heading(rate_rad_s * person.t_s)
         person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
@@ -116,9 +116,9 @@ def drifting(person: Worn, names: Sequence[str], rate_rad_s: float) -> Worn:
 
 
 def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) -> Worn:
-    """Return the person near iron: some headings are pulled away, stay for 30 s, and come back.
+    """Return the subject under a magnetic disturbance: headings deviate for 30 s and return.
 
-    It takes :data:`PULL_S` either way, as a filter of a few seconds lets in a magnetic field.
+    The deviation rises and falls in :data:`PULL_S`, like a filter with a time constant of seconds.
     """
     begin, end = (person.t_s - at_s) / PULL_S, (person.t_s - at_s - PULL_S - STAY_S) / PULL_S
     turn = rotation.heading(angle_rad * (_smooth(begin) - _smooth(end)))
@@ -128,7 +128,7 @@ def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) ->
 
 
 def _smooth(share: Array) -> Array:
-    """Return a step from 0 to 1 while `share` goes there, without a kink."""
+    """Return a smooth step from 0 to 1 that rises with `share`."""
     x = np.clip(share, 0.0, 1.0)
     return np.asarray(x * x * (3.0 - 2.0 * x))
 
@@ -136,12 +136,12 @@ def _smooth(share: Array) -> Array:
 def play(
     fuser: LimbFuser, person: Worn
 ) -> tuple[list[LimbState], list[tuple[float, SensorReport]]]:
-    """Return what fusion says of every frame, and what it told when (s)."""
+    """Return the fused result of every frame, and the events with their times (s)."""
     rows = {name: [(w, x, y, z) for w, x, y, z in q.tolist()] for name, q in person.said.items()}
     states, told = [], []
     for k, t_s in enumerate(person.t_s.tolist()):
         t_ns = round((BEGIN_S + t_s) * NS)
-        heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is silence
+        heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN: no sample
         states.append(fuser.fuse(t_ns, t_ns, k, heard))
         told += [(t_s, news) for news in fuser.pop_reports(t_ns)]
     return states, told
@@ -153,7 +153,7 @@ def oriented(states: Sequence[LimbState], segment: int) -> Array:
 
 
 def jumps(before: Sequence[LimbState], after: Sequence[LimbState], segment: int) -> Array:
-    """Return how far a fault moved the output, in units of the RMS error claimed, shape (n,)."""
+    """Return the change of the output by a fault over the predicted RMS error, shape (n,)."""
     claimed = np.array([state.segments[segment].sd for state in after], dtype=np.float64)
     moved = rotation.angle_between(oriented(before, segment), oriented(after, segment))
     return np.asarray(moved / (np.sqrt(3.0) * claimed))

@@ -1,8 +1,8 @@
-"""Joint centers that musculoskeletal models have in real trials, by OpenSim.
+"""Joint centers of musculoskeletal models in recorded trials, computed by OpenSim.
 
-Law: the judge is independent: its model was scaled by others and follows markers by inverse
-kinematics; it shares no code with the estimators. It is no truth either: a model's hip comes from a
-regression or a scaling factor, and its joints follow skin markers.
+Invariant: the reference is independent. Its model was scaled by others, follows markers by inverse
+kinematics, and shares no code with the estimators. It is not ground truth: the hip of a model comes
+from a regression or a scaling factor, and its joints follow skin markers.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.mocap import MarkerTrial
 
 _EVERY = {"squats1": 5, "STS1": 5}
-"""Model poses computed: every so many frames."""
+"""Interval of the computed model poses, frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelTrial:
-    """A marker trial and where a model has its joints in it."""
+    """Marker trial and joint positions of a model."""
 
     markers: MarkerTrial
     frames: NDArray[np.int64]
-    """Frames of `markers` that the model was fitted to."""
+    """Frames of `markers` to which the model was fitted."""
     centers: dict[str, NDArray[np.float64]]
     """By joint of the model, m, world z up, shape (len(frames), 3)."""
 
 
 @cache
 def opencap(data: Path, trial: str) -> ModelTrial:
-    """Return a trial of OpenCap's subject 4 with the manually scaled model."""
+    """Return a trial of OpenCap subject 4 with the manually scaled model."""
     folder = data / "opencap_subject4"
     motion = folder / "ik" / f"{trial}_manual_scaling_ik.mot"
     model = folder / "models" / "manually_scaled.osim"
@@ -57,7 +57,7 @@ def opencap(data: Path, trial: str) -> ModelTrial:
 
 @cache
 def gait2354(data: Path) -> ModelTrial:
-    """Return the walk of OpenSim's gait2354, after its own inverse kinematics, 0.4 to 1.6 s."""
+    """Return the walk of OpenSim's gait2354, after its inverse kinematics, 0.4 to 1.6 s."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     source = data / "opensim_gait2354"
@@ -76,7 +76,7 @@ def gait2354(data: Path) -> ModelTrial:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep the descriptor of standard output from what C++ prints: tables go there."""
+    """Redirect the output of C++ code away from standard output, on which tables are printed."""
     sys.stdout.flush()
     kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)

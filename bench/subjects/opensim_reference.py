@@ -1,8 +1,8 @@
-"""OpenSim's own inverse kinematics: the judge of refined marker sets.
+"""Inverse kinematics of OpenSim, the reference for refined marker sets.
 
-Law: the judge keeps its own model. Joints, scaling and weights stay as their file has them; only
-the places of markers on their bodies are ours. Forces are taken out: inverse kinematics has no use
-for them, and they cost time.
+Invariant: the model is unchanged: joints, scaling and weights are those of its file; only marker
+positions on their bodies are replaced. Forces are removed, since inverse kinematics does not use
+them and they take time.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _ACCURACY = 1e-5
-"""InverseKinematicsTool's own default."""
+"""Default of InverseKinematicsTool."""
 CONVERGED = 1e-7
-"""Where its errors no longer depend on the accuracy asked for: within 2 micrometres of 1e-9."""
+"""Accuracy at which errors no longer depend on it: within 2 micrometres of those at 1e-9."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How well a model followed a trial."""
+    """Errors of a model that follows a trial."""
 
     frame_rms: NDArray[np.float64]
-    """RMS over the markers seen in every frame, m."""
+    """RMS over the markers visible in every frame, m."""
     rms: float
-    """Over all frames, m."""
+    """RMS over all frames, m."""
     coordinates: NDArray[np.float64]
     """Joint angles of every frame, rad (translations, m), shape (frames, coordinates)."""
     seconds: float
 
     @property
     def variance(self) -> float:
-        """Variance of the frames' RMS over time, m²."""
+        """Variance of the RMS of the frames over time, m²."""
         return float(np.var(self.frame_rms))
 
 
@@ -67,7 +67,7 @@ def trial_frames(path: Path, names: Sequence[str], every: int = 1) -> MarkerTraj
 
 
 def shared_markers(model: Path, trial: Path, leave_out: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the markers that model and trial both have, in the model's order."""
+    """Return the common markers of model and trial, in the order of the model."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     opensim.Logger.setLevelString("off")
@@ -87,11 +87,11 @@ def judge(
     Parameters
     ----------
     model
-        An .osim file, left as it is.
+        An .osim file, which is not changed.
     refined
-        Where markers are on their bodies; the model's own if None.
+        Marker positions on their bodies; those of the model if None.
     accuracy
-        At which the tool stops.
+        Accuracy at which the tool stops.
     """
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
@@ -134,7 +134,7 @@ def judge(
 
 
 def without_forces(model: Path) -> Any:
-    """Return an OpenSim model of kinematics alone."""
+    """Return an OpenSim model without forces."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     loaded = opensim.Model(os.fspath(model))
@@ -146,7 +146,7 @@ def without_forces(model: Path) -> Any:
 def place(
     model: Any, places: Mapping[str, NDArray[np.float64]], bodies: Sequence[str] | None = None
 ) -> None:
-    """Move markers of a loaded model on their bodies, or onto these."""
+    """Move markers of a loaded model on their bodies, or to other bodies."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     markers = model.updMarkerSet()
@@ -158,9 +158,9 @@ def place(
 
 
 class OpenSimFollower:
-    """A model of OpenSim that follows a trial again and again, its markers elsewhere each time.
+    """OpenSim model that follows a trial repeatedly with different marker positions.
 
-    Positions and poses are in our axes: z up, bodies turned alike.
+    Positions and poses are in our axes: z up, bodies rotated alike.
     """
 
     def __init__(self, model: Path, trial: MarkerTrajectories, segments: Sequence[str]) -> None:
@@ -178,7 +178,7 @@ class OpenSimFollower:
         self.runs = 0
 
     def __call__(self, positions: NDArray[np.float64], _weights: Any = None) -> Carriers:
-        """Return where the markers' segments are in every frame."""
+        """Return the poses of the marker bodies in every frame."""
         poses, _ = self._run(positions)
         at = [sorted(set(self._segments)).index(s) for s in self._segments]
         turned = poses[:, at][:, :, [2, 0, 1]]  # y up to z up, rows and columns
@@ -191,7 +191,7 @@ class OpenSimFollower:
     def _run(
         self, positions: NDArray[np.float64], *, poses: bool = True
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return body poses, shape (T, B, 3, 4), and squared errors of what is seen, m²."""
+        """Return body poses, shape (T, B, 3, 4), and squared errors of the visible markers, m²."""
         opensim, model = self._opensim, self._model
         self.runs += 1
         place(model, dict(zip(self._trial.names, to_y_up(positions), strict=True)), self._segments)

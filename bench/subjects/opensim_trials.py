@@ -1,7 +1,7 @@
-"""Trials and unchanged OpenSim models that refined markers are judged on.
+"""Trials and unchanged OpenSim models with which refined markers are evaluated.
 
-Law: what is learned from and what judges are told apart by name; a chain is made of the model
-alone. All markers are let go, those that a model calls fixed included.
+Invariant: training and evaluation trials have different names; a chain is made from the model
+alone. All markers are free, including those that a model marks as fixed.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
 GAIT, OPENCAP = "opensim_gait2354", "opencap_subject4"
 _WALK_S = (0.4, 1.6)
 _STEPS = {"walking1": 1, "squats1": 10, "DJ1": 2, "STS1": 10}
-"""Every so many frames are learned from; fewer judge."""
+"""Interval of the training frames; evaluation uses fewer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A model and trials of one person."""
+    """Model and trials of one subject."""
 
     model: Path
     names: tuple[str, ...]
     trials: Mapping[str, MarkerTrajectories]
-    """To learn from."""
+    """Training frames."""
     judged: Mapping[str, MarkerTrajectories]
-    """The same trials, the frames that OpenSim judges."""
+    """Frames of the same trials that OpenSim evaluates."""
 
     def motion(self, name: str) -> MotionTrial:
         """Return a trial in our axes."""
@@ -46,7 +46,7 @@ class Subject:
         return MotionTrial(name, to_z_up(trial.positions), trial.rate_hz)
 
     def chain(self) -> ChainModel:
-        """Return the chain of the model, all markers let go."""
+        """Return the chain of the model with all markers free."""
         chain = read_osim(self.model).model
         at = {m.name: m for m in chain.markers}
         kept = tuple(replace(at[n], locked=(False, False, False)) for n in self.names)
@@ -55,12 +55,12 @@ class Subject:
     def verdicts(
         self, trials: Sequence[str], refined: ChainModel | None = None
     ) -> dict[str, Verdict]:
-        """Return what OpenSim says of the model as it is, or with refined markers."""
+        """Return the errors of OpenSim with the markers of the model, or with refined ones."""
         return {name: judge(self.model, self.judged[name], refined) for name in trials}
 
 
 def gait2354(data: Path) -> Subject:
-    """Return OpenSim's example, scaled and its markers not placed: 73 frames, 31 markers."""
+    """Return the example of OpenSim, scaled, its markers not adjusted: 73 frames, 31 markers."""
     folder = data / GAIT
     model, path = folder / "subject01_scaledOnly.osim", folder / "subject01_walk1.trc"
     names = shared_markers(model, path)
@@ -76,14 +76,14 @@ def gait2354(data: Path) -> Subject:
 
 
 def opencap(data: Path, coarser: int = 2, *, computed: bool = False) -> Subject:
-    """Return OpenCap's subject 4, scaled by hand.
+    """Return OpenCap subject 4, scaled manually.
 
     Parameters
     ----------
     coarser
-        One of so many frames that are learned from judges.
+        Ratio of training frames to evaluated frames.
     computed
-        The recording's computed hip centers count as markers: 45, not 43.
+        Use the computed hip centers of the recording as markers: 45 instead of 43.
     """
     folder = data / OPENCAP
     model = folder / "models" / "manually_scaled.osim"

@@ -1,4 +1,4 @@
-"""Simulated runs of planar centers: many at once, and how they are judged."""
+"""Simulated runs of planar centers of rotation, many at once, and their evaluation."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Runs:
     """Centers of many runs about the origin."""
 
     centers: Array
-    """m, shape (runs, 2); NaN where there was no circle."""
+    """Shape (runs, 2), m; NaN where no circle was found."""
     covariances: Array
     conditioning: Array
     bound: float
-    """m, RMS."""
+    """RMS, m."""
 
     @property
     def published(self) -> NDArray[np.bool_]:
@@ -62,7 +62,7 @@ def runs_on(
     tempered: bool = True,
     correlated: bool = False,
 ) -> Runs:
-    """Fit `runs` noisy arcs of `n` points evenly over `arc` degrees, both ends included."""
+    """Fit `runs` noisy arcs of `n` points at even intervals over `arc` degrees, ends included."""
     rng = np.random.default_rng(round(1000 * arc) + n)
     t = np.linspace(-0.5, 0.5, n) * np.deg2rad(arc)
     truth = arc_points(t, radius)
@@ -86,7 +86,7 @@ def upper_rms(found: Runs) -> float:
 
 
 def share_covered(found: Runs, n: int) -> float:
-    """Return the share of published centers whose 95 % ellipse holds the origin."""
+    """Return the share of accepted centers whose 95 % ellipse contains the origin."""
     passed = found.published
     e, covariances = found.centers[passed], found.covariances[passed]
     d2 = np.einsum("ri,rij,rj->r", e, np.linalg.inv(covariances), e)

@@ -1,4 +1,4 @@
-"""Raw readings as bytes of an Xbus device, and two trials of a board with its optical truth."""
+"""Raw readings as bytes of an Xbus device, and two trials of a board with optical truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 TRIALS = ("02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B")
 RATE_HZ = 286
-"""Nominal; the trials have 2000/7 Hz, and the device's ticks say so."""
+"""Nominal rate, Hz; the trials have 2000/7 Hz, as the device's ticks show."""
 PERIOD_NS = 3_500_000
 _KINDS = (Item.RATE_OF_TURN, Item.ACCELERATION, Item.MAGNETIC_FIELD)
 
@@ -36,15 +36,15 @@ class BoardTrial:
     """One IMU on a board that is turned by hand."""
 
     felt: tuple[Array, Array, Array]
-    """Rate, rad/s; specific force, m/s^2; magnetic field. Shape (n, 3), as a float of 32 bit."""
+    """Rate, rad/s; specific force, m/s^2; magnetic field. Shape (n, 3), 32-bit floats."""
     optical: Array
-    """q_world_sensor, shape (n, 4); NaN where unseen."""
+    """q_world_sensor, shape (n, 4); NaN where occluded."""
     moving: NDArray[np.bool_]
 
 
 def load(data: Path, name: str) -> BoardTrial:
-    """Return a trial of the folder ``broad``, rounded to what the wire carries."""
-    h5py = import_module("h5py")  # only this bench needs it
+    """Return a trial of the folder ``broad``, rounded to the precision of the wire."""
+    h5py = import_module("h5py")  # imported by this experiment only
     with h5py.File(data / "broad" / f"{name}.hdf5") as trial:
         rate, force, field = (
             trial[f"imu_{kind}"][:].astype(np.float32).astype(np.float64)
@@ -56,7 +56,7 @@ def load(data: Path, name: str) -> BoardTrial:
 
 
 def messages(felt: Sequence[Array]) -> list[bytes]:
-    """Counter, time, status and as many kinds of readings as given."""
+    """Counter, time, status and the given kinds of readings."""
     kinds = _KINDS[: len(felt)]
     return [
         xbus.encode(
@@ -75,7 +75,7 @@ def messages(felt: Sequence[Array]) -> list[bytes]:
 
 
 def decoder(*, magnetometer: bool, settle_s: float = 0.0) -> Decoder:
-    """Return a fresh decoder of the driver as rig.toml would set it, from the start by default."""
+    """Return a new decoder of the driver, configured as by rig.toml."""
     driver = find_driver("xbus")
     settings = driver.Settings(
         id="S1",
@@ -92,7 +92,7 @@ def decoder(*, magnetometer: bool, settle_s: float = 0.0) -> Decoder:
 
 
 def through_driver(felt: Sequence[Array], *, magnetometer: bool, settle_s: float = 0.0) -> Array:
-    """Return q_world_sensor as the driver gives it, shape (n, 4)."""
+    """Return q_world_sensor from the driver, shape (n, 4)."""
     path = decoder(magnetometer=magnetometer, settle_s=settle_s)
     said = [
         item.q_world_sensor

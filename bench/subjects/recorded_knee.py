@@ -1,6 +1,7 @@
-"""The semi-real knee: real skin motion and filter error on four virtual sensors, and a bone model.
+"""Knee with recorded soft-tissue artefact and filter errors on four virtual sensors, and a bone
+model.
 
-Loads `semireal_knee4imu` into the project's conventions and states errors the way its tables do.
+Loads `semireal_knee4imu` in the conventions of the project and computes errors as its tables do.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ TRAINING_SHARE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class KneeTrial:
-    """One movement, only frames in which everything was seen."""
+    """One movement, only frames with all markers."""
 
     sensors: tuple[Array, Array, Array, Array]
     """S1, S2 on the thigh, S3, S4 on the shank: bone-aligned q_world_segment, shape (n, 4)."""
@@ -40,7 +41,7 @@ class KneeTrial:
         return KneeTrial((a, b, c, d), self.thigh[frames], self.shank[frames])
 
     def turned(self, angle: float) -> KneeTrial:
-        """Return the same movement by a subject who faces elsewhere, rad about the vertical."""
+        """Return the same movement of a subject who faces another way, rad about the vertical."""
         turn = rotation.heading(angle)
         a, b, c, d = (rotation.multiply(turn, q) for q in self.sensors)
         return KneeTrial(
@@ -67,13 +68,13 @@ def load(data: Path, name: str) -> KneeTrial:
 
 
 def training_frames(trial: KneeTrial) -> int:
-    """Return how many frames the first 60 % are."""
+    """Return the number of frames in the first 60 %."""
     return int(TRAINING_SHARE * len(trial))
 
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """States errors: RMS degrees of thigh, shank and knee flexion about one functional axis."""
+    """Computes RMS errors of thigh, shank and knee flexion about one functional axis, deg."""
 
     axis: Array
 

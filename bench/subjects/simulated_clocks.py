@@ -1,6 +1,6 @@
-"""A simulated run as events of the core: five clocks, a walk without soft tissue, two incidents.
+"""Simulated run as events of the core: five clocks, a walk without soft tissue, two incidents.
 
-Law: deterministic; no process, no port, no waiting. Truth goes along with the events.
+Invariant: deterministic, without processes, ports or waiting. Ground truth accompanies the events.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ TICK_NS = 100_000
 SERVER_HZ = 10_000_000
 VERSION = (3, 1)
 PATH_NS = 400_000
-"""Least time of a datagram from one end to the other."""
+"""Least transit time of a datagram."""
 BAUD = 115_200
-"""Speed of the serial lines: `bench_rig` configures the same."""
+"""Speed of the serial lines, as configured by `bench_rig`."""
 ON_UART = ("S1", "S3")
 REBOOTED, INTERRUPTED = "S3", "S2"
 DOWN_NS = 1_500_000_000
@@ -57,30 +57,30 @@ DOWN_NS = 1_500_000_000
 
 @dataclass(frozen=True)
 class Run:
-    """What a plot is made from."""
+    """Input of a plot."""
 
     events: Sequence[Event]
     taken_ns: Mapping[tuple[str, int], int] = field(default_factory=dict)
-    """Truth: when the sample of a source with these ticks was taken."""
+    """Truth: the instant of the sample of a source with these ticks."""
     unseen_ns: Mapping[str, int] = field(default_factory=dict)
-    """Least delay of each transport, which no clock can see; none where echoes answer."""
+    """Least delay of each transport, which no clock can estimate; none where echoes answer."""
     lag_ns: Mapping[str, int] = field(default_factory=dict)
-    """What of it is left between a sensor and the cameras."""
+    """Remaining part between a sensor and the cameras."""
     incidents: Mapping[str, float] = field(default_factory=dict)
-    """What happened, and when, s after the beginning."""
+    """Incidents and their times, s after the beginning."""
     title: str = ""
 
 
 @dataclass
 class _Made:
-    """What the run is gathered in."""
+    """Events and truth while the run is generated."""
 
     chunks: list[tuple[int, str, bytes]] = field(default_factory=list)
     taken_ns: dict[tuple[str, int], int] = field(default_factory=dict)
 
 
 def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
-    """Return a run of four IMUs and a camera system, all with clocks of their own."""
+    """Return a run of four IMUs and a camera system, each with its own clock."""
     knobs = Knobs(
         seed=seed,
         clock_skew_ppm=50.0,
@@ -120,7 +120,7 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
         events,
         made.taken_ns,
         unseen_ns,
-        # devices cut their stamps to whole ticks: half of one too early on average
+        # devices truncate their stamps to whole ticks: half a tick early on average
         {name: unseen - TICK_NS // 2 for name, unseen in unseen_ns.items()},
         {f"{REBOOTED} reboots": 0.45 * seconds, f"{INTERRUPTED} silent": 0.7 * seconds},
         f"simulated, {seconds:g} s, a walk, clocks within ±50 ppm",
@@ -128,7 +128,7 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
 
 
 def _rig() -> Rig:
-    """Return a rig whose segments the cameras see as rigid bodies."""
+    """Return a rig whose segments are rigid bodies of the cameras."""
     table = bench_rig().table
     bodies = {part: part.capitalize() for part in set(SENSORS.values())}
     mocap = {key: value for key, value in table["mocap"].items() if key != "markers"}
@@ -136,7 +136,7 @@ def _rig() -> Rig:
 
 
 Track = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
-"""True instants, device stamps, instants on the wire, what is never sent."""
+"""True instants, device stamps, instants on the wire, and samples that are not sent."""
 
 
 def _latency_ms(knobs: Knobs, name: str) -> float:
@@ -186,7 +186,7 @@ def _sensor(
     for number, ((host, device, due, dropped), q) in enumerate(
         zip(_rows(track), orientations, strict=True)
     ):
-        ticks = max(0, device // TICK_NS)  # the first stamp after a boot may jitter below 0
+        ticks = max(0, device // TICK_NS)  # jitter after a boot must not lead below 0
         if dropped or hush[0] <= host < hush[1]:
             continue
         made.taken_ns[name, ticks] = host
@@ -207,7 +207,7 @@ def xbus_chunk(
             ]
         ),
     )
-    return due_ns + len(data) * 10 * NS // BAUD, data  # read when its last byte is there
+    return due_ns + len(data) * 10 * NS // BAUD, data  # read when its last byte has arrived
 
 
 def xcdi_chunk(name: str, number: int, ticks: int, due_ns: int, q: Quaternion) -> tuple[int, bytes]:

@@ -1,6 +1,6 @@
-"""Joints that move as the rows say: true paths, noisy markers, frames fitted to them.
+"""Simulated joints: true paths, noisy markers, and frames fitted to them.
 
-Law: the center is the origin of the parent; all randomness comes from the generator given.
+Invariant: the center is the origin of the parent; all random numbers come from the given generator.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ CHI2_95 = {2: 5.991, 3: 7.815}
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What cameras see of one run."""
+    """Observation of one run by cameras."""
 
     points: Array
-    """Child's markers in the parent's fitted frame, m, shape (n, k, 3)."""
+    """Markers of the child in the fitted frame of the parent, m, shape (n, k, 3)."""
     parent: BodyPoses
     child: BodyPoses
 
@@ -66,7 +66,7 @@ def carried(turns: Array, markers: Array = CHILD) -> Array:
 
 
 def fan(arc_deg: float, n: int = 100) -> Array:
-    """Return four markers' paths in a plane, at different angles round the joint, (n, 4, 2)."""
+    """Return paths of four markers in a plane, at different angles about the joint, (n, 4, 2)."""
     theta = np.linspace(0.0, np.radians(arc_deg), n)[:, None] + np.array(OFFSETS)
     return np.asarray(np.array(RADII)[:, None] * np.stack((np.cos(theta), np.sin(theta)), axis=-1))
 
@@ -80,7 +80,7 @@ def watched(
     template_error: float = 0.0,
     frame: Array = PARENT,
 ) -> Seen:
-    """Let the parent move, too, and both be seen by noisy markers."""
+    """Move the parent as well and observe both with noisy markers."""
     n = len(turns)
     moved = rotation.to_matrix(rotation.exp(rng.normal(0, 0.1, (n, 3))))
     t = rng.normal(0, 0.05, (n, 3))
@@ -95,20 +95,20 @@ def watched(
 
 
 def sphere_bound(paths: Array, noise: float) -> float:
-    """Return the least mean square error of a center from these true paths, m²."""
+    """Return the smallest mean squared error of a center from these true paths, m²."""
     u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
     u = u - u.mean(axis=0)
     return float(np.trace(np.linalg.inv(np.einsum("tja,tjb->ab", u, u)))) * noise**2
 
 
 def joint_bound(paths: Array, noise: float, frame: Array = PARENT) -> float:
-    r"""Return the same for markers seen from a parent that is a fit to noisy markers, m².
+    r"""Return the same bound for markers relative to a parent fitted to noisy markers, m².
 
     .. math:: \left[ \sum_t A_t^T S_t^{-1} A_t \right]^{-1}, \qquad A_t = (U_t \; I), \quad
               S_t = σ^2 \left( I + U_t Σ_c U_t^T \right)
 
-    U the directions, the columns of I for the radii, Σ_c what the fit does to the center, which all
-    markers share, over σ².
+    U are the directions, the columns of I belong to the radii, and Σ_c over σ² is the effect of the
+    fit on the center, common to all markers.
     """
     u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
     k = u.shape[1]
@@ -120,7 +120,7 @@ def joint_bound(paths: Array, noise: float, frame: Array = PARENT) -> float:
 
 
 def covers(found: CenterEstimate) -> bool:
-    """Tell whether the 95 % ellipse told, in the directions seen, holds the origin."""
+    """Return whether the predicted 95 % ellipse in observed directions contains the origin."""
     d = len(found.center)
     across = np.linalg.svd(found.unseen)[2][len(found.unseen) :] if len(found.unseen) else np.eye(d)
     e, spread = across @ found.center, across @ found.covariance @ across.T

@@ -1,7 +1,8 @@
-"""A worn leg without wires: trials, a calibration and a stream of samples, in milliseconds.
+"""Simulated wearer without wire formats: trials, a calibration and a stream of samples.
 
-Law: the simulator's wearer and sensors on one clock. The same knobs and seed as a `jointfit-sim`
-process give the same person with the same mounts, so a calibration made here fits its hardware.
+Invariant: wearer and sensors of the simulator on one clock. The same settings and seed as in a
+`jointfit-sim` process give the same subject with the same mounts, so a calibration made here fits
+its devices.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 MOVES = ("functional", "walk", "squat", "sit_to_stand")
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
-_LEAD_S = 2.0  # a blend between two motions is over
+_LEAD_S = 2.0  # the transition between two motions has ended
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def _track(
 
 
 def fitted(rig: Rig, seed: int = 1) -> Calibration:
-    """Return the calibration that `rig` would make of this wearer."""
+    """Return the calibration of this wearer for `rig`."""
     trials = phases(seed)
     settings = rig.calibration
     alignment = fit_plate_alignment(trials.align, settings)
@@ -102,7 +103,7 @@ def fitted(rig: Rig, seed: int = 1) -> Calibration:
 
 
 def bench_rig(rate_hz: float = 100.0) -> Rig:
-    """Return the rig of the simulator's leg, with ports that nobody opens."""
+    """Return the rig of the simulated leg, with ports that are never opened."""
     baud = 115_200 if rate_hz <= 100.0 else 921_600  # 400 Hz need 188 kbit/s
 
     tables = ['[can.can0]\ninterface = "slcan"\nchannel = "/dev/null"\n']
@@ -126,7 +127,7 @@ def bench_rig(rate_hz: float = 100.0) -> Rig:
 
 
 def walking(sensor: str, rate_hz: float, seconds: float) -> list[Quaternion]:
-    """Return what one sensor says of a walk, q_world_sensor."""
+    """Return q_world_sensor of one sensor during a walk."""
     knobs = Knobs(rate_hz=rate_hz)
     t_s = np.arange(0.0, seconds, 1 / rate_hz)
     streams = [t_s if name == sensor else t_s[:0] for name in SENSORS]

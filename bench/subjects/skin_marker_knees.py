@@ -1,12 +1,13 @@
-"""Knees made of skin markers of the recorded subject: both legs, sit-to-stand among the movements.
+"""Knees of skin markers of the recorded subject: both legs, sit-to-stand included.
 
-The semi-real recordings hold the right leg without sit-to-stand. These trials are made from the
-subject's marker files by the same recipe: a sensor is the Kabsch rotation of three neighbouring
-skin markers against their mean in the static trial, with the error of a real filter upon it, as
-the semi-real recordings of the same movement have it (of squats for sit-to-stand); the reference is
-the subject's model by our inverse kinematics without any marker of thigh and shank clusters.
+The recorded knee has the right leg without sit-to-stand. These trials are made from the subject's
+marker files in the same way. The orientation of a sensor is the Kabsch rotation of three
+neighbouring skin markers against their mean in the static trial, with the recorded error of a
+filter in the same movement (of squats for sit-to-stand). The reference is the subject's model,
+posed by our inverse kinematics without any marker of the thigh and shank clusters.
 
-Law: nothing of a sensor's own markers enters its reference. All mounts come from the static trial.
+Invariant: no marker of a sensor contributes to its reference. All mounts come from the static
+trial.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ if TYPE_CHECKING:
 SUBJECT = "opencap_subject4"
 MODEL = "optimized_scale_and_markers.osim"
 MOVEMENTS = {"squats1": 2, "walking1": 1, "DJ1": 1, "STS1": 2}
-"""Every so many frames of 100 Hz, as the semi-real recordings."""
+"""Interval of the frames of 100 Hz, as in the recorded knee."""
 STATIC, STATIC_EVERY = "static1", 20
 RATE_HZ = 100.0
 CLUSTERS = ("thigh", "sh1", "sh2", "sh3", "sh4", "shank")
-"""Parts of names of the markers on thighs and shanks."""
+"""Parts of the names of markers on thighs and shanks."""
 SENSORS = {
     "r": (
         ("r_thigh1", "r_thigh2", "r_thigh4"),
@@ -50,17 +51,17 @@ SENSORS = {
         ("L_shank_antsup", "L_sh2", "L_sh3"),
     ),
 }
-"""Three markers of each; the left shank has but three, so both of its sensors ride the same."""
+"""Three markers per sensor; the left shank has three in all, so its two sensors share them."""
 MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
-"""Worn while standing alone; a model whose poses change with them would have other bones then."""
+"""Markers present only in the static trial; with them the bones would differ in other trials."""
 
 
 AS_RECORDED = (0, 1, 2, 3)
-"""Each sensor has the errors that the semi-real recordings give it."""
+"""Filter errors of each sensor, as in the recorded knee."""
 
 
 class _Leg(NamedTuple):
-    """What a trial says of one leg before mounts and filters, shape (n, 4) each."""
+    """Orientations of one leg before mounts and filters, shape (n, 4) each."""
 
     skin: tuple[Array, ...]
     """Rotation of each sensor's markers since the static trial."""
@@ -73,9 +74,9 @@ class _Leg(NamedTuple):
 def skin_knee(
     data: Path, movement: str, side: str, errors_of: tuple[int, ...] = AS_RECORDED
 ) -> KneeTrial:
-    """Return one movement, or the static trial without a filter's errors, of leg ``r`` or ``l``.
+    """Return one movement, or the static trial without filter errors, of leg ``r`` or ``l``.
 
-    `errors_of` says whose filter's errors each sensor has.
+    `errors_of` selects the filter errors of each sensor.
     """
     leg, static = (_legs(data, name)[side] for name in (movement, STATIC))
     mounts = [
@@ -94,7 +95,7 @@ def skin_knee(
 
 @cache
 def _legs(data: Path, name: str) -> dict[str, _Leg]:
-    """Return both legs of a trial; one search for the poses of all bones."""
+    """Return both legs of a trial, with one inverse-kinematics solution for all bones."""
     trial, static = (read_trc(data / SUBJECT / "trc" / f"{n}.trc") for n in (name, STATIC))
     every = MOVEMENTS.get(name, STATIC_EVERY)
     seen = to_z_up(trial.positions[::every])
@@ -122,7 +123,8 @@ def _legs(data: Path, name: str) -> dict[str, _Leg]:
 
 
 def _filter_errors(data: Path, movement: str, t_s: Array) -> list[Array]:
-    """Return the error of each sensor's filter, q_world_world, shape (n, 4); none while static."""
+    """Return the filter error of each sensor, q_world_world, shape (n, 4); none in the static
+    trial."""
     if movement == STATIC:
         return [np.tile(rotation.IDENTITY, (len(t_s), 1))] * len(SENSORS["r"])
     known = movement if movement != "STS1" else "squats1"

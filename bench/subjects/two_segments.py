@@ -1,4 +1,4 @@
-"""A thigh and a shank with four markers each, swinging: the smallest chain worth a bench."""
+"""Swinging thigh and shank with four markers each: the smallest chain for a benchmark."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Rows E2E-*: the recorded trials as bytes through the real daemon give the offline figures.
+"""Recorded trials replayed as bytes through the daemon, compared with the offline results.
 
-Every figure stands beside the offline figure that this bench measures on the same frames, which is
-its expected value; a tenth of a degree is allowed.
+The expected value of each result is the offline result on the same frames; the tolerance is 0.1°.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ ALLOWED_DEG = 0.1
 
 @cache
 def _played(data: Path) -> dict[tuple[str, Method], Played]:
-    """Return all runs; they share one half minute of real time."""
+    """Return all runs, which share half a minute of real time."""
     return recorded_trial.run(data, METHODS, WALKERS)
 
 
@@ -40,7 +39,7 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Re
         figures = []
         for method in methods:
             live = _played(data)[trial, method]
-            # frames for which this machine was too busy to deliver in time are judged by neither
+            # frames that this machine delivered too late are excluded from both
             same = live.of(held)
             models = KneeModels(method, [knee.training])
             offline = knee.judge.errors(models.predict(same), same)

@@ -1,7 +1,7 @@
-"""Rows F-7 to F-11: sit-to-stand, movements left out, claims, and standing still, on both legs.
+"""Fusion on both legs: sit-to-stand, movements left out, coverage, and the static pose.
 
-Trials of `skin_knee`: the same subject as rows F-1 to F-5, made anew with poses of our own inverse
-kinematics, the left leg and sit-to-stand besides.
+The trials of `skin_marker_knees` show the subject of the recorded knee with poses of our own
+inverse kinematics. They add the left leg and sit-to-stand.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 
 SIDES = {"right": "r", "left": "l"}
 EXCHANGED = (AS_RECORDED, (1, 2, 3, 0), (3, 0, 1, 2), (2, 3, 0, 1), (1, 0, 3, 2))
-"""Whose filter's errors each sensor has."""
+"""Assignments of the recorded filter errors to the sensors."""
 RIVALS = ("mean", "patent12", "linear", DEFAULT)
 DEEP_DEG = 40.0
 
 
 def sit_to_stand(data: Path) -> list[Result]:
-    """F-7: trained on 60 % of the squats, walking and the jump, judged on sit-to-stand.
+    """Train on 60 % of the squats, walking and the jump; evaluate on sit-to-stand.
 
-    The default must be worse in nothing than the mean of two or patent12.
+    The default may not be worse than the mean of two or patent12 in any result.
     """
     figures = []
     for side, trials in _both(data).items():
@@ -56,9 +56,9 @@ def sit_to_stand(data: Path) -> list[Result]:
 
 
 def exchanged(data: Path) -> list[Result]:
-    """F-11: the same with the filters' errors exchanged between the sensors, RMS of five ways.
+    """The same with the filter errors exchanged between the sensors, RMS of five assignments.
 
-    The recordings give every sensor one filter's error; which has which is chance.
+    The recordings assign one filter error to each sensor, arbitrarily.
     """
     figures = []
     for side in SIDES:
@@ -83,7 +83,7 @@ def exchanged(data: Path) -> list[Result]:
 
 
 def left_out(data: Path) -> list[Result]:
-    """F-8: each of four movements judged by what the other three have taught."""
+    """Train on three of four movements; evaluate on the fourth."""
     figures = []
     for side, trials in _both(data).items():
         squats = trials["squats1"]
@@ -99,9 +99,10 @@ def left_out(data: Path) -> list[Result]:
 
 
 def coverage(data: Path) -> list[Result]:
-    """F-9: how often errors of flexion lie within what is claimed, both legs and all movements.
+    """Coverage of flexion errors on both legs, for all movements.
 
-    Movements left out, and the last 40 % of each where the first 60 % of all four have taught.
+    The movements left out, and the last 40 % of each movement after training on the first 60 % of
+    all four.
     """
     unseen, later = [], []
     for trials in _both(data).values():
@@ -124,10 +125,10 @@ def coverage(data: Path) -> list[Result]:
 
 
 def standing(data: Path) -> list[Result]:
-    """F-10: what is corrected in the static pose of people who stand as they stand.
+    """Correction in the static pose of simulated subjects in natural stance.
 
-    Bones lean and knees are not quite straight there; the mounts of the sensors make the mean the
-    reference, so what is corrected is an error. Trained on squats, and on deep bends alone.
+    In stance the bones lean and the knees are slightly flexed. The sensor mounts make the mean the
+    reference, so any correction is an error. Trained on squats, and on deep squats alone.
     """
     figures = []
     for side, trials in _both(data).items():
@@ -155,7 +156,7 @@ def _both(data: Path, errors_of: tuple[int, ...] = AS_RECORDED) -> dict[str, dic
 
 
 def _risen(trials: dict[str, KneeTrial]) -> dict[str, Errors]:
-    """Return errors in sit-to-stand, trained on 60 % of the squats, walking and the jump."""
+    """Return the errors in sit-to-stand; trained on 60 % of squats, walking and jump."""
     squats = trials["squats1"]
     begin = squats.part(slice(0, training_frames(squats)))
     taught = [begin, trials["walking1"], trials["DJ1"]]

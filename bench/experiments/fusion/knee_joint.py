@@ -1,6 +1,6 @@
-"""Rows B-10 and B-14: the rotation of the joint, and errors over what is claimed of them.
+"""Rotation of the knee, and its errors normalized by the predicted deviation.
 
-Law: the same recordings, training and hold-out as the rows on segments.
+Invariant: recordings, training and hold-out are those of the experiments on segments.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ JOINT_GOALS = {"hold-out": 1.2, "walking": 3.0, "drop jump": 4.3}
 NORMALIZED = (0.5, 1.3)
 EQUAL = (0.5, 0.5)
 ROTATIONS = 3
-"""The joint as the means see it, and what the sensors of each segment disagree by."""
+"""Joint rotation as the means of sensors measure it, and deviations among the sensors of each
+segment."""
 
 
 def joint_itself(data: Path) -> list[Result]:
-    """B-10: RMS angle of the joint's rotation: by both segments, and by a fit to the joint alone.
+    """RMS angle of the joint rotation, from both segments and from a fit to the joint alone.
 
-    The reference's knee is a hinge, so its adduction and rotation follow from flexion: a fit to the
-    joint learns that, a real knee would not let it.
+    The knee of the reference is a hinge: adduction and rotation are functions of flexion. A fit to
+    the joint learns these functions, which a real knee does not have.
     """
     squats = Squats(data)
     judged = {
@@ -62,7 +63,7 @@ def joint_itself(data: Path) -> list[Result]:
 
 
 def normalized_errors(data: Path) -> list[Result]:
-    """B-14: root of the mean of squared errors over claimed variances, three trained movements."""
+    """RMS ratio of error to predicted deviation, after training on three movements."""
     squats = Squats(data)
     walk, jump = load(data, "walking1"), load(data, "DJ1")
     models = fusion_methods.models([squats.training, walk, jump])
@@ -82,7 +83,8 @@ def normalized_errors(data: Path) -> list[Result]:
 
 
 def _joint(trial: KneeTrial) -> tuple[Array, Array, Array]:
-    """Return what a fit looks at, the joint as the means of sensors see it, and as it is."""
+    """Return the regressors of a joint fit, the joint rotation of the means, and that of the
+    reference."""
     a, b, c, d = trial.sensors
     seen = joint_rotation(fuse([a, b], EQUAL), fuse([c, d], EQUAL))
     pairs = [rotation.log(joint_rotation(*pair)) for pair in ((a, b), (c, d))]

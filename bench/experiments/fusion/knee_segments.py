@@ -1,7 +1,7 @@
-"""Rows B-6 to B-9, B-11 to B-13: two sensors a segment, on the semi-real knee.
+"""Two sensors a segment on the recorded knee: baselines, default, and degraded cases.
 
-One subject, one leg, virtual sensors made of skin markers, a model as reference: figures to measure
-again and again, not a validation of the product.
+One subject, one leg, virtual sensors made of skin markers, a model as reference. The results detect
+regressions; they do not validate the product.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ THIGH, SHANK = (0, 1), (2, 3)
 
 
 class KneeModels:
-    """Both segments' models of one method and one choice of sensors, trained on some trials.
+    """Models of both segments, for one method and one choice of sensors.
 
-    What a segment sees of its neighbour is the mean of the neighbour's sensors, as in a rig.
+    Each segment uses the mean of its neighbour's sensors, as in a rig.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ def _mean_of(sensors: Sequence[Array], chosen: tuple[int, ...]) -> Array:
 
 
 class Squats:
-    """The squats, cut into training and hold-out, and the judge of both."""
+    """The squats, split into training and hold-out, and the error metric."""
 
     def __init__(self, data: Path) -> None:
         whole = load(data, "squats1")
@@ -85,7 +85,7 @@ def _mean(trial: KneeTrial) -> tuple[Array, Array]:
 
 
 def baselines(data: Path) -> list[Result]:
-    """B-6: what single sensors, their mean and the patent's regressions give."""
+    """Single sensors, their mean, and the regressions of the patent."""
     squats = Squats(data)
     said = {
         "single sensor (S2, S4)": (_single(1), (9.04, 9.00, 6.15)),
@@ -111,7 +111,7 @@ def _goals(errors: tuple[float, ...], goals: tuple[float, ...], label: str = "")
 
 
 def held_out(data: Path) -> list[Result]:
-    """B-7: the anchored correction on the last 40 %."""
+    """The anchored correction on the last 40 % of the squats."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (1.4, 1.6, 1.2))
@@ -127,7 +127,7 @@ def _untrained(name: str, goals: tuple[float, ...]) -> Callable[[Path], list[Res
 
 
 def three_movements(data: Path) -> list[Result]:
-    """B-11: trained on squats, walking and jump together."""
+    """Train on squats, walking and jump together."""
     squats = Squats(data)
     trials = [squats.training, load(data, "walking1"), load(data, "DJ1")]
     models = KneeModels("anchored", trials)
@@ -135,7 +135,7 @@ def three_movements(data: Path) -> list[Result]:
 
 
 def facing_elsewhere(data: Path) -> list[Result]:
-    """B-12: the largest change of any orientation, seen from a subject who turned around."""
+    """Largest change of any orientation if the subject faces another way."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     straight = models.predict(squats.held)
@@ -150,7 +150,7 @@ def facing_elsewhere(data: Path) -> list[Result]:
 
 
 def one_sensor(data: Path) -> list[Result]:
-    """B-13: a model for each sensor that may be left alone."""
+    """A model for each single sensor, used when the other is lost."""
     squats = Squats(data)
     figures = []
     for index, goals in ((0, (1.5, 1.9)), (1, (2.1, 2.0))):

@@ -1,9 +1,9 @@
-"""Rows ONLINE: people calibrated on walking, who then do other things in view of the cameras.
+"""Online learning: subjects calibrated on walking who then squat and sit in view of the cameras.
 
-Simulated people at the demo's defaults; truth is the bones, which neither the cameras' markers nor
-any fit has seen. Circles and walking are calibrated, squats and sitting down and up are learned in
-three rounds, and what is judged comes later still: both kinds again, and walking, to see whether
-it was forgotten. Errors are RMS over all people, heading's wandering included in the segments.
+Simulated subjects with the settings of the demo. Ground truth are the bones, which no fit receives.
+Circles and walking are calibrated; squats and sit-to-stand are learned in three rounds. The
+evaluation uses later repetitions of both and of walking, to detect forgetting. Errors are RMS over
+all subjects; those of segments include heading drift.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ FRESH_HZ = 10.0
 ROUNDS = 3
 ROUND_S = 80.0
 TURN_DEG = 15.0
-"""How each sensor is turned on the skin when it is put on again."""
+"""Rotation of each sensor on the skin at re-donning."""
 OTHER_SKIN = 0.25
-"""And how much otherwise the skin of its new place moves: standard deviation of a factor."""
+"""Standard deviation of the factor by which the soft-tissue artefact of the new place differs."""
 PLAN = (
     Step("plate", 24.0), Step("stand", 9.0), Step("functional", 15.0), Step("walk", 40.0),
     *(Step(name, 20.0) for _ in range(ROUNDS) for name in ("squat", "sit_to_stand") * 2),
@@ -71,7 +71,7 @@ KINDS = {"new movements": (JUDGE_S + 1, JUDGE_S + 30), "old one": (JUDGE_S + 31,
 
 @dataclass(frozen=True)
 class Person:
-    """Everything one person did."""
+    """Trials of one subject."""
 
     t_s: Array
     said: dict[str, Array]
@@ -80,7 +80,7 @@ class Person:
     flexion: Array
 
     def trial(self, begin_s: float, end_s: float) -> CalibrationTrial:
-        """Return what a phase of the calibration records."""
+        """Return the trial that a calibration phase records."""
         now = (self.t_s >= begin_s) & (self.t_s < end_s)
         t_ns = np.round(self.t_s[now] * NS).astype(np.int64)
         shot = (self.optical.t_ns >= begin_s * NS) & (self.optical.t_ns < end_s * NS)
@@ -100,7 +100,7 @@ def _cut(track: OpticalTrack, rows: NDArray[np.bool_]) -> OpticalTrack:
 
 @cache
 def person(seed: int) -> Person:
-    """Return one person."""
+    """Return one subject."""
     knobs = Knobs(seed=seed, rate_hz=RATE_HZ)
     wearer = SimulatedSubject(knobs, list(PLAN))
     end_s = sum(step.seconds for step in PLAN)
@@ -126,7 +126,7 @@ def person(seed: int) -> Person:
 
 @cache
 def calibrated(seed: int) -> Calibration | None:
-    """Return the person's calibration; None where the daemon would ask for another pose."""
+    """Return the calibration of the subject, or None if the daemon would request another pose."""
     rig, one = bench_rig(), person(seed)
     settings = replace(rig.calibration, functional_min_s=0.0)
     try:
@@ -139,7 +139,7 @@ def calibrated(seed: int) -> Calibration | None:
 
 
 def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -> OnlineFrames:
-    """Return what the daemon keeps of a while in view of the cameras."""
+    """Return the trial that the daemon collects in a span in view of the cameras."""
     trial = one.trial(begin_s, end_s)
     optical = trial.optical
     if optical is None:
@@ -165,7 +165,7 @@ def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -
 
 
 def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
-    """Return the calibration after all rounds, and how many of them were taken."""
+    """Return the calibration after all rounds, and the number of accepted rounds."""
     taken = 0
     for k in range(ROUNDS):
         begin_s = LEARN_S + k * ROUND_S
@@ -177,7 +177,7 @@ def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
 
 
 def squares(one: Person, calibration: Calibration, span: tuple[float, float]) -> Array:
-    """Return the mean squared error of flexion, thigh and shank of a span, rad²."""
+    """Return the mean squared errors of flexion, thigh and shank in a span, rad²."""
     now = (one.t_s >= span[0]) & (one.t_s < span[1])
     part = Worn(
         one.t_s[now] - one.t_s[now][0],
@@ -196,7 +196,7 @@ def squares(one: Person, calibration: Calibration, span: tuple[float, float]) ->
 
 
 def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return errors before and after learning on."""
+    """Return the errors before and after online learning."""
     taken, people = 0, 0
     rows: dict[tuple[str, str], list[Array]] = {}
     worst = -np.inf
@@ -228,7 +228,7 @@ def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     return figures
 
 
-# --- cameras that are wrong -------------------------------------------------------------------
+# --- wrong optical reference --------------------------------------------------------------------
 
 
 def _swapped(new: OnlineFrames) -> OnlineFrames:
@@ -242,7 +242,7 @@ def _two_names(new: OnlineFrames) -> OnlineFrames:
 
 
 def _moved(new: OnlineFrames) -> OnlineFrames:
-    """Turn the whole cluster on the thigh by 12°: it fits as well as ever."""
+    """Rotate the whole cluster of the thigh by 12°, which leaves its fit unchanged."""
     x = new.markers["thigh"]
     middle = x.mean(axis=1, keepdims=True)
     local = new.sensors["S1"]
@@ -268,7 +268,7 @@ SPOILERS: dict[str, Callable[[OnlineFrames], OnlineFrames]] = {
 
 
 def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return how often something was taken from cameras that are wrong."""
+    """Return the number of rounds accepted from a wrong optical reference."""
     taken = dict.fromkeys(SPOILERS, 0)
     for seed in seeds:
         calibration = calibrated(seed)
@@ -285,11 +285,11 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     return [Result(f"accepted refits, {name}", float(n), 0.0, unit="") for name, n in taken.items()]
 
 
-# --- put on anew ------------------------------------------------------------------------------
+# --- re-donning ---------------------------------------------------------------------------------
 
 
 def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return errors of taught people whose sensors were turned: with a new static pose only."""
+    """Return the errors of learned subjects after re-donning, with a new static pose only."""
     rows: dict[str, list[Array]] = {"as worn": [], "put on anew": []}
     for seed in seeds:
         calibration = calibrated(seed)
@@ -317,7 +317,7 @@ def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
 
 
 def _anew(one: Person, calibration: Calibration, dice: np.random.Generator) -> Person:
-    """Return the person with every sensor turned, on skin that moves otherwise."""
+    """Return the subject with every sensor rotated and another soft-tissue artefact."""
     said = {}
     for name, q in one.said.items():
         item = calibration.sensor[name]

@@ -1,7 +1,7 @@
-"""Rows F-1 to F-5 and S-2: every method on the recorded movements of the semi-real knee.
+"""Every fusion method on the recorded movements of the knee.
 
-One subject, one leg, virtual sensors made of skin markers, a model as reference: figures to measure
-again and again, not a validation of the product.
+One subject, one leg, virtual sensors made of skin markers, a model as reference. The results detect
+regressions; they do not validate the product.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ HOLD_OUT_GOALS = (1.2, 1.4, 1.0)
 HEADING_GOAL_DEG = 0.01
 DONNED_GOAL_DEG = 1.0
 POSE_SD_DEG = 1.0
-"""How well a person repeats a static pose, as each sensor sees it, deg per axis."""
+"""Repeatability of a static pose measured by each sensor, deg per axis."""
 DEFAULT = "anchored"
 FIT_GOAL_S = 0.5
 TOLERANCE = 0.05
-"""Of shares."""
+"""Tolerance of shares."""
 
 
 @cache
@@ -55,7 +55,7 @@ def _halves(data: Path) -> tuple[KneeTrial, KneeTrial]:
 
 
 def _errors(judge: Judge, taught: list[KneeTrial], trial: KneeTrial) -> dict[str, Errors]:
-    """Return what every method, trained alike, errs on one trial: thigh, shank, flexion, deg."""
+    """Return the errors of every method on one trial: thigh, shank, flexion, deg."""
     return {
         m: judge.errors(fusion_methods.fit(m, taught)(trial), trial) for m in fusion_methods.METHODS
     }
@@ -64,7 +64,7 @@ def _errors(judge: Judge, taught: list[KneeTrial], trial: KneeTrial) -> dict[str
 def _beside(
     found: Mapping[str, Sequence[float]], goals: Sequence[float], prefix: str = ""
 ) -> list[Result]:
-    """Tell every method's errors; only the default has goals."""
+    """Return the errors of every method; only the default has thresholds."""
     return [
         Result(f"{prefix}{method}: {name}", error, round(goal, 3) if method == DEFAULT else NOTHING)
         for method, errors in found.items()
@@ -73,16 +73,16 @@ def _beside(
 
 
 def hold_out(data: Path) -> list[Result]:
-    """F-1: trained on the first 60 % of the squats, judged on the rest."""
+    """Train on the first 60 % of the squats; evaluate on the rest."""
     training, held = _halves(data)
     judge = Judge.of(training)
     return _beside(_errors(judge, [training], held), HOLD_OUT_GOALS)
 
 
 def left_out(data: Path) -> list[Result]:
-    """F-2: each movement in turn judged by what the others have taught.
+    """Train on two movements; evaluate on the third.
 
-    The default must be worse in nothing than the mean of two or patent12.
+    The default may not be worse than the mean of two or patent12 in any result.
     """
     trials = _trials(data)
     judge = Judge.of(_halves(data)[0])
@@ -96,7 +96,7 @@ def left_out(data: Path) -> list[Result]:
 
 
 def together(data: Path) -> list[Result]:
-    """F-3: trained on three movements together, judged on the squats' last 40 %."""
+    """Train on three movements together; evaluate on the last 40 % of the squats."""
     training, held = _halves(data)
     trials = [training, *(_trials(data)[name] for name in MOVEMENTS[1:])]
     found = _errors(Judge.of(training), trials, held)
@@ -104,7 +104,7 @@ def together(data: Path) -> list[Result]:
 
 
 def turned_and_donned(data: Path) -> list[Result]:
-    """F-4: a heading that changed since calibration, and sensors put on anew with a new pose."""
+    """A heading that changed after calibration, and re-donned sensors with a new static pose."""
     training, held = _halves(data)
     judge = Judge.of(training)
     predict = fusion_methods.fit(DEFAULT, [training])
@@ -134,9 +134,9 @@ def turned_and_donned(data: Path) -> list[Result]:
 
 
 def coverage(data: Path) -> list[Result]:
-    """F-5: how often errors lie within what is claimed: same movement, others, one of several.
+    """Coverage of errors: same movement, other movements, one of several.
 
-    Seconds of one movement are few independent frames: only all together are held to the goal.
+    Seconds of one movement hold few independent frames, so only the total has a threshold.
     """
     training, held = _halves(data)
     trials = _trials(data)
@@ -169,7 +169,7 @@ def coverage(data: Path) -> list[Result]:
 
 
 def fit_time(data: Path) -> list[Result]:
-    """S-2: how long the default takes to learn both segments from 60 % of the squats."""
+    """Time to fit both segments to 60 % of the squats."""
     training = _halves(data)[0]
     took = []
     for _ in range(5):
@@ -182,7 +182,7 @@ def fit_time(data: Path) -> list[Result]:
 def flexion_scores(
     taught: list[KneeTrial], judged: KneeTrial, method: str = DEFAULT
 ) -> NDArray[np.float64]:
-    """Return errors of flexion over their claimed deviations, shape (n,)."""
+    """Return the flexion errors divided by their predicted deviations, shape (n,)."""
     said, claimed = [], []
     for model, segment in zip(
         fusion_methods.models(taught, method), fusion_methods.segments(judged), strict=True
@@ -200,9 +200,9 @@ def flexion_scores(
 
 
 def _donned(trial: KneeTrial, seed: int) -> KneeTrial:
-    """Return the trial with mounts turned by 10 to 20 degrees and a new static pose.
+    """Return the trial with mounts rotated by 10 to 20 degrees and a new static pose.
 
-    The new pose takes back all of the turned mount but what the pose itself was repeated to.
+    The new pose corrects the rotated mount up to the repeatability of the pose.
     """
     rng = np.random.default_rng(seed)
     sensors = []

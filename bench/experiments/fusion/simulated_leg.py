@@ -1,8 +1,9 @@
-"""Row SIM: calibration and live on the simulator's wearer, without bytes, for several people.
+"""Calibration and live estimation of simulated subjects, without wire formats.
 
-Each seed is another person with other mounts, headings, skin and sensor errors, all at the demo's
-defaults. Truth is the bones, which the optical reference never sees: it is made of skin markers.
-Calibrated on 60 s (joint circles, walking, squats, sitting down and up), judged on 24 s afterwards.
+Each seed is another subject: alignment, headings, soft-tissue artefact and sensor errors differ, at
+the settings of the demo. Ground truth are the bones; the optical reference consists of skin
+markers. Calibrated on 60 s (joint circles, walking, squats, sit-to-stand), evaluated on 24 s
+afterwards.
 """
 
 from __future__ import annotations
@@ -40,35 +41,35 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState, Quaternion
 
 SEEDS = tuple(range(1, 9))
-"""The first one is the demo's."""
+"""The first one is the subject of the demo."""
 METHODS: tuple[Method, ...] = ("anchored", "patent12", "patent6", "mean")
 SEGMENTS = ("thigh", "shank")
 BEGIN_S = 100.0
-"""Errors and skin wander with time: the live part is later than all of the calibration."""
+"""Errors and soft-tissue artefact change with time: the live part is later than the calibration."""
 LIVE = (("walk", 8.0), ("squat", 8.0), ("sit_to_stand", 8.0))
 RATE_HZ = 50.0
 KNEE_GOAL_DEG = 3.0
 NS = 1_000_000_000
-_STILL_S = np.arange(3.0, 8.0, 0.1)  # of a person who stands
+_STILL_S = np.arange(3.0, 8.0, 0.1)  # of a standing subject
 
 
 @dataclass(frozen=True, slots=True)
 class Live:
-    """One person in motion: what sensors say, and the bones, in the optical world."""
+    """Sensors and bones of one subject in motion, in the optical world."""
 
     t_ns: list[int]
     said: dict[str, list[Quaternion]]
     bones: dict[str, Array]
     """q_optical_segment, shape (n, 4)."""
     flexion: Array
-    """Of the knee, rad, shape (n,)."""
+    """Knee flexion, rad, shape (n,)."""
     standing_m: dict[str, Array]
     """Joint centers in the static pose, shape (3,)."""
 
 
 @dataclass(slots=True)
 class Errors:
-    """Squares and shares of one method on one person."""
+    """Squared errors and coverage of one method on one subject."""
 
     knee: float = 0.0
     thigh: float = 0.0
@@ -146,7 +147,7 @@ def _rms_deg(angles: Array) -> float:
 
 @cache
 def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
-    """Return the errors of every method on every person, in the order of `seeds`."""
+    """Return the errors of every method on every subject, in the order of `seeds`."""
     rig = bench_rig()
     found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
     for seed in seeds:
@@ -163,7 +164,7 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
 
 
 def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
-    """Return the pose that the daemon would take; None where it would ask for another."""
+    """Return the accepted static pose, or None if the daemon would request another."""
     until_ns = min(int(track.t_ns[0]) for track in static.sensors.values())
     until_ns += round(rig.calibration.static_s * NS)
     optical = static.optical
@@ -211,7 +212,7 @@ def _row(method: Method) -> Callable[[Path], list[Result]]:
 
 
 def centers(_: Path) -> list[Result]:
-    """Return how far joint centers are from the true ones in the static pose."""
+    """Return the distances of the joint centers from ground truth in the static pose."""
     errors = people()["anchored"]
     figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):

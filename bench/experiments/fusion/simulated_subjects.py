@@ -1,8 +1,8 @@
-"""Row F-6: twenty simulated people with skin that moves, every method against the bones.
+"""Every fusion method on twenty simulated subjects with soft-tissue artefact.
 
-Each is another person with other mounts, headings, skin and sensor errors at the demo's defaults.
-Trained on 60 s of four movements against markers, which ride the skin too; judged on 24 s
-afterwards, when errors and headings have wandered on. Truth is the bones, which nobody measured.
+Alignment, headings, soft-tissue artefact and sensor errors differ, at the settings of the demo.
+Trained on 60 s of four movements against skin markers, evaluated on 24 s afterwards, when errors
+and headings have drifted. Ground truth are the bones.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ SEEDS = tuple(range(1, 21))
 SEGMENTS = ("thigh", "shank")
 TOLERANCE = 0.05
 STRIDE = 4
-"""Frames of the live part between one and the next that is judged: neighbours say the same."""
+"""Interval of the evaluated frames of the live part: neighbouring frames are correlated."""
 
 
 @cache
 def person(seed: int) -> tuple[KneeTrial, KneeTrial] | None:
-    """Return what one person was trained on and what came later; None if the pose was refused."""
+    """Return training and later trial of one subject; None if the static pose was rejected."""
     rig, trials = bench_rig(), phases(seed)
     pose = take_pose(trials.static, rig)
     optical = trials.functional.optical
@@ -72,7 +72,7 @@ def _knee(columns: list[Array]) -> KneeTrial:
 
 
 def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """F-6: errors of all methods; what patent12, mean and the default claim, against them."""
+    """Errors of all methods; predicted errors of patent12, mean and the default."""
     people = [found for seed in seeds if (found := person(seed)) is not None]
     figures = [Result("subjects accepted", len(people), len(seeds), len(seeds) - 2, unit="")]
     errors = {
@@ -110,7 +110,7 @@ def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
 
 
 def _segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
-    """Return errors about each axis of both segments over what is claimed, with the heading's."""
+    """Return errors about each axis of both segments over the predicted ones, with heading."""
     scores = []
     for model, part in zip(
         fusion_methods.models([taught]), fusion_methods.segments(later), strict=True

@@ -1,4 +1,4 @@
-"""Rows C-1 to C-9 and beyond: centers in the plane against theory, bound, peers and time."""
+"""Centers of rotation in the plane: equations, Cramér-Rao bound, other libraries, time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
 def three_frames(_: Path) -> list[Result]:
-    """C-1: closed form against Cramer's rule; the misprinted denominator against a meter."""
+    """Closed form against Cramer's rule; effect of the misprinted denominator at 1 m."""
     rng = np.random.default_rng(1)
     p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
     u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -61,7 +61,7 @@ def three_frames(_: Path) -> list[Result]:
 
 
 def _as_printed(rng: np.random.Generator) -> float:
-    """Return the RMS error that (x1 - x2) in place of (x1 - x3) gives at 60° and 1 mm, m."""
+    """Return the RMS error caused by (x1 - x2) in place of (x1 - x3) at 60° and 1 mm, m."""
     p = arc_points(np.deg2rad(60.0) * np.arange(3), 0.2) + rng.normal(0, 0.001, (20_000, 3, 2))
     x, y, s = p[..., 0], p[..., 1], (p**2).sum(axis=-1)
     above = (s[:, 1] - s[:, 0]) * (y[:, 2] - y[:, 0]) - (s[:, 2] - s[:, 0]) * (y[:, 1] - y[:, 0])
@@ -70,7 +70,7 @@ def _as_printed(rng: np.random.Generator) -> float:
 
 
 def equal_steps(_: Path) -> list[Result]:
-    """C-2: equation 15 against 200 000 runs."""
+    """Equation 15 against 200 000 runs."""
     figures = []
     for step in (45, 60, 90, 120, 150):
         rng = np.random.default_rng(step)
@@ -83,7 +83,7 @@ def equal_steps(_: Path) -> list[Result]:
 
 
 def forms(_: Path) -> list[Result]:
-    """C-3: equation 14 by angles, by side lengths, and the Cramér-Rao bound."""
+    """Equation 14 by angles, by side lengths, and the Cramér-Rao bound."""
     rng = np.random.default_rng(3)
     t = np.sort(rng.uniform(0.0, 2.0 * np.pi, (500, 3)), axis=1)
     t = t[np.diff(t, axis=1).min(axis=1) > 0.2]
@@ -100,7 +100,7 @@ CASES = ((100, 90, 0.002), (100, 45, 0.005), (100, 20, 0.0005), (100, 20, 0.002)
 
 
 def plain_hyper(_: Path) -> list[Result]:
-    """C-4: the textbook's Hyper over the bound, and Kåsa beside it."""
+    """Hyper as published relative to the bound, and Kåsa."""
     figures = []
     for n, arc, noise in CASES:
         goal = 1.2 if (n, arc, noise) == (100, 20, 0.002) else 1.05
@@ -112,7 +112,7 @@ def plain_hyper(_: Path) -> list[Result]:
 
 
 def streaming(_: Path) -> list[Result]:
-    """C-5: one frame at a time against all at once, forgetting and windowed, and its time."""
+    """Streaming against batch fits, with forgetting and with a window, and their time."""
     rng = np.random.default_rng(5)
     n = 2000
     swing = 0.6 * np.sin(np.arange(n) * 0.05)
@@ -142,7 +142,7 @@ def streaming(_: Path) -> list[Result]:
 
 
 def claims(_: Path) -> list[Result]:
-    """C-6: predicted error over actual, and how many short arcs pass the gate."""
+    """Ratio of predicted to actual error, and share of short arcs that pass the gate."""
     figures = []
     for n, arc, noise in ((100, 22, 0.002), (100, 30, 0.002), *CASES[:3], CASES[4]):
         found = runs_on(n, arc, noise, runs=8000)
@@ -155,7 +155,7 @@ def claims(_: Path) -> list[Result]:
 
 
 def several(_: Path) -> list[Result]:
-    """C-7a: four markers at different angles round the joint, 20° arc."""
+    """Four markers at different angles about the joint, 20° arc."""
     rng = np.random.default_rng(7)
     t = np.linspace(-0.5, 0.5, 100) * np.deg2rad(20.0)
     offsets, radii = np.array([0.0, 0.25, -0.3, 0.6]), np.array([0.30, 0.35, 0.20, 0.28])
@@ -180,7 +180,7 @@ def _rms(centers: list[Array]) -> float:
 
 
 def at_the_bound(_: Path) -> list[Result]:
-    """20 000 runs of what is published, upper 95 % limit of the RMS error over the bound."""
+    """20 000 runs of accepted estimates: upper 95 % limit of the RMS error over the bound."""
     figures = []
     for arc, goal in ((20, 1.15), (30, 1.15), (45, 1.03), (60, 1.03), (90, 1.03), (180, 1.03)):
         found = runs_on(100, arc, 0.002)
@@ -205,7 +205,7 @@ ELLIPSES: tuple[tuple[int, float, float, float], ...] = (
 
 
 def ellipses(_: Path) -> list[Result]:
-    """Share of published centers whose 95 % ellipse holds the truth; over 10 % are published."""
+    """Share of accepted centers whose 95 % ellipse contains the truth; over 10 % are accepted."""
     figures = []
     for n, arc, noise, radius in ELLIPSES:
         found = runs_on(n, arc, noise, radius=radius, runs=10_000, correlated=True)
@@ -217,7 +217,7 @@ def ellipses(_: Path) -> list[Result]:
 
 
 def peers(_: Path) -> list[Result]:
-    """One run: the PyPI package circle-fit and scipy, time and accuracy, 45° and 5 mm."""
+    """Accuracy and time of the PyPI package circle-fit and of scipy in one run, 45° and 5 mm."""
     from circle_fit import hyperLSQ, hyperSVD, lm, taubinSVD  # noqa: PLC0415 - only this row's
     from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import
 

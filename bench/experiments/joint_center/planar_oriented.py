@@ -1,4 +1,4 @@
-"""Rows C-8 and C-9: measured angles help a center, and wrong ones do little harm."""
+"""Centers of rotation from points with measured angles, right and wrong ones."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ARCS = (20, 30, 45, 60, 75, 90, 180)
 
 
 def angle_error(kind: Kind, size: float, rng: np.random.Generator) -> Array:
-    """Return errors of the angle, RMS `size`, shape (FRAMES,)."""
+    """Return angle errors of RMS `size`, shape (FRAMES,)."""
     n = FRAMES
     if kind == "white":
         return np.asarray(size * rng.normal(size=n))
@@ -58,7 +58,7 @@ def angle_error(kind: Kind, size: float, rng: np.random.Generator) -> Array:
 
 @cache
 def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float, float, int]:
-    """Return the RMS errors with and without angles, m, where both answer, and refusals."""
+    """Return the RMS errors with and without angles where both estimate, m, and the rejections."""
     rng = np.random.default_rng(1000 + round(arc))
     theta = np.linspace(-0.5, 0.5, FRAMES) * np.deg2rad(arc)
     truth = arc_points(theta, RADIUS_M)
@@ -78,7 +78,7 @@ def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float
 
 
 def table(_: Path) -> list[Result]:
-    """C-8: RMS with angles over RMS of plain Hyper."""
+    """RMS error with angles over that of Hyper alone."""
     figures = []
     for arc in ARCS:
         for kind, degrees in (*STATED, *BEYOND):
@@ -94,7 +94,7 @@ def table(_: Path) -> list[Result]:
 
 
 def short_arc(_: Path) -> list[Result]:
-    """C-9: 20° with slow errors of 1°; and a few of the worst of C-8."""
+    """Arc of 20° with slow errors of 1°, and the worst cases of the angle-noise experiment."""
     with_angles, without, refused = rms_errors(20, "slow", 1.0, 200)
     figures = [
         Result("arc of 20°, slow noise of 1°: with angles", 1000 * with_angles, 28.0, unit="mm"),

@@ -1,4 +1,4 @@
-"""Row C-13: the source's numerical experiment, repeated; table 1 as its printed digits are read."""
+"""Replication of the published numerical experiment; table 1 as its legible digits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 EXPECTED = {"α–σ": (0.98, 0.81), "r–σ": (1.00, 0.99), "r–α": (0.96, 0.91)}
-"""By an independent implementation, at the clip that comes nearest to print."""
+"""From an independent implementation, at the clip that is nearest to the print."""
 
 
 @cache

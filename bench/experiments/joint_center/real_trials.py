@@ -1,8 +1,8 @@
-"""Rows R: hips and knees of people, beside the joint centers of their models.
+"""Hip and knee centers of recorded subjects, compared with the centers of their models.
 
-No goal is fitted to these figures. Across the knee's axis there is a floor, far above what was
-measured: it tells when something breaks. Along the axis a hinge shows nothing, and thigh skin
-slides over the femur with every step: both are reported as they come.
+The thresholds are far above the measured values: they detect regressions. Along the axis of a hinge
+the center is undetermined, and the thigh skin slides over the femur with every step. Both are
+reported without a threshold.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ KNEE_FLOOR_MM = 50.0
 
 
 def compare(trial: str, data: Path) -> list[Result]:
-    """Return distances from the model's centers, and what the estimates said of themselves."""
+    """Return the distances from the model's centers and the predicted errors."""
     figures: list[Result] = []
     for found in judged(data, trial, METHODS):
         floor = KNEE_FLOOR_MM if "knee" in found.joint.name else inf

@@ -1,8 +1,8 @@
-"""Row SIM-markers: what refining marker places in the daemon is worth, against the bones.
+"""Effect of marker refinement in the daemon, measured against the bones.
 
-The people of ``SIM``, calibrated with `refine_markers` on and off; some of them again with a marker
-of each segment knocked off its place between static pose and movement. Live errors are compared,
-person by person; the optical reference itself is seen only through them.
+Simulated subjects are calibrated with `refine_markers` on and off. For some, a marker of each
+segment is displaced between static pose and movement. Live errors are compared subject by subject;
+the optical reference enters only through them.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 KNOCKED = {"thigh": "T2", "shank": "C2"}
 KNOCKED_M = 0.015
 FEW = 4
-"""People whose markers are knocked off."""
+"""Subjects with displaced markers."""
 NOTHING = float("inf")
 COSTS_NOTHING_DEG = 0.1
 
 
 def refined(_: Path) -> list[Result]:
-    """SIM-markers: change of live errors by refining, deg; negative is better."""
+    """Change of live errors by refinement, deg; negative is better."""
     rig = bench_rig()
     worn: list[Array] = []
     knocked: list[Array] = []
@@ -81,7 +81,7 @@ def refined(_: Path) -> list[Result]:
 def _change(
     rig: Rig, pose: StaticPose, functional: CalibrationTrial, alignment: PlateAlignment, live: Live
 ) -> tuple[Array, Calibration]:
-    """Return errors of knee, thigh and shank with refining less those without, deg."""
+    """Return the errors of knee, thigh and shank with refinement less those without, deg."""
     found = [
         fit_calibration(
             pose, functional, alignment, replace(rig.calibration, refine_markers=on), rig.chain
@@ -104,7 +104,7 @@ def _changes(label: str, found: list[Array], goal: float) -> list[Result]:
 
 
 def _knocked(functional: CalibrationTrial, pose: StaticPose, seed: int) -> CalibrationTrial:
-    """Return the movement with one marker of each segment shifted on its segment."""
+    """Return the movement with one marker of each segment displaced on its segment."""
     optical, rng = functional.optical, np.random.default_rng(seed)
     if optical is None:
         return functional

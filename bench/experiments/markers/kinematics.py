@@ -1,6 +1,6 @@
-"""Rows D-1, D-2, D-3, D-12: the chain's Jacobian, its fit to an adult, its speed.
+"""Jacobian of the chain, its fit to a recorded adult, and its speed.
 
-Times are CPU time of one thread, medians, as in the speed bench.
+Times are median CPU times of one thread, as in the speed experiments.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ROOT_SHIFT = [3, 4, 5]
 
 
 def slope(data: Path) -> list[Result]:
-    """D-1: central differences at 5 instants of walking."""
+    """Central differences at 5 instants of walking."""
     model = oc4_lower(data)
     state = solve_frames(model, measured(data, "walking1", model)[::26]).state
     told, h, off = jacobian(model, state), 1e-6, 0.0
@@ -46,7 +46,7 @@ def slope(data: Path) -> list[Result]:
 
 
 def fit(data: Path) -> list[Result]:
-    """D-2: tracking error before any refinement, all instants."""
+    """Tracking error without refinement, all instants."""
     model = oc4_lower(data)
     figures = []
     for trial, expected in EXPECTED_MM.items():
@@ -57,7 +57,7 @@ def fit(data: Path) -> list[Result]:
 
 
 def exact(data: Path) -> tuple[ChainModel, ChainState, Array]:
-    """Return the model, its walk and the markers of that walk without noise."""
+    """Return the model, its walk and noise-free markers of that walk."""
     model = oc4_lower(data)
     truth = solve_frames(model, measured(data, "walking1", model)).state
     return model, truth, marker_positions(model, truth)
@@ -68,7 +68,7 @@ def turns_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> Array:
 
 
 def occluded(data: Path) -> list[Result]:
-    """D-3: every segment loses one marker in half of all instants; then a fifth of all markers."""
+    """Every segment loses one marker in half of all instants; then 20 % of all markers are lost."""
     model, truth, clean = exact(data)
     rng = np.random.default_rng(0)
     y = clean.copy()
@@ -103,7 +103,7 @@ def batch_us(model: ChainModel, y: Array) -> float:
 
 
 def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
-    """Return the median time an instant, covariance included, and the tracking error, mm."""
+    """Return the median time an instant with covariance, and the tracking error, mm."""
     live = LiveInverseKinematics(model)
     residuals: list[Array] = []
 
@@ -115,7 +115,7 @@ def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
 
 
 def speed(data: Path) -> list[Result]:
-    """D-12: seven segments, 29 markers, 20 degrees of freedom; then two segments."""
+    """Seven segments, 29 markers, 20 degrees of freedom; then two segments."""
     model = oc4_lower(data)
     y = measured(data, "walking1", model)
     small = two_segments()

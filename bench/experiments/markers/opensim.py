@@ -1,7 +1,7 @@
-"""Rows D-14 to D-17: refined markers judged by OpenSim's own inverse kinematics.
+"""Refined markers evaluated by the inverse kinematics of OpenSim.
 
-The models are as their files have them; only markers are ours. Trials that are called unseen were
-not learned from, and nothing was chosen by them.
+The models are unchanged except for marker positions. Trials called unseen were used neither for
+learning nor for any choice.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ THREE = ("walking1", "squats1", "DJ1")
 EVERYTHING = (*THREE, "STS1")
 _EVENNESS = (0.0, 1.0, 2.0, 4.0)
 _DEARER = 1.02
-"""The mean error of movements held back may be this much above the least."""
+"""Largest mean error of held-out movements, relative to the smallest."""
 
 
 def _less(before: float, after: float) -> float:
@@ -44,7 +44,7 @@ def _less(before: float, after: float) -> float:
 
 
 def scaled_only(data: Path) -> list[Result]:
-    """D-14."""
+    """gait2354 as scaled: refined markers in OpenSim's inverse kinematics."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
     before = subject.verdicts(["walk1"])["walk1"].rms
@@ -66,7 +66,7 @@ def _off(found: Refinement, verdict: Verdict) -> float:
 
 
 def beside_opensim(data: Path) -> list[Result]:
-    """D-15: the published search through OpenSim, to its end; the joint method, the same frames."""
+    """Compare simultaneous refinement with the published coordinate search through OpenSim."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
     refine_markers(chain, walk, PLAIN)
@@ -117,7 +117,7 @@ def _untouched(data: Path) -> dict[str, Verdict]:
 
 
 def walking_alone(data: Path) -> list[Result]:
-    """D-16."""
+    """Markers refined on walking alone, in OpenSim's inverse kinematics."""
     subject = opencap(data)
     found = refine_markers(subject.chain(), [subject.motion("walking1")], PLAIN)
     after = subject.verdicts(EVERYTHING, found.model)
@@ -130,7 +130,7 @@ def walking_alone(data: Path) -> list[Result]:
 
 
 def _to_the_end(subject: Subject, found: Refinement) -> list[Result]:
-    """What OpenSim finds of the walk when its default accuracy does not stop it."""
+    """OpenSim's result for the walk at an accuracy that does not stop it early."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
     after = judge(subject.model, walk, found.model, CONVERGED).rms
@@ -151,7 +151,7 @@ def _to_the_end(subject: Subject, found: Refinement) -> list[Result]:
 
 
 def three_movements(data: Path) -> list[Result]:
-    """D-17: one set of markers for all; how even trials are weighed, chosen on these three."""
+    """One marker set for three movements; the weighting of the trials is chosen on these three."""
     subject = opencap(data)
     evenness = chosen_evenness(subject, THREE)
     figures = [Result("evenness chosen by cross-validation", evenness, inf, unit="")]
@@ -185,17 +185,17 @@ def _across(verdicts: Mapping[str, Verdict]) -> float:
 def refined_evenly(
     subject: Subject, trained: Sequence[str], power: float, judged: Sequence[str] = ()
 ) -> Refinement:
-    """Return markers learned from some trials, harder ones weighing more."""
+    """Return markers learned from some trials, those with larger errors weighted more."""
     settings = RefinementSettings(huber_m=None, frames=100, evenness=power)
     trials, others = ([subject.motion(n) for n in names] for names in (trained, judged))
     return refine_markers(subject.chain(), trials, settings, others)
 
 
 def chosen_evenness(subject: Subject, trained: Sequence[str]) -> float:
-    """Return the greatest evenness that movements held back do not pay for.
+    """Return the largest exponent of the weighting that does not raise the held-out error.
 
-    Each training trial is held back in turn. Of all powers whose mean error of trials held back is
-    within 2 % of the least, the greatest: it spreads what is left most evenly.
+    Each training trial is held out in turn. Among the exponents whose mean held-out error is within
+    2 % of the smallest, the largest one distributes the remaining errors most evenly.
     """
     means = {}
     for power in _EVENNESS:

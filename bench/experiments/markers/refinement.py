@@ -1,8 +1,8 @@
-"""Rows D-4 to D-11, D-13, D-13F: markers refined on an adult's movements and on made-up ones.
+"""Marker refinement on the movements of a recorded adult and on simulated ones.
 
-Goals are the figures of a reference run of the same equations, with a margin. Published figures of
-the coordinate search (tracking error down 38.4 %, its variance down 53.7 %) are of its own training
-trials; D-10 has their like.
+The thresholds are the results of a reference implementation of the same equations, with a margin.
+The published results of the coordinate search (tracking error −38.4 %, its variance −53.7 %) refer
+to its own training trials; the experiment on simulated subjects reports the same quantities.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _EVERY = {"walking1": 1, "squats1": 8, "DJ1": 2, "STS1": 8}
-"""Frames that judge; squats learn from every tenth."""
+"""Evaluated frames; every tenth frame of the squats is used for learning."""
 _RECORDED = (FOLDER,)
 _ALL = 10_000
 _PELVIS = 4
@@ -58,7 +58,7 @@ def rms_mm(found: Refinement, trial: str) -> float:
 
 @cache
 def walked(data: Path) -> tuple[Refinement, float]:
-    """Return the refinement on walking alone, and its seconds."""
+    """Return the refinement on walking alone, and its time, s."""
     model, trials = oc4_lower(data), [motion(data, "walking1")]
     refine_markers(model, trials, PLAIN)
     began = time.process_time()
@@ -67,7 +67,7 @@ def walked(data: Path) -> tuple[Refinement, float]:
 
 
 def fast(data: Path) -> list[Result]:
-    """D-4."""
+    """Simultaneous refinement on walking."""
     found, seconds = walked(data)
     return [
         Result("walking1", rms_mm(found, "walking1"), 4.85, unit="mm"),
@@ -77,7 +77,7 @@ def fast(data: Path) -> list[Result]:
 
 
 def same_minimum(data: Path) -> list[Result]:
-    """D-5."""
+    """Simultaneous and block refinement reach the same minimum."""
     settings = RefinementSettings("block", huber_m=None, frames=_ALL, tolerance=1e-6)
     in_turns = refine_markers(oc4_lower(data), [motion(data, "walking1")], settings)
     off = abs(in_turns.costs[-1] / walked(data)[0].costs[-1] - 1.0)
@@ -87,7 +87,7 @@ def same_minimum(data: Path) -> list[Result]:
 
 
 def never_rises(data: Path) -> list[Result]:
-    """D-6: 20 starts, 15 mm an axis."""
+    """The objective never increases: 20 starts, each marker displaced by 15 mm an axis."""
     model, trial = oc4_lower(data), motion(data, "walking1", 8)
     rises = steps = 0
     for seed in range(20):
@@ -105,7 +105,7 @@ def never_rises(data: Path) -> list[Result]:
 
 
 def misplaced(data: Path) -> ChainModel:
-    """Return the chain with all markers but the pelvis's 10 mm an axis off."""
+    """Return the chain with all markers displaced by 10 mm an axis, except those of the pelvis."""
     model = oc4_lower(data)
     off = np.random.default_rng(11).normal(0.0, 0.01, (29, 3))
     off[:_PELVIS] = 0.0
@@ -114,7 +114,7 @@ def misplaced(data: Path) -> ChainModel:
 
 
 def beside_search(data: Path, every: int = 1) -> list[Result]:
-    """D-7, D-9: the published search from a misplaced start, beside the joint method."""
+    """The published coordinate search from a displaced start, and the simultaneous method."""
     model, trials = misplaced(data), [motion(data, "walking1", every)]
     validation = [motion(data, "STS1")]
     began = time.process_time()
@@ -150,7 +150,7 @@ def beside_search(data: Path, every: int = 1) -> list[Result]:
 
 
 def unseen(data: Path) -> list[Result]:
-    """D-8."""
+    """Refined on three movements, evaluated on a fourth."""
     trials = [motion(data, "walking1"), motion(data, "squats1", 10), motion(data, "DJ1")]
     found = refine_markers(oc4_lower(data), trials, PLAIN, [motion(data, "STS1")])
     before, after = found.variance_of_trials(trained=True)
@@ -163,7 +163,7 @@ def unseen(data: Path) -> list[Result]:
 
 
 def invisible(data: Path) -> list[Result]:
-    """D-11."""
+    """Directions that the tracking error does not determine."""
     gauge = walked(data)[0].gauge
     return [
         Result("free directions", gauge.free, 7, 7, unit=""),
@@ -172,7 +172,7 @@ def invisible(data: Path) -> list[Result]:
 
 
 def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
-    """Return markers sliding to and fro, 6 mm, and 1 mm of noise."""
+    """Return markers that slide by 6 mm to and fro, with 1 mm of noise."""
     frames, markers = clean.shape[:2]
     turns = (1 + 0.3 * rate) * np.arange(frames)[:, None, None] / frames
     phase = rng.uniform(0.0, 2 * np.pi, (markers, 1))
@@ -181,7 +181,7 @@ def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
 
 
 def people(data: Path, count: int = 8) -> list[Result]:
-    """D-10: made-up people at three paces; each learns from the first."""
+    """Simulated subjects at three speeds; the first speed is learned."""
     model = oc4_lower(data)
     held = {m.name: (True, True, True) for m in model.markers[:_PELVIS]}
     walk = solve_frames(model, measured(data, "walking1", model)).state
@@ -211,7 +211,7 @@ def people(data: Path, count: int = 8) -> list[Result]:
 
 @dataclass(frozen=True, slots=True)
 class _Draw:
-    """Made-up movements, 3 mm of noise, and a model whose free markers are 10 mm off an axis."""
+    """Simulated movements with 3 mm of noise; free markers displaced by 10 mm an axis."""
 
     start: ChainModel
     clean: dict[str, Array]
@@ -226,7 +226,7 @@ class _Draw:
 def _draws(
     model: ChainModel, truly: dict[str, ChainState], right: tuple[str, ...], count: int
 ) -> Iterator[_Draw]:
-    """Draw misplacements and noise; markers named so are right, and locked."""
+    """Draw displacements and noise; the named markers are exact and locked."""
     free = np.array([not any(a in m.name for a in right) for m in model.markers])
     held = {m.name: (True,) * 3 for m, f in zip(model.markers, free, strict=True) if not f}
     rng = np.random.default_rng(2)
@@ -247,7 +247,7 @@ def _moved(data: Path) -> dict[str, ChainState]:
 
 
 def truth(data: Path, count: int = 8) -> list[Result]:
-    """D-13: 3 mm of noise, 10 mm of misplacement, anatomical markers right and locked."""
+    """Noise of 3 mm, displacements of 10 mm, anatomical markers exact and locked."""
     model, truly = oc4_lower(data), _moved(data)
     off_mm, shares, errors = [], [], []
     for draw in _draws(model, truly, _ANATOMICAL, count):
@@ -267,10 +267,10 @@ def truth(data: Path, count: int = 8) -> list[Result]:
 
 
 def feet_let_go(data: Path, count: int = 32) -> list[Result]:
-    """D-13F: heels and toes are off and free, too, so nothing holds how a foot is turned.
+    """Heels and toes are displaced and free too, so the foot's rotation is undetermined.
 
-    What the best of trials would give: the same, learned from movements without noise, by a prior
-    that only chooses among markers that fit alike.
+    The result of an ideal trial is reported as well: learned from noise-free movements, with a
+    prior that only selects among equally good markers.
     """
     model, truly = oc4_lower(data), _moved(data)
     shares = []
@@ -290,13 +290,13 @@ def feet_let_go(data: Path, count: int = 32) -> list[Result]:
 def _all_off(
     model: ChainModel, fitted: ChainModel, truly: dict[str, ChainState], seen: dict[str, Array]
 ) -> float:
-    """Return the RMS of joint angles' distances from the truth over movements, rad."""
+    """Return the RMS difference of joint angles from ground truth over movements, rad."""
     off = [_angles_off(model, fitted, truly[name], y) for name, y in seen.items()]
     return float(np.sqrt(np.mean(np.square(off))))
 
 
 def _angles_off(model: ChainModel, fitted: ChainModel, true: ChainState, y: Array) -> float:
-    """Return the RMS distance of all joint angles from the truth, rad."""
+    """Return the RMS difference of all joint angles from ground truth, rad."""
     found = solve_frames(fitted, y)
     step = step_between(model, true, found.state)[:, 6:]
     return float(np.sqrt(np.mean(step**2)))

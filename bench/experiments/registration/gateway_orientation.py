@@ -1,7 +1,7 @@
-"""Rows E-1 and E-2: orientation from raw readings, through the driver.
+"""Orientation computed on the gateway from raw readings, through the driver.
 
-Against optics and the package that filters; and what it is worth when the filter begins while the
-sensor is already in motion.
+Compared with optics and with the filter package alone; and the error if the filter starts while the
+sensor moves.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ FAST = raw_imu_trials.TRIALS[1]
 STARTS = 20
 SECOND = round(1e9 / raw_imu_trials.PERIOD_NS)
 SETTLED_GOAL_DEG = 4.0
-"""What is given out begins no worse than this; later the fast trial is at 2.8 deg."""
+"""Largest error at the first output, deg; later the fast trial has an error of 2.8 deg."""
 ROUNDING_DEG = 1e-6
-"""What of a difference is rounding, not another filter."""
+"""Largest difference due to rounding, deg."""
 
 
 def raw_orientation(data: Path) -> list[Result]:
-    """E-1: bytes of gyroscope, accelerometer and magnetometer in, orientations out."""
+    """Bytes of gyroscope, accelerometer and magnetometer in, orientations out."""
     figures = []
     for name in raw_imu_trials.TRIALS:
         trial = raw_imu_trials.load(data, name)
@@ -57,7 +57,7 @@ def raw_orientation(data: Path) -> list[Result]:
 
 
 def _from_package(trial: raw_imu_trials.BoardTrial, said: Array | None, kind: str) -> float:
-    """Return the largest angle between the driver's orientations and the package's, deg."""
+    """Return the largest angle between the orientations of driver and package, deg."""
     felt = trial.felt if said is not None else trial.felt[:2]
     if said is None:
         said = raw_imu_trials.through_driver(felt, magnetometer=False)
@@ -69,7 +69,7 @@ def _from_package(trial: raw_imu_trials.BoardTrial, said: Array | None, kind: st
 
 
 def begun_in_motion(data: Path) -> list[Result]:
-    """E-2: RMS error by second after the filter begins, at twenty instants of fast motion."""
+    """RMS error by second after the start of the filter, at twenty instants of fast motion."""
     trial = raw_imu_trials.load(data, FAST)
     rng = np.random.default_rng(0)
     last = len(trial.moving) - 8 * SECOND
@@ -81,7 +81,7 @@ def begun_in_motion(data: Path) -> list[Result]:
         felt = [values[part] for values in trial.felt]
         for settle_s, errors in ((0.0, at_once), (SETTLE_S, settled)):
             said = raw_imu_trials.through_driver(felt, magnetometer=True, settle_s=settle_s)
-            # what is held back is at the beginning
+            # withheld orientations are at the beginning
             optical = trial.optical[part][-len(said) :]
             errors.append(rotation.angle_between(said, optical)[: 3 * SECOND])
     figures = [

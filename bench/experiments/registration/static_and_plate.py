@@ -1,4 +1,4 @@
-"""Rows B-1 to B-5: stillness, the static mean, and the alignment of sensor and optical world."""
+"""Stillness, the static mean, and the alignment of sensor and optical world."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def _rms(values: list[float]) -> float:
 
 
 def stillness(data: Path) -> list[Result]:
-    """B-1: rest found, and motion taken for rest, on two whole trials of a board."""
-    h5py = import_module("h5py")  # only this bench needs it
+    """Detected rest, and motion detected as rest, in two whole trials of a board."""
+    h5py = import_module("h5py")  # imported by this experiment only
     figures = []
     for name in TRIALS:
         with h5py.File(data / "broad" / f"{name}.hdf5") as trial:
@@ -53,7 +53,7 @@ def stillness(data: Path) -> list[Result]:
 
 
 def static_mean(_: Path) -> list[Result]:
-    """B-2: 1 degree of scatter per axis, a fifth of the frames turned by 30 to 90 degrees."""
+    """Scatter of 1 degree per axis, a fifth of the frames rotated by 30 to 90 degrees."""
     rng = np.random.default_rng(2)
     errors = []
     for _run in range(100):
@@ -71,7 +71,7 @@ def static_mean(_: Path) -> list[Result]:
 def random_walk(
     rng: np.random.Generator, outliers: float = 0.0, axis: tuple[float, ...] | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return sensor and body orientations of a plate turned by hand, and true q_W and q_B."""
+    """Return orientations of sensor and body of a hand-turned plate, and true q_W and q_B."""
     n, steps = 2000, rng.normal(0.0, 0.05, (1999, 3))
     if axis is not None:
         steps = steps[:, :1] * np.array(axis)
@@ -88,7 +88,7 @@ def random_walk(
 
 
 def plate(_: Path) -> list[Result]:
-    """B-3: world and mount of a plate, with and without 15 % random orientations, 10 runs each."""
+    """World and mount of a plate, with and without 15 % random orientations, 10 runs each."""
     figures = []
     for share, label in ((0.0, "clean"), (0.15, "15 % outliers")):
         world, mount = [], []
@@ -105,7 +105,7 @@ def plate(_: Path) -> list[Result]:
 
 
 def one_axis(_: Path) -> list[Result]:
-    """B-4: turning about one axis only must be refused."""
+    """Rotation about one axis only is rejected."""
     q_s, q_body, *_truth = random_walk(np.random.default_rng(4), axis=(1.0, 0.0, 0.0))
     found = fit_observable_alignment(q_s, q_body)
     kappa = fit_sensor_alignment("full", q_s, q_body).kappa
@@ -128,8 +128,8 @@ def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Result]:
 
 
 def real_plate(data: Path) -> list[Result]:
-    """B-5: a real board, its orientation by a filter; 30 s of motion at 47.6 Hz."""
-    h5py, vqf = import_module("h5py"), import_module("vqf")  # only this bench needs them
+    """A recorded board, its orientation from a filter; 30 s of motion at 47.6 Hz."""
+    h5py, vqf = import_module("h5py"), import_module("vqf")  # imported by this experiment only
     with h5py.File(data / "broad" / f"{TRIALS[0]}.hdf5") as trial:
         rate = float(trial.attrs["sampling_rate"])
         columns = [np.ascontiguousarray(trial[f"imu_{kind}"][:]) for kind in ("gyr", "acc", "mag")]
@@ -140,7 +140,7 @@ def real_plate(data: Path) -> list[Result]:
 
 
 def integrated_plate(data: Path) -> list[Result]:
-    """The same board, its orientation by adding up the gyro alone; 30 s, 5 s into the motion."""
+    """The same board, its orientation from integrated angular rate; 30 s, 5 s into the motion."""
     with np.load(data / "broad_excerpts" / f"{TRIALS[0]}_60s.npz", allow_pickle=False) as trial:
         rate = float(trial["sampling_rate"])
         gyr = trial["imu_gyr"].astype(np.float64)
@@ -148,7 +148,7 @@ def integrated_plate(data: Path) -> list[Result]:
         first = int(np.flatnonzero(trial["movement"])[0])
     rates = gyr - gyr[:first].mean(axis=0)
     steps = rotation.exp(0.5 * (rates[1:] + rates[:-1]) / rate)
-    q_s = q_opt.copy()  # starts with the optics' world, so that the truth is known
+    q_s = q_opt.copy()  # starts in the optical world, so that ground truth is known
     for i in range(first, len(steps)):
         q_s[i + 1] = rotation.multiply(q_s[i], steps[i])
     begin = first + int(5 * rate)

@@ -1,8 +1,8 @@
-"""Rows FAULT and DRIFT: sensors that fall silent, stick, slip or drift, on simulated people.
+"""Sensors that are lost, stick, slip or drift, on simulated subjects.
 
-The person is at the demo's defaults: 5 degrees of skin in common and 3 of each sensor, errors of
-the sensors' own filters, mounts and headings of any kind. Jumps are counted against the same
-person without the fault, in units of the RMS error that is claimed in that very frame.
+Settings of the demo: 5 degrees of common soft-tissue artefact and 3 of each sensor, errors of the
+sensors' filters, any alignment and heading. Jumps are counted against the same subject without the
+fault, in units of the RMS error predicted for that frame.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SEEDS = (1, 2, 5, 6, 7, 8)
 RATE_HZ = 50.0
 FAULT_S = 60.0
 FIRST_S, APART_S = 17.3, 6.1
-"""Faults begin in all kinds of movement."""
+"""Start times of the faults, in all kinds of movement, s."""
 SLIPS_DEG = (10.0, 15.0, 30.0)
 RATES = (0.0, 1.0, 3.0, 10.0)
 DRIFT_S, DRIFT_HZ = 300.0, 25.0
@@ -43,10 +43,10 @@ HOURS_EACH = 0.5
 KNEE = Chain(("hip", "knee", "ankle"), SEGMENTS, (("S1", "S2"), ("S3", "S4")))
 SEMIREAL_HZ = 100.0
 SOON_S = 3.0
-"""Jumps are looked for so long after the fault began."""
+"""Time after the start of a fault in which jumps are counted, s."""
 SOON_TOLD_S = 2.0
 JUMP_GOAL = 1.61
-"""In units of the RMS error that is claimed: the sphere that holds 95 % of normal errors."""
+"""Radius of the sphere that contains 95 % of normal errors, in units of the predicted RMS error."""
 
 
 def calibrated_people(seeds: tuple[int, ...]) -> Iterator[tuple[int, Calibration]]:
@@ -64,7 +64,7 @@ def _cases(
     seeds: tuple[int, ...],
     spoil: Callable[[faulty_wearer.Worn, str, float, int], faulty_wearer.Worn],
 ) -> Iterator[tuple[float, str, list[tuple[float, SensorReport]], Array]]:
-    """Yield, for every person and sensor: when the fault began, who, what was told, jumps."""
+    """Yield for every subject and sensor: start of the fault, subject, events, jumps."""
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, FAULT_S, RATE_HZ)
         before, _ = faulty_wearer.play(fuser_of(calibration), person)
@@ -106,17 +106,17 @@ def _found(
 
 
 def stuck(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return how soon a sensor that repeats itself is found."""
+    """Delay until a sensor that repeats its value is reported."""
     return _found(lambda p, name, t, _: faulty_wearer.stuck(p, name, t), "stuck", 0.5, seeds)
 
 
 def silent(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return how soon a silent sensor is told."""
+    """Delay until a silent sensor is reported."""
     return _found(lambda p, name, t, _: faulty_wearer.silent(p, name, t), "lost", 0.5, seeds)
 
 
 def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return how soon a slip is told."""
+    """Delay until a slip is reported."""
     angle = np.deg2rad(degrees)
     figures = _found(
         lambda p, name, t, dice: faulty_wearer.slipped(p, name, t, float(angle), dice),
@@ -124,14 +124,14 @@ def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result
     )  # fmt: skip
     if degrees > SLIPS_DEG[0]:
         return figures
-    share = figures[0]  # the smallest is at the limit of what skin allows
+    share = figures[0]  # the smallest slip is near the size of the soft-tissue artefact
     return [Result(share.name, share.value, 100.0, 80.0, unit="%"), *figures[1:]]
 
 
 def false_alarms(
     _: Path, seeds: tuple[int, ...] = SEEDS[:4], hours: float = HOURS_EACH
 ) -> list[Result]:
-    """Return how often healthy people are told anything, per hour."""
+    """Events of healthy sensors per hour."""
     told, played = 0, 0.0
     part_s = 300.0
     for seed, calibration in calibrated_people(seeds):
@@ -152,7 +152,7 @@ def false_alarms(
 
 
 def real_skin(data: Path) -> list[Result]:
-    """Return what is told of healthy sensors on real skin, in movements that were not trained."""
+    """Events of healthy sensors on recorded skin, in movements that were not trained."""
     trials = {name: _offline(data, name) for name in ("squats1", "walking1", "DJ1")}
     mounts = {name: rotation.IDENTITY for group in KNEE.sensors for name in group}
     told, seconds = 0, 0.0
@@ -177,7 +177,7 @@ def _offline(data: Path, name: str) -> OfflineTrial:
 
 
 def drift(_: Path, seeds: tuple[int, ...] = SEEDS[:3]) -> list[Result]:
-    """Return the error of the knee's rotation after 4 to 5 minutes of drift, without and with."""
+    """Error of the knee rotation after 4 to 5 minutes of drift, without and with correction."""
     figures = []
     for rate in RATES:
         for names, who in ((("S3", "S4"), "shank"), (("S4",), "one sensor")):

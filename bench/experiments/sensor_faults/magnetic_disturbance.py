@@ -1,8 +1,8 @@
-"""Rows FAULT-magnet: iron nearby pulls headings away for half a minute, and lets them go.
+"""Magnetic disturbance: the headings of one or both sensors deviate for half a minute.
 
-A filter with a magnetometer follows the field within seconds: 20 to 40 degrees, to either side, of
-one sensor or of both on a segment, in all kinds of movement. What fusion says is compared with the
-bones, and with what it says of the same person without iron.
+A filter with a magnetometer follows the field within seconds: 20 to 40 degrees, to either side, for
+one sensor or both of a segment, in all kinds of movement. The fused result is compared with the
+bones and with the result of the same subject without disturbance.
 """
 
 from __future__ import annotations
@@ -37,36 +37,36 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
 
 PEOPLE = (*SEEDS, 11, 12, 13, 14)
-"""Four more than those the limits were found with."""
+"""Four subjects more than those with which the limits were chosen."""
 MAGNET_S, FIRST_S, APART_S = 80.0, 12.3, 2.9
 LEAST_DEG, MOST_DEG = 20.0, 40.0
 PASSED_DEG = 10.0
-"""What is told is told within so and so long of this."""
+"""Deviation of the heading from which the delay of a report is counted, deg."""
 OVER_S = 8.0
-"""Errors are those of after the disturbance from so long after its end on."""
+"""Time after the end of the disturbance from which errors are evaluated, s."""
 ALONE = (("S1",), ("S2",), ("S3",), ("S4",))
 BOTH = (("S1", "S2"), ("S3", "S4"))
 FLEXION_GOAL = 1.96
-"""Standard deviations that hold 95 % of normal errors in one dimension."""
+"""Standard deviations that contain 95 % of normal errors in one dimension."""
 
 
 class Pulled(NamedTuple):
-    """One person, one disturbance."""
+    """Results of one subject and one disturbance."""
 
     delay_s: float
-    """From passing 10 degrees to what was told first; infinite: nothing was."""
+    """Time from a deviation of 10 degrees to the first event, s; infinite without event."""
     ended_s: float
-    """From the end of the disturbance to the word that all is well."""
+    """Time from the end of the disturbance to the event of recovery, s."""
     others: int
-    """Things told of other segments, or when nothing was the matter."""
+    """Number of events about other segments or without a disturbance."""
     segment: Array
-    """Error over claimed RMS error of both segments while it lasts, shape (2 n,)."""
+    """Error over predicted RMS error of both segments during the disturbance, shape (2 n,)."""
     flexion: Array
-    """Error of the knee's flexion over its claimed deviation, while it lasts."""
+    """Error of knee flexion over its predicted deviation during the disturbance."""
     healthy: Array
-    """As `segment`, without iron."""
+    """As `segment`, without disturbance."""
     knee: tuple[float, float, float]
-    """RMS error of the knee's rotation: while it lasts, after, and in both times without, rad."""
+    """RMS error of the knee rotation: during, after, and in both times without disturbance, rad."""
 
 
 def _cases(
@@ -109,7 +109,7 @@ def _pulled(
 
 
 def _share_passed(angle: float) -> float:
-    """Return when, as a share of the time it takes to come, the disturbance passes 10 degrees."""
+    """Return the time at which the disturbance passes 10 degrees, as a share of its rise time."""
     grid = np.linspace(0.0, 1.0, 501)
     way = grid * grid * (3.0 - 2.0 * grid) * angle
     return float(np.interp(np.deg2rad(PASSED_DEG), way, grid))
@@ -135,7 +135,7 @@ def _rms(x: Array) -> float:
 def magnet(
     _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = PEOPLE
 ) -> list[Result]:
-    """Return what is told of a disturbance, and how far the output is from the bones."""
+    """Return the events of a disturbance and the errors of the output."""
     found = [_pulled(*case) for case in _cases(seeds, groups)]
     delays = np.array([case.delay_s for case in found])
     segment, healthy, flexion = (

@@ -1,4 +1,4 @@
-"""Codecs and decoders, a message and a sample at a time; python-can's SLCAN in the same breath."""
+"""Codecs and decoders, per message and per sample; SLCAN of python-can in the same run."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ PERIOD_NS = 2_500_000
 IDS = xcdi.id_block(0x100)
 SAMPLES = 33
 BATCH = 3 * SAMPLES
-"""Frames on the pty at once: 2 kB, well below what a tty holds."""
+"""Frames on the pty at once: 2 kB, well below the buffer of a tty."""
 
 
 def _decoding(
     make: Callable[[], Decoder], chunks: list[Chunk], kind: type, opening: tuple[Chunk, ...] = ()
 ) -> Callable[[], Callable[[], object]]:
-    """Return what prepares a decoder's run, having checked that it gives a sample a chunk."""
+    """Return a function that prepares a run of a decoder; check that each chunk gives a sample."""
     decoder = make()
     given = [item for chunk in (*opening, *chunks) for item in decoder.feed(chunk)]
     assert sum(isinstance(item, kind) for item in given) == len(chunks), given[:3]
@@ -124,11 +124,11 @@ def natnet_rows(quick: bool) -> list[Result]:
     ]
 
 
-# --- python-can's SLCAN, on the same pty with the same bytes ----------------------------------
+# --- SLCAN of python-can, on the same pty with the same bytes -----------------------------------
 
 
 class Line:
-    """A pty with SLCAN frames at the other end."""
+    """Pty with SLCAN frames at the other end."""
 
     def __init__(self) -> None:
         self._far, self.near = pty.openpty()
@@ -138,7 +138,7 @@ class Line:
         self._bytes = b"".join(device_bytes.slcan_lines(groups))
 
     def send(self) -> None:
-        """Put `BATCH` frames on the line and wait until all of them can be read."""
+        """Write `BATCH` frames and wait until all of them can be read."""
         assert os.write(self._far, self._bytes) == len(self._bytes)
         until = time.monotonic() + 5.0
         while self._waiting() < len(self._bytes):
@@ -171,7 +171,7 @@ def _theirs(bus: Any) -> Callable[[], int]:
 
 
 def rival_rows(quick: bool) -> list[Result]:
-    """Read the same frames from the same pty by both, in turns."""
+    """Read the same frames from the same pty with both libraries, in turns."""
     line = Line()
     bus: Any = can.Bus(interface="slcan", channel=line.path, sleep_after_open=0)
     ours: list[float] = []

@@ -1,4 +1,4 @@
-"""The pure core: clock, aligner, fusion, whole frames, and what a frame costs to encode."""
+"""The pure core: clock, aligner, fusion, complete frames, and the encoding of a frame."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 START_NS = 1_000 * NS
 SETTLE_S = 3.0
-"""Clocks settle meanwhile; not measured."""
+"""Time in which the clocks settle, not measured, s."""
 
 
 @cache
@@ -57,7 +57,8 @@ def clock_rows(quick: bool) -> list[Result]:
 
 
 def align_rows(quick: bool) -> list[Result]:
-    """Four streams at 400 Hz to frames at 100 Hz, time looked at after each, as in the core."""
+    """Four streams at 400 Hz to frames at 100 Hz; time is advanced after each sample, as in the
+    core."""
     period_ns, seconds = 2_500_000, 2
     n = seconds * NS // period_ns
     orientations = walking("S1", NS / period_ns, seconds)
@@ -86,7 +87,7 @@ def _inputs(seconds: float) -> list[dict[str, Quaternion]]:
 
 
 def _plainly(frames: list[dict[str, Quaternion]]) -> Callable[[], object]:
-    """Return the same corrections by the arrays' way, one frame at a time; nothing around them."""
+    """Apply the array form of the corrections to one frame at a time, nothing else."""
     segments = list(worn().segment.values())
     pairs = (("S1", "S2"), ("S3", "S4"))
     models = [segments[i].models[f"{'+'.join(pairs[i])}|{'+'.join(pairs[1 - i])}"] for i in (0, 1)]
@@ -132,11 +133,11 @@ def fusion_rows(quick: bool) -> list[Result]:
     ]
 
 
-# --- whole frames -----------------------------------------------------------------------------
+# --- complete frames ----------------------------------------------------------------------------
 
 
 def events(rate_hz: float, seconds: float) -> list[Event]:
-    """Return what four IMUs send during a walk, one chunk a sample, in order of arrival."""
+    """Return the chunks of four IMUs during a walk, one a sample, in order of arrival."""
     period_ns = round(NS / rate_hz)
     chunks: list[tuple[Chunk, str]] = []
     for number, sensor in enumerate(SENSORS, 1):
@@ -155,7 +156,7 @@ def events(rate_hz: float, seconds: float) -> list[Event]:
 
 
 def frame_times(rate_hz: float, seconds: float) -> list[float]:
-    """Return the CPU time that goes into each limb state: all its chunks and the state, s."""
+    """Return the CPU time of each limb state, s: all its chunks and the state itself."""
     core = Core()
     core.feed(Configured(START_NS, bench_rig(rate_hz), worn(), 1))
     stream = events(rate_hz, SETTLE_S + seconds)
@@ -164,7 +165,7 @@ def frame_times(rate_hz: float, seconds: float) -> list[float]:
     for event in stream:
         began = time.thread_time()
         outputs = core.feed(event)
-        deadline = core.next_deadline_ns  # asked for by the shell after every event
+        deadline = core.next_deadline_ns  # the runner requests it after every event
         spent += time.thread_time() - began
         states = [o for o in outputs if isinstance(o, LimbState)]
         if states:

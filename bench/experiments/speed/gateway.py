@@ -123,7 +123,7 @@ def embedded_rows(quick: bool) -> list[Result]:
 
 
 def flood_rows(quick: bool) -> list[Result]:
-    """Measure one run without requests and then under a flood; it is as short as it can be."""
+    """Measure one short run without requests and then under a flood of requests."""
     del quick
     load = Load(100.0)
     found = _played("mosquitto", lambda folder, port: run_flooded(folder, port, load))

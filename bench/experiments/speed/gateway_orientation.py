@@ -1,4 +1,4 @@
-"""What an orientation on the gateway costs: raw bytes of an Xbus device to an oriented sample."""
+"""Cost of orientations computed on the gateway: raw bytes of an Xbus device to oriented samples."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def _of(
 
     def live() -> Callable[[], object]:
         following = LiveInverseKinematics(model)
-        following.feed(y[0])  # it begins from nowhere
+        following.feed(y[0])  # starts without a previous pose
         return lambda: [following.feed(row) for row in y[1:]]
 
     count = len(y)

@@ -1,4 +1,4 @@
-"""Joint centers while the wearer moves: what a camera frame and a look at the progress cost."""
+"""Joint centers during movement: cost of a camera frame and of a progress report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FRAMES, LOOKS = 1200, 30
 EVERY = 24
-"""Frames between two looks: five a second at 120 Hz."""
+"""Frames between two progress reports: five reports a second at 120 Hz."""
 
 
 def _frames() -> list[MocapFrame]:
@@ -34,7 +34,7 @@ def _guide() -> MovementGuide:
 
 def _feed(frames: list[MocapFrame]) -> Callable[[], object]:
     one = _guide()
-    for i, frame in enumerate(frames[: 4 * EVERY]):  # the estimators know where to look
+    for i, frame in enumerate(frames[: 4 * EVERY]):  # the estimators have converged
         one.add_mocap(frame)
         if i % EVERY == 0:
             one.look({}, 1.0)

@@ -1,4 +1,4 @@
-"""What a start costs before any device is asked, and a calibration fit."""
+"""Cost of a start before any device is opened, and of a calibration fit."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def import_rows(quick: bool) -> list[Result]:
 
 
 def fit_rows(quick: bool) -> list[Result]:
-    """The jobs of the worker, on trials as long as the demo's."""
-    del quick  # one fit is quick enough
+    """Jobs of the worker, on trials as long as those of the demo."""
+    del quick  # one fit is fast enough
     trials, rig = phases(), bench_rig()
     alignment = fit_plate_alignment(trials.align, rig.calibration).to_dict()
     job = FunctionalJob(rig.chain, rig.calibration, trials.static, trials.functional, alignment)
@@ -66,7 +66,7 @@ def fit_rows(quick: bool) -> list[Result]:
 
 
 def exposure_rows(quick: bool) -> list[Result]:
-    """How open the shipped unit is, as systemd counts: 0 is locked, 10 is open."""
+    """Exposure of the shipped unit by systemd-analyze: 0 is closed, 10 is open."""
     del quick
     tool = shutil.which("systemd-analyze")
     if tool is None:

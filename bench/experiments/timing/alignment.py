@@ -1,8 +1,8 @@
-"""Rows AL-*: streams to frames: what interpolation costs in accuracy, and waiting in latency.
+"""Alignment of streams to frames: interpolation error and latency.
 
-Everything goes through the daemon's own aligner. The shaken body turns about three axes at once,
-550 deg/s RMS and 950 deg/s at most; ``broad`` is a real board turned by hand, 579 deg/s RMS, its
-gyro added up, of which every third or fifth sample goes in and the others are the truth.
+Samples pass through the aligner of the daemon. The shaken body rotates about three axes at once,
+550 deg/s RMS and at most 950 deg/s. ``broad`` is a recorded board turned by hand, 579 deg/s RMS,
+its angular rate integrated; every third or fifth sample is used and the others are ground truth.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def aligned(
     frame_ns: int = FRAME_NS,
     noise: Callable[[Quaternion], Quaternion] | None = None,
 ) -> list[AlignedFrame]:
-    """Return the frames of one stream that arrives at once."""
+    """Return the frames of one stream that arrives without delay."""
     aligner = FrameAligner({"S": round(period_ns)}, frame_ns)
     frames: list[AlignedFrame] = []
     for k in range(round(SECONDS * NS / period_ns)):
@@ -81,7 +81,7 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def errors_deg(frames: Sequence[AlignedFrame], motion: Motion) -> list[float]:
-    """Return the error of every orientation in the frames, deg; the first few are left out."""
+    """Return the error of every orientation in the frames, deg, without the first few."""
     return [
         degrees(angle_between_one(q, motion(frame.t_ns)))
         for frame in frames[5:]
@@ -90,7 +90,7 @@ def errors_deg(frames: Sequence[AlignedFrame], motion: Motion) -> list[float]:
 
 
 def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int) -> float:
-    """Return the RMS error a slerp between neighbors would have in the same frames."""
+    """Return the RMS error of a slerp between neighbouring samples in the same frames."""
     found = []
     for frame in frames[5:]:
         k = int((frame.t_ns - BEGIN_NS - phase_ns) // period_ns)
@@ -101,7 +101,7 @@ def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int)
 
 
 def interpolation(_data: Path) -> list[Result]:
-    """60, 100 and 120 Hz to frames at 100 Hz, in the middle between samples where it is fixed."""
+    """Streams of 60, 100 and 120 Hz to frames at 100 Hz, midway between samples if fixed."""
     figures = []
     for rate_hz, goal in ((60.0, 0.025), (100.0, 0.008), (120.0, 0.004)):
         period_ns, phase_ns = NS / rate_hz, 5 * MS
@@ -122,12 +122,12 @@ def interpolation(_data: Path) -> list[Result]:
     return [*figures, Result(name, _rms(errors_deg(frames, shaken)), 0.1)]
 
 
-# --- a real board -----------------------------------------------------------------------------
+# --- recorded board ----------------------------------------------------------------------------
 
 
 @cache
 def _board(data: Path, trial: str) -> tuple[list[Quaternion], float]:
-    """Return the orientations of a trial, its gyro added up, and their rate in Hz."""
+    """Return the orientations of a trial, integrated from angular rate, and their rate, Hz."""
     with np.load(data / "broad_excerpts" / f"{trial}_60s.npz", allow_pickle=False) as file:
         rate_hz = float(file["sampling_rate"])
         gyro = file["imu_gyr"][_REST:].astype(float)
@@ -138,8 +138,8 @@ def _board(data: Path, trial: str) -> tuple[list[Quaternion], float]:
 
 
 def _left_out_rms(truth: Sequence[Quaternion], rate_hz: float, step: int) -> float:
-    """Return the error in the samples between every `step`-th one, deg RMS."""
-    period_ns = round(NS / rate_hz)  # of the frames, too: one an original sample
+    """Return the RMS error in the samples between every `step`-th one, deg."""
+    period_ns = round(NS / rate_hz)  # one frame per original sample
     begin_ns = -(-BEGIN_NS // period_ns) * period_ns
 
     def motion(t_ns: int) -> Quaternion:
@@ -152,7 +152,7 @@ def _left_out_rms(truth: Sequence[Quaternion], rate_hz: float, step: int) -> flo
 
 
 def board(data: Path) -> list[Result]:
-    """Every third or fifth sample of a real board, judged by those left out."""
+    """Every third or fifth sample of a recorded board; the omitted samples are ground truth."""
     figures = []
     for trial, name, goals in ((FAST, "fast", (0.03, 0.12)), (SLOW, "slow", (0.008, 0.025))):
         truth, rate_hz = _board(data, trial)
@@ -162,7 +162,7 @@ def board(data: Path) -> list[Result]:
     return figures
 
 
-# --- ahead of the last sample -----------------------------------------------------------------
+# --- extrapolation ------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
@@ -176,7 +176,7 @@ class _Sample:
 def _ahead_rms(
     truth: Sequence[Quaternion], rate_hz: float, scatter_rad: float, bend: float
 ) -> float:
-    """Return the error of up to one period ahead of every third sample, deg RMS."""
+    """Return the RMS error of extrapolation by up to one period after every third sample, deg."""
     dice, period_ns = np.random.default_rng(5), round(NS / rate_hz)
     samples = []
     for k in range(0, len(truth), 3):
@@ -193,7 +193,7 @@ def _ahead_rms(
 
 
 def ahead(data: Path) -> list[Result]:
-    """Straight on, bent as it is in the daemon, and bent in full."""
+    """Extrapolation with constant rate, with part of the acceleration (daemon), and with all."""
     figures = []
     for trial, name, scatter_deg, goal in (
         (FAST, "fast", 0.0, 0.45),
@@ -220,7 +220,7 @@ STREAMS = {"S1": (1.3, 2.0), "S2": (3.7, 1.0), "S3": (6.1, 2.0), "S4": (8.8, 1.0
 
 
 def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
-    """Return the frames of four streams with an exponential delay of 0.5 ms on top."""
+    """Return the frames of four streams with an additional exponential delay of 0.5 ms."""
     dice = np.random.default_rng(seed)
     arrivals: list[tuple[int, str, int]] = []
     for name, (phase_ms, least_ms) in STREAMS.items():
@@ -239,7 +239,7 @@ def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
 
 
 def latency(_data: Path) -> list[Result]:
-    """Instant of the frame to the moment it is complete, and what its orientations err."""
+    """Time from the instant of a frame to its completion, and the error of its orientations."""
     figures = []
     goals: dict[Literal["smooth", "fast"], tuple[float, float, float]] = {
         "smooth": (10.5, 13.0, 0.006),
@@ -256,7 +256,7 @@ def latency(_data: Path) -> list[Result]:
     return figures
 
 
-# --- whether a frame may call itself synced ---------------------------------------------------
+# --- synchronization flag -----------------------------------------------------------------------
 
 
 def honesty(_data: Path) -> list[Result]:

@@ -1,4 +1,4 @@
-"""Rows T1, T2, T3, T5, T10: device clocks to host time, simulated on the paths they are met on."""
+"""Device clocks to host time, simulated on their transports."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ SERVER_SKEW = 42e-6
 
 
 def exponential(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """0.3 ms of jitter."""
+    """UART: 0.3 ms of jitter."""
     return rng.exponential(3e5, n)
 
 
 def spiky(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """The same, and 2 % spikes of 5 to 20 ms."""
+    """The same with 2 % of spikes of 5 to 20 ms."""
     return rng.exponential(3e5, n) + (rng.random(n) < 0.02) * rng.uniform(5e6, 20e6, n)
 
 
 def usb_polling(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """A bus asked every millisecond."""
+    """Bus that is polled every millisecond."""
     return rng.uniform(0, 1e6, n) + rng.exponential(5e4, n)
 
 
 def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """A USB bridge with its timer at 16 ms."""
+    """USB bridge with a latency timer of 16 ms."""
     return rng.uniform(0, 16e6, n)
 
 
@@ -69,12 +69,12 @@ def passive_run(
 
 
 def server_ticks(t: float) -> int:
-    """Return what the simulated server's clock shows at host time `t`."""
+    """Return the clock of the simulated server at host time `t`."""
     return int((t - START + 400 * S) * (1 + SERVER_SKEW) * (SERVER_HZ / S))
 
 
 def echo_run(seed: int) -> tuple[float, float, float]:
-    """Return the error after 10 and after 60 s of echoes, us, and that of the skew, ppm."""
+    """Return the errors after 10 and after 60 s of echoes, us, and that of the skew, ppm."""
     rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
     now, first, error = START, 0.0, 0.0
     for number in range(70):
@@ -88,12 +88,12 @@ def echo_run(seed: int) -> tuple[float, float, float]:
 
 
 def spread(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return root mean square and 99th percentile of the size."""
+    """Return RMS and 99th percentile of the magnitude."""
     return float(np.sqrt(np.mean(values**2))), float(np.quantile(np.abs(values), 0.99))
 
 
 def echoes(_: Path, runs: int = 200) -> list[Result]:
-    """T1: round trips of 0.86 ms and 0.1 ms exponential each way, 1 % spikes of 20 ms."""
+    """Round trips of 0.86 ms and 0.1 ms exponential each way, 1 % spikes of 20 ms."""
     first, last, skew = np.array([echo_run(seed) for seed in range(runs)]).T
     (sd10, p10), (sd60, p60) = spread(first), spread(last)
     return [
@@ -108,7 +108,7 @@ def echoes(_: Path, runs: int = 200) -> list[Result]:
 def passive(
     delays: Delays, seconds: float, goals: tuple[float, float], runs: int
 ) -> tuple[list[Result], NDArray[np.float64], NDArray[np.float64]]:
-    """Return rms and 99 % of the error at the end, the skews' errors, and errors in sigmas."""
+    """Return RMS and 99th percentile of the final errors, skew errors, and errors in sigmas."""
     ends, skews, scaled = [], [], []
     for seed in range(runs):
         errors, clock, sigmas = passive_run(seed, delays, seconds)
@@ -125,7 +125,7 @@ def passive(
 
 
 def jitter(_: Path, runs: int = 60) -> list[Result]:
-    """T2: passive clocks under ordinary jitter."""
+    """Passive clocks under ordinary jitter."""
     figures: list[Result] = []
     skews = np.zeros(0)
     for delays, seconds, goals in (
@@ -140,7 +140,7 @@ def jitter(_: Path, runs: int = 60) -> list[Result]:
 
 
 def timer(_: Path, runs: int = 90) -> list[Result]:
-    """T3: passive clocks under a badly set latency timer."""
+    """Passive clocks with a badly configured latency timer."""
     ten, _skews, scaled = passive(latency_timer, 10.0, (0.11, 0.25), runs)
     sixty, _skews, _scaled = passive(latency_timer, 60.0, (0.015, 0.05), runs // 3)
     honest = Result("error over standard deviation, RMS", spread(scaled)[0], 1.5, 0.3, unit="")
@@ -148,7 +148,7 @@ def timer(_: Path, runs: int = 90) -> list[Result]:
 
 
 def wraps_and_restarts(_: Path) -> list[Result]:
-    """T5: a wrap of every clock met, then a reboot."""
+    """Wrap of every clock type, then a reboot."""
     worst, settle, early = 0.0, 0.0, 0
     for tick_ns, modulus in ((1000, 1 << 32), (100_000, 1 << 32), (100_000, 864_000_000)):
         for seed in range(3):
@@ -162,7 +162,7 @@ def wraps_and_restarts(_: Path) -> list[Result]:
 
 
 def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
-    """Return the worst error across the wrap, the time to settle, synced stamps that were off."""
+    """Return the largest error across the wrap, the settling time, and wrong synced stamps."""
     rng, device = np.random.default_rng(seed), DeviceClock(PERIOD)
     modulus = clock.modulus or 1
     worst, settled_at, wrong = 0.0, None, 0
@@ -185,7 +185,7 @@ def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
 
 
 def cost(_: Path) -> list[Result]:
-    """T10: time of one sample, refits included, best of five minutes of samples."""
+    """Time of one sample with refits, best of five minutes of samples."""
     rng = np.random.default_rng(0)
     n = 6000
     best = float("inf")

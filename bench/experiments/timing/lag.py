@@ -1,7 +1,8 @@
-"""Rows T6, T7, T8, T10-lag and LAG-*: the lag of an IMU behind the cameras, found from motion.
+"""Lag of an IMU behind the cameras, estimated from motion.
 
-On recordings the optics is taken at 120 Hz and a random phase, and a random lag within 50 ms is
-added to the gyro. The truth of both recordings is half a frame of their cameras, 1/240 s.
+On recordings the optics are resampled at 120 Hz with a random phase, and a random lag within 50 ms
+is added to the angular rate. The true lag of both recordings is half a frame of their cameras,
+1/240 s.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 MARGIN_S = 0.3
 FAST_SD_MS = {2.0: 0.054, 5.0: 0.025, 10.0: 0.02, 30.0: 0.02}
 SLOW_SD_MS = {2.0: 0.307, 5.0: 0.21, 10.0: 0.14, 30.0: 0.14}
-"""Standard deviations wanted, by the length of the window, s."""
+"""Target standard deviations by length of the window, s."""
 
 
 class Recording(NamedTuple):
@@ -47,7 +48,7 @@ class Recording(NamedTuple):
 
 
 class Treatment(NamedTuple):
-    """What is done to the optics."""
+    """Disturbances of the optical data."""
 
     noise_deg: float = 0.0
     lost: float = 0.0
@@ -67,7 +68,7 @@ AS_IT_IS = Treatment()
 
 
 class Window(NamedTuple):
-    """One window's answer, the injected lag taken off."""
+    """Estimate of one window, with the injected lag subtracted."""
 
     lag_ms: float
     sigma_ms: float
@@ -160,7 +161,7 @@ def excerpts(
 
 
 def honest(data: Path) -> list[Result]:
-    """No accepted window is off by more than four of its own sigmas, whatever is done to it."""
+    """No accepted window has an error above four standard deviations, for any disturbance."""
     treatments = {
         "as recorded": AS_IT_IS,
         "0.3 deg optical noise": Treatment(noise_deg=0.3),
@@ -185,7 +186,7 @@ def honest(data: Path) -> list[Result]:
 
 
 def quaternion_input(data: Path) -> list[Result]:
-    """Orientations propagated from the gyro lead it by half a sample, also when rounded."""
+    """Orientations propagated from the angular rate lead it by half a sample, also when rounded."""
     recording = excerpt(data, FAST)
     steps = rotation.exp(recording.gyro * 0.0035)
     path = np.empty_like(steps)
@@ -207,7 +208,7 @@ def quaternion_input(data: Path) -> list[Result]:
 def made_up(
     seed: int, seconds: float, lag_ms: float, *, drift: float = 0.0, noise: float = 0.1
 ) -> Tracks:
-    """Return the stamps and orientations of a wearer's sensor and of the cameras; truth known."""
+    """Return stamps and orientations of a wearer's sensor and of the cameras, with known truth."""
     rng = np.random.default_rng(seed)
 
     def body(t: Floats) -> Floats:
@@ -244,7 +245,7 @@ def estimate_between(tracks: Tracks, low_s: float, high_s: float) -> LagEstimate
 
 
 def sigma(_: Path) -> list[Result]:
-    """T7: deviations over sigma in 32 independent windows, at five levels of optical noise."""
+    """Errors over sigma in 32 independent windows, at five levels of optical noise."""
     figures = []
     for noise in (0.05, 0.1, 0.2, 0.3, 0.5):
         ratios = []
@@ -260,7 +261,7 @@ def sigma(_: Path) -> list[Result]:
 
 
 def track(drift: float, seed: int) -> tuple[float, float]:
-    """Return the drift found over two minutes, and its sigma, both in ppm."""
+    """Return the drift estimated over two minutes, and its sigma, both in ppm."""
     tracks = made_up(seed, 121.0, 5.0, drift=drift)
     tracker, tracked = LagTracker(), None
     for start_s in np.arange(0.4, 110.0, 2.5):
@@ -272,7 +273,7 @@ def track(drift: float, seed: int) -> tuple[float, float]:
 
 
 def drift(_: Path) -> list[Result]:
-    """T8: no drift is told as none, and 1 ppm is found, over two minutes."""
+    """Over two minutes zero drift is reported as zero, and 1 ppm is detected."""
     figures = []
     for truth, seed in ((0.0, 1), (0.0, 2), (1.0, 3), (-1.0, 4)):
         found, sd = track(truth * 1e-6, seed)
@@ -290,9 +291,9 @@ def drift(_: Path) -> list[Result]:
 
 
 def cost(data: Path) -> list[Result]:
-    """T10: a 10 s window at 120 Hz against a gyro at 286 Hz, median of nine; a tracker's update.
+    """A 10 s window at 120 Hz against an angular rate at 286 Hz, median of nine; a tracker update.
 
-    CPU time of this thread: what others do does not count.
+    CPU time of this thread, independent of other processes.
     """
     recording = excerpt(data, FAST)
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)
@@ -318,7 +319,7 @@ def cost(data: Path) -> list[Result]:
 
 
 def ordinary(data: Path) -> list[Result]:
-    """T6: what ten seconds are worth in vigorous and in ordinary motion, and at rest."""
+    """Accuracy of ten seconds of vigorous motion, of ordinary motion, and of rest."""
     figures = []
     for name, label, goal in ((FAST, "vigorous", 0.02), (SLOW, "ordinary", 0.14)):
         recording = excerpt(data, name)

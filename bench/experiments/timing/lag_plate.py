@@ -1,7 +1,7 @@
-"""Row LAG-plate: the lag that the align phase finds, on simulated plates turned by hand.
+"""Lag estimated in the align phase, on simulated plates turned by hand.
 
-Eight plates with four sensors each, errors of filters and cameras at the demo's defaults, 22 s. All
-streams are on one clock, so that the true lag is 0.
+Eight plates with four sensors each, errors of filters and cameras at the settings of the demo, 22
+s. All streams are on one clock, so the true lag is 0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FREE = float("inf")
 
 
 def on_the_plate(_: Path) -> list[Result]:
-    """LAG-plate: how far the lags of all sensors are off, ms, and in their own sigmas."""
+    """Errors of the lags of all sensors, ms and in their standard deviations."""
     settings = bench_rig().calibration
     lags, sigmas, refused = [], [], 0
     for seed in SEEDS:

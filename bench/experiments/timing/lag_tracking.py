@@ -1,4 +1,4 @@
-"""Row T8-live: device clocks far off, mapped as they run, and the live watch of the lag on them."""
+"""Drifting device clocks mapped live, and lag tracking on the mapped stamps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ START = 7_000 * S
 MICROSECONDS = TickClock(1000, None)
 SERVER = TickClock(100, None)
 LEAST_MS = 2.0
-"""Delay of the sensor's transport that nobody told: this is the lag."""
+"""Delay of the sensor's transport, unknown to the clock model: this is the lag."""
 CHAIN = Chain(("hip", "knee"), ("thigh",), (("S1",),))
 LAYOUT = MocapLayout((), ("thigh",))
 CALIBRATION = Calibration(
@@ -41,7 +41,7 @@ CALIBRATION = Calibration(
 
 
 class Case(NamedTuple):
-    """Skews of both clocks, and a drift behind the sensor's clock that no clock model can see."""
+    """Skews of both clocks, and a drift of the sensor's clock that no clock model can detect."""
 
     sensor_ppm: float
     cameras_ppm: float
@@ -49,7 +49,7 @@ class Case(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the watch said at the end."""
+    """Result of lag tracking at the end."""
 
     lag_ms: float
     sigma_ms: float
@@ -59,7 +59,7 @@ class Found(NamedTuple):
 
 
 class _Stamps:
-    """Both clocks, fed as the daemon feeds them."""
+    """Both clocks, fed as in the daemon."""
 
     def __init__(self, case: Case, seed: int) -> None:
         self._case, self._rng = case, np.random.default_rng(seed)
@@ -91,7 +91,7 @@ class _Stamps:
 
 
 def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
-    """Play a moving wearer through both clocks into the watch; return what it found."""
+    """Play a moving wearer through both clocks into lag tracking; return its result."""
     tracks, stamps = made_up(seed, seconds, 0.0), _Stamps(case, seed)
     watch, told = LagMonitor(CHAIN, CALIBRATION), []
     events: list[tuple[int, int, Quaternion]] = []
@@ -121,11 +121,12 @@ def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
 
 
 def drifting(_: Path) -> list[Result]:
-    """Clocks 100 ppm apart leave no drift; one that no clock model sees is found and told."""
+    """Clocks 100 ppm apart leave no drift; a drift outside the clock model is detected and
+    reported."""
     figures = []
     for case in (Case(50.0, -50.0), Case(-50.0, 50.0, 5.0)):
         found = run(case)
-        # the window's center is what the tracker's lag is true for: up to 8 s before the end
+        # the lag of the tracker refers to the center of its window: up to 8 s before the end
         truth = LEAST_MS + 1e-3 * case.unseen_ppm * 114.0
         slack = 1e-3 * abs(case.unseen_ppm) * 2.0
         off = max(0.0, abs(found.lag_ms - truth) - slack)
@@ -149,4 +150,4 @@ EXPERIMENTS = (
         SIMULATED_CLOCKS,
     ),
 )
-"""The lag is the delay that no clock model can see, 2 ms, whatever the skews."""
+"""The lag is the delay that no clock model can detect, 2 ms, for any skew."""

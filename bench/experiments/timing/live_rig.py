@@ -1,4 +1,4 @@
-"""Rows T4 and T9: arrival stamps under load, and every stamp of a live rig through restarts."""
+"""Arrival stamps under load, and every stamp of a live rig through restarts."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Row AL-5: the core after ten simulated hours holds what it held after the first.
+"""Memory of the core: after ten simulated hours it holds as much as after the first.
 
-The whole core is fed: four IMUs on UART and CAN, cameras with an echo a second; every hour one
-sensor reboots and another falls silent for a minute, in turn. All of them run at 5 Hz, so that ten
-hours are 900 000 samples and not 19 million: what is kept by time (windows, histograms, buckets,
-echoes) fills as at any rate; what is kept by number of samples reaches its bound within minutes.
+The complete core is fed: four IMUs on UART and CAN, and cameras with one echo a second. Every hour
+one sensor reboots and another is silent for a minute, in turn. All run at 5 Hz, so that ten hours
+are 900 000 samples instead of 19 million. Buffers limited by time (windows, histograms, buckets,
+echoes) fill as at any rate; those limited by number reach their limit within minutes.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ PERIOD_NS = round(NS / RATE_HZ)
 BEGIN_NS = 1_000 * NS
 MINUTE_NS = 60 * NS
 REBOOT, SILENCE = 20, 40
-"""Minutes of every hour."""
+"""Minutes of each hour with these events."""
 SETTLE_H = 0.5
-"""Windows and histograms are full by then."""
+"""Time after which windows and histograms are full."""
 _SHARED = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
 _SKEW = {"S1": -40e-6, "S2": -10e-6, "S3": 20e-6, "S4": 50e-6, "mocap": 30e-6}
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a core keeps alive at one time."""
+    """Objects that a core keeps alive at one time."""
 
     hours: float
     size: int
-    """Bytes of all objects, code left out."""
+    """Bytes of all objects except code."""
     objects: int
 
 
@@ -74,7 +74,7 @@ def rig() -> Rig:
 
 
 def held(root: object, hours: float) -> Held:
-    """Return what `root` keeps alive."""
+    """Return the objects that `root` keeps alive."""
     seen: set[int] = set()
     todo: list[Any] = [root]
     size = 0
@@ -89,7 +89,7 @@ def held(root: object, hours: float) -> Held:
 
 
 class Hardware:
-    """Endless bytes of five devices."""
+    """Endless byte streams of five devices."""
 
     def __init__(self) -> None:
         self._clocks = {
@@ -99,7 +99,7 @@ class Hardware:
         self._dice = np.random.default_rng(11)
 
     def minutes(self) -> Iterator[list[ChunkArrived]]:
-        """Yield what arrives in one minute after the other."""
+        """Yield the events of one minute after the other."""
         for minute in count():
             begin_ns = BEGIN_NS + minute * MINUTE_NS
             hour, of_hour = divmod(minute, 60)
@@ -155,7 +155,7 @@ class Hardware:
 
 
 def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
-    """Run a core for that long; return what it held, its samples and its limb states."""
+    """Run a core for some hours; return its memory, samples and limb states."""
     core = Core()
     made = rig()
     core.feed(Configured(BEGIN_NS, made, None))
@@ -169,22 +169,22 @@ def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
         for event in events:
             states += sum(isinstance(output, LimbState) for output in core.feed(event))
         if minute % every == 0:
-            core.health(events[-1].chunk.t_ns)  # as the daemon asks for it
+            core.health(events[-1].chunk.t_ns)  # as the daemon requests it
             looks.append(held(core, minute / 60))
         if minute >= 60 * hours:
             return looks, samples, states
-    raise AssertionError  # the hardware has no end
+    raise AssertionError  # the simulated devices have no end
 
 
 def growth(looks: list[Held]) -> float:
-    """Return by how many bytes an hour a core grows once it has settled (least squares)."""
+    """Return the growth of a core after settling, bytes per hour (least squares)."""
     settled = [look for look in looks if look.hours > SETTLE_H]
     hours = [look.hours for look in settled]
     return float(np.polyfit(hours, [look.size for look in settled], 1)[0])
 
 
 def flat(_data: Path) -> list[Result]:
-    """Ten hours, looked at four times an hour."""
+    """Ten hours, measured four times an hour."""
     looks, samples, states = watch(10.0, 4)
     sizes = [look.size for look in looks if look.hours > SETTLE_H]
     return [
