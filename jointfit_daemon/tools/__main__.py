@@ -32,16 +32,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command(name="check")(check)
-app.command(name="demo")(demo)
-app.command(name="calibrate")(calibrate)
-app.command(name="center")(center)
-app.command(name="decode")(decode)
+for command in (check, demo, calibrate, center, decode, markers, report, sample, schema):
+    app.command()(command)
 app.add_typer(fuse.app)
-app.command(name="markers")(markers)
-app.command(name="report")(report)
-app.command(name="sample")(sample)
-app.command(name="schema")(schema)
 
 
 def _print_version(wanted: bool) -> None:

@@ -14,7 +14,6 @@ import orjson
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
     from pathlib import Path
-    from types import TracebackType
 
 READY_S = 30.0
 """Time limit for a process to become ready, s; a Raspberry Pi needs 10 s to import SciPy."""
@@ -73,12 +72,7 @@ class ChildProcess:
 
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *ended: object) -> None:
         """Terminate the process; kill it after `STOP_S`."""
         process = self.process
         if process is None:

@@ -68,8 +68,12 @@ class CommandGroup(TyperGroup):
             if known is None:
                 raise
             code, text = known
-            bare = ctx.invoked_subcommand is None or _is_config_error(error)
-            typer.echo(text if bare else f"jointfit {ctx.invoked_subcommand}: {text}", err=True)
+            # Each line of a configuration error begins with the file name.
+            config = sys.modules.get("jointfit_daemon.config")
+            named = config is not None and isinstance(error, config.ConfigError)
+            if ctx.invoked_subcommand is not None and not named:
+                text = f"jointfit {ctx.invoked_subcommand}: {text}"
+            typer.echo(text, err=True)
             raise typer.Exit(code) from None
         finally:
             _drop_lost_output()
@@ -93,26 +97,14 @@ def _known_error(error: Exception) -> tuple[int, str] | None:
         return EXIT_MISUSE, os_error_text(error)
     if isinstance(error, OSError | ValueError):
         return EXIT_MISUSE, str(error)
-    return _known_elsewhere(error)
 
-
-def _known_elsewhere(error: Exception) -> tuple[int, str] | None:
-    """Return exit code and message for errors of modules that are imported on demand.
-
-    A module that is not loaded cannot have raised the error.
-    """
+    # A module that is not loaded cannot have raised the error.
     for code, module, name in ON_DEMAND_ERRORS:
         loaded = sys.modules.get(module)
         if loaded is not None and isinstance(error, getattr(loaded, name)):
             return code, str(error)
 
     return None
-
-
-def _is_config_error(error: Exception) -> bool:
-    """Return whether each line of the message already begins with the file name."""
-    loaded = sys.modules.get("jointfit_daemon.config")
-    return loaded is not None and isinstance(error, loaded.ConfigError)
 
 
 def os_error_text(error: OSError) -> str:

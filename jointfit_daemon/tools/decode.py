@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from jointfit_daemon.model import (
-    ClockEcho,
-    Corrupt,
-    DeviceEvent,
-    ImuSample,
-    MocapFrame,
-    SyncPulse,
-)
+from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

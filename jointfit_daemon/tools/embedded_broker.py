@@ -74,20 +74,21 @@ def embedded_broker(folder: Path) -> Iterator[int]:
     broker = Broker(config_path=str(config))
     broker.start()
     try:
-        _wait_for_listener(port)
+        until = time.monotonic() + START_S
+        while not _listens(port):
+            if time.monotonic() > until:
+                raise TimeoutError(
+                    f"the embedded broker does not listen on {HOST}:{port} after {START_S:g} s"
+                )
+            time.sleep(0.02)
         yield port
     finally:
         broker.stop()
 
 
-def _wait_for_listener(port: int) -> None:
-    until = time.monotonic() + START_S
-    while time.monotonic() < until:
-        try:
-            socket.create_connection((HOST, port), timeout=0.2).close()
-        except OSError:
-            time.sleep(0.02)
-        else:
-            return
-    message = f"the embedded broker does not listen on {HOST}:{port} after {START_S:g} s"
-    raise TimeoutError(message)
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection((HOST, port), timeout=0.2).close()
+    except OSError:
+        return False
+    return True

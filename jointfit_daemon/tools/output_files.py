@@ -7,6 +7,7 @@ import os
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.tools.plotting import PlottingUnavailableError
+from jointfit_daemon.tools.text_output import join_choices
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,8 +28,9 @@ def check_output(option: str, path: Path | None, endings: Sequence[str]) -> None
     if path is None:
         return
     if path.suffix.lower() not in endings:
-        listed = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
-        raise ValueError(f"{option} {path}: expected a file name that ends in {listed}")
+        raise ValueError(
+            f"{option} {path}: expected a file name that ends in {join_choices(endings)}"
+        )
 
     folder = path.parent
     if not folder.is_dir():

@@ -121,10 +121,7 @@ def read_orientations_sto(path: Path) -> OrientationTable:
     t_s = np.array(times, dtype=np.float64)
     require_times(path, t_s)
     reject_sparse_table(
-        path,
-        rows=len(found),
-        columns=_QUATERNION * (len(columns) - 1),
-        characters=characters,
+        path, rows=len(found), columns=_QUATERNION * (len(columns) - 1), characters=characters
     )
 
     quaternions = np.full((len(times), len(columns) - 1, _QUATERNION), np.nan)

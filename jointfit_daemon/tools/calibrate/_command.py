@@ -135,13 +135,7 @@ def _print_status(status: Mapping[str, Any], *, json: bool) -> None:
 
 
 async def _guide_phases(
-    rig: Rig,
-    phases: Sequence[str],
-    seconds: float | None,
-    config: Path,
-    *,
-    force: bool,
-    ask: bool,
+    rig: Rig, phases: Sequence[str], seconds: float | None, config: Path, *, force: bool, ask: bool
 ) -> dict[str, Any]:
     from rich.console import Console
 

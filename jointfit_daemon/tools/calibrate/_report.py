@@ -28,7 +28,21 @@ def report(quality: Mapping[str, Any]) -> list[str]:
         _error_line(f"{name}: flexion", by_method, method)
         for name, by_method in (holdout.get("flexion_deg") or {}).items()
     ]
-    lines += _marker_lines(quality.get("markers") or {})
+
+    # Marker refinement by body part, and the markers with large displacement.
+    markers: Mapping[str, Any] = quality.get("markers") or {}
+    for name, part in (markers.get("parts") or {}).items():
+        before, after = (1000 * part[key] for key in ("before_m", "after_m"))
+        kept = "" if part.get("refined") else ", positions of the static pose retained"
+        lines.append(f"{name}: RMS marker error {before:.1f} mm, refined {after:.1f} mm{kept}")
+
+    moved: Mapping[str, float] = markers.get("moved_m") or {}
+    lines += [
+        f"{name}: {1000 * m:.0f} mm from its position in the static pose: check the marker"
+        for name, m in sorted(moved.items(), key=lambda item: -item[1])
+        if m >= MOVED_M
+    ]
+
     anatomy: Mapping[str, Any] = quality.get("anatomy") or {}
     for name, joint in (anatomy.get("joints") or {}).items():
         sd_m = joint.get("sd_m")
@@ -44,23 +58,6 @@ def report(quality: Mapping[str, Any]) -> list[str]:
     if "alignment" in quality and quality["alignment"] is None:
         lines.append("no align phase: sensor headings are estimated from the static pose")
 
-    return lines
-
-
-def _marker_lines(markers: Mapping[str, Any]) -> list[str]:
-    """Return the marker refinement by body part, and the markers with large displacement."""
-    lines = []
-    for name, part in (markers.get("parts") or {}).items():
-        before, after = (1000 * part[key] for key in ("before_m", "after_m"))
-        kept = "" if part.get("refined") else ", positions of the static pose retained"
-        lines.append(f"{name}: RMS marker error {before:.1f} mm, refined {after:.1f} mm{kept}")
-
-    moved: Mapping[str, float] = markers.get("moved_m") or {}
-    far = {name: m for name, m in moved.items() if m >= MOVED_M}
-    lines += [
-        f"{name}: {1000 * m:.0f} mm from its position in the static pose: check the marker"
-        for name, m in sorted(far.items(), key=lambda item: -item[1])
-    ]
     return lines
 
 

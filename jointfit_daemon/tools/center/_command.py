@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -51,48 +51,34 @@ def center(
     The centre is given in the frame of the parent's markers. Exits with 1 if every estimate is
     refused.
     """
+    from jointfit_daemon.files.mocap import read_marker_trial
+    from jointfit_daemon.tools.center.trial import answers, reduce
     from jointfit_daemon.tools.output_files import check_plot
+    from jointfit_daemon.tools.text_output import check_choice
 
-    _check_axes(plane=plane, up=up)
+    check_choice("--plane", plane, "xyz")
+    check_choice("--up", up, "xyz")
     check_plot(plot)
+
+    read = read_marker_trial(trial, cast("Axis | None", up))
     asked = _names(parent), _names(markers)
-    read, reduced, found = _found(trial, asked, method=method, plane=plane, window=window, up=up)
+    read.points([*asked[0], *asked[1]])  # reports all unknown names at once
+    reduced = reduce(read, *asked, cast("Axis | None", plane))
+    found = list(answers(read, reduced, method, window))
+
     _print(read, asked, reduced, found, as_table=window is not None, as_json=json)
     if plot is not None:
-        _draw(plot, trial, reduced, asked[1], found)
+        from jointfit_daemon.tools.center._plot import draw_center
+
+        draw_center(plot, reduced, asked[1], found, f"{trial.name}: {found[0].estimate.method}")
+        typer.echo(f"wrote {plot}", err=True)
     if all(answer.estimate.refused for answer in found):
         raise typer.Exit(EXIT_FAILED)
-
-
-def _check_axes(**axes: str | None) -> None:
-    for name, axis in axes.items():
-        if axis is not None and axis not in ("x", "y", "z"):
-            raise ValueError(f"--{name} is {axis!r}, expected x, y or z")
 
 
 def _names(text: str) -> list[str]:
     names = [name.strip() for name in text.split(",") if name.strip()]
     return list(dict.fromkeys(names))
-
-
-def _found(
-    path: Path,
-    asked: tuple[list[str], list[str]],
-    *,
-    method: str,
-    plane: str | None,
-    window: float | None,
-    up: str | None,
-) -> tuple[MarkerTrial, ParentFrameMotion, list[WindowEstimate]]:
-    from typing import cast
-
-    from jointfit_daemon.files.mocap import read_marker_trial
-    from jointfit_daemon.tools.center.trial import answers, reduce
-
-    trial = read_marker_trial(path, cast("Axis | None", up))
-    trial.points([*asked[0], *asked[1]])  # reports all unknown names at once
-    reduced = reduce(trial, *asked, cast("Axis | None", plane))
-    return trial, reduced, list(answers(trial, reduced, method, window))
 
 
 def _print(
@@ -105,11 +91,10 @@ def _print(
     as_json: bool,
 ) -> None:
     from jointfit_daemon.tools.center import _report
+    from jointfit_daemon.tools.text_output import echo_json
 
     if as_json:
-        import orjson
-
-        typer.echo(orjson.dumps(_report.as_json(trial, *asked, reduced, found)))
+        echo_json(_report.as_json(trial, *asked, reduced, found))
         return
     typer.echo(_report.head(trial, *asked, reduced))
     if as_table:
@@ -117,16 +102,3 @@ def _print(
         typer.echo(_report.windows(found))
     else:
         typer.echo(_report.details(found[0]))
-
-
-def _draw(
-    plot: Path,
-    trial: Path,
-    reduced: ParentFrameMotion,
-    markers: Sequence[str],
-    found: Sequence[WindowEstimate],
-) -> None:
-    from jointfit_daemon.tools.center._plot import draw_center
-
-    draw_center(plot, reduced, markers, found, f"{trial.name}: {found[0].estimate.method}")
-    typer.echo(f"wrote {plot}", err=True)

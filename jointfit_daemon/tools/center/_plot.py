@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 _MM = 1000.0
@@ -43,33 +41,22 @@ def draw_center(
     sides = ((0, 1),) if points.shape[-1] == len("xy") else ((0, 1), (1, 2), (0, 2))
     figure = new_figure(4.8 * len(sides) + 1.6, 5.2)
     figure.suptitle(title)
+    step = max(1, len(points) // _MOST_POINTS)
     for axes, side in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides, strict=True):
-        _side(axes, points, markers, found, side)
+        for k, name in enumerate(markers):
+            x, y = _MM * points[::step, k, side[0]], _MM * points[::step, k, side[1]]
+            axes.plot(x, y, ".", markersize=2.5, label=name)
+        for number, answer in enumerate(found):
+            _center(axes, answer, side, labelled=number == 0)
+
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel(f"{'xyz'[side[0]]} of the parent, mm")
+        axes.set_ylabel(f"{'xyz'[side[1]]} of the parent, mm")
+        axes.grid(alpha=0.3)
 
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=120)
-
-
-def _side(
-    axes: Any,
-    points: NDArray[np.float64],
-    markers: Sequence[str],
-    found: Sequence[WindowEstimate],
-    side: tuple[int, int],
-) -> None:
-    step = max(1, len(points) // _MOST_POINTS)
-    for k, name in enumerate(markers):
-        x, y = _MM * points[::step, k, side[0]], _MM * points[::step, k, side[1]]
-        axes.plot(x, y, ".", markersize=2.5, label=name)
-
-    for number, answer in enumerate(found):
-        _center(axes, answer, side, labelled=number == 0)
-
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{'xyz'[side[0]]} of the parent, mm")
-    axes.set_ylabel(f"{'xyz'[side[1]]} of the parent, mm")
-    axes.grid(alpha=0.3)
 
 
 def _center(axes: Any, answer: WindowEstimate, side: tuple[int, int], *, labelled: bool) -> None:

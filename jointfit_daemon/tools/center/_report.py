@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jointfit_daemon.tools.text_output import align_columns
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -72,11 +74,21 @@ def details(answer: WindowEstimate) -> str:
             return "\n".join(lines)
         lines.append("          do not use the following values")
 
+    if not len(e.unseen):
+        error = (
+            f"{_mm(e.sd)} mm RMS predicted; lower bound for any method on this movement:"
+            f" {_mm(e.bound)} mm"
+        )
+    else:
+        error = "unknown along the unobservable directions"
+        if len(e.unseen) < len(e.center):
+            error += f"; {_mm(_sd_seen(answer))} mm RMS predicted in the other directions"
+
     lines += [
         f"center    in the parent  {_point(e.center)} mm",
         f"          in the world   {_point(answer.world)} mm, at the mean parent pose, in the"
         " axes of the file",
-        _error(answer),
+        f"error     {error}",
         f"          95 % ellipsoid: semi-axes {_semi_axes(answer)} mm",
         f"arc       {degrees(e.arc):.0f}°",
         f"residual  {_mm(e.residual)} mm RMS; marker noise {_mm(e.noise)} mm per coordinate",
@@ -90,16 +102,6 @@ def details(answer: WindowEstimate) -> str:
 
     lines += [f"note      {_FLAGS.get(flag, flag.replace('_', ' '))}" for flag in e.flags]
     return "\n".join(lines)
-
-
-def _error(answer: WindowEstimate) -> str:
-    e = answer.estimate
-    if len(e.unseen) == 0:
-        least = f"lower bound for any method on this movement: {_mm(e.bound)} mm"
-        return f"error     {_mm(e.sd)} mm RMS predicted; {least}"
-    seen = f"; {_mm(_sd_seen(answer))} mm RMS predicted in the other directions"
-    known = len(e.unseen) < len(e.center)
-    return f"error     unknown along the unobservable directions{seen if known else ''}"
 
 
 def _sd_seen(answer: WindowEstimate) -> float:
@@ -129,13 +131,7 @@ def windows(found: Sequence[WindowEstimate]) -> str:
             )
         )
 
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_WINDOW_HEAD) - 1)]
-    return "\n".join(_aligned(row, widths) for row in rows)
-
-
-def _aligned(row: Sequence[str], widths: Iterable[int]) -> str:
-    cells = (cell.rjust(width) for cell, width in zip(row, widths, strict=False))
-    return "  ".join((*cells, row[-1])).rstrip()
+    return align_columns(rows, right=range(len(_WINDOW_HEAD) - 1))
 
 
 def _point(x: NDArray[np.float64]) -> str:
@@ -170,14 +166,14 @@ def as_json(
     reduced: ParentFrameMotion,
     found: Sequence[WindowEstimate],
 ) -> dict[str, Any]:
-    """Return all results in SI units; null means unknown or infinite."""
+    """Return all results in SI units; NaN and infinity become null."""
     return {
         "frames": len(trial.trajectories.t_s),
         "rate_hz": trial.trajectories.rate_hz,
         "up_axis": trial.up_axis,
         "parent": list(parent),
         "markers": list(markers),
-        "parent_rms_m": _nullable(reduced.rms),
+        "parent_rms_m": reduced.rms,
         "answers": [_answer(answer) for answer in found],
     }
 
@@ -189,25 +185,21 @@ def _answer(answer: WindowEstimate) -> dict[str, Any]:
         "end_s": answer.end_s,
         "method": e.method,
         "refused": e.refused,
-        "center_parent_m": [_nullable(v) for v in e.center],
-        "center_world_m": [_nullable(v) for v in answer.world],
-        "covariance_m2": [[_nullable(v) for v in row] for row in e.covariance],
-        "sd_m": _nullable(e.sd),
-        "sd_seen_m": _nullable(_sd_seen(answer)),
-        "bound_m": _nullable(e.bound),
-        "semi_axes_95_m": [_nullable(v) for v in answer.semi_axes],
+        "center_parent_m": e.center.tolist(),
+        "center_world_m": answer.world.tolist(),
+        "covariance_m2": e.covariance.tolist(),
+        "sd_m": e.sd,
+        "sd_seen_m": _sd_seen(answer),
+        "bound_m": e.bound,
+        "semi_axes_95_m": answer.semi_axes.tolist(),
         "unseen": e.unseen.tolist(),
         "axis": None if e.axis is None else e.axis.tolist(),
-        "noise_m": _nullable(e.noise),
-        "residual_m": _nullable(e.residual),
-        "radii_m": [_nullable(r) for r in e.radii],
-        "arc_rad": _nullable(e.arc),
-        "conditioning": _nullable(e.conditioning),
+        "noise_m": e.noise,
+        "residual_m": e.residual,
+        "radii_m": e.radii.tolist(),
+        "arc_rad": e.arc,
+        "conditioning": e.conditioning,
         "frames": e.frames,
-        "effective_frames": _nullable(e.effective_frames),
+        "effective_frames": e.effective_frames,
         "flags": list(e.flags),
     }
-
-
-def _nullable(value: float) -> float | None:
-    return float(value) if isfinite(value) else None

@@ -60,8 +60,7 @@ class ParentFrameMotion:
         """Return the world position of a parent point at the mean parent pose, m, shape (3,)."""
         known = visible(self.poses.q) & visible(self.poses.t)
         mean = BodyPoses(
-            rotation.average(self.poses.q[known])[None],
-            self.poses.t[known].mean(axis=0)[None],
+            rotation.average(self.poses.q[known])[None], self.poses.t[known].mean(axis=0)[None]
         )
         return np.asarray(mean.to_world(self.basis @ center)[0])
 
@@ -123,7 +122,11 @@ def reduce(
             " a marker off the line among the first three"
         )
 
-    template = template @ _own_axes(template)
+    # Axes of the parent frame as columns.
+    x = template[1] - template[0]
+    z = np.cross(x, template[2] - template[0])
+    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
+    template = template @ np.column_stack((x, np.cross(z, x), z))
     poses, rms = _poses(template, seen)
     if not visible(poses.t).any():
         raise UnsuitableTrialError(
@@ -170,14 +173,6 @@ def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int) -> None
             f"--parent: {', '.join(parent)} are collinear, so rotation about the line is"
             " unobservable: add a marker off the line, or use --plane with two markers"
         )
-
-
-def _own_axes(template: Array) -> Array:
-    """Return the axes of the parent frame as columns, shape (3, 3)."""
-    x = template[1] - template[0]
-    z = np.cross(x, template[2] - template[0])
-    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-    return np.column_stack((x, np.cross(z, x), z))
 
 
 def _poses(template: Array, seen: Array) -> tuple[BodyPoses, float]:

@@ -196,7 +196,12 @@ class _Curve:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         label = f"{self.name:6} "
         room = max(1, options.max_width - len(label))
-        yield Text(label + _spark([*self.values][-room:]), style=self.style, no_wrap=True)
+        low, high, steps = -5.0, 110.0, len(_BARS) - 1
+        curve = "".join(
+            _BARS[round(steps * min(1.0, max(0.0, (value - low) / (high - low))))]
+            for value in [*self.values][-room:]
+        )
+        yield Text(label + curve, style=self.style, no_wrap=True)
 
 
 def _knee(pose: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,11 +211,3 @@ def _knee(pose: Mapping[str, Any]) -> dict[str, Any]:
 
 def _deg(value: object, sign: str = "") -> str:
     return f"{value:{sign}.1f}°" if isinstance(value, int | float) else "—"
-
-
-def _spark(values: Iterable[float]) -> str:
-    low, high = -5.0, 110.0
-    steps = len(_BARS) - 1
-    return "".join(
-        _BARS[round(steps * min(1.0, max(0.0, (value - low) / (high - low))))] for value in values
-    )

@@ -43,7 +43,7 @@ MATURE_NS = 300_000_000
 """Age, ns, at which the ground truth of a pose is written and the pose is evaluated."""
 CALIBRATIONS = "state/calibrations"
 """Calibration store of the demo, relative to its folder."""
-VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
+OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 
 
 @dataclass(slots=True)
@@ -105,8 +105,8 @@ class DemoRun:
         if not self._evaluating:
             return
         self.latencies_ms.append((now_us - pose["completed_us"]) / 1e3)
-        t_ns = pose["t_us"] * 1000 - _unix_minus_monotonic_ns()
-        self._poses.append((t_ns, pose))
+        unix_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
+        self._poses.append((pose["t_us"] * 1000 - unix_minus_monotonic_ns, pose))
 
     def _evaluate(self) -> None:
         """Compare the poses whose ground truth is available."""
@@ -116,7 +116,13 @@ class DemoRun:
             t_ns, pose = self._poses.pop(0)
             if (truth := self.truth.track.at(t_ns)) is not None:
                 self.score.add(pose, truth, self.rig.chain.joints[1])
-                self.display.live(pose, truth, self._short())
+                rms, p50 = self.score.flexion.rms, percentile(self.latencies_ms[-500:], 0.5)
+                shown = {
+                    "frames": self.score.frames,
+                    "flexion RMSE": "—" if rms is None else f"{rms:.2f}°",
+                    "latency": "—" if p50 is None else f"{p50:.1f} ms",
+                }
+                self.display.live(pose, truth, shown)
 
     # --- steps -------------------------------------------------------------------------------
 
@@ -142,7 +148,13 @@ class DemoRun:
             if answer.get("status") != "accepted":
                 raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
             self.display.step(phase, 0.0, "")
-            moving = asyncio.create_task(self._move(motions), name="demo wearer")
+
+            async def move(motions: tuple[tuple[str, float], ...] = motions) -> None:
+                for name, seconds in motions:
+                    await self.simulator.say(f"play {name}")
+                    await asyncio.sleep(seconds)
+
+            moving = asyncio.create_task(move(), name="demo wearer")
             try:
                 await self._tracker.wait_for_end(phase)
             finally:
@@ -150,11 +162,6 @@ class DemoRun:
                 await asyncio.wait([moving])
             if phase == "static":
                 self._static_ns = time.monotonic_ns() - 1_000_000_000
-
-    async def _move(self, motions: tuple[tuple[str, float], ...]) -> None:
-        for name, seconds in motions:
-            await self.simulator.say(f"play {name}")
-            await asyncio.sleep(seconds)
 
     async def _live(self, seconds: float) -> None:
         self._evaluating = True
@@ -185,27 +192,25 @@ class DemoRun:
 
     # --- results -----------------------------------------------------------------------------
 
-    def _short(self) -> dict[str, object]:
-        rms, p50 = self.score.flexion.rms, percentile(self.latencies_ms[-500:], 0.5)
-        return {
-            "frames": self.score.frames,
-            "flexion RMSE": "—" if rms is None else f"{rms:.2f}°",
-            "latency": "—" if p50 is None else f"{p50:.1f} ms",
-        }
-
     def figures(self) -> dict[str, Any]:
         """Return errors, latency and sample counts; None where not yet known."""
         devices = self._health.get("devices", {})
         counts = {
             key: sum(int(device.get(key) or 0) for device in devices.values())
-            for key in ("received", *VERDICTS, "pending")
+            for key in ("received", *OUTCOMES, "pending")
         }
         counts["dropped"] += counts.pop("pending")
-        flexion = self.score.flexion.rms
+
+        # Samples without an outcome, or sent but not received, or the reverse.
+        sent, unaccounted = self._sent or {}, 0
+        for name, device in devices.items():
+            received = int(device.get("received") or 0)
+            outcomes = sum(int(device.get(key) or 0) for key in (*OUTCOMES, "pending"))
+            unaccounted += abs(received - outcomes) + abs(int(sent.get(name, 0)) - received)
 
         return {
             "frames": self.score.frames,
-            "knee_flexion_rmse_deg": _rounded(flexion),
+            "knee_flexion_rmse_deg": _rounded(self.score.flexion.rms),
             **{
                 f"{name}_rmse_deg": _rounded(error.rms)
                 for name, error in self.score.segments.items()
@@ -218,8 +223,8 @@ class DemoRun:
             },
             "samples": counts,
             "corrupt": sum(int(device.get("corrupt") or 0) for device in devices.values()),
-            "sent": None if self._sent is None else sum(self._sent.values()),
-            "unaccounted": None if self._sent is None else _unaccounted(self._sent, devices),
+            "sent": None if self._sent is None else sum(sent.values()),
+            "unaccounted": None if self._sent is None else unaccounted,
             "within_2_sd_share": _rounded(self.score.covered / max(1, self.score.flexion.n)),
         }
 
@@ -234,20 +239,6 @@ class DemoRun:
             if joint.center is not None and joint.source == "fit" and name in truth.centers:
                 error.add(1e3 * math.dist(joint.center, truth.centers[name]))
         return error.rms
-
-
-def _unaccounted(sent: dict[str, Any], devices: dict[str, Any]) -> int:
-    """Return the number of samples without an outcome, or sent but not received, or the reverse."""
-    lost = 0
-    for name, device in devices.items():
-        received = int(device.get("received") or 0)
-        verdicts = sum(int(device.get(key) or 0) for key in (*VERDICTS, "pending"))
-        lost += abs(received - verdicts) + abs(int(sent.get(name, 0)) - received)
-    return lost
-
-
-def _unix_minus_monotonic_ns() -> int:
-    return time.time_ns() - time.monotonic_ns()
 
 
 def _rounded(value: float | None) -> float | None:

@@ -114,7 +114,8 @@ class DemoScore:
         for name, segment in _table(pose, "segments").items():
             q = segment.get("q")
             if isinstance(q, list) and name in truth.orientations:
-                error = angle_between_one(_quaternion(q), truth.orientations[name])
+                w, x, y, z = map(float, q)
+                error = angle_between_one((w, x, y, z), truth.orientations[name])
                 self.segments.setdefault(name, RmsAccumulator()).add(math.degrees(error))
 
         knee = _table(pose, "joints").get(joint, {})
@@ -131,10 +132,6 @@ class DemoScore:
 def _table(pose: Mapping[str, object], key: str) -> dict[str, dict[str, object]]:
     value = pose.get(key)
     return value if isinstance(value, dict) else {}
-
-
-def _quaternion(q: Sequence[float]) -> Quaternion:
-    return (float(q[0]), float(q[1]), float(q[2]), float(q[3]))
 
 
 def percentile(values: Sequence[float], share: float) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import orjson
@@ -34,27 +35,24 @@ class TruthReader:
             row = orjson.loads(line)
             if "truth" in row:
                 self.facts = row
-            else:
-                self.track.add(_truth(row))
+                continue
+
+            centers = {
+                name: tuple(math.nan if x is None else x for x in center)
+                for name, center in row["joint_m"].items()
+            }
+            flexion = row["knee"]["flexion"]
+            self.track.add(
+                TrueLimbState(
+                    row["t_ns"],
+                    row["motion"],
+                    {name: tuple(q) for name, q in row["q_world_segment"].items()},
+                    centers,  # type: ignore[arg-type]  # the log has three numbers per centre
+                    math.nan if flexion is None else flexion,
+                )
+            )
 
     def close(self) -> None:
         """Close the file."""
         if self._file is not None:
             self._file.close()
-
-
-def _truth(row: dict[str, Any]) -> TrueLimbState:
-    nan = float("nan")
-    centers = {
-        name: tuple(nan if x is None else x for x in center)
-        for name, center in row["joint_m"].items()
-    }
-    flexion = row["knee"]["flexion"]
-
-    return TrueLimbState(
-        row["t_ns"],
-        row["motion"],
-        {name: tuple(q) for name, q in row["q_world_segment"].items()},
-        centers,  # type: ignore[arg-type]  # the log has three numbers per centre
-        nan if flexion is None else flexion,
-    )

@@ -6,7 +6,7 @@ Invariant: a model file is a calibration of the daemon, and `apply` runs the dae
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.phases import OfflineTrial
+    from jointfit_daemon.files.mocap import Axis
     from jointfit_daemon.tools.fuse._trial import LimbDescription
 
 METHODS_WITHOUT_MOTION = ("mean", "single")
@@ -87,6 +88,7 @@ def evaluate(
     from jointfit_daemon.calibration.phases import evaluate
     from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_plot
+    from jointfit_daemon.tools.text_output import echo_json
 
     check_plot(plot)
     limb, read, mounts, trial_warnings = _inputs(
@@ -94,9 +96,10 @@ def evaluate(
     )
     _refuse_unmoved(limb, read)
     found = evaluate(limb.chain, read, mounts, holdout=holdout)
-    _warn(trial_warnings)
+    for warning in trial_warnings:
+        typer.echo(f"warning: {warning}", err=True)
     if json:
-        _echo_json(_report.evaluation_json(found) | {"notes": trial_warnings})
+        echo_json(_report.evaluation_json(found) | {"notes": trial_warnings})
     else:
         typer.echo(_report.evaluation_table(found))
     if plot is not None:
@@ -124,17 +127,22 @@ def fit(
     """Fit a model to all trials and write it as a calibration of the daemon."""
     from datetime import UTC, datetime
 
+    import orjson
+
     from jointfit_daemon import __version__
     from jointfit_daemon.calibration.phases import fit_offline, mounts_of
+    from jointfit_daemon.calibration.soft_tissue import METHODS
     from jointfit_daemon.tools.fuse import _report
     from jointfit_daemon.tools.output_files import check_output
+    from jointfit_daemon.tools.text_output import echo_json
 
     check_output("--out", out, (".json",))
-    chosen = _method(method)
+    if method not in METHODS:
+        raise ValueError(f"--method: {unknown_name('method', method, METHODS)}")
     limb, read, mounts, trial_warnings = _inputs(
         trials, segment, joints, static, markers=markers, up=up
     )
-    if chosen not in METHODS_WITHOUT_MOTION:
+    if method not in METHODS_WITHOUT_MOTION:
         _refuse_unmoved(limb, read)
     if mounts is None:
         mounts = {s: mean.q for s, mean in mounts_of(limb.chain, read).items()}
@@ -142,15 +150,15 @@ def fit(
         limb.chain,
         read,
         mounts,
-        chosen,
+        cast("Any", method),
         notes=tuple(trial_warnings),
         software=__version__,
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    _write_json(out, calibration.to_dict())
+    out.write_bytes(orjson.dumps(calibration.to_dict(), option=orjson.OPT_INDENT_2) + b"\n")
     frames = sum(len(trial.t_s) for trial in read)
     if json:
-        _echo_json({"model": str(out), "frames": frames, "notes": trial_warnings})
+        echo_json({"model": str(out), "frames": frames, "notes": trial_warnings})
     else:
         typer.echo(_report.fit_summary(calibration, frames))
         typer.echo(f"wrote {out}", err=True)
@@ -165,31 +173,41 @@ def apply(
         Path, typer.Option("--out", help="Orientations and joint angles: .sto, .npz or .csv.")
     ],
     without: Annotated[
-        list[str] | None,
-        typer.Option("--without", help="Sensor to ignore; repeatable."),
+        list[str] | None, typer.Option("--without", help="Sensor to ignore; repeatable.")
     ] = None,
     left: Annotated[
-        bool,
-        typer.Option("--left", help="Left limb (signs of adduction, rotation)."),
+        bool, typer.Option("--left", help="Left limb (signs of adduction, rotation).")
     ] = False,
     up: Up = "z",
     json: Json = False,
 ) -> None:
     """Fuse the sensors of a trial as the daemon does, with uncertainty."""
+    from jointfit_daemon.calibration.record import MOST_BYTES
+    from jointfit_daemon.files.text import read_json
+    from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
     from jointfit_daemon.tools.fuse import _output, _report
     from jointfit_daemon.tools.fuse._trial import read_available_sensors
     from jointfit_daemon.tools.output_files import check_output
+    from jointfit_daemon.tools.text_output import check_choice, echo_json
 
     check_output("--out", out, _output.ENDINGS)
-    axis = _axis(up)
-    calibration = _read_model(model)
+    check_choice("--up", up, "yz")
+    data = read_json(model, MOST_BYTES)
+    try:
+        calibration = Calibration.from_dict(data if isinstance(data, dict) else {})
+    except CalibrationSchemaError as fault:
+        raise ValueError(
+            f"{model}: expected a model written by `jointfit fuse fit`: {fault}"
+        ) from fault
+
+    axis = cast("Axis", up)
     chain = _output.chain_of(calibration, left=left)
     table = read_available_sensors(sensors, chain, axis, without or ())
     found = _output.fuse_trial(calibration, table, left=left)
     files = _output.write_fused(out, found, table, axis)
     if json:
-        data = {"frames": len(found.t_s), "known": found.known, "flags": dict(found.flags)}
-        _echo_json(data | {"files": [str(file) for file in files]})
+        shares = {"known": found.known, "flags": dict(found.flags)}
+        echo_json({"frames": len(found.t_s), **shares, "files": [str(file) for file in files]})
     else:
         typer.echo(_report.fusion_summary(found))
         typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
@@ -207,8 +225,10 @@ def _inputs(
     """Return limb, trials, sensor alignments (None: estimated later) and warnings."""
     from jointfit_daemon.calibration.phases import trial_warnings
     from jointfit_daemon.tools.fuse import _trial
+    from jointfit_daemon.tools.text_output import check_choice
 
-    limb = _trial.read_limb(segments, joints, markers or (), _axis(up))
+    check_choice("--up", up, "yz")
+    limb = _trial.read_limb(segments, joints, markers or (), cast("Axis", up))
     mounts, still = None, None
     if static is not None:
         mounts, still = _trial.read_static(*_pair(static), limb)
@@ -228,53 +248,8 @@ def _pair(text: str) -> tuple[Path, Path | None]:
     return Path(sensors), Path(reference) if equals else None
 
 
-def _axis(up: str) -> Any:
-    if up not in {"y", "z"}:
-        raise ValueError(f"--up is {up!r}, expected y or z")
-    return up
-
-
-def _method(name: str) -> Any:
-    from jointfit_daemon.calibration.soft_tissue import METHODS
-
-    if name in METHODS:
-        return name
-    raise ValueError(f"--method: {unknown_name('method', name, METHODS)}")
-
-
-def _read_model(path: Path) -> Any:
-    from jointfit_daemon.calibration.record import MOST_BYTES
-    from jointfit_daemon.files.text import read_json
-    from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
-
-    data = read_json(path, MOST_BYTES)
-    try:
-        return Calibration.from_dict(data if isinstance(data, dict) else {})
-    except CalibrationSchemaError as fault:
-        raise ValueError(
-            f"{path}: expected a model written by `jointfit fuse fit`: {fault}"
-        ) from fault
-
-
-def _write_json(path: Path, data: dict[str, Any]) -> None:
-    import orjson
-
-    path.write_bytes(orjson.dumps(data, option=orjson.OPT_INDENT_2) + b"\n")
-
-
-def _echo_json(data: dict[str, Any]) -> None:
-    import orjson
-
-    typer.echo(orjson.dumps(data))
-
-
 def _refuse_unmoved(limb: LimbDescription, trials: Sequence[OfflineTrial]) -> None:
     from jointfit_daemon.calibration.phases import unmoved_joint
 
     if why := unmoved_joint(limb.chain, trials):
         raise ValueError(why)
-
-
-def _warn(trial_warnings: Sequence[str]) -> None:
-    for doubt in trial_warnings:
-        typer.echo(f"warning: {doubt}", err=True)

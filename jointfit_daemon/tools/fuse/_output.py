@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.files.mocap import Axis
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.model import LimbState
     from jointfit_daemon.tools.fuse._tables import OrientationRecording
 
 
@@ -81,40 +80,28 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, *, left: b
         t_ns = round(t_s * 1e9)
         states.append(fuser.fuse(t_ns, t_ns, k, alive))
 
-    return _collected(chain, table.t_s, states)
-
-
-def _collected(chain: Chain, t_s: Array, states: list[LimbState]) -> FusedTrial:
-    nan = float("nan")
     flags = Counter(flag for state in states for flag in state.flags)
     inner = range(1, len(chain.joints) - 1)
-
     return FusedTrial(
-        t_s,
+        table.t_s,
         {
             name: np.array([state.segments[i].q_world_segment or _UNKNOWN for state in states])
             for i, name in enumerate(chain.segments)
         },
         {
-            name: np.array([_or(state.segments[i].sd, nan) for state in states])
+            name: np.array([state.segments[i].sd for state in states], np.float64)
             for i, name in enumerate(chain.segments)
         },
         {
-            chain.joints[i]: np.array(
-                [state.joints[i].angles or (nan, nan, nan) for state in states]
-            )
+            chain.joints[i]: np.array([state.joints[i].angles or _UNKNOWN[:3] for state in states])
             for i in inner
         },
         {
-            chain.joints[i]: np.array([_or(state.joints[i].angle_sd, nan) for state in states])
+            chain.joints[i]: np.array([state.joints[i].angle_sd for state in states], np.float64)
             for i in inner
         },
         {flag: count / len(states) for flag, count in sorted(flags.items())},
     )
-
-
-def _or(value: float | None, unknown: float) -> float:
-    return unknown if value is None else value
 
 
 def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: Axis) -> list[Path]:
@@ -126,10 +113,31 @@ def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: 
     """
     kind = path.suffix.lower()
     if kind == ".npz":
-        _write_npz(path, found, table)
+        write_orientations_npz(path, OrientationTrial(found.t_s, table.q, found.segments, {}))
+        with np.load(path, allow_pickle=False) as arrays:
+            all_arrays = {name: arrays[name] for name in arrays.files}
+        all_arrays |= {f"angles_{joint}": angles for joint, angles in found.angles.items()}
+        all_arrays |= {f"sd_flexion_{joint}": sd for joint, sd in found.angle_sd.items()}
+        all_arrays |= {f"sd_{segment}": sd for segment, sd in found.sd.items()}
+        np.savez_compressed(path, allow_pickle=False, **all_arrays)
         return [path]
+
+    # Angles and standard deviations as columns, degrees
+    names, columns = [], []
+    for joint, angles in found.angles.items():
+        names += [f"{joint}_{angle}" for angle in ANGLES] + [f"{joint}_flexion_sd"]
+        columns += [*angles.T, found.angle_sd[joint]]
+    for segment, sd in found.sd.items():
+        names.append(f"{segment}_sd")
+        columns.append(sd)
+    values = np.rad2deg(np.stack(columns, axis=1))
+
     if kind == ".csv":
-        _write_csv(path, found)
+        quaternions = [f"{segment}_q{part}" for segment in found.segments for part in "wxyz"]
+        head = ",".join(("t_s", *quaternions, *(f"{name}_deg" for name in names)))
+        cells = np.column_stack((found.t_s, *found.segments.values(), values))
+        rows = (",".join(f"{x:.9g}" if isfinite(x) else "" for x in row) for row in cells.tolist())
+        path.write_text("\n".join((head, *rows)) + "\n", encoding="utf-8")
         return [path]
 
     rate_hz = float(np.round(1.0 / np.median(np.diff(found.t_s)), 6))
@@ -139,37 +147,7 @@ def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: 
         path, OrientationTable(tuple(found.segments), found.t_s, turned, rate_hz)
     )
     second = path.with_name(f"{path.stem}_angles.sto")
-    columns, values = _angle_columns(found)
-    write_sto(second, TimeTable(columns, found.t_s, values, in_degrees=True, name="joint angles"))
+    write_sto(
+        second, TimeTable(tuple(names), found.t_s, values, in_degrees=True, name="joint angles")
+    )
     return [path, second]
-
-
-def _angle_columns(found: FusedTrial) -> tuple[tuple[str, ...], Array]:
-    """Return column names and values of angles and standard deviations, deg, shape (n, columns)."""
-    names, columns = [], []
-    for joint, angles in found.angles.items():
-        names += [f"{joint}_{angle}" for angle in ANGLES] + [f"{joint}_flexion_sd"]
-        columns += [*angles.T, found.angle_sd[joint]]
-    for segment, sd in found.sd.items():
-        names.append(f"{segment}_sd")
-        columns.append(sd)
-    return tuple(names), np.rad2deg(np.stack(columns, axis=1))
-
-
-def _write_npz(path: Path, found: FusedTrial, table: OrientationRecording) -> None:
-    write_orientations_npz(path, OrientationTrial(found.t_s, table.q, found.segments, {}))
-    with np.load(path, allow_pickle=False) as arrays:
-        all_arrays = {name: arrays[name] for name in arrays.files}
-    all_arrays |= {f"angles_{joint}": angles for joint, angles in found.angles.items()}
-    all_arrays |= {f"sd_flexion_{joint}": sd for joint, sd in found.angle_sd.items()}
-    all_arrays |= {f"sd_{segment}": sd for segment, sd in found.sd.items()}
-    np.savez_compressed(path, allow_pickle=False, **all_arrays)
-
-
-def _write_csv(path: Path, found: FusedTrial) -> None:
-    names, degrees = _angle_columns(found)
-    quaternions = [f"{segment}_q{part}" for segment in found.segments for part in "wxyz"]
-    head = ",".join(("t_s", *quaternions, *(f"{name}_deg" for name in names)))
-    values = np.column_stack((found.t_s, *found.segments.values(), degrees))
-    rows = (",".join(f"{x:.9g}" if isfinite(x) else "" for x in row) for row in values.tolist())
-    path.write_text("\n".join((head, *rows)) + "\n", encoding="utf-8")

@@ -5,8 +5,10 @@ from __future__ import annotations
 from math import degrees, isfinite
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.tools.text_output import align_columns
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from jointfit_daemon.calibration.phases import MethodEvaluation, MethodScore
     from jointfit_daemon.limb_model import Calibration
@@ -35,7 +37,7 @@ def evaluation_table(found: MethodEvaluation) -> str:
         last = row.trial
         rows.append((*lead, row.method, *map(_deg, _figures(row))))
 
-    lines = [f"RMS error in degrees; hold-out: {found.held_out}", "", format_columns(rows), ""]
+    lines = [f"RMS error in degrees; hold-out: {found.held_out}", "", _format_columns(rows), ""]
     return "\n".join(lines + _comparisons(found))
 
 
@@ -64,7 +66,7 @@ def _comparisons(found: MethodEvaluation) -> list[str]:
 
 
 def evaluation_json(found: MethodEvaluation) -> dict[str, Any]:
-    """Return the evaluation in SI units (rad); null means unknown."""
+    """Return the evaluation in SI units (rad); NaN becomes null."""
     return {
         "judged_on": found.held_out,
         "unit": "rad",
@@ -73,8 +75,8 @@ def evaluation_json(found: MethodEvaluation) -> dict[str, Any]:
                 "trial": row.trial,
                 "method": row.method,
                 "frames": row.frames,
-                "segments_rms": {name: _known(x) for name, x in row.segments.items()},
-                "flexion_rms": {name: _known(x) for name, x in row.joints.items()},
+                "segments_rms": dict(row.segments),
+                "flexion_rms": dict(row.joints),
             }
             for row in found.rows
         ],
@@ -89,7 +91,7 @@ def fit_summary(calibration: Calibration, frames: int) -> str:
         whole = max(segment.models, key=len, default=None)
         left = "–" if whole is None else _deg(segment.models[whole].residual_sd)
         rows.append((name, ", ".join(sensors), str(len(segment.models)), left))
-    lines = [f"method {calibration.method}, {frames} frames", "", format_columns(rows)]
+    lines = [f"method {calibration.method}, {frames} frames", "", _format_columns(rows)]
     return "\n".join([*lines, *(f"note: {note}" for note in calibration.notes)])
 
 
@@ -103,23 +105,15 @@ def fusion_summary(found: FusedTrial) -> str:
     return "\n".join(lines)
 
 
-def format_columns(rows: Sequence[Sequence[str]]) -> str:
+def _format_columns(rows: Sequence[Sequence[str]]) -> str:
     """Return rows as aligned text columns; numeric columns are right-aligned."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    right = [all(_is_number(row[k]) for row in rows[1:]) for k in range(len(rows[0]))]
-
-    def line(row: Iterable[str]) -> str:
-        cells = (
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(row, widths, right, strict=True)
-        )
-        return "  ".join(cells).rstrip()
-
-    return "\n".join(map(line, rows))
-
-
-def _is_number(text: str) -> bool:
-    return text in {"", "–"} or text.replace(".", "", 1).isdigit()
+    columns = enumerate(zip(*rows[1:], strict=True))
+    numeric = [
+        k
+        for k, column in columns
+        if all(cell in {"", "–"} or cell.replace(".", "", 1).isdigit() for cell in column)
+    ]
+    return align_columns(rows, right=numeric)
 
 
 def _shown(angle: float) -> float:
@@ -128,7 +122,3 @@ def _shown(angle: float) -> float:
 
 def _deg(angle: float) -> str:
     return f"{degrees(angle):.{_DIGITS}f}" if isfinite(angle) else "–"
-
-
-def _known(value: float) -> float | None:
-    return value if isfinite(value) else None

@@ -129,7 +129,7 @@ def read_trial(
         Missing columns, implausible units, or too few common samples.
     """
     table = read_recording(sensors, limb.up)
-    q = select_sensors(table, [s for group in limb.chain.sensors for s in group], sensors)
+    q = select_sensors(table, sensors_of(limb.chain), sensors)
     if reference is None or reference.suffix.lower() not in MARKER_FILES:
         found = table if reference is None else read_recording(reference, limb.up)
         where = sensors if reference is None else reference
@@ -141,14 +141,35 @@ def read_trial(
 
     resampled = {s: _at(t_s, values, table.t_s) for s, values in by_segment.items()}
     trial = OfflineTrial(sensors.stem, table.t_s, q, resampled)
-    _check_overlap(trial, t_s, sensors, reference)
+    for segment, values in resampled.items():
+        seen = int(np.isfinite(values).all(axis=1).sum())
+        if seen >= FEWEST:
+            continue
+        apart = trial.t_s[-1] < t_s[0] or t_s[-1] < trial.t_s[0]
+        raise UnusableInputError(
+            f"{sensors}: {segment} has {seen} samples in common with its reference "
+            f"{reference or sensors}, expected at least {FEWEST}: sensors "
+            f"{trial.t_s[0]:.2f} to {trial.t_s[-1]:.2f} s, reference {t_s[0]:.2f} to "
+            f"{t_s[-1]:.2f} s; "
+            + (
+                "start both clocks at the same instant"
+                if apart
+                else "the reference has only gaps there: omit the trial"
+            )
+        )
+
     return trial
+
+
+def sensors_of(chain: Chain) -> list[str]:
+    """Return the names of all sensors, segment by segment."""
+    return [name for group in chain.sensors for name in group]
 
 
 def read_sensors(path: Path, chain: Chain, up: Axis) -> OrientationRecording:
     """Read the orientations of all sensors of a chain; raises as `read_trial`."""
     table = read_recording(path, up)
-    q = select_sensors(table, [s for group in chain.sensors for s in group], path)
+    q = select_sensors(table, sensors_of(chain), path)
     return OrientationRecording(table.t_s, q, table.bones)
 
 
@@ -180,7 +201,7 @@ def read_available_sensors(
     UnusableInputError
         A sensor that is missing from the file, or a name in `without` that the chain lacks.
     """
-    sensors = [s for group in chain.sensors for s in group]
+    sensors = sensors_of(chain)
     if strange := [name for name in without if name not in sensors]:
         problems = "; ".join(unknown_name("sensor", name, sensors) for name in strange)
         raise UnusableInputError(f"--without: the model has {problems}")
@@ -208,7 +229,13 @@ def read_static(
         As `read_trial`, or the subject moved.
     """
     by_markers = reference is not None and reference.suffix.lower() in MARKER_FILES
-    markers = _static_markers(reference, limb) if reference is not None and by_markers else None
+    markers = None
+    if reference is not None and by_markers:
+        track, settings = _optical(reference, limb)
+        clusters = {s: static_cluster(track, s, settings) for s in limb.chain.segments}
+        turns = {name: track_cluster(track, cluster).q for name, cluster in clusters.items()}
+        _check_stillness(reference, {name: robust_mean(q) for name, q in turns.items()})
+        markers = StaticMarkers(clusters)
     if sensors.suffix.lower() == ".json":
         return read_mounts(sensors, limb.chain), markers
 
@@ -225,14 +252,6 @@ def read_static(
     found = mounts_of(limb.chain, [trial])
     _check_stillness(sensors, found)
     return {name: mean.q for name, mean in found.items()}, markers
-
-
-def _static_markers(path: Path, limb: LimbDescription) -> StaticMarkers:
-    track, settings = _optical(path, limb)
-    clusters = {s: static_cluster(track, s, settings) for s in limb.chain.segments}
-    turns = {name: track_cluster(track, cluster).q for name, cluster in clusters.items()}
-    _check_stillness(path, {name: robust_mean(q) for name, q in turns.items()})
-    return StaticMarkers(clusters)
 
 
 def _check_stillness(path: Path, found: Mapping[str, RobustMean]) -> None:
@@ -258,7 +277,7 @@ def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
     if not isinstance(mounts, dict):
         raise UnusableInputError(f'{path}: expected {{"q_bias": {{SENSOR: [w, x, y, z]}}}}')
     found = {}
-    for name in (s for group in chain.sensors for s in group):
+    for name in sensors_of(chain):
         if name not in mounts:
             raise UnusableInputError(f"{path}: {unknown_name('sensor', name, mounts)}")
         q = np.asarray(mounts[name], dtype=np.float64)
@@ -288,7 +307,18 @@ def _optical(path: Path, limb: LimbDescription) -> tuple[OpticalTrack, Calibrati
     trial = read_marker_trial(path)
     names = tuple(dict.fromkeys(name for group in limb.markers.values() for name in group))
     positions = trial.points(names)  # reports all unknown names at once
-    _check_extent(path, limb, names, positions)
+    for segment in limb.chain.segments:
+        seen = positions[:, [names.index(name) for name in limb.markers[segment]]]
+        seen = seen[visible(seen).all(axis=1)]
+        if not len(seen):
+            continue
+        widest = float(np.median(np.ptp(seen, axis=1).max(axis=-1)))
+        if not SMALLEST_M <= widest <= LARGEST_M:
+            raise UnusableInputError(
+                f"{path}: the markers of {segment} extend over {widest:.3g} m, expected "
+                f"{SMALLEST_M:g} to {LARGEST_M:g} m: check the units stated in the file"
+            )
+
     empty = np.empty((len(positions), 0, 3))
     track = OpticalTrack(
         _ns(trial.trajectories.t_s), names, positions, (), empty, np.empty((len(positions), 0, 4))
@@ -318,39 +348,3 @@ def _by_markers(
             )
 
     return np.asarray(track.t_ns / 1e9), turned
-
-
-def _check_extent(
-    path: Path, limb: LimbDescription, names: Sequence[str], positions: Array
-) -> None:
-    """Check that the markers of each segment have a plausible extent in metres."""
-    for segment in limb.chain.segments:
-        seen = positions[:, [names.index(name) for name in limb.markers[segment]]]
-        seen = seen[visible(seen).all(axis=1)]
-        if not len(seen):
-            continue
-        widest = float(np.median(np.ptp(seen, axis=1).max(axis=-1)))
-        if not SMALLEST_M <= widest <= LARGEST_M:
-            raise UnusableInputError(
-                f"{path}: the markers of {segment} extend over {widest:.3g} m, expected "
-                f"{SMALLEST_M:g} to {LARGEST_M:g} m: check the units stated in the file"
-            )
-
-
-def _check_overlap(trial: OfflineTrial, t_s: Array, sensors: Path, reference: Path | None) -> None:
-    for segment, q in trial.reference.items():
-        seen = int(np.isfinite(q).all(axis=1).sum())
-        if seen >= FEWEST:
-            continue
-        apart = trial.t_s[-1] < t_s[0] or t_s[-1] < trial.t_s[0]
-        raise UnusableInputError(
-            f"{sensors}: {segment} has {seen} samples in common with its reference "
-            f"{reference or sensors}, expected at least {FEWEST}: sensors "
-            f"{trial.t_s[0]:.2f} to {trial.t_s[-1]:.2f} s, reference {t_s[0]:.2f} to "
-            f"{t_s[-1]:.2f} s; "
-            + (
-                "start both clocks at the same instant"
-                if apart
-                else "the reference has only gaps there: omit the trial"
-            )
-        )

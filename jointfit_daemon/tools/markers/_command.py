@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
@@ -12,11 +12,7 @@ from jointfit_daemon.tools.command_group import EXIT_FAILED
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement import (
-        Refinement,
-        RefinementMethod,
-        RefinementSettings,
-    )
+    from jointfit_daemon.calibration.marker_refinement import Refinement, RefinementSettings
     from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
@@ -39,37 +35,28 @@ Validate = Annotated[
     typer.Option("--validate", help="Validation trial, not used in the fit. Repeatable."),
 ]
 Method = Annotated[
-    str,
-    typer.Option("--method", help="joint (all at once), block, or search (slow)."),
+    str, typer.Option("--method", help="joint (all at once), block, or search (slow).")
 ]
 Prior = Annotated[
-    float,
-    typer.Option("--prior", min=0.0, help="Cost of displacement relative to tracking error."),
+    float, typer.Option("--prior", min=0.0, help="Cost of displacement relative to tracking error.")
 ]
 Evenness = Annotated[
     float,
     typer.Option(
-        "--evenness",
-        min=0.0,
-        max=8.0,
-        help="Trial weight: this power of its error; 0: equal.",
+        "--evenness", min=0.0, max=8.0, help="Trial weight: this power of its error; 0: equal."
     ),
 ]
 Holdout = Annotated[
     float,
     typer.Option(
-        "--holdout",
-        min=0.0,
-        max=0.5,
-        help="Last share of each trial, for early stopping.",
+        "--holdout", min=0.0, max=0.5, help="Last share of each trial, for early stopping."
     ),
 ]
 Frames = Annotated[
     int, typer.Option("--frames", min=10, help="Largest number of frames per trial, evenly spaced.")
 ]
 Up = Annotated[
-    str | None,
-    typer.Option("--up", help="Vertical axis, if the files do not define it."),
+    str | None, typer.Option("--up", help="Vertical axis, if the files do not define it.")
 ]
 Out = Annotated[
     list[Path] | None,
@@ -101,44 +88,34 @@ def markers(
 
     Exits with 1 if the trials do not fit the model.
     """
-    from jointfit_daemon.calibration.marker_refinement import RefinementError, RefinementSettings
+    from jointfit_daemon.calibration.marker_refinement import (
+        RefinementError,
+        RefinementMethod,
+        RefinementSettings,
+    )
+    from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.markers._trials import ModelRequest
+    from jointfit_daemon.tools.output_files import check_output, check_plot
+    from jointfit_daemon.tools.text_output import check_choice
 
-    _check(method=method, up=up, out=out or [], plot=plot)
+    check_choice("--method", method, get_args(RefinementMethod))
+    check_choice("--up", up, "xyz")
+    for path in out or ():
+        check_output("--out", path, ENDINGS)
+    check_plot(plot)
+
     names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
+    asked = ModelRequest(model, *names, up or None)
+    chosen = cast("RefinementMethod", method)
     settings = RefinementSettings(
-        cast("RefinementMethod", method),
-        prior,
-        frames=frames,
-        evenness=evenness,
-        holdout_share=holdout,
+        chosen, prior, frames=frames, evenness=evenness, holdout_share=holdout
     )
     try:
-        chain, remarks, found = _refined(
-            ModelRequest(model, *names, up or None), (trials, validate or []), settings
-        )
+        chain, remarks, found = _refined(asked, (trials, validate or []), settings)
     except RefinementError as refused:
         typer.echo(f"jointfit markers: refused: {refused}", err=True)
         raise typer.Exit(EXIT_FAILED) from None
-    _print(chain, remarks, found, as_json=json)
-    _write(chain, found, out or [], plot)
-
-
-def _check(*, method: str, up: str | None, out: Sequence[Path], plot: Path | None) -> None:
-    from typing import get_args
-
-    from jointfit_daemon.calibration.marker_refinement import RefinementMethod
-    from jointfit_daemon.tools.markers._output import ENDINGS
-    from jointfit_daemon.tools.output_files import check_output, check_plot
-
-    methods = get_args(RefinementMethod)
-    if method not in methods:
-        raise ValueError(f"--method is {method!r}, expected {', '.join(methods)}")
-    if up is not None and up not in ("x", "y", "z"):
-        raise ValueError(f"--up is {up!r}, expected x, y or z")
-    for path in out:
-        check_output("--out", path, ENDINGS)
-    check_plot(plot)
+    _write_result(chain, remarks, found, out or (), plot, as_json=json)
 
 
 def _refined(
@@ -165,22 +142,23 @@ def _refined(
         return chain, remarks, refine_markers(chain, learned, settings, judged, show_progress)
 
 
-def _print(
-    chain: ChainModel, remarks: tuple[str, ...], found: Refinement, *, as_json: bool
+def _write_result(
+    chain: ChainModel,
+    remarks: tuple[str, ...],
+    found: Refinement,
+    out: Sequence[Path],
+    plot: Path | None,
+    *,
+    as_json: bool,
 ) -> None:
     from jointfit_daemon.tools.markers import _report
+    from jointfit_daemon.tools.markers._output import write_markers
+    from jointfit_daemon.tools.text_output import echo_json
 
     if as_json:
-        import orjson
-
-        typer.echo(orjson.dumps(_report.as_json(chain, remarks, found)))
-        return
-    typer.echo(_report.as_text(chain, remarks, found))
-
-
-def _write(chain: ChainModel, found: Refinement, out: Sequence[Path], plot: Path | None) -> None:
-    from jointfit_daemon.tools.markers._output import write_markers
-
+        echo_json(_report.as_json(chain, remarks, found))
+    else:
+        typer.echo(_report.as_text(chain, remarks, found))
     for path in out:
         write_markers(path, chain, found.model)
         typer.echo(f"wrote {path}", err=True)

@@ -30,7 +30,10 @@ def write_markers(path: Path, before: ChainModel, after: ChainModel) -> None:
     if kind == ".xml":
         _write_marker_set(path, after)
     elif kind == ".trc":
-        _write_offsets(path, before, after)
+        # One frame with the displacement of each marker, m, in segment axes.
+        moved = (after.positions - before.positions)[None]
+        one = np.ones(1, dtype=np.int64)
+        write_trc(path, MarkerTrajectories(after.marker_names, np.zeros(1), one, moved, 1.0))
     else:
         write_model(path, after)
 
@@ -48,10 +51,3 @@ def _write_marker_set(path: Path, model: ChainModel) -> None:
     ET.SubElement(whole, "groups")
     ET.indent(root)
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
-
-
-def _write_offsets(path: Path, before: ChainModel, after: ChainModel) -> None:
-    """Write one frame with the displacement of each marker, m, in segment axes."""
-    moved = (after.positions - before.positions)[None]
-    one = np.ones(1, dtype=np.int64)
-    write_trc(path, MarkerTrajectories(after.marker_names, np.zeros(1), one, moved, 1.0))

@@ -5,15 +5,12 @@ from __future__ import annotations
 from math import degrees, isfinite
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.tools.text_output import align_columns
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement import (
-        MarkerOutcome,
-        Refinement,
-        TrackingStatistics,
-        TrialOutcome,
-    )
+    from jointfit_daemon.calibration.marker_refinement import Refinement, TrialOutcome
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _MM = 1000.0
@@ -24,33 +21,32 @@ _TRIAL_HEAD = ("trial", "", "frames", "RMS, mm", "", "variance over time, mm²",
 
 def as_text(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> str:
     """Return the tables of markers and trials, and a summary."""
+    if found.method == "search":
+        effort = f"{found.runs} runs of inverse kinematics"
+    else:
+        effort = f"{len(found.costs) - 1} steps, prior {found.prior:g}"
+
+    moved = []
+    for m in found.markers:
+        held = "".join(axis for axis, is_held in zip("xyz", m.held, strict=True) if is_held)
+        by_axis = " ".join(f"{_MM * v:+.1f}" for v in m.moved)
+        residual = f"{_mm(m.rms_before)} → {_mm(m.rms_after)}"
+        moved.append((m.name, m.segment, f"{_MM * m.distance:.1f}", by_axis, held, residual))
+
     lines = [
         f"model     {chain.name}: {len(chain.segments)} segments, {chain.nq} degrees of freedom,"
         f" {len(chain.markers)} markers",
-        f"method    {found.method}: {_effort(found)}; {found.stopped}",
+        f"method    {found.method}: {effort}; {found.stopped}",
         *(f"import    {text}" for text in remarks),
         *(f"note      {text}" for text in found.notes),
         "",
-        _table([_MARKER_HEAD, *(_marker(m) for m in found.markers)]),
+        align_columns([_MARKER_HEAD, *moved]),
         "",
-        _table([_TRIAL_HEAD, *(_trial(t) for t in found.trials)]),
+        align_columns([_TRIAL_HEAD, *map(_trial, found.trials)]),
         "",
         *_summary(found),
     ]
     return "\n".join(lines)
-
-
-def _effort(found: Refinement) -> str:
-    if found.method == "search":
-        return f"{found.runs} runs of inverse kinematics"
-    return f"{len(found.costs) - 1} steps, prior {found.prior:g}"
-
-
-def _marker(m: MarkerOutcome) -> tuple[str, ...]:
-    held = "".join(axis for axis, is_held in zip("xyz", m.held, strict=True) if is_held)
-    moved = " ".join(f"{_MM * v:+.1f}" for v in m.moved)
-    residual = f"{_mm(m.rms_before)} → {_mm(m.rms_after)}"
-    return (m.name, m.segment, f"{_MM * m.distance:.1f}", moved, held, residual)
 
 
 def _trial(t: TrialOutcome) -> tuple[str, ...]:
@@ -94,14 +90,6 @@ def _summary(found: Refinement) -> list[str]:
     return lines
 
 
-def _table(rows: Sequence[tuple[str, ...]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
-
-
 def _mm(metres: float) -> str:
     return f"{_MM * metres:.2f}" if isfinite(metres) else "–"
 
@@ -133,15 +121,28 @@ def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dic
                 "position_m": list(position.position),
                 "moved_m": list(m.moved),
                 "held": [bool(h) for h in m.held],
-                "rms_before_m": _nullable(m.rms_before),
-                "rms_after_m": _nullable(m.rms_after),
+                "rms_before_m": m.rms_before,
+                "rms_after_m": m.rms_after,
             }
             for m, position in zip(found.markers, found.model.markers, strict=True)
         ],
-        "trials": [_trial_json(t) for t in found.trials],
-        "angle_change_rad": {"rms": _nullable(rms), "max": _nullable(most)},
+        "trials": [
+            {
+                "name": t.name,
+                "trained": t.trained,
+                "frames": t.frames,
+                "rate_hz": t.rate_hz,
+                "before": {"rms_m": t.before.rms, "variance_m2": t.before.variance},
+                "after": {"rms_m": t.after.rms, "variance_m2": t.after.variance},
+                "angles_rad": {
+                    name: {"rms": rms, "max": most} for name, (rms, most) in t.angles.items()
+                },
+            }
+            for t in found.trials
+        ],
+        "angle_change_rad": {"rms": rms, "max": most},
         "variance_of_trials_m2": {
-            word: [_nullable(v) for v in found.variance_of_trials(trained=trained)]
+            word: found.variance_of_trials(trained=trained)
             for word, trained in (("trained", True), ("unseen", False))
         },
         "gauge": {
@@ -152,23 +153,3 @@ def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dic
             "eigenvalues": found.gauge.eigenvalues.tolist(),
         },
     }
-
-
-def _trial_json(t: TrialOutcome) -> dict[str, Any]:
-    return {
-        "name": t.name,
-        "trained": t.trained,
-        "frames": t.frames,
-        "rate_hz": t.rate_hz,
-        "before": _fit_json(t.before),
-        "after": _fit_json(t.after),
-        "angles_rad": {name: {"rms": rms, "max": most} for name, (rms, most) in t.angles.items()},
-    }
-
-
-def _fit_json(fit: TrackingStatistics) -> dict[str, Any]:
-    return {"rms_m": _nullable(fit.rms), "variance_m2": _nullable(fit.variance)}
-
-
-def _nullable(value: float) -> float | None:
-    return float(value) if isfinite(value) else None

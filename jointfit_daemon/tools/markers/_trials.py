@@ -46,20 +46,10 @@ def load(
     ValueError
         Unknown names in locks; `MalformedFileError` for broken files.
     """
-    read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
-    judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
-    chain, remarks = _chain(asked)
-    learned = [_motion(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
-    chain = _locked(chain, asked.unlock, hold=False)
-    chain = _locked(chain, asked.lock, hold=True)
-    judged = [_motion(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
-    return chain, remarks, learned, judged
-
-
-def _chain(asked: ModelRequest) -> tuple[ChainModel, tuple[str, ...]]:
-    """Return the chain and the remarks of its import."""
     from jointfit_daemon.files.models import read_model, read_osim
 
+    read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
+    judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
     remarks: tuple[str, ...] = ()
     if asked.model.suffix.lower() == ".osim":
         imported = read_osim(asked.model)
@@ -69,7 +59,13 @@ def _chain(asked: ModelRequest) -> tuple[ChainModel, tuple[str, ...]]:
     for name in asked.without:
         _known(chain, name, "--without")
     kept = tuple(m for m in chain.markers if m.name not in asked.without)
-    return replace(chain, markers=kept), remarks
+    chain = replace(chain, markers=kept)
+
+    learned = [_motion(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
+    chain = _locked(chain, asked.unlock, hold=False)
+    chain = _locked(chain, asked.lock, hold=True)
+    judged = [_motion(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
+    return chain, remarks, learned, judged
 
 
 def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainModel:
@@ -79,20 +75,15 @@ def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainMode
         if text == _ALL:
             locks = {name: [hold] * 3 for name in locks}
             continue
-        name, axis = _split(chain, text)
+        # A full marker name with a dot takes precedence over a marker and its coordinate.
+        name, dot, axis = text.rpartition(".")
+        if text in locks or not dot or axis not in tuple(_AXES):
+            name, axis = text, _AXES
         _known(chain, name, "--lock" if hold else "--unlock")
-        for at in range(3) if axis is None else (axis,):
-            locks[name][at] = hold
+        for letter in axis:
+            locks[name][_AXES.index(letter)] = hold
 
     return chain.with_locks({name: (x, y, z) for name, (x, y, z) in locks.items()})
-
-
-def _split(chain: ChainModel, text: str) -> tuple[str, int | None]:
-    """Return marker and coordinate index; a full marker name with a dot takes precedence."""
-    head, dot, tail = text.rpartition(".")
-    if text not in chain.marker_names and dot and tail in tuple(_AXES):
-        return head, _AXES.index(tail)
-    return text, None
 
 
 def _known(chain: ChainModel, name: str, option: str) -> None:

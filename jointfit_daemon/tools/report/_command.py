@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import orjson
 import typer
 
 from jointfit_daemon.tools.output_files import check_output
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
 
 
 def report(
@@ -49,7 +45,12 @@ def report(
 
 
 def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:
-    from jointfit_daemon.center_of_rotation.study import StudySetup
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from jointfit_daemon.center_of_rotation.study import StudySetup, run_study
+    from jointfit_daemon.tools.plotting import PlottingUnavailableError
+    from jointfit_daemon.tools.report._plot import draw_study
     from jointfit_daemon.tools.report.tables import as_json, tables
 
     plain = StudySetup()
@@ -59,35 +60,18 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
         frames_repeats=min(plain.frames_repeats, repeats),
         seed=seed,
     )
-    study = _computed(setup)
-    text = tables(setup, study)
-    typer.echo(text, nl=False)
-    if json is not None:
-        import orjson
-
-        json.write_bytes(orjson.dumps(as_json(setup, study), option=orjson.OPT_INDENT_2))
-    if out is not None:
-        (out / "cor-study.txt").write_text(text, encoding="utf-8")
-        _draw(study, out)
-
-
-def _computed(setup: StudySetup) -> list[PairMaps]:
-    """Run the study, with a progress bar on a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from jointfit_daemon.center_of_rotation.study import run_study
-
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("computing nine maps", total=1.0)
-        return run_study(setup, lambda share: bar.update(task, completed=share))
+        study = run_study(setup, lambda share: bar.update(task, completed=share))
 
-
-def _draw(study: Sequence[PairMaps], out: Path) -> None:
-    from jointfit_daemon.tools.plotting import PlottingUnavailableError
-    from jointfit_daemon.tools.report._plot import draw_study
-
+    text = tables(setup, study)
+    typer.echo(text, nl=False)
+    if json is not None:
+        json.write_bytes(orjson.dumps(as_json(setup, study), option=orjson.OPT_INDENT_2))
+    if out is None:
+        return
+    (out / "cor-study.txt").write_text(text, encoding="utf-8")
     try:
         for path in draw_study(study, out):
             typer.echo(f"wrote {path}", err=True)

@@ -32,11 +32,7 @@ _OURS = (
     ("hyper", "hyper, all frames"),
     ("oriented", "orientation-aided, all frames"),
 )
-_AXES = {
-    "α": ("α, deg", float(np.rad2deg(1.0))),
-    "σ": ("σ, mm", _MM),
-    "r": ("r, m", 1.0),
-}
+_AXES = {"α": ("α, deg", float(np.rad2deg(1.0))), "σ": ("σ, mm", _MM), "r": ("r, m", 1.0)}
 
 
 def draw_study(study: Sequence[PairMaps], folder: Path) -> list[Path]:

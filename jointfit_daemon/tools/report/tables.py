@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from textwrap import indent
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jointfit_daemon.center_of_rotation.study import CLIPS_M, PRINTED, correlation
+from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Sequence
 
     from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
 
@@ -47,11 +47,12 @@ def tables(setup: StudySetup, study: Sequence[PairMaps]) -> str:
         " (2021), repeated",
         _setup(setup),
         "Table 1: correlation of whole maps, prediction–analytic / analytic–grid",
-        _aligned(_correlations(study, "grid")),
+        _indented(_correlations(study, "grid")),
         "The same with the grid shifted by half a step",
-        _aligned(_correlations(study, "shifted grid")),
-        _errors_title(setup),
-        _aligned(_errors(study)),
+        _indented(_correlations(study, "shifted grid")),
+        f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
+        f" σ = {_MM * setup.noise:g} mm; refused: share of runs that hyper refuses",
+        _indented(_errors(study)),
         "Limits",
         "\n".join(f"- {text}" for text in CAVEATS),
     ]
@@ -85,14 +86,13 @@ def _correlations(study: Sequence[PairMaps], grid: str) -> list[tuple[str, ...]]
     rows: list[tuple[str, ...]] = [("pair", "printed", *heads)]
     for pair in study:
         printed = "/".join(f"{value:.2f}" for value in PRINTED[pair.name])
-        rows.append((pair.name, printed, *(_pair_cell(pair, grid, clip) for clip in CLIPS_M)))
+        cells = []
+        for clip in CLIPS_M:
+            first, second = correlations(pair, grid, clip)
+            mark = "*" if NEAREST[pair.name] == clip and grid == "grid" else ""
+            cells.append(f"{first:.2f}/{second:.2f}{mark}")
+        rows.append((pair.name, printed, *cells))
     return rows
-
-
-def _pair_cell(pair: PairMaps, grid: str, clip: float | None) -> str:
-    first, second = correlations(pair, grid, clip)
-    mark = "*" if NEAREST[pair.name] == clip and grid == "grid" else ""
-    return f"{first:.2f}/{second:.2f}{mark}"
 
 
 def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, float]:
@@ -104,49 +104,32 @@ def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, 
     )
 
 
-def _errors_title(setup: StudySetup) -> str:
-    return (
-        f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
-        f" σ = {_MM * setup.noise:g} mm; refused: share of runs that hyper refuses"
-    )
-
-
 def _errors(study: Sequence[PairMaps]) -> list[tuple[str, ...]]:
     pair = next(p for p in study if p.name == "r–α")
     degrees = np.rint(np.rad2deg(pair.columns)).astype(int).tolist()
     rows: list[tuple[str, ...]] = [("α", *_METHODS, "refused")]
     for angle in (a for a in _SHOWN_DEG if a in degrees):
         at = degrees.index(angle)
-        cells = (_mm(float(pair.maps[key][-1, at])) for key in _METHODS)
+        errors_m = [float(pair.maps[key][-1, at]) for key in _METHODS]
+        cells = (
+            "–" if np.isnan(m) else f"{_MM * m:.3g}" if m < 1.0 else "> 1000" for m in errors_m
+        )
         rows.append((f"{angle}°", *cells, f"{100 * pair.refused[-1, at]:.0f} %"))
     return rows
 
 
-def _mm(metres: float) -> str:
-    return "–" if np.isnan(metres) else f"{_MM * metres:.3g}" if metres < 1.0 else "> 1000"
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join("  " + _line(row, widths) for row in rows)
-
-
-def _line(row: Iterable[str], widths: Iterable[int]) -> str:
-    return "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+def _indented(rows: Sequence[Sequence[str]]) -> str:
+    return indent(align_columns(rows, right=range(len(rows[0]))), "  ")
 
 
 def as_json(setup: StudySetup, study: Sequence[PairMaps]) -> dict[str, Any]:
-    """Return setup, correlations and maps in SI units; null means unknown."""
+    """Return setup, correlations and maps in SI units; NaN becomes null."""
     return {
         "setup": {
             "radii_m": setup.radii.tolist(),
             "noises_m": setup.noises.tolist(),
             "steps_rad": setup.steps.tolist(),
-            "fixed": {
-                "radius_m": setup.radius,
-                "noise_m": setup.noise,
-                "step_rad": setup.step,
-            },
+            "fixed": {"radius_m": setup.radius, "noise_m": setup.noise, "step_rad": setup.step},
             "repeats": setup.repeats,
             "grid_repeats": setup.grid_repeats,
             "box_m": setup.box,
@@ -176,10 +159,6 @@ def _pair_json(pair: PairMaps) -> dict[str, Any]:
         ],
         "rows": pair.rows.tolist(),
         "columns": pair.columns.tolist(),
-        "rms_m": {key: _nullable(values) for key, values in pair.maps.items()},
+        "rms_m": {key: values.tolist() for key, values in pair.maps.items()},
         "refused_share": pair.refused.tolist(),
     }
-
-
-def _nullable(values: NDArray[np.float64]) -> list[list[float | None]]:
-    return [[None if np.isnan(v) else float(v) for v in row] for row in values]

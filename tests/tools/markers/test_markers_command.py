@@ -145,7 +145,7 @@ def test_opensim_reads_the_marker_set(folder: Path) -> None:
     [
         (["--lock", "T3"], 2, ["--lock T3", "did you mean 'T3.x'"]),
         (["--without", "Z"], 2, ["--without Z"]),
-        (["--method", "magic"], 2, ["joint, block, search"]),
+        (["--method", "magic"], 2, ["joint, block or search"]),
         (["--out", "new.osim"], 2, [".toml, .json, .xml or .trc"]),
         (["--up", "w"], 2, ["x, y or z"]),
         (["--lock", "*"], 1, ["all coordinates are locked"]),

@@ -1,0 +1,48 @@
+"""Output that the commands share: tables in text, JSON on standard output, checks of choices."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Sequence
+
+
+def echo_json(data: Any) -> None:
+    """Print one JSON object in a line; NaN and infinity become null."""
+    import orjson
+
+    typer.echo(orjson.dumps(data, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
+def align_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> str:
+    """Return rows as text columns; those whose numbers are in `right` are right-aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+
+    def line(row: Iterable[str]) -> str:
+        cells = (
+            cell.rjust(width) if k in right else cell.ljust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(map(line, rows))
+
+
+def join_choices(names: Sequence[str]) -> str:
+    """Return names as ``a, b or c``."""
+    return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def check_choice(option: str, value: str | None, choices: Sequence[str]) -> None:
+    """Check the value of an option; None (option not given) is accepted.
+
+    Raises
+    ------
+    ValueError
+        `value` is not one of `choices`.
+    """
+    if value is not None and value not in tuple(choices):
+        raise ValueError(f"{option} is {value!r}, expected {join_choices(choices)}")
