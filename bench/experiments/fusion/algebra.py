@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.baselines.joint_angle_arrays import grood_suntay, patent_angles
 from bench.baselines.recursive_least_squares import InformationForm, RecursiveLeastSquares
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SEEDED
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.kinematics.joint_angles import grood_suntay, patent_angles
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -68,7 +68,12 @@ def geometric_estimate(
     p = p[:, None, :] if p.ndim == 2 else p
     seen = seen_places(p)
     frames = int(seen.any(axis=1).sum())
-    begin = _begin(p) if start is None else np.asarray(start, dtype=np.float64)
+    if start is None:  # Hyper's center of the best conditioned marker
+        circles = fit_circles(np.moveaxis(p, 1, 0))
+        best = int(np.argmax(circles.conditioning)) if p.shape[1] else 0
+        begin = circles.center[best] if p.shape[1] and circles.valid[best] else None
+    else:
+        begin = np.asarray(start, dtype=np.float64)
     if seen.sum() < 2 + p.shape[1] + 1 or begin is None:
         reason = (
             "no marker path is an arc (too few frames, no motion or a line): "
@@ -80,13 +85,6 @@ def geometric_estimate(
     x = np.where(seen[..., None], p, 0.0)
     c, weights = _descend(x, seen, begin, robust=robust)
     return _accept_estimate(x, seen, c, weights, limits or CircleLimits())
-
-
-def _begin(p: Array) -> Array | None:
-    """Return Hyper's center of the best conditioned marker."""
-    found = fit_circles(np.moveaxis(p, 1, 0))
-    best = int(np.argmax(found.conditioning)) if found.conditioning.size else 0
-    return found.center[best] if found.conditioning.size and found.valid[best] else None
 
 
 def _descend(x: Array, seen: NDArray[np.bool_], c: Array, *, robust: bool) -> tuple[Array, Array]:

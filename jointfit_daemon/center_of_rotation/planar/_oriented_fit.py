@@ -230,7 +230,13 @@ def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, A
     center, covariance, residual or None
         m, m² and the RMS radial residual, m; None where J has no minimum.
     """
-    z, start = _least_squares(x, theta), x.mean(axis=0)
+    # start: linear least squares of x = c + R(θ) p, which is attenuated
+    c, s, one, zero = np.cos(theta), np.sin(theta), np.ones_like(theta), np.zeros_like(theta)
+    A = np.concatenate((np.column_stack((one, zero, c, -s)), np.column_stack((zero, one, s, c))))
+    found = np.linalg.lstsq(A, x.T.ravel(), rcond=None)[0]
+    rho, beta = np.hypot(found[2], found[3]), np.arctan2(found[3], found[2])
+    z, start = np.array([found[0], found[1], rho, beta]), x.mean(axis=0)
+
     M: Array = np.eye(len(x))
     rho0 = -1.0
     H = np.eye(4)
@@ -254,15 +260,6 @@ def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, A
         return None
     e = np.linalg.norm(x - z[:2], axis=1) - z[2]
     return z[:2], C, float(np.sqrt((e**2).mean()))
-
-
-def _least_squares(x: Array, theta: Array) -> Array:
-    """Return (c, ρ, β) of x = c + R(θ) p by linear least squares: attenuated, a place to begin."""
-    c, s, one, zero = np.cos(theta), np.sin(theta), np.ones_like(theta), np.zeros_like(theta)
-    A = np.concatenate((np.column_stack((one, zero, c, -s)), np.column_stack((zero, one, s, c))))
-    found = np.linalg.lstsq(A, x.T.ravel(), rcond=None)[0]
-    rho, beta = np.hypot(found[2], found[3]), np.arctan2(found[3], found[2])
-    return np.array([found[0], found[1], rho, beta])
 
 
 def _normal(

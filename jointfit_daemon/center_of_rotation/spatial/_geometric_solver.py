@@ -129,18 +129,20 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
         if np.linalg.norm(step) < 1e-9:
             break
 
-    return _at(points, m, w, basis)
-
-
-def _at(points: Array, m: Array, w: Array, basis: Array) -> SphereFit:
-    seen = np.asarray(np.isfinite(points).all(axis=-1))
-    v = np.where(seen[..., None], points, 0.0)
     e, J = radial_residuals(v, m, w)
     u = np.linalg.norm(v - m, axis=-1)
-    radii = (w * u).sum(axis=0) / np.maximum(w.sum(axis=0), 1e-12)
+    total = np.maximum(w.sum(axis=0), 1e-12)
     resultant = np.einsum("tj,tja->ja", w, (v - m) / np.maximum(u, 1e-9)[..., None])
-    resultant /= np.maximum(w.sum(axis=0), 1e-12)[:, None]
-    return SphereFit(m, basis, np.where(seen, e, 0.0), seen, w, J, radii, resultant)
+    return SphereFit(
+        center=m,
+        basis=basis,
+        residuals=np.where(seen, e, 0.0),
+        seen=seen,
+        weights=w,
+        turning=J,
+        radii=(w * u).sum(axis=0) / total,
+        resultant=resultant / total[:, None],
+    )
 
 
 def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:

@@ -112,8 +112,17 @@ def observe(
             basis = basis @ np.linalg.eigh(np.einsum("j,jab->ab", flat.n, flat.C))[1][:, 1:]
             continue
 
+        # the information, in squared radians, that noise may bring along the least seen direction
         spread, axes = np.linalg.eigh(found.information)
-        if spread[0] > _hidden_by_noise(axes[:, 0], flat, found, limits):
+        radius2 = float(np.median(found.radii2))
+        noise = max(MIN_CONDITIONING**2 * found.noise2 / radius2, 0.0)
+        if len(spread) == 3:
+            total = float(flat.n.sum())
+            floor = float(axes[:, 0] @ found.floor @ axes[:, 0])
+            chance = MIN_SIGNIFICANCE * floor * float(np.sqrt(2.0 / total))
+            noise = max(noise, chance, limits.min_direction**2 * total)
+
+        if spread[0] > noise:
             # Paths that fill an area as wide as it is long are a small movement seen face on. Its
             # center lies before or behind it, too far for the bend to show; a circle is chance.
             wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", flat.n / flat.n.sum(), flat.C))[-1]
@@ -122,7 +131,7 @@ def observe(
 
             left = _residuals(sums, basis, flat, found, limits)
             skin2 = found.noise2 + soft_tissue_variance(left, flat, found)
-            shown = spread > MIN_CONDITIONING**2 * skin2 / float(np.median(found.radii2))
+            shown = spread > MIN_CONDITIONING**2 * skin2 / radius2
 
             # one direction alone gives no center: the error then shows it
             shown = shown if shown.sum() >= 2 else np.ones_like(shown)
@@ -131,19 +140,6 @@ def observe(
         basis = basis @ axes[:, 1:]
 
     return None
-
-
-def _hidden_by_noise(
-    direction: Array, paths: MarkerPaths, found: ConcentricSpheres, limits: SphereLimits
-) -> float:
-    """Return the information, in squared radians, that noise may bring along a direction."""
-    total = float(paths.n.sum())
-    enough = MIN_CONDITIONING**2 * found.noise2 / float(np.median(found.radii2))
-    if len(direction) < 3:
-        return max(enough, 0.0)
-    floor = float(direction @ found.floor @ direction)
-    chance = MIN_SIGNIFICANCE * floor * float(np.sqrt(2.0 / total))
-    return max(enough, chance, limits.min_direction**2 * total, 0.0)
 
 
 def soft_tissue_variance(

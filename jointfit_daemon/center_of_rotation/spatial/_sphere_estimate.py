@@ -130,18 +130,22 @@ def _answer(
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
     spread = seen.shown.T @ spread @ seen.shown
     C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
-    radii, arc = _round(seen)
+
+    # radii and arc about the observable part of the center
+    away = found.center - seen.paths.mean
+    inside = away @ seen.shown
+    aside2 = np.maximum((away**2).sum(axis=1) - (inside**2).sum(axis=1), 0.0)
+    radii = np.sqrt(np.maximum(found.radii2 - aside2, 1e-8))
+    arc = arc_of(float((np.linalg.norm(inside, axis=1) / radii).min()))
     radius = float(np.median(radii))
     conditioning = radius / float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 1e-300)))
     relative, rho = found.relative, seen.left.persistence
     residual2 = np.maximum(np.diagonal(seen.left.together), 0.0)
     loud = np.flatnonzero(relative > LOUD * np.median(relative))
-    flags = [
-        *(["hinge"] if len(unseen) else []),
-        *(["residuals_persist"] if rho > PERSISTENT else []),
-        *(["residuals_repeat"] if seen.left.posture > 0.0 else []),
-        *(f"noisy_marker:{j}" for j in loud),
-    ]
+    flags = ["hinge"] if len(unseen) else []
+    flags += ["residuals_persist"] if rho > PERSISTENT else []
+    flags += ["residuals_repeat"] if seen.left.posture > 0.0 else []
+    flags += [f"noisy_marker:{j}" for j in loud]
 
     return CenterEstimate(
         method="",
@@ -161,15 +165,6 @@ def _answer(
         within95=seen.within95,
         refused=objection(arc, radius, conditioning, limits, soft_tissue=seen.left.posture > 0.0),
     )
-
-
-def _round(seen: ObservedCenter) -> tuple[Array, float]:
-    """Return the radii, m, and the arc, rad, about the observable part of the center."""
-    away = seen.found.center - seen.paths.mean
-    inside = away @ seen.shown
-    aside2 = np.maximum((away**2).sum(axis=1) - (inside**2).sum(axis=1), 0.0)
-    radii = np.sqrt(np.maximum(seen.found.radii2 - aside2, 1e-8))
-    return radii, arc_of(float((np.linalg.norm(inside, axis=1) / radii).min()))
 
 
 def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:

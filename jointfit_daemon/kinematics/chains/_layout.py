@@ -88,7 +88,10 @@ def _layout(model: ChainModel) -> ChainLayout:
     segment_of = np.array([i for i, _ in columns], dtype=np.intp)
     shifts = np.array([row for row, (_, k) in enumerate(columns) if k > 2], dtype=np.intp)
     center = np.where(is_free[:, None], 0.0, [j.center for j in joints])
-    below = _below(parents)
+    below = np.eye(len(parents))
+    for i in reversed(range(len(parents))):
+        if parents[i] >= 0:
+            below[parents[i]] = np.maximum(below[parents[i]], below[i])
 
     corners = np.tile(np.eye(4), (len(joints), 1, 1))
     corners[:, :3, 3] = np.where(is_free[:, None], 0.0, [j.center_in_parent for j in joints])
@@ -122,14 +125,6 @@ def _layout(model: ChainModel) -> ChainLayout:
             if j.kind == "coupled"
         ),
     )
-
-
-def _below(parents: list[int]) -> Array:
-    below = np.eye(len(parents))
-    for i in reversed(range(len(parents))):
-        if parents[i] >= 0:
-            below[parents[i]] = np.maximum(below[parents[i]], below[i])
-    return below
 
 
 def _levels(parents: list[int]) -> tuple[tuple[Index | slice, Index | slice], ...]:

@@ -229,6 +229,7 @@ def _wrong_joint(s: Segment) -> list[str]:
         wrong.append("a free joint has no parent")
     if not np.isfinite([*j.center_in_parent, *j.center, *j.axis, *j.rest]).all():
         wrong.append("its joint is not finite")
+
     for what, values in (("axis", j.axis), ("rest", j.rest)):
         if abs(float(np.linalg.norm(values)) - 1.0) > _UNIT_TOLERANCE:
             wrong.append(f"{what} {values} is not of length 1")

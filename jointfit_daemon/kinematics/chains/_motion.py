@@ -86,6 +86,8 @@ def transforms(layout: ChainLayout, state: ChainState) -> Array:
     if layout.has_own_centers:
         local[..., :3, 3] -= (rotations @ layout.center[:, :, None])[..., 0]
     local[..., :3, 3][:, layout.free] = state.origins
+
+    # paths of coupled joints, then from the root outwards
     if state.couplings is not None:
         for c, (segment, _, _) in enumerate(layout.coupled):
             local[:, segment, :3, 3] += state.couplings[:, c, 1:4]
@@ -163,7 +165,9 @@ def apply_step(model: ChainModel, state: ChainState, delta: Array) -> ChainState
 
 def step_state(layout: ChainLayout, state: ChainState, delta: Array) -> ChainState:
     """Return the state after the step `delta`, shape (T, nq)."""
-    rotations = step_rotations(layout, state.rotations, delta)
+    vectors = (delta @ layout.spread).reshape(*state.rotations.shape[:2], 3)
+    exp = exp_matrix if len(vectors) > 1 else _exp_of_few
+    rotations = state.rotations @ exp(vectors)
     origins = state.origins + delta[:, layout.shifts].reshape(len(delta), -1, 3)
     if state.couplings is None:
         return ChainState(rotations, origins)
@@ -190,13 +194,6 @@ def place_coupled(
         q = np.full(len(rotations), curve.home) if amounts is None else amounts[:, c]
         rotations[:, segment], found[:, c] = curve.at(q)
     return ChainState(rotations, origins, found)
-
-
-def step_rotations(layout: ChainLayout, rotations: Array, delta: Array) -> Array:
-    """Return A exp(delta) for all joints but coupled ones: (T, S, 3, 3) by (T, nq)."""
-    vectors = (delta @ layout.spread).reshape(*rotations.shape[:2], 3)
-    exp = exp_matrix if len(vectors) > 1 else _exp_of_few
-    return rotations @ exp(vectors)
 
 
 def exp_matrix(r: Array) -> Array:

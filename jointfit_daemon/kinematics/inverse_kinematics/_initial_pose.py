@@ -14,7 +14,6 @@ import numpy as np
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chains import exp_matrix, place_coupled, rest_state
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
-    MarkerSlots,
     marker_slots,
 )
 
@@ -76,7 +75,8 @@ def start_from_markers(
             cloud = _with_center(*cloud, own, center)
 
         laid, middle, spans = _laid(*cloud, above_R @ rest[i])
-        guessed |= (spans < _THIN_M2) & _has_markers(slots, i)
+        has_markers = bool((slots.places // slots.shape[1] == i).any())
+        guessed |= (spans < _THIN_M2) & has_markers
         turned = np.swapaxes(above_R, -1, -2) @ laid
         A[:, i] = _about_axis(rest[i], turned, joint.axis) if joint.kind == "hinge" else turned
         if curve is not None:
@@ -122,11 +122,6 @@ def _laid(
     minors = 0.5 * (size**2 - np.einsum("tij,tij->t", moments, moments))
     second = minors / np.maximum(size, 1e-12)  # a little more than it, never much
     return R, middle_y - (R @ middle_p[..., None])[..., 0], second
-
-
-def _has_markers(slots: MarkerSlots, i: int) -> bool:
-    """Return whether a segment has markers of its own."""
-    return bool((slots.places // slots.shape[1] == i).any())
 
 
 def _nearest_rotation(B: Array) -> Array:

@@ -110,6 +110,8 @@ def log_matrix(R: Array) -> Array:
         ),
         axis=-1,
     )
+
+    # v has the length of the sine; near zero the angle over the sine is 1
     sine = np.sqrt(np.einsum("...i,...i->...", v, v))
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
     small = sine < 1e-9
@@ -118,7 +120,7 @@ def log_matrix(R: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class SearchProblem:
+class PoseProblem:
     """Least-squares problem at T instants."""
 
     model: ChainModel
@@ -138,7 +140,7 @@ class SearchProblem:
         weighing = self.weights[self.weights > 0.0]
         return float(np.median(weighing)) if weighing.size else 1.0
 
-    def take(self, instants: NDArray[np.intp], hold: Band | None = None) -> SearchProblem:
+    def take(self, instants: NDArray[np.intp], hold: Band | None = None) -> PoseProblem:
         """Return the problem at some instants, with an additional band if given."""
         kept = tuple(b if len(b.weights) == 1 else b.take(instants) for b in self.bands)
         return replace(
@@ -169,8 +171,8 @@ class SearchProblem:
 
 
 @dataclass(frozen=True, slots=True)
-class SearchResult:
-    """Result of a search."""
+class PoseSolution:
+    """Minimum that `find_poses` reached."""
 
     state: ChainState
     weights: Array
@@ -179,11 +181,13 @@ class SearchResult:
     iterations: NDArray[np.intp]
 
 
-def search(problem: SearchProblem, start: ChainState) -> SearchResult:
+def find_poses(problem: PoseProblem, start: ChainState) -> PoseSolution:
     """Return the minimum from `start`, with robust weights if configured."""
     found = _descend(problem, start)
     if problem.huber_m is None:
         return found
+
+    # errors above Huber's threshold lose weight, and the minimum moves a little
     iterations = found.iterations
     for _ in range(problem.reweightings):
         errors = problem.at(found.state)[0].errors
@@ -195,7 +199,7 @@ def search(problem: SearchProblem, start: ChainState) -> SearchResult:
     return replace(found, iterations=iterations)
 
 
-def _descend(problem: SearchProblem, start: ChainState) -> SearchResult:
+def _descend(problem: PoseProblem, start: ChainState) -> PoseSolution:
     count = len(start)
     found = start.copy()
     converged = np.zeros(count, dtype=np.bool_)
@@ -232,7 +236,7 @@ def _descend(problem: SearchProblem, start: ChainState) -> SearchResult:
             if not len(here):
                 break
     found.put(here, state)
-    return SearchResult(found, problem.weights, converged, iterations)
+    return PoseSolution(found, problem.weights, converged, iterations)
 
 
 def _kept(
@@ -251,6 +255,7 @@ def _kept(
         np.where(keep, onward.origins, state.origins),
         couplings,
     )
+
     pairs = ((there.world, at.world), (there.cloud, at.cloud), (there.weighted, at.weighted))
     world, cloud, weighted = (np.where(keep[..., None], n, o) for n, o in pairs)
     return state, MarkerFit(world, cloud, weighted, couplings)

@@ -20,9 +20,9 @@ import numpy as np
 from jointfit_daemon.kinematics.inverse_kinematics._initial_pose import start_from_markers
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import (
     Band,
-    SearchProblem,
+    PoseProblem,
+    find_poses,
     limits_of,
-    search,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
     marker_fit,
@@ -118,7 +118,7 @@ def solve_frames(
         raise ValueError(f"start has {len(start)} instants, the markers {len(measured)}")
 
     slots = marker_slots(model)
-    problem = SearchProblem(
+    problem = PoseProblem(
         model,
         slots.filled_vectors(measured),
         slots.filled(w),
@@ -148,14 +148,14 @@ def solve_frames(
 class _Solution:
     """Solution in progress; its arrays are written in place."""
 
-    problem: SearchProblem
+    problem: PoseProblem
     state: ChainState
     weights: Array
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
 
     @classmethod
-    def of(cls, problem: SearchProblem, start: ChainState) -> _Solution:
+    def of(cls, problem: PoseProblem, start: ChainState) -> _Solution:
         count = len(start)
         return cls(
             problem,
@@ -168,7 +168,7 @@ class _Solution:
     def solve(self, instants: NDArray[np.intp], hold: Band | None = None) -> None:
         """Solve some instants from their current state."""
         part = self.problem.take(instants, hold)
-        found = search(part, self.state.take(instants))
+        found = find_poses(part, self.state.take(instants))
         self.state.put(instants, found.state)
         self.weights[instants] = found.weights
         self.converged[instants] = found.converged
@@ -204,6 +204,7 @@ class _Solution:
         at = marker_fit(slots, self.state, self.problem.measured, self.weights)
         residuals = slots.taken(at.errors)
         residuals[~seen] = np.nan
+
         return IkResult(
             self.state,
             at.world[..., :3, :3],
