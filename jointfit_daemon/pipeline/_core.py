@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.fusion import SensorReport
-    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
@@ -90,9 +88,9 @@ class Core:
             SourceOpened: self._open_source,
             SourceClosed: self._close_source,
             Tick: lambda _: [],
-            Request: self._request,
-            JobFinished: self._finish_job,
-            CalibrationStored: self._set_stored_version,
+            Request: self._update_session,
+            JobFinished: self._update_session,
+            CalibrationStored: self._update_session,
             UnixOffset: self._set_unix_offset,
         }
 
@@ -139,7 +137,13 @@ class Core:
         self._reload_sources(rig)
 
         outputs: list[Output] = []
-        session = _session(event)
+        session = CalibrationSession(
+            rig.chain,
+            rig.calibration,
+            mocap=any(source.kind == "mocap" for source in rig.sources),
+            calibration=event.calibration,
+            version=event.calibration_version,
+        )
         if before is not None:
             outputs += self._session.abort(event.t_ns, "the configuration was reloaded")
             outputs.append(
@@ -323,8 +327,9 @@ class Core:
             outputs += self._collector.notices(now_ns)
 
         outputs += self._limiter.due(now_ns)
-        if reports := self._fuser.pop_reports(now_ns):
-            outputs += [_sensor_notice(now_ns, report) for report in reports]
+        for report in self._fuser.pop_reports(now_ns):
+            level, data = NoticeLevel(report.level), {"state": report.state, **report.data}
+            outputs.append(Notice(now_ns, NoticeKind.SENSOR, report.id, report.text, level, data))
         return outputs
 
     def _fuse(self, frame: AlignedFrame) -> LimbState:
@@ -347,52 +352,27 @@ class Core:
 
     # --- calibration -------------------------------------------------------------------------
 
-    def _request(self, event: Request) -> list[Output]:
-        if event.command == "calibrate":
-            before = self._session.calibration
-            outputs = self._session.request(event)
-            self._apply_calibration_change(before)
-            return outputs
-
-        message = f"unknown request {event.command!r}; known: calibrate"
-        error = {"key": "command", "message": message}
-        return [event.reply("error", {}, error)]
-
-    def _set_stored_version(self, event: CalibrationStored) -> list[Output]:
-        return self._session.set_stored_version(event)
-
-    def _finish_job(self, event: JobFinished) -> list[Output]:
+    def _update_session(self, event: Request | JobFinished | CalibrationStored) -> list[Output]:
+        """Pass an event to the session, and use its new calibration, if any."""
         before = self._session.calibration
-        outputs = self._session.finish_job(event)
-        self._apply_calibration_change(before)
-        return outputs
+        if isinstance(event, JobFinished):
+            outputs = self._session.finish_job(event)
+        elif isinstance(event, CalibrationStored):
+            outputs = self._session.set_stored_version(event)
+        elif event.command == "calibrate":
+            outputs = self._session.request(event)
+        else:
+            message = f"unknown request {event.command!r}; known: calibrate"
+            return [event.reply("error", {}, {"key": "command", "message": message})]
 
-    def _apply_calibration_change(self, before: Calibration | None) -> None:
         after = self._session.calibration
         if before and after and after is not before and only_models_differ(before, after):
             self._fuser.replace_models(after)
         elif after is not before:
             self._use_calibration()
-
-
-def _session(event: Configured) -> CalibrationSession:
-    rig = event.rig
-    return CalibrationSession(
-        rig.chain,
-        rig.calibration,
-        mocap=any(source.kind == "mocap" for source in rig.sources),
-        calibration=event.calibration,
-        version=event.calibration_version,
-    )
+        return outputs
 
 
 def _calibration_inputs(rig: Rig) -> tuple[object, ...]:
     """Return the parts of a rig on which a static pose or an alignment depends."""
     return rig.chain, rig.calibration, rig.sources
-
-
-def _sensor_notice(now_ns: int, report: SensorReport) -> Notice:
-    data = {"state": report.state, **report.data}
-    return Notice(
-        now_ns, NoticeKind.SENSOR, report.id, report.text, NoticeLevel(report.level), data
-    )

@@ -30,7 +30,7 @@ class FrameGrid:
 
     def __init__(self, rig: Rig, begin_ns: int) -> None:
         self._layout = _layout(rig)
-        self._names = _sensors(rig)
+        self._names = [source.id for source in rig.sources if source.kind == "imu"]
         self._counts_before: dict[str, dict[str, int]] = {}
         """Counts of the aligners that reloads replaced."""
         self.aligner = _aligner(rig, begin_ns)
@@ -42,26 +42,24 @@ class FrameGrid:
         self.aligner.close()
         counts = self.counts()
         self.aligner = _aligner(rig, self.aligner.next_ns)
-        self._layout, self._names = _layout(rig), _sensors(rig)
+        self._layout = _layout(rig)
+        self._names = [source.id for source in rig.sources if source.kind == "imu"]
         # A removed sensor loses its counts: if it is added again, it starts from 0.
         self._counts_before = {name: counts[name] for name in self._names if name in counts}
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return the counts of every sensor's samples since the daemon started, by outcome."""
-        return {name: self._sensor_counts(name) for name in self._names}
-
-    def _sensor_counts(self, name: str) -> dict[str, int]:
-        before = self._counts_before.get(name, {})
-        return {key: n + before.get(key, 0) for key, n in self.aligner.counts(name).items()}
+        found = {}
+        for name in self._names:
+            before = self._counts_before.get(name, {})
+            now = self.aligner.counts(name)
+            found[name] = {outcome: n + before.get(outcome, 0) for outcome, n in now.items()}
+        return found
 
 
 def _layout(rig: Rig) -> tuple[object, ...]:
     imus = tuple((s.id, s.rate_hz) for s in rig.sources if s.kind == "imu")
     return rig.output_rate_hz, rig.align_mode, imus
-
-
-def _sensors(rig: Rig) -> tuple[str, ...]:
-    return tuple(source.id for source in rig.sources if source.kind == "imu")
 
 
 def _aligner(rig: Rig, begin_ns: int | None) -> FrameAligner:

@@ -30,6 +30,7 @@ _LEVELS = {"warning": NoticeLevel.WARNING, "error": NoticeLevel.ERROR}
 """Level of the notice by kind of device event, if it is not ``info``."""
 _JUMPS = {"restart": NoticeKind.CLOCK, "clock": NoticeKind.CLOCK, "counter": NoticeKind.WIRE}
 """Kind of the notice for device events that are reported by their last text and their number."""
+_NO_DATA: Mapping[str, object] = MappingProxyType({})
 
 
 @dataclass(slots=True)
@@ -37,6 +38,7 @@ class _Condition:
     reported_ns: int
     count: int = 0
     amount: int = 0
+    """Lost samples or discarded bytes."""
     lasting: bool = False
     """Whether it was reported more than once, so that its end is worth a notice."""
     text: str = ""
@@ -52,94 +54,74 @@ class NoticeLimiter:
     def add(self, now_ns: int, source: str, item: Corrupt | DeviceEvent) -> list[Notice]:
         """Add one event; return the notices that are due."""
         if isinstance(item, Corrupt):
-            return self._collect(now_ns, (source, "corrupt"), item.discarded, item.reason)
-
-        if item.kind == "gap":
+            kind, amount, text, data = "corrupt", item.discarded, item.reason, _NO_DATA
+        elif item.kind == "gap":
             lost = item.data.get("lost", 1)
-            return self._collect(
-                now_ns, (source, "gap"), lost if isinstance(lost, int) else 1, item.text
-            )
-        if item.kind in _JUMPS:
-            return self._collect(now_ns, (source, item.kind), 1, item.text, item.data)
-        level = _LEVELS.get(item.kind, NoticeLevel.INFO)
-        return [Notice(now_ns, NoticeKind.DEVICE, source, item.text, level, dict(item.data))]
+            kind, text, data = "gap", item.text, _NO_DATA
+            amount = lost if isinstance(lost, int) else 1
+        elif item.kind in _JUMPS:
+            kind, amount, text, data = item.kind, 1, item.text, item.data
+        else:
+            level = _LEVELS.get(item.kind, NoticeLevel.INFO)
+            return [Notice(now_ns, NoticeKind.DEVICE, source, item.text, level, dict(item.data))]
 
-    def due(self, now_ns: int) -> list[Notice]:
-        """Return the collected notices whose quiet time has passed."""
-        if not self._conditions:
-            return []
-        notices = []
-        for key, condition in self._conditions.items():
-            if now_ns - condition.reported_ns < QUIET_NS:
-                continue
-
-            if condition.count:
-                condition.lasting = key[1] not in _JUMPS
-                notices.append(_notice(now_ns, key, condition))
-            elif condition.lasting:
-                notices.append(_end_notice(now_ns, key, condition))
-        return notices
-
-    def _collect(
-        self,
-        now_ns: int,
-        key: tuple[str, str],
-        amount: int,
-        text: str,
-        data: Mapping[str, object] = MappingProxyType({}),
-    ) -> list[Notice]:
+        key = source, kind
         condition = self._conditions.setdefault(key, _Condition(reported_ns=now_ns - QUIET_NS))
         condition.count += 1
         condition.amount += amount
         condition.text, condition.data = text, data
-
         if now_ns - condition.reported_ns < QUIET_NS:
             return []
         condition.lasting = False
         return [_notice(now_ns, key, condition)]
 
+    def due(self, now_ns: int) -> list[Notice]:
+        """Return the collected notices whose quiet time has passed."""
+        notices = []
+        for key, condition in self._conditions.items():
+            if now_ns - condition.reported_ns < QUIET_NS:
+                continue
+
+            source, kind = key
+            if condition.count:
+                condition.lasting = kind not in _JUMPS
+                notices.append(_notice(now_ns, key, condition))
+            elif condition.lasting:
+                what = "no samples lost" if kind == "gap" else "no bytes discarded"
+                text = f"{what} for {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
+                data = _totals(kind, condition)
+                notices.append(
+                    Notice(now_ns, NoticeKind.WIRE, source, text, NoticeLevel.INFO, data)
+                )
+                condition.reported_ns, condition.lasting = now_ns, False
+        return notices
+
 
 def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
+    """Return the notice of a condition, and begin its next quiet time."""
     source, kind = key
     if kind in _JUMPS:
-        return _jump_notice(now_ns, key, condition)
-
-    if kind == "gap":
-        text = f"{condition.amount} sample{'s' if condition.amount > 1 else ''} lost"
+        text, data = condition.text, dict(condition.data)
+        if condition.count > 1:
+            text = f"{text} (last of {condition.count} such events)"
+            data["events"] = condition.count
     else:
         text = f"{condition.amount} bytes discarded: {condition.text}"
-    if condition.lasting:
-        text = f"{text}, in the last {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
-    data = _totals(kind, condition)
+        if kind == "gap":
+            text = f"{condition.amount} sample{'s' if condition.amount > 1 else ''} lost"
+        if condition.lasting:
+            text = f"{text}, in the last {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
+        data = _totals(kind, condition)
+
     condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
-    return Notice(now_ns, NoticeKind.WIRE, source, text, NoticeLevel.WARNING, data)
-
-
-def _end_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
-    """Return the notice that a condition did not occur since the last one."""
-    source, kind = key
-    what = "no samples lost" if kind == "gap" else "no bytes discarded"
-    quiet_s = (now_ns - condition.reported_ns) / _NS_PER_S
-    condition.reported_ns, condition.lasting = now_ns, False
-    text = f"{what} for {quiet_s:.0f} s"
-    return Notice(now_ns, NoticeKind.WIRE, source, text, NoticeLevel.INFO, _totals(kind, condition))
+    reported = _JUMPS.get(kind, NoticeKind.WIRE)
+    return Notice(now_ns, reported, source, text, NoticeLevel.WARNING, data)
 
 
 def _totals(kind: str, condition: _Condition) -> dict[str, object]:
     if kind == "gap":
         return {"gaps": condition.count, "lost": condition.amount}
     return {"runs": condition.count, "discarded_bytes": condition.amount}
-
-
-def _jump_notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
-    """Return the last event of a kind, and the number of events since the last notice."""
-    source, kind = key
-    text, data = condition.text, dict(condition.data)
-    if condition.count > 1:
-        text = f"{text} (last of {condition.count} such events)"
-        data["events"] = condition.count
-    condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
-    return Notice(now_ns, _JUMPS[kind], source, text, NoticeLevel.WARNING, data)
 
 
 def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:

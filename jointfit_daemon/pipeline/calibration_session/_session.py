@@ -188,23 +188,20 @@ class CalibrationSession:
             return self._revert_refits(request)
         if wanted == "abort":
             outputs = self.abort(request.t_ns, "abort requested")
-            data = {"phase": self.phase}
-            return [*outputs, request.reply("ok", data)]
+            return [*outputs, request.reply("ok", {"phase": self.phase})]
 
         wanted_s = _seconds(request.arguments.get("seconds"))
-        refusal = self._refusal(wanted)
-        if refusal is None and wanted_s is not None and not 0.0 < wanted_s <= MAX_PHASE_S:
-            refusal = ("seconds", f"expected a number above 0 and up to {MAX_PHASE_S}")
-        if refusal is not None:
-            key, message = refusal
-            error = {"key": key, "message": message}
-            return [request.reply("error", {}, error)]
+        key, message = "phase", self._refusal(wanted)
+        if message is None and wanted_s is not None and not 0.0 < wanted_s <= MAX_PHASE_S:
+            key, message = "seconds", f"expected a number above 0 and up to {MAX_PHASE_S}"
+        if message is not None:
+            return [request.reply("error", {}, {"key": key, "message": message})]
 
         phase = CalibrationPhase(wanted)
         self._force = request.arguments.get("force") is True
         return [
             request.reply("accepted", {"phase": wanted}),
-            *self._start(request.t_ns, phase, wanted_s or self._default_s(phase)),
+            *self._start(request.t_ns, phase, wanted_s),
         ]
 
     def _revert_refits(self, request: Request) -> list[Output]:
@@ -221,7 +218,7 @@ class CalibrationSession:
         return [
             request.reply("ok", {"phase": self.phase}),
             CalibrationReady(before),
-            self._status(request.t_ns, self.phase, text),
+            self.status(request.t_ns, text),
         ]
 
     def request_refit(self, fresh: OnlineFrames) -> list[Output]:
@@ -232,77 +229,62 @@ class CalibrationSession:
         self.refits.job = self._jobs
         return [FitJob(self._jobs, RefitJob(self._chain, self.calibration, fresh))]
 
-    def _finish_refit(self, event: JobFinished, before: Calibration) -> list[Output]:
-        found, notice = self.refits.finish(event, before, self.version)
-        if found is None:
-            return [notice]
-        self.calibration, self.version = found, None
-        text = "models from online learning are in use"
-        return [notice, CalibrationReady(found), self._status(event.t_ns, self.phase, text)]
-
-    def _refusal(self, wanted: str) -> tuple[str, str] | None:
-        """Return key and message of the reason why a phase cannot start, or None."""
+    def _refusal(self, wanted: str) -> str | None:
+        """Return the reason why a phase cannot start, or None."""
+        settings = self._settings
         if wanted not in COLLECTING:
-            return "phase", f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
+            return f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
         if self._state not in RESTING:
-            return "phase", (
+            return (
                 f"phase '{self.phase}' is running: wait until it ends, or abort it with"
                 ' `jointfit calibrate RIG.toml --abort` (over MQTT: {"phase":"abort"})'
             )
-        if wanted in ("align", "functional") and not self._mocap:
-            return "phase", f"{wanted!r} needs a mocap system: add [mocap] to rig.toml"
 
-        reason = self._missing_markers(wanted)
-        if reason is None and wanted == "functional":
-            reason = self._missing_pose()
-        return None if reason is None else ("phase", reason)
+        if wanted != "static" and not self._mocap:
+            return f"{wanted!r} needs a mocap system: add [mocap] to rig.toml"
+        if wanted == "functional":
+            return self._functional_refusal()
+        if wanted == "static" or settings.plate is not None or PLATE in settings.markers:
+            return None
+        return (
+            "'align' needs the plate that carries the sensors: name its rigid body in rig.toml "
+            '([mocap] plate = "Plate") or its markers (markers.plate = [...])'
+        )
 
-    def _missing_pose(self) -> str | None:
+    def _functional_refusal(self) -> str | None:
+        """Return the reason why the functional phase has no markers or no static pose, or None."""
+        named = {*self._settings.markers, *self._settings.rigid_bodies}
+        bare = [segment for segment in self._chain.segments if segment not in named]
+        if bare:
+            return (
+                f"'functional' needs markers on {', '.join(bare)}: name three or more in rig.toml "
+                f"([mocap] markers.{bare[0]} = [...]) or a rigid body (rigid_body.{bare[0]} = "
+                '"..."), then repeat the static pose'
+            )
         if self._static is None:
             return "'functional' needs a static pose first: request static and stand still"
         if self._static.optical is None:
             return "no mocap data of the static pose: repeat it in view of the cameras"
         return None
 
-    def _missing_markers(self, wanted: str) -> str | None:
-        settings = self._settings
-        if wanted == "align" and settings.plate is None and PLATE not in settings.markers:
-            return (
-                "'align' needs the plate that carries the sensors: name its rigid body in rig.toml "
-                '([mocap] plate = "Plate") or its markers (markers.plate = [...])'
-            )
-
-        named = {*settings.markers, *settings.rigid_bodies}
-        bare = [segment for segment in self._chain.segments if segment not in named]
-        if wanted == "functional" and bare:
-            return (
-                f"'functional' needs markers on {', '.join(bare)}: name three or more in rig.toml "
-                f"([mocap] markers.{bare[0]} = [...]) or a rigid body (rigid_body.{bare[0]} = "
-                '"..."), then repeat the static pose'
-            )
-        return None
-
-    def _default_s(self, phase: CalibrationPhase) -> float:
-        settings = self._settings
-        return {
-            CalibrationPhase.ALIGN: settings.align_s,
-            CalibrationPhase.STATIC: settings.static_s,
-            CalibrationPhase.FUNCTIONAL: settings.functional_s,
-        }[phase]
-
-    def _start(self, t_ns: int, phase: CalibrationPhase, wanted_s: float) -> list[Output]:
+    def _start(self, t_ns: int, phase: CalibrationPhase, requested_s: float | None) -> list[Output]:
         self._change(START[phase])
         guide, settings = None, self._settings
         if phase == CalibrationPhase.FUNCTIONAL:
             guide = MovementGuide(self._chain, settings, self._static)
 
-        wanted_s = min(wanted_s, MAX_PHASE_S)
+        default_s = {
+            CalibrationPhase.ALIGN: settings.align_s,
+            CalibrationPhase.STATIC: settings.static_s,
+            CalibrationPhase.FUNCTIONAL: settings.functional_s,
+        }
+        wanted_s = min(requested_s or default_s[phase], MAX_PHASE_S)
         min_s = settings.functional_min_s
         self._recording = PhaseRecording(
             phase, self._chain, t_ns, wanted_s, guide=guide, min_s=min_s
         )
         most = "at most " if guide is not None else ""
-        return [self._status(t_ns, phase, f"{INSTRUCTIONS[phase]}, {most}{wanted_s:g} s")]
+        return [self.status(t_ns, f"{INSTRUCTIONS[phase]}, {most}{wanted_s:g} s", phase)]
 
     def _change(self, event: SessionEvent) -> None:
         self._state = TRANSITIONS[self._state, event]
@@ -329,7 +311,7 @@ class CalibrationSession:
             outputs += _notices(now_ns, phase, [text])
         outputs += _notices(now_ns, phase, recording.missing)
         text = "; ".join((f"fitting the {phase} trial", *recording.missing))
-        return [*outputs, self._status(now_ns, CalibrationPhase.FITTING, text), self._fit]
+        return [*outputs, self.status(now_ns, text, CalibrationPhase.FITTING), self._fit]
 
     def _job(self, phase: CalibrationPhase, trial: CalibrationTrial) -> CalibrationJob:
         """Return the fit of the phase that ended."""
@@ -350,7 +332,12 @@ class CalibrationSession:
         """Use the result of the worker. Results of cancelled jobs are ignored."""
         fit = self._fit
         if event.job == self.refits.job and self.calibration is not None:
-            return self._finish_refit(event, self.calibration)
+            found, notice = self.refits.finish(event, self.calibration, self.version)
+            if found is None:
+                return [notice]
+            self.calibration, self.version = found, None
+            text = "models from online learning are in use"
+            return [notice, CalibrationReady(found), self.status(event.t_ns, text)]
         if fit is None or event.job != fit.job:
             return []
 
@@ -361,7 +348,7 @@ class CalibrationSession:
         if event.result is None or failure is not None:
             self._change(SessionEvent.FAILED)
             text = f"{work.name}: {failure}"
-            return [self._status(event.t_ns, CalibrationPhase.ABORTED, text)]
+            return [self.status(event.t_ns, text, CalibrationPhase.ABORTED)]
         return self._use_result(event.t_ns, CalibrationPhase(work.name), event.result)
 
     def _use_result(self, t_ns: int, phase: CalibrationPhase, result: FitResult) -> list[Output]:
@@ -370,7 +357,7 @@ class CalibrationSession:
             self._change(SessionEvent.ALIGNMENT_FITTED)
             self._alignment = result.alignment
             quality = {"alignment": quality}
-            status = self._status(t_ns, CalibrationPhase.ALIGNED, "worlds aligned", quality)
+            status = self.status(t_ns, "worlds aligned", CalibrationPhase.ALIGNED, quality)
             return [*_notices(t_ns, phase, result.alignment.get("notes", ())), status]
 
         static = phase == CalibrationPhase.STATIC
@@ -378,12 +365,12 @@ class CalibrationSession:
             quality = {"static": quality}
         if result.calibration is None:
             self._change(SessionEvent.POSE_FITTED)
-            return [self._status(t_ns, CalibrationPhase.POSED, "static pose recorded", quality)]
+            return [self.status(t_ns, "static pose recorded", CalibrationPhase.POSED, quality)]
 
         if (worse := result.worse) is not None and not self._force:
             self._change(SessionEvent.RESULT_WORSE)
             text = f"new calibration rejected, it is worse than the stored one: {worse}; use force"
-            status = self._status(t_ns, self.phase, f"{text} to replace it")
+            status = self.status(t_ns, f"{text} to replace it")
             return [replace(status, kept=worse, refused=quality)]
 
         self._change(SessionEvent.POSE_FITTED if static else SessionEvent.CALIBRATION_FITTED)
@@ -395,7 +382,7 @@ class CalibrationSession:
             *(() if static else _notices(t_ns, phase, self.calibration.notes)),
             *_notices(t_ns, phase, result.notes or (), NoticeLevel.INFO),
             CalibrationReady(self.calibration),
-            self._status(t_ns, self._state, text, quality),
+            self.status(t_ns, text, self._state, quality),
         ]
 
     def set_stored_version(self, event: CalibrationStored) -> list[Output]:
@@ -403,9 +390,17 @@ class CalibrationSession:
         self.version = event.version
         return [self.status(event.t_ns, f"stored as version {event.version}")]
 
-    def status(self, t_ns: int, text: str) -> CalibrationStatus:
-        """Return the status of the session."""
-        return self._status(t_ns, self.phase, text)
+    def status(
+        self,
+        t_ns: int,
+        text: str,
+        phase: CalibrationPhase | None = None,
+        quality: Mapping[str, object] | None = None,
+    ) -> CalibrationStatus:
+        """Return a status, by default of the present phase and the calibration in force."""
+        if quality is None:
+            quality = {} if self.calibration is None else self.calibration.quality
+        return CalibrationStatus(t_ns, phase or self.phase, text, self.version, quality)
 
     def abort(self, t_ns: int, reason: str) -> list[Output]:
         """Abort the running phase or fit, if any."""
@@ -416,19 +411,7 @@ class CalibrationSession:
             outputs.append(CancelJob(self._fit.job))
         self._change(SessionEvent.FAILED)
         self._recording = self._fit = None
-        return [*outputs, self._status(t_ns, CalibrationPhase.ABORTED, reason)]
-
-    def _status(
-        self,
-        t_ns: int,
-        phase: CalibrationPhase,
-        text: str,
-        quality: Mapping[str, object] | None = None,
-    ) -> CalibrationStatus:
-        """Return a status with the given quality, else that of the calibration in force."""
-        if quality is None:
-            quality = {} if self.calibration is None else self.calibration.quality
-        return CalibrationStatus(t_ns, phase, text, self.version, quality)
+        return [*outputs, self.status(t_ns, reason, CalibrationPhase.ABORTED)]
 
 
 def _seconds(value: object) -> float | None:

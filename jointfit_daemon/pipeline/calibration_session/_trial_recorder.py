@@ -49,10 +49,13 @@ class TrialRecorder:
         """Return the recording between two instants, both included."""
         low = -(2**62) if start_ns is None else start_ns
         high = 2**62 if end_ns is None else end_ns
-        sensors = {
-            sensor: _sensor_track([row for row in track if low <= row[0] <= high])
-            for sensor, track in self._samples.items()
-        }
+        sensors = {}
+        for sensor, track in self._samples.items():
+            rows = [row for row in track if low <= row[0] <= high]
+            t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+            q = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 4)
+            keep = _increasing(t_ns)
+            sensors[sensor] = SensorTrack(t_ns[keep], q[keep])
 
         frames = [row for row in self._frames if low <= row[0] <= high]
         return CalibrationTrial(sensors, _optical_track(frames) if frames else None)
@@ -60,17 +63,8 @@ class TrialRecorder:
 
 def _increasing(t_ns: np.ndarray) -> np.ndarray:
     """Return the indices of a strictly increasing subsequence: restarted clocks may step back."""
-    if t_ns.size == 0:
-        return np.zeros(0, dtype=np.int64)
-    before = np.concatenate(([np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)[:-1]))
+    before = np.concatenate(([np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)))[:-1]
     return np.flatnonzero(t_ns > before)
-
-
-def _sensor_track(rows: list[tuple[int, Quaternion]]) -> SensorTrack:
-    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
-    q = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 4)
-    keep = _increasing(t_ns)
-    return SensorTrack(t_ns[keep], q[keep])
 
 
 def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:

@@ -16,6 +16,7 @@ import numpy as np
 
 from jointfit_daemon.calibration import OnlineFrames
 from jointfit_daemon.kinematics.rotation_scalar import interpolate_one, multiply_one
+from jointfit_daemon.model import FrameFlag
 from jointfit_daemon.pipeline.online_learning._learning_state import LearningMonitor, not_visible
 
 if TYPE_CHECKING:
@@ -42,9 +43,11 @@ MIN_FRAMES = 600
 """Number of frames that trigger a refit: one minute of movement."""
 REFIT_NS = 180_000_000_000
 """Time between two refits, and before the first one once there are enough frames, ns."""
-_FAULT_FLAGS = (
-    "stuck:", "slipped:", "pair_disagrees:", "heading_disagrees:", "one_sensor:", "held:", "lost:",
+_FAULTS = (
+    FrameFlag.STUCK, FrameFlag.SLIPPED, FrameFlag.PAIR_DISAGREES, FrameFlag.HEADING_DISAGREES,
+    FrameFlag.ONE_SENSOR, FrameFlag.HELD, FrameFlag.LOST,
 )  # fmt: skip
+"""Flags of a frame that is not used for training."""
 _RECENT, _WAITING = 64, 16
 
 
@@ -104,11 +107,6 @@ class OnlineFrameCollector:
         """Return the state of online learning."""
         return self._monitor.health(now_ns, len(self._kept))
 
-    @property
-    def kept(self) -> int:
-        """Number of frames that wait for a refit."""
-        return len(self._kept)
-
     # --- input -------------------------------------------------------------------------------
 
     def add_mocap(self, t_ns: int, frame: MocapFrame, epoch: int = 0) -> None:
@@ -117,8 +115,7 @@ class OnlineFrameCollector:
             return
         if frame.layout is not self._layout:
             self._layout = frame.layout
-            self._missing = self._missing_names(frame.layout)
-            self._columns = None if self._missing else self._cluster_columns(frame.layout)
+            self._find_columns(frame.layout)
         if epoch != self._epoch:
             self._clear()
             self._epoch = epoch
@@ -151,7 +148,7 @@ class OnlineFrameCollector:
         waiting = self._waiting
         while waiting and waiting[0][0] <= frame.t_ns:
             t_ns, mocap = waiting.popleft()
-            faults = [flag for flag in flags if flag.startswith(_FAULT_FLAGS)]
+            faults = [flag for flag in flags if flag.partition(":")[0] in _FAULTS]
             if not faults:
                 self._pair(t_ns, mocap)
             else:
@@ -182,23 +179,15 @@ class OnlineFrameCollector:
 
     # --- mocap names -------------------------------------------------------------------------
 
-    def _missing_names(self, layout: MocapLayout) -> list[str]:
-        """Return markers and bodies of the calibration that the stream does not contain."""
-        missing = [
-            name
-            for markers, body in self._clusters
-            for name in (markers if body is None else (body,))
-            if name not in (layout.markers if body is None else layout.bodies)
-        ]
-        return list(dict.fromkeys(missing))
-
-    def _cluster_columns(self, layout: MocapLayout) -> list[list[int]]:
-        return [
-            [layout.markers.index(name) for name in markers]
-            if body is None
-            else [layout.bodies.index(body)]
-            for markers, body in self._clusters
-        ]
+    def _find_columns(self, layout: MocapLayout) -> None:
+        """Find the markers or the rigid body of every cluster in a new layout of the stream."""
+        columns, missing = [], []
+        for markers, body in self._clusters:
+            known, names = (layout.markers, markers) if body is None else (layout.bodies, (body,))
+            missing += [name for name in names if name not in known]
+            columns.append([known.index(name) for name in names if name in known])
+        self._missing = list(dict.fromkeys(missing))
+        self._columns = None if missing else columns
 
     def _invisible_names(self, mocap: list[Array]) -> list[str]:
         """Return markers and bodies that are not visible; mostly none."""
@@ -229,7 +218,17 @@ class OnlineFrameCollector:
 
         sensors = self._sensors_at(t_ns, before, after)
         if sensors is None:
-            self._monitor.add_obstacle(t_ns, self._sensor_obstacle(before, after))
+            absent = [
+                sensor
+                for sensor in self._sensors
+                if sensor not in before.orientations or sensor not in after.orientations
+            ]
+            reason = "sensor clocks are not synchronized yet"
+            if absent:
+                reason = f"no data from {absent[0]}"
+            elif before.synced and after.synced:
+                reason = "gaps in the data of the sensors"
+            self._monitor.add_obstacle(t_ns, reason)
             return
         self._monitor.add_usable(t_ns)
         if self._kept and t_ns - self._kept_ns < POSTURE_NS:
@@ -238,14 +237,6 @@ class OnlineFrameCollector:
                 return
         self._kept.append(_TrainingFrame(sensors, mocap))
         self._kept_ns = t_ns
-
-    def _sensor_obstacle(self, before: AlignedFrame, after: AlignedFrame) -> str:
-        for sensor in self._sensors:
-            if sensor not in before.orientations or sensor not in after.orientations:
-                return f"no data from {sensor}"
-        if before.synced and after.synced:
-            return "gaps in the data of the sensors"
-        return "sensor clocks are not synchronized yet"
 
     def _sensors_at(
         self, t_ns: int, before: AlignedFrame, after: AlignedFrame

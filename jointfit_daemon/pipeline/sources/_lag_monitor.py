@@ -171,8 +171,11 @@ class LagMonitor:
         if not self._clusters:
             return
         frames = self._frames
-        if self._mocap_epoch not in (None, epoch):
-            self._restart_mocap()
+        if self._mocap_epoch not in (None, epoch):  # their clock restarted
+            frames.clear()
+            self._next_ns = None
+            for lag in self.sensors.values():
+                lag.tracker.widen(RESTART_SD_NS)
         elif frames and frames[-1][1].layout != frame.layout:
             frames.clear()
         self._mocap_epoch = epoch
@@ -187,13 +190,6 @@ class LagMonitor:
         elif t_ns >= self._next_ns + MARGIN_NS and not self._waiting and self._window is None:
             self._waiting.extend((sensor, self._next_ns) for sensor in self.sensors)
             self._next_ns = max(self._next_ns + HOP_NS, t_ns - MARGIN_NS)
-
-    def _restart_mocap(self) -> None:
-        """Discard the mocap frames: their clock restarted."""
-        self._frames.clear()
-        self._next_ns = None
-        for lag in self.sensors.values():
-            lag.tracker.widen(RESTART_SD_NS)
 
     # --- estimation --------------------------------------------------------------------------
 
@@ -252,44 +248,45 @@ class LagMonitor:
         if tracked is None or estimate.refused is not None:
             return []
 
-        notices = []
-        if tracked.step_ns is not None:
-            notices.append(_step_notice(now_ns, name, tracked.step_ns))
+        # A step invalidates the calibration if it is large.
+        notices, warning = [], NoticeLevel.WARNING
+        if (step_ns := tracked.step_ns) is not None:
+            kind, level = NoticeKind.CLOCK, NoticeLevel.INFO
+            text = f"lag changed by {_ms(step_ns)}: a clock or a filter of the sensor changed"
+            if abs(step_ns) > STEP_FAULT_NS:
+                kind, level = NoticeKind.CALIBRATION, warning
+                text += "; the calibration may be invalid: repeat the functional phase"
+            data = {"step_ms": round(step_ns * 1e-6, 3)}
+            notices.append(Notice(now_ns, kind, name, text, level, data))
+
+        # Drift between synchronized clocks, reported once.
         excess = abs(tracked.drift) - DRIFT_FAULT
         drifts = excess > 2.0 * tracked.drift_sigma
         if drifts and not lag.drifted:
-            notices.append(_drift_notice(now_ns, name, tracked))
+            text = (
+                f"lag drifts by {1e6 * tracked.drift:.1f} ppm although both clocks are "
+                "synchronized: one of the two clock fits is wrong; restart the sensor, then the "
+                "mocap server"
+            )
+            data = {"drift_ppm": round(1e6 * tracked.drift, 2)}
+            notices.append(Notice(now_ns, NoticeKind.CLOCK, name, text, warning, data))
         lag.drifted = drifts or (lag.drifted and excess > 0.0)
-        return [*notices, *self._contradiction(now_ns, name, lag, tracked)]
 
-    def _contradiction(
-        self, now_ns: int, name: str, lag: _SensorLag, tracked: TrackedLag
-    ) -> list[Notice]:
-        known = self._known.get(name)
-        if known is None:
-            return []
-
+        # Contradiction of a configured lag, reported once.
+        if (known := self._known.get(name)) is None:
+            return notices
         difference = tracked.lag_ns - known.lag_ns
         sigma = float(np.hypot(tracked.sigma_ns, known.sigma_ns))
-        before = lag.contradicted
-        lag.contradicted = abs(difference) > CONTRADICTION_SIGMA * sigma
-        if before or not lag.contradicted:
-            return []
-        text = (
-            f"lag estimated from motion is {_ms(tracked.lag_ns)}, configured {_ms(known.lag_ns)}: "
-            f"{abs(difference) / sigma:.0f} standard deviations apart; check the sync cable and "
-            "lag_ms in rig.toml"
-        )
-        return [
-            Notice(
-                now_ns,
-                NoticeKind.CLOCK,
-                name,
-                text,
-                NoticeLevel.WARNING,
-                {"lag_ms": tracked.lag_ns * 1e-6},
+        before, lag.contradicted = lag.contradicted, abs(difference) > CONTRADICTION_SIGMA * sigma
+        if lag.contradicted and not before:
+            text = (
+                f"lag estimated from motion is {_ms(tracked.lag_ns)}, configured "
+                f"{_ms(known.lag_ns)}: {abs(difference) / sigma:.0f} standard deviations apart; "
+                "check the sync cable and lag_ms in rig.toml"
             )
-        ]
+            data = {"lag_ms": tracked.lag_ns * 1e-6}
+            notices.append(Notice(now_ns, NoticeKind.CLOCK, name, text, warning, data))
+        return notices
 
     # --- output ------------------------------------------------------------------------------
 
@@ -307,23 +304,18 @@ class LagMonitor:
 
     def health(self) -> dict[str, LagHealth]:
         """Return used and estimated lag of every sensor."""
-        return {sensor: self._sensor_health(sensor) for sensor in self.sensors}
-
-    def _sensor_health(self, sensor: str) -> LagHealth:
-        lag, known = self.sensors[sensor], self._known.get(sensor)
-        if known is not None:
-            source = LagSource.CONFIGURED
-            return LagHealth(source, known.lag_ns, known.sigma_ns, None, lag.tracked, lag.refused)
-
-        used, quality = self._calibrated.get(sensor), self._quality.get(sensor, {})
-        return LagHealth(
-            LagSource.NONE if used is None else LagSource.CALIBRATION,
-            used,
-            quality.get("sigma_ns"),
-            quality.get("source"),
-            lag.tracked,
-            lag.refused,
-        )
+        found = {}
+        for sensor, lag in self.sensors.items():
+            if (known := self._known.get(sensor)) is not None:
+                found[sensor] = LagHealth(
+                    LagSource.CONFIGURED, *known, None, lag.tracked, lag.refused
+                )
+                continue
+            used, quality = self._calibrated.get(sensor), self._quality.get(sensor, {})
+            source = LagSource.NONE if used is None else LagSource.CALIBRATION
+            sigma, method = quality.get("sigma_ns"), quality.get("source")
+            found[sensor] = LagHealth(source, used, sigma, method, lag.tracked, lag.refused)
+        return found
 
 
 def _orientations(
@@ -354,26 +346,6 @@ def _orientations(
 
 def _no_estimate(refused: str) -> LagEstimate:
     return LagEstimate(np.nan, np.inf, np.nan, refused)
-
-
-def _step_notice(now_ns: int, name: str, step_ns: float) -> Notice:
-    text = f"lag changed by {_ms(step_ns)}: a clock or a filter of the sensor changed"
-    invalid = abs(step_ns) > STEP_FAULT_NS
-    if invalid:
-        text += "; the calibration may be invalid: repeat the functional phase"
-    data = {"step_ms": round(step_ns * 1e-6, 3)}
-    if not invalid:
-        return Notice(now_ns, NoticeKind.CLOCK, name, text, NoticeLevel.INFO, data)
-    return Notice(now_ns, NoticeKind.CALIBRATION, name, text, NoticeLevel.WARNING, data)
-
-
-def _drift_notice(now_ns: int, name: str, tracked: TrackedLag) -> Notice:
-    text = (
-        f"lag drifts by {1e6 * tracked.drift:.1f} ppm although both clocks are synchronized: one "
-        "of the two clock fits is wrong; restart the sensor, then the mocap server"
-    )
-    data = {"drift_ppm": round(1e6 * tracked.drift, 2)}
-    return Notice(now_ns, NoticeKind.CLOCK, name, text, NoticeLevel.WARNING, data)
 
 
 def _ms(value_ns: float) -> str:

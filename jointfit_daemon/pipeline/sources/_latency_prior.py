@@ -41,16 +41,14 @@ def latency_prior(source: Source) -> LatencyPrior:
         settings, "usual_delay_ms", None
     )
     declared = getattr(source.driver_class, "least_delay_ms", None)
-    mean, sd = configured or declared or _transport_delay_ms(source)
+    if delay := configured or declared:
+        mean, sd = delay
+    elif source.driver_class.wire == "can":
+        mean, sd = CAN_MS
+    elif source.driver_class.wire == "datagram":
+        mean, sd = DATAGRAM_MS
+    else:
+        port = str(getattr(settings, "port", "")).lower()
+        usb = getattr(settings, "transport", None) == "usb"
+        mean, sd = USB_MS if usb or any(name in port for name in _USB_NAMES) else UART_MS
     return LatencyPrior(round(mean * _NS_PER_MS), round(sd * _NS_PER_MS))
-
-
-def _transport_delay_ms(source: Source) -> tuple[float, float]:
-    wire = source.driver_class.wire
-    if wire == "can":
-        return CAN_MS
-    if wire == "datagram":
-        return DATAGRAM_MS
-    port = str(getattr(source.settings, "port", "")).lower()
-    usb = getattr(source.settings, "transport", None) == "usb"
-    return USB_MS if usb or any(name in port for name in _USB_NAMES) else UART_MS

@@ -34,11 +34,6 @@ class SyncLines:
         self._lines: dict[int, _Line] = {}
         self._mocap_lines: set[int] = set()
 
-    @property
-    def unmatched(self) -> int:
-        """Number of edges that could not be assigned to one edge of the reference."""
-        return sum(line.edges.unmatched for line in self._lines.values())
-
     def add_exposure(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
         """Add a mocap frame whose exposure made an edge on line `number`."""
         self._mocap_lines.add(number)

@@ -71,13 +71,13 @@ def feed(one: OnlineFrameCollector, seconds: float, begin_s: float = 0.0, **how:
 def test_ten_frames_a_second_are_collected_in_movement() -> None:
     one = collector()
     feed(one, 10.0)
-    assert one.kept == pytest.approx(100, abs=2)
+    assert one.health(0).kept == pytest.approx(100, abs=2)
 
 
 def test_held_posture_is_collected_once_a_second() -> None:
     one = collector()
     feed(one, 10.0, speed=0.0)
-    assert one.kept == pytest.approx(10, abs=1)
+    assert one.health(0).kept == pytest.approx(10, abs=1)
 
 
 def test_sensors_are_interpolated_at_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +87,7 @@ def test_sensors_are_interpolated_at_the_exposure(monkeypatch: pytest.MonkeyPatc
     assert one.take_due(3 * S) is None  # the waiting time starts
     taken = one.take_due(3 * S + _frame_collector.REFIT_NS)
     assert taken is not None
-    assert one.kept == 0
+    assert one.health(0).kept == 0
     for q, markers in zip(taken.sensors["S2"], taken.markers["thigh"], strict=True):
         assert angle_between_one(tuple(q), turned(float(markers[0, 0]))) < 1e-6
 
@@ -105,20 +105,20 @@ def test_sensors_are_interpolated_at_the_exposure(monkeypatch: pytest.MonkeyPatc
 def test_incomplete_or_faulty_frames_are_not_collected(how: dict[str, Any]) -> None:
     one = collector()
     feed(one, 3.0, **how)
-    assert one.kept == 0
+    assert one.health(0).kept == 0
 
 
 def test_postures_outside_the_training_range_are_collected() -> None:
     one = collector()
     feed(one, 3.0, flags=("untrained:thigh",))
-    assert one.kept > 20
+    assert one.health(0).kept > 20
 
 
 def test_collector_is_inactive_without_calibration_memory_or_setting() -> None:
     for one in (collector(wanted=False), collector(memory=""), collector(clusters={})):
         feed(one, 2.0)
         assert not one.active
-        assert one.kept == 0
+        assert one.health(0).kept == 0
     assert not OnlineFrameCollector(CHAIN, None, wanted=True).active
 
 
@@ -126,14 +126,14 @@ def test_collection_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_frame_collector, "MAX_FRAMES", 50)
     one = collector()
     feed(one, 10.0)
-    assert one.kept == 50
+    assert one.health(0).kept == 50
 
 
 def test_restart_of_the_mocap_clock_clears_the_collection() -> None:
     one = collector()
     feed(one, 3.0)
     one.add_mocap(3 * S + 200 * MS, seen(3 * S), epoch=1)
-    assert one.kept == 0
+    assert one.health(0).kept == 0
 
 
 def test_refits_are_at_least_three_minutes_apart(monkeypatch: pytest.MonkeyPatch) -> None:
