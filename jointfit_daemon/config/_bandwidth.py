@@ -46,11 +46,13 @@ def check_serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
         needed = getattr(source.settings, "serial_bits_per_s", None)
         baud = getattr(source.settings, "baud", None)
         if needed is not None and baud is not None and needed > baud:
-            slower = int(source.rate_hz * baud / needed)
+            rate_hz = int(source.rate_hz * baud / needed)
+            slower = f"set rate_hz = {rate_hz} or less"
             yield Fault(
                 f"imu[{source.id}].baud",
                 f"{source.rate_hz:g} Hz need {needed:.0f} bit/s, the line carries {baud}: "
-                f"{_faster('baud', needed, _BAUDS)}{_slower(slower)}",
+                f"{_faster('baud', needed, _BAUDS)}"
+                f"{slower if rate_hz else 'no rate in whole Hz is slow enough'}",
                 baud,
             )
 
@@ -67,7 +69,11 @@ def check_can_buses(
 
     for name, members in users.items():
         bus = buses[name]
-        sent = [(source.rate_hz, frame) for source in members for frame in _frames(source)]
+        sent = [
+            (source.rate_hz, frame)
+            for source in members
+            for frame in getattr(source.settings, "can_frames", ())
+        ]
         needing = f"{', '.join(source.id for source in members)} need"
         on_bus = sum(hz * frame_bits(size, extended=ext) for hz, (size, ext) in sent)
         if on_bus > bus.bitrate:
@@ -88,15 +94,6 @@ def check_can_buses(
             )
 
 
-def _frames(source: Source) -> tuple[tuple[int, bool], ...]:
-    frames: tuple[tuple[int, bool], ...] = getattr(source.settings, "can_frames", ())
-    return frames
-
-
 def _faster(key: str, needed: float, speeds: Sequence[int]) -> str:
     enough = next((speed for speed in speeds if speed >= needed), None)
     return "" if enough is None else f"set {key} = {enough} or more here and on the device, or "
-
-
-def _slower(rate_hz: int) -> str:
-    return f"set rate_hz = {rate_hz} or less" if rate_hz else "no rate in whole Hz is slow enough"

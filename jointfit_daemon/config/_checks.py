@@ -84,6 +84,7 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
         for name in names:
             yield from check_topic_name(f"chain.{key}", name)
         yield from _repeated(f"chain.{key}", names)
+
     found = [len(names) for names in (table.joints, table.segments) if names]
     if len(found) == 2 and found[0] != found[1] + 1:  # noqa: PLR2004 - both could be read
         yield Fault(
@@ -91,22 +92,18 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
             f"expected {len(table.segments) + 1} joints, one more than segments",
             list(table.joints),
         )
-    yield from _neighbours(table)
+
+    # Adjacent body parts, and configured lengths.
+    for key in ("proximal", "distal"):
+        if (name := getattr(table, key)) is not None:
+            yield from check_topic_name(f"chain.{key}", name)
+            if name in (table.segments or ()):
+                yield Fault(f"chain.{key}", "is already a segment", name)
     for name, length in (table.lengths_m or {}).items():
         if table.segments:
             yield from check_known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
         if not 0 < length < _LONGEST_M:
             yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
-
-
-def _neighbours(table: ChainTable) -> Iterator[Fault]:
-    for key in ("proximal", "distal"):
-        name = getattr(table, key)
-        if name is None:
-            continue
-        yield from check_topic_name(f"chain.{key}", name)
-        if name in (table.segments or ()):
-            yield Fault(f"chain.{key}", "is already a segment", name)
 
 
 def check_known_name(
@@ -136,6 +133,7 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
             yield Fault(f"imu[{name}].id", "is reserved for the optical source", name)
     if table is None or not table.segments:
         return
+
     worn = [imu["segment"] for imu in imus if isinstance(imu.get("segment"), str)]
     for at, imu in enumerate(imus, 1):
         if isinstance(imu.get("segment"), str):
@@ -154,6 +152,7 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
                 parts = [*table.segments, *filter(None, (table.proximal, table.distal))]
                 taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
                 yield from check_known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
+
     for part, names in (settings.markers or {}).items():
         key = f"mocap.markers.{part}"
         yield from _repeated(key, names)
@@ -161,10 +160,8 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
             yield Fault(key, "expected at least three different markers", list(names))
         if part in (settings.rigid_body or {}):
             yield Fault(f"mocap.rigid_body.{part}", "has markers already; give one of the two")
-    yield from _shared_markers(settings)
 
-
-def _shared_markers(settings: MocapSettings) -> Iterator[Fault]:
+    # A marker belongs to one body part.
     owners: dict[str, str] = {}
     for part, names in (settings.markers or {}).items():
         for name in dict.fromkeys(names):
@@ -182,6 +179,7 @@ def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) 
         for name, bus in buses.items()
         if bus.interface == "slcan"
     ]
+
     taken: dict[str, str] = {}
     for key, port in users:
         if isinstance(port, str):  # a link and its target are the same port
@@ -198,8 +196,8 @@ def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
         if bus is None:
             continue
         for message, number in _numbers(getattr(source.settings, "ids", None)):
-            owner = owners.setdefault((repr(bus), number), f"{source.id} ({message})")
-            if owner != f"{source.id} ({message})":
+            user = f"{source.id} ({message})"
+            if (owner := owners.setdefault((repr(bus), number), user)) != user:
                 text = f"id {number:#x} on this bus belongs to {owner}; expected a unique id"
                 yield Fault(f"imu[{source.id}].ids.{message}", text)
 

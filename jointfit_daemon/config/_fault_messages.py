@@ -44,7 +44,10 @@ class Fault:
 
     def text(self) -> str:
         """Return the message, one line."""
-        shown = "" if self.value is _NO_VALUE else f" = {_brief(self.value)}"
+        value = repr(self.value)
+        if len(value) > _LONGEST_VALUE:
+            value = f"{value[:_LONGEST_VALUE]}…"
+        shown = f" = {value}" if self.has_value else ""
         hint = f"; did you mean {self.near!r}?" if self.near else ""
         return f"{self.key}{shown}: {self.expected}{hint}"
 
@@ -65,11 +68,6 @@ class ConfigError(Exception):
         super().__init__("\n  ".join([f"{source}: {count}", *[fault.text() for fault in faults]]))
         self.source = source
         self.faults = tuple(faults)
-
-
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}…"
 
 
 def faults_of(error: ValidationError, model: type[BaseModel], key: str) -> list[Fault]:
@@ -105,17 +103,13 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
         case _:
             name = next((part for part in reversed(loc) if part in fields), loc[-1] if loc else "")
             why = f" ({about})" if (about := _described(fields, name)) else ""
-            return Fault(path, f"{_lowered(detail['msg'])}{why}", detail["input"])
+            text = detail["msg"].removeprefix("Value error, ").removeprefix("Input ")
+            return Fault(path, f"{text[:1].lower()}{text[1:]}{why}", detail["input"])
 
 
 def join(key: str, loc: Sequence[int | str]) -> str:
     """Return the path of `loc` below `key`: names after dots, positions in brackets."""
     return key + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
-
-
-def _lowered(text: str) -> str:
-    text = text.removeprefix("Value error, ").removeprefix("Input ")
-    return text[:1].lower() + text[1:]
 
 
 def _described(fields: Mapping[str, Any], name: object) -> str:

@@ -58,7 +58,10 @@ def load_rig(path: Path) -> Rig:
         The file cannot be read, is not TOML, or is invalid; the message lists all faults.
     """
     table, syntax = read_table(path)
-    _anchor_files(table, path.absolute().parent)
+    mqtt, folder = table.get("mqtt"), path.absolute().parent
+    if isinstance(mqtt, dict):
+        _anchor(mqtt, ("password_file", "request_key_file"), folder)
+        _anchor(mqtt.get("tls"), ("ca", "cert", "key"), folder)
     return _rig_of(table, str(path), syntax)
 
 
@@ -104,6 +107,8 @@ def _partial(table: Mapping[str, Any], model: type[Model], error: ValidationErro
         else field.get_default(call_default_factory=True)
         for name, field in model.model_fields.items()
     }
+
+    # Keys without faults, validated one at a time.
     for name in values.keys() & table.keys() - wrong:
         text = json.dumps(table[name], default=str)
         annotation: Any = model.model_fields[name].annotation
@@ -112,14 +117,8 @@ def _partial(table: Mapping[str, Any], model: type[Model], error: ValidationErro
     return model.model_construct(**values)
 
 
-def _anchor_files(table: dict[str, Any], folder: Path) -> None:
-    mqtt = table.get("mqtt")
-    if isinstance(mqtt, dict):
-        _anchor(mqtt, ("password_file", "request_key_file"), folder)
-        _anchor(mqtt.get("tls"), ("ca", "cert", "key"), folder)
-
-
 def _anchor(part: object, keys: Sequence[str], folder: Path) -> None:
+    """Make the file names of a table absolute."""
     if isinstance(part, dict):
         for key in keys:
             if isinstance(part.get(key), str):
@@ -147,15 +146,16 @@ class _RigReader:
         chain = self._section("chain", ChainTable, needed=True)
         calibration = self._section("calibration", CalibrationTable)
         mqtt = self._section("mqtt", MqttSettings)
-        recording = (
-            self._section("recording", RecordingSettings) if "recording" in self.table else None
-        )
+        recording = None
+        if "recording" in self.table:
+            recording = self._section("recording", RecordingSettings)
 
         buses = self._buses()
         limb = chain or self.partial.get("chain")
         sources = self._imus(limb, buses)
         mocap = self._mocap(limb, head)
 
+        # Checks across tables, even if some of them have faults.
         self.faults += _checks.check_ports(self.imus_read, buses)
         self.faults += _checks.check_can_ids(self.imus_read)
         self.faults += _bandwidth.check_serial_lines(sources)
@@ -173,7 +173,13 @@ class _RigReader:
             align_mode=head.align_mode,
             chain=_chain(chain, sources),
             sources=(*sources, mocap) if mocap is not None else tuple(sources),
-            calibration=_calibration(calibration, mocap),
+            calibration=CalibrationSettings(
+                **calibration.model_dump(exclude={"store", "center_target_mm"}),
+                center_target_m=calibration.center_target_mm / 1e3,
+                markers={} if mocap is None else dict(mocap.settings.markers),
+                rigid_bodies={} if mocap is None else dict(mocap.settings.rigid_body),
+                plate=None if mocap is None else mocap.settings.plate,
+            ),
             calibration_store=calibration.store,
             mqtt=mqtt.model_copy(update={"base": base}),
             recording=recording,
@@ -226,6 +232,7 @@ class _RigReader:
         if not isinstance(tables, list) or not all(isinstance(imu, dict) for imu in tables):
             self.faults.append(Fault("imu", "expected [[imu]] tables", tables))
             return []
+
         self.faults += _checks.check_sensors(tables, chain)
         found = []
         for at, imu in enumerate(tables, 1):
@@ -235,6 +242,7 @@ class _RigReader:
             settings = self._settings(key, table, driver, ImuSettings)
             if driver is not None and settings is not None:
                 found.append(_imu_source(imu["driver"], settings, driver))
+
             known = settings or self.partial.get(key)
             if driver is not None and known is not None and known.id is not None:
                 self.imus_read.append(_imu_source(imu["driver"], known, driver))
@@ -253,9 +261,8 @@ class _RigReader:
         if isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(buses) or 'none'}"
             self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, buses)))
-        return imu | {
-            "can": CanBusSettings(channel="unknown").model_dump()
-        }  # the fault is reported already
+        # The fault is reported already: any valid bus will do.
+        return imu | {"can": CanBusSettings(channel="unknown").model_dump()}
 
     def _driver(
         self, key: str, table: dict[str, Any], base: type[BaseModel]
@@ -263,6 +270,7 @@ class _RigReader:
         name = table.get("driver")
         if not isinstance(name, str):
             return None  # missing or not a text: the settings model reports it
+
         try:
             driver = find_driver(name)
         except UnknownDriverError:
@@ -271,6 +279,7 @@ class _RigReader:
         except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig
             self.faults.append(Fault(f"{key}.driver", f"cannot be loaded: {error!r}", name))
             return None
+
         if not issubclass(driver.Settings, base):
             what = "motion capture" if base is ImuSettings else "an IMU"
             self.faults.append(Fault(f"{key}.driver", f"is a driver for {what}", name))
@@ -320,22 +329,4 @@ def _chain(table: ChainTable, sources: Sequence[Source]) -> Chain:
         proximal=table.proximal,
         distal=table.distal,
         static_axes=table.axes == "static",
-    )
-
-
-def _calibration(table: CalibrationTable, mocap: Source | None) -> CalibrationSettings:
-    optical = mocap.settings if mocap is not None else None
-    return CalibrationSettings(
-        method=table.method,
-        static_s=table.static_s,
-        align_s=table.align_s,
-        functional_s=table.functional_s,
-        functional_min_s=table.functional_min_s,
-        center_target_m=table.center_target_mm / 1e3,
-        holdout_share=table.holdout_share,
-        refine_markers=table.refine_markers,
-        learn_online=table.learn_online,
-        markers=dict(optical.markers) if optical is not None else {},
-        rigid_bodies=dict(optical.rigid_body) if optical is not None else {},
-        plate=optical.plate if optical is not None else None,
     )

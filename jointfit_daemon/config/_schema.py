@@ -29,7 +29,14 @@ _SECTIONS: dict[str, type[BaseModel]] = {
 
 def rig_schema() -> dict[str, Any]:
     """Return the JSON schema (2020-12) of rig.toml, without drivers that cannot be loaded."""
-    drivers = _driver_models()
+    drivers: dict[str, type[BaseModel]] = {}
+    for name in driver_names():
+        try:
+            drivers[name] = find_driver(name).Settings
+        except Exception:  # noqa: BLE001, S112 - a broken plug-in must not hide the others
+            continue
+
+    # Definitions of all models, adapted to the file.
     models: list[type[BaseModel]] = [*_SECTIONS.values(), CanBusSettings, *drivers.values()]
     refs, definitions = models_json_schema(
         [(model, "validation") for model in models], ref_template="#/$defs/{model}"
@@ -41,6 +48,7 @@ def rig_schema() -> dict[str, Any]:
         properties["driver"] = {"const": name, "description": "driver name"}
         if "can" in properties:  # a name in the file, a table for the driver
             properties["can"] = {"type": "string", "description": "name of a [can.NAME] table"}
+
     imus = [at[model] for model in drivers.values() if issubclass(model, ImuSettings)]
     mocaps = [at[model] for model in drivers.values() if not issubclass(model, ImuSettings)]
     properties = {name: at[model] for name, model in _SECTIONS.items()}
@@ -56,13 +64,3 @@ def rig_schema() -> dict[str, Any]:
         "additionalProperties": False,
         "$defs": defs,
     }
-
-
-def _driver_models() -> dict[str, type[BaseModel]]:
-    found = {}
-    for name in driver_names():
-        try:
-            found[name] = find_driver(name).Settings
-        except Exception:  # noqa: BLE001, S112 - a broken plug-in must not hide the others
-            continue
-    return found

@@ -40,9 +40,9 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
     try:
         text = read_text(path, _MOST_BYTES)
     except MalformedFileError as error:
-        raise ConfigError(
-            str(path), [Fault("file", str(error).removeprefix(f"{path}: "))]
-        ) from error
+        fault = Fault("file", str(error).removeprefix(f"{path}: "))
+        raise ConfigError(str(path), [fault]) from error
+
     try:
         table, faults = _parse(text.split("\n"))
     except RecursionError as error:
@@ -63,6 +63,7 @@ def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
         try:
             return parse_toml("\n".join(lines)), faults
         except ValueError as error:  # an integer of 5000 digits is a plain ValueError
+            # Line of the error; without one nothing can be removed.
             found = _AT_LINE.fullmatch(str(error))
             number = int(found[2]) if found else 0
             if faults and (found is None or (number == last + 1 and opened)):
@@ -70,18 +71,12 @@ def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
             if found is None:
                 faults.append(Fault("TOML", str(error)))
                 break
-            line = lines[number - 1].strip()
-            faults.append(Fault(f"line {number}", f"{_lowered(found[1])}{_remedy(line)}", line))
+
+            line, text = lines[number - 1].strip(), found[1]
+            remedy = "; use a decimal point, not a comma" if _DECIMAL_COMMA.search(line) else ""
+            faults.append(Fault(f"line {number}", f"{text[:1].lower()}{text[1:]}{remedy}", line))
             if not line or line.startswith("["):
                 break  # its keys would belong to another table
             lines[number - 1], last = "", number
             opened = any(mark in line for mark in _OF_SEVERAL_LINES)
     return None, faults
-
-
-def _lowered(text: str) -> str:
-    return text[:1].lower() + text[1:]
-
-
-def _remedy(line: str) -> str:
-    return "; use a decimal point, not a comma" if _DECIMAL_COMMA.search(line) else ""
