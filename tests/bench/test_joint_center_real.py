@@ -17,7 +17,7 @@ NAME = "model-centers-sit-to-stand"
 
 
 @pytest.mark.timeout(180)
-def test_an_error_told_of_a_real_joint_is_not_far_too_small(tmp_path: Path) -> None:
+def test_predicted_error_of_a_recorded_joint_center_is_not_much_too_small(tmp_path: Path) -> None:
     row = next(e for e in find_experiments("joint_center") if e.id == NAME)
     reason = row.missing()
     if reason is not None:

@@ -140,7 +140,7 @@ def test_a_stray_marker_is_weighed_down() -> None:
     assert rms(LiveOptions(huber_m=0.005)) < 0.5 * rms(LiveOptions())
 
 
-def test_rotations_stay_rotations_for_ever() -> None:
+def test_rotations_remain_orthonormal() -> None:
     model = limb()
     live = LiveInverseKinematics(model)
     y = noisy(model, swing(model, 30))

@@ -13,7 +13,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 @pytest.mark.parametrize("name", sorted(pages.render_all()))
-def test_committed_page_equals_what_its_template_generates(name: str) -> None:
+def test_committed_page_equals_its_generated_text(name: str) -> None:
     generated = pages.render_all()[name]
     assert (DOCS / name).read_text(encoding="utf-8") == generated, "python -m bench.framework.pages"
 

@@ -9,7 +9,7 @@ FULL_H = 0.06
 """Minute-long windows are full, two minutes of echoes too."""
 
 
-def test_a_quarter_of_an_hour_leaves_nothing_behind() -> None:
+def test_core_memory_does_not_grow_in_a_quarter_of_an_hour() -> None:
     looks, samples, states = watch(0.25, 30)
     sizes = [look.size for look in looks if look.hours > FULL_H]
     assert samples > 20_000
@@ -18,7 +18,7 @@ def test_a_quarter_of_an_hour_leaves_nothing_behind() -> None:
     assert max(sizes) - min(sizes) < 16 * KIB  # eight bytes a sample would be 170
 
 
-def test_what_is_kept_is_counted_and_its_growth_told() -> None:
+def test_memory_experiment_measures_size_and_growth() -> None:
     kept: list[float] = []
     before = held(kept, 1.0)
     kept += [k + 0.5 for k in range(1000)]

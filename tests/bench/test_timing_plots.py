@@ -40,7 +40,7 @@ def test_every_stream_is_traced_with_its_skew_and_the_error_of_its_stamps() -> N
         assert abs(looks[-1].skew_ppm) < 80
 
 
-def test_a_lag_is_what_no_clock_can_see() -> None:
+def test_trace_contains_the_lag_that_clocks_cannot_estimate() -> None:
     run, trace = watched()
     for name, windows in trace.lags.items():
         good = [w.estimate for w in windows if w.estimate.refused is None]
@@ -50,7 +50,7 @@ def test_a_lag_is_what_no_clock_can_see() -> None:
             assert abs(estimate.lag_ns - truth_ns) < 4 * estimate.sigma_ns + 50_000
 
 
-def test_both_incidents_are_seen() -> None:
+def test_trace_contains_both_incidents() -> None:
     run, trace = watched()
     gone_s = run.incidents["S3 reboots"]
     after = [row.synced for row in trace.stamps["S3"] if row.arrival_ns > _at(trace, gone_s + 1)]
@@ -87,7 +87,7 @@ def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
     assert {*ran.stdout.split()} == {str(pictures / name) for name in drawn}
 
 
-def test_what_cannot_be_drawn_is_told_and_is_no_crash(
+def test_unreadable_event_log_is_reported_by_the_plots(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")

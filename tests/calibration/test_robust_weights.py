@@ -17,12 +17,12 @@ def test_the_scale_of_normal_residuals_is_their_deviation_whatever_a_third_does(
     assert robust_scale(np.zeros(5), floor=1e-3) == 1e-3
 
 
-def test_only_what_lies_far_out_weighs_less() -> None:
+def test_only_outliers_have_reduced_weight() -> None:
     weights = huber_weights(np.array([0.0, 1.4, 1.5, 3.0, 1e6]), 1.0)
     assert np.allclose(weights, [1.0, 1.0, 1.0, 0.5, 1.5e-6])
 
 
-def test_a_correlated_series_is_worth_fewer_looks() -> None:
+def test_correlated_series_has_fewer_effective_samples() -> None:
     rng = np.random.default_rng(1)
     white = rng.normal(size=(4000, 3))
     slow = np.empty_like(white)

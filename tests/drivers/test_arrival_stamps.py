@@ -84,7 +84,7 @@ def test_a_wall_clock_stepped_by_an_hour_in_a_burst_moves_no_arrival(
     assert all(a <= b + 1_000 for a, b in pairwise(stamps))
 
 
-def test_an_hour_asleep_is_a_step_like_any_other() -> None:
+def test_arrivals_after_an_hour_of_suspend_are_a_step() -> None:
     """While a host is suspended CLOCK_MONOTONIC stands still and the wall clock goes on."""
     host = Host(EPOCH + 5_000_000, HOUR)
     arrivals = [EPOCH + k * 1_000_000 for k in range(1, 10)]
@@ -97,7 +97,7 @@ def test_a_stamp_that_no_clock_explains_is_replaced_by_now_and_counted() -> None
     assert wall.replaced == 1
 
 
-def test_no_arrival_lies_in_the_future() -> None:
+def test_arrival_stamps_are_never_in_the_future() -> None:
     wall, now = WallClock(), time.monotonic_ns()
     assert wall.monotonic(time.time_ns() + 200_000, now) <= now
 
@@ -192,7 +192,7 @@ def test_frames_of_one_read_from_usb_lie_one_behind_the_other_on_the_bus() -> No
     ]
 
 
-def test_a_usb_adapter_at_a_made_up_speed_is_not_believed_to_be_slow() -> None:
+def test_configured_baud_rate_does_not_delay_stamps_of_a_usb_adapter() -> None:
     """At 115 200 baud, as configured, the group below would have taken 4 ms."""
     wire = b"".join(encode_frame(frame) for frame in GROUP)
     slow = SlcanCodec(BAUD).feed(wire, EPOCH)[0]

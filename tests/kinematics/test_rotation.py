@@ -85,7 +85,7 @@ def test_no_digit_is_lost_at_small_or_large_angles(angle: float) -> None:
 
 
 @given(quaternions)
-def test_sign_means_nothing(q: Quaternion) -> None:
+def test_quaternion_sign_does_not_change_the_rotation(q: Quaternion) -> None:
     negative = tuple(-c for c in q)
     assert np.allclose(rot.log(q), rot.log(negative)) or np.linalg.norm(rot.log(q)) > 3.1415
     assert float(rot.angle_between(q, negative)) < 1e-7
@@ -154,7 +154,7 @@ def test_heading_is_the_turn_about_the_vertical(angle: float) -> None:
     assert float(rot.heading_of(tilted)) == pytest.approx(angle)
 
 
-def test_nothing_normalizes_to_unknown() -> None:
+def test_zero_quaternion_normalizes_to_nan() -> None:
     assert np.isnan(rot.normalize(np.array([[0.0, 0, 0, 0], [np.nan, 1, 0, 0]]))).all()
     with pytest.raises(ZeroDivisionError):
         one.normalize_one((0.0, 0.0, 0.0, 0.0))

@@ -70,7 +70,7 @@ def test_the_wheel_has_programs_units_rules_and_manual_pages(archives: dict[str,
     assert not [name for name in names if name.startswith(("tests/", "bench/"))]
 
 
-def test_the_sdist_has_what_builds_tests_and_pins(archives: dict[str, Path]) -> None:
+def test_sdist_contains_build_files_tests_and_pinned_versions(archives: dict[str, Path]) -> None:
     with tarfile.open(archives[".gz"]) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}
     for wanted in ("pyproject.toml", "requirements.lock", "LICENSE", "CHANGELOG.md", "Makefile"):

@@ -62,7 +62,7 @@ def test_the_shipped_times_are_the_documented_ones() -> None:
     assert "at most 512 MB" in GUIDE
 
 
-def test_the_service_gets_the_credentials_that_the_daemon_looks_for() -> None:
+def test_unit_passes_the_credentials_that_the_daemon_reads() -> None:
     named = {value.partition(":")[0] for key, value in directives(ONE) if key == "LoadCredential"}
     assert named == {CREDENTIAL, "jointfitd.request-key"}
     assert all(f"/etc/credstore/{name}" in GUIDE for name in named)
@@ -93,7 +93,7 @@ def test_serial_ports_are_named_by_serial_number_never_by_vendor_alone() -> None
     assert any('ATTR{latency_timer}="1"' in line for line in rules)
 
 
-def test_the_bus_does_not_hold_up_the_boot_nor_ask_for_what_adapters_lack() -> None:
+def test_can_unit_neither_delays_the_boot_nor_uses_optional_adapter_features() -> None:
     text = (SYSTEMD / "80-jointfit-can0.network").read_text()
     active = [line for line in text.splitlines() if not line.startswith("#")]
     assert "RequiredForOnline=no" in active

@@ -32,7 +32,7 @@ def rotation(q: Any) -> Rotation:
 
 
 @given(unit, worlds)
-def test_a_vector_lands_where_the_world_table_says(q: Any, world: Any) -> None:
+def test_vector_is_rotated_as_the_world_table_defines(q: Any, world: Any) -> None:
     vector = np.array([1.0, 2.0, 3.0])
     expected = ENU_FROM[world] @ rotation(q).apply(vector)
     assert rotation(canonical(q, world)).apply(vector) == pytest.approx(expected, abs=1e-12)
@@ -52,7 +52,7 @@ def test_native_of_undoes_canonical(q: Any, world: Any) -> None:
 
 
 @given(st.lists(unit, min_size=1, max_size=20))
-def test_what_the_gate_lets_through_is_unit_and_never_jumps_sign(path: Any) -> None:
+def test_accepted_quaternions_are_unit_with_continuous_sign(path: Any) -> None:
     gate, last = OrientationGate(), None
     for q in path:
         out = gate.admit(tuple(1.005 * part for part in q))
@@ -72,7 +72,7 @@ def test_the_norm_decides(norm: float, passes: bool) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
-def test_what_is_not_finite_is_refused(bad: float) -> None:
+def test_non_finite_quaternions_are_rejected(bad: float) -> None:
     assert OrientationGate().admit((bad, 0.0, 0.0, 1.0)) is None
 
 

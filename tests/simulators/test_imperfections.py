@@ -61,7 +61,7 @@ def test_own_soft_tissue_is_each_sensors_own(seed: int) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.15, 0.5])
-def test_the_random_share_is_what_does_not_repeat_with_posture(share: float) -> None:
+def test_random_share_of_the_artefact_does_not_repeat_with_posture(share: float) -> None:
     wearer = SimulatedSubject(NOTHING, WALK_AND_SQUATS)
     coordinates = wearer._programme.coordinates(T)
     skins = [
@@ -90,7 +90,7 @@ def test_skin_is_still_while_the_wearer_stands() -> None:
         assert np.degrees(rms(rotation.magnitude())) < 0.3
 
 
-def test_on_the_plate_nothing_moves_against_anything() -> None:
+def test_sensors_on_the_plate_do_not_move_relative_to_it() -> None:
     wearer = SimulatedSubject(Knobs(), parse_motion_script("plate"))
     t = np.arange(0.0, 20.0, 0.1)
     found = wearer.observe([t] * 4, t, t)

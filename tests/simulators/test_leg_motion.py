@@ -177,7 +177,7 @@ def test_a_switch_bends_the_future_only() -> None:
     assert [programme.name_at(t) for t in (2.9, 3.1, 6.0)] == ["stand", "squat", "squat"]
 
 
-def test_forgetting_changes_nothing_that_is_still_to_come() -> None:
+def test_forgetting_the_past_does_not_change_later_motion() -> None:
     steps = parse_motion_script("stand:3,walk:1,squat:3,turn")
     whole, forgetful = MotionScript(DOING, steps), MotionScript(DOING, steps)
     for begin in np.arange(0.0, 12.0, 0.2):

@@ -163,7 +163,7 @@ async def test_requests_are_answered_and_unknown_ones_named_so() -> None:
         )
 
 
-async def test_the_echo_tells_a_clock_with_offset_and_skew() -> None:
+async def test_echo_of_the_simulated_server_has_clock_offset_and_skew() -> None:
     async with calling(clock_hz=3_312_787, device_ns=lambda ns: ns + ns // 20_000 + 10**12) as (
         _,
         caller,
@@ -187,7 +187,7 @@ async def test_no_frame_comes_before_the_model_was_answered() -> None:
         assert server.sent == 1
 
 
-async def test_a_client_that_never_asks_for_the_model_gets_frames_after_a_while() -> None:
+async def test_client_without_model_request_receives_frames_after_a_delay() -> None:
     async with calling() as (server, caller):
         await caller.ask(Connect(0))
         await asyncio.sleep(0.06)
@@ -195,7 +195,7 @@ async def test_a_client_that_never_asks_for_the_model_gets_frames_after_a_while(
         assert isinstance(await caller.hear(), FrameOfData)
 
 
-async def test_a_silent_client_is_dropped_and_told() -> None:
+async def test_silent_client_is_dropped_and_reported() -> None:
     async with calling(keepalive_s=0.05) as (server, caller):
         await caller.ask(Connect(0))
         await asyncio.sleep(0.06)
@@ -205,7 +205,7 @@ async def test_a_silent_client_is_dropped_and_told() -> None:
 
 
 @pytest.mark.parametrize(("hiding", "count", "params"), [("missing", 2, 10), ("filled", 3, 11)])
-async def test_what_is_hidden_looks_as_it_does_in_real_frames(
+async def test_occluded_markers_are_encoded_as_in_recorded_frames(
     hiding: str, count: int, params: int
 ) -> None:
     async with calling(hiding=hiding) as (server, caller):
@@ -238,7 +238,7 @@ async def test_a_unicast_client_may_choose_its_bitstream_from_4_0_on() -> None:
 
 
 @pytest.mark.parametrize("knob", ["loss", "duplication", "reordering", "hostile"])
-async def test_the_network_can_be_as_bad_as_asked(knob: str) -> None:
+async def test_simulated_network_has_the_configured_faults(knob: str) -> None:
     async with calling(**{knob: 0.5}) as (server, caller):
         await caller.ask(Connect(0))
         await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))

@@ -84,7 +84,7 @@ def test_with_its_biases_the_static_pose_is_upright(squats: list[Path]) -> None:
     assert (said * q_bias).magnitude().max() < 1e-9  # q_sensor q_bias = q_segment = identity
 
 
-def test_nothing_jumps_between_standing_and_the_trial(squats: list[Path]) -> None:
+def test_transition_from_standing_to_the_trial_is_continuous(squats: list[Path]) -> None:
     subject = RecordedSubject(
         read_recorded_trial(squats), SENSORS, parse_motion_script("stand:2,trial:12,stand")
     )
@@ -130,7 +130,7 @@ def test_files_that_make_no_trial_are_refused(tmp_path: Path, squats: list[Path]
         RecordedSubject(read_recorded_trial(squats), SENSORS, [Step("walk", 1.0)])
 
 
-def test_the_truth_log_tells_no_future_and_writes_unknown_as_null(
+def test_truth_log_contains_past_instants_only_and_null_for_unknown_values(
     tmp_path: Path, squats: list[Path]
 ) -> None:
     subject = RecordedSubject(read_recorded_trial(squats), SENSORS, [Step("trial", 1.0)])
@@ -163,7 +163,7 @@ def test_a_part_of_the_trial_is_played_at_its_place(squats: list[Path]) -> None:
         subject.play("trial@13.5-", 20.0)
 
 
-def test_cameras_see_bones_standing_and_recorded_but_never_made_up(squats: list[Path]) -> None:
+def test_cameras_track_bones_except_in_interpolated_frames(squats: list[Path]) -> None:
     steps = parse_motion_script("stand:2,trial@0-4:8,stand")
     subject = RecordedSubject(read_recorded_trial(squats), SENSORS, steps, transition_s=1.0)
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)

@@ -38,7 +38,7 @@ def test_a_skew_alone_leaves_the_start_to_the_dice() -> None:
     assert ticker.clock.skew == pytest.approx(-20e-6)
 
 
-def test_the_log_tells_device_number_and_instant(tmp_path: Path) -> None:
+def test_sample_log_contains_device_number_and_instant(tmp_path: Path) -> None:
     log = SampleLog(tmp_path / "samples.jsonl")
     log.add("S1", 65535, NOW)
     log.close()
@@ -58,7 +58,7 @@ def test_clocks_that_are_not_there_cannot_be_asked(tmp_path: Path) -> None:
         scene(tmp_path, clocks={"S9": ClockFault(1.0)})
 
 
-async def test_a_script_is_obeyed_in_time_and_its_faults_are_told(tmp_path: Path) -> None:
+async def test_script_commands_run_on_time_and_errors_are_reported(tmp_path: Path) -> None:
     script = ((0.0, "reboot S9"), (0.0, "mocap restart"), (0.1, "quit"))
     said: list[dict[str, object]] = []
     async with asyncio.timeout(10):

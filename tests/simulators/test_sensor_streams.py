@@ -83,7 +83,7 @@ def test_every_sample_is_sent_dropped_or_refused(skew: int) -> None:
     assert source.unheard == 0
 
 
-def test_what_nobody_hears_is_counted_apart() -> None:
+def test_unreceived_samples_are_counted_separately() -> None:
     device = Listed()
     source = stream(perfect(Knobs()), device, shared=True)
     source.unplug()

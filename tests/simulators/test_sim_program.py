@@ -105,7 +105,7 @@ async def quiet(sim: Sim, heard: dict[str, list[Decoded]]) -> Counter[str]:
     return sent
 
 
-async def test_every_sample_sent_is_heard_by_the_real_drivers(tmp_path: Path) -> None:
+async def test_drivers_receive_every_simulated_sample(tmp_path: Path) -> None:
     async with playing(tmp_path, "--programme", "walk") as (sim, ready):
         rig = load_rig(tmp_path / "rig.toml")
         assert ready["ready"] is True
@@ -133,7 +133,7 @@ async def test_every_sample_sent_is_heard_by_the_real_drivers(tmp_path: Path) ->
     assert not any(isinstance(item, Corrupt) for items in heard.values() for item in items)
 
 
-async def test_what_is_heard_is_the_truth_when_nothing_is_imperfect(tmp_path: Path) -> None:
+async def test_received_orientations_equal_the_truth_without_imperfections(tmp_path: Path) -> None:
     async with playing(tmp_path, "--perfect", "--programme", "squat", "--rate", "200") as (sim, _):
         rig = load_rig(tmp_path / "rig.toml")
         heard: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
@@ -165,7 +165,7 @@ async def test_what_is_heard_is_the_truth_when_nothing_is_imperfect(tmp_path: Pa
         assert np.median(apart) < 0.5
 
 
-async def test_commands_change_the_scene_and_bad_ones_are_answered(tmp_path: Path) -> None:
+async def test_commands_change_the_scene_and_invalid_ones_return_an_error(tmp_path: Path) -> None:
     async with playing(tmp_path, "--no-mocap") as (sim, _):
         assert (await sim.ask())["motion"] == "stand"
         await sim.tell("play walk")
@@ -244,7 +244,7 @@ async def test_a_recorded_trial_plays_from_the_command_line(
         (["--trial", "nothing.npz"], "nothing.npz"),
     ],
 )
-async def test_a_wrong_command_line_exits_2_and_says_why(
+async def test_wrong_command_line_exits_with_2_and_a_message(
     tmp_path: Path, options: list[str], message: str
 ) -> None:
     process = await asyncio.create_subprocess_exec(

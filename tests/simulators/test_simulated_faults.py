@@ -25,7 +25,7 @@ def rotations(q: np.ndarray) -> Rotation:
     return Rotation.from_quat(q, scalar_first=True)
 
 
-def test_without_a_mishap_nothing_is_touched() -> None:
+def test_samples_without_a_fault_are_unchanged() -> None:
     assert np.array_equal(blocks(SensorFaults(), 0, 400), SAID)
 
 
@@ -61,7 +61,7 @@ def test_a_drift_turns_the_world_about_the_vertical_and_stops_where_it_is() -> N
     assert np.allclose(turned.as_rotvec(), [0.0, 0.0, 0.5 * 2.0])
 
 
-def test_what_was_never_said_stays_unsaid() -> None:
+def test_missing_samples_remain_missing_under_faults() -> None:
     holes = SAID.copy()
     holes[::7] = np.nan
     mishaps = SensorFaults()

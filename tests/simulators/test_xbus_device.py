@@ -77,9 +77,7 @@ async def test_a_bad_output_list_is_error_21(host: Host) -> None:
 
 
 @pytest.mark.parametrize(("asked", "used"), [(100, 100), (120, 100), (0xFFFF, 400), (150, 133)])
-async def test_the_acknowledgement_tells_the_rates_really_used(
-    host: Host, asked: int, used: int
-) -> None:
+async def test_acknowledgement_contains_the_actual_rates(host: Host, asked: int, used: int) -> None:
     serve = asyncio.create_task(host.device.run())
     wanted = setup.encode_outputs([(0x1020, 100), (0x2010, asked)])
     (reply,) = await host.ask(XbusMessageId.OUTPUT_CONFIGURATION, wanted)
@@ -102,7 +100,9 @@ async def test_left_alone_after_waking_up_it_measures(host: Host) -> None:
 
 
 @pytest.mark.parametrize("host", [{"wakes_up": True}], indirect=True, ids=[""])
-async def test_told_so_after_waking_up_it_stays_in_configuration(host: Host) -> None:
+async def test_simulated_device_remains_in_configuration_after_a_wake_up_acknowledgement(
+    host: Host,
+) -> None:
     serve = asyncio.create_task(host.device.run())
     await asyncio.sleep(0.05)
     await host.ask(XbusMessageId.WAKE_UP_ACK)
@@ -145,7 +145,7 @@ def test_lost_messages_take_counters_and_are_not_sent(host: Host) -> None:
 
 
 @streams()
-def test_where_nobody_reads_samples_are_lost_whole(host: Host) -> None:
+def test_unread_line_loses_complete_samples(host: Host) -> None:
     for number in range(5000):
         host.device.push(number * PERIOD_NS, IDENTITY)
     assert host.device.sent < 5000
@@ -158,7 +158,7 @@ def test_where_nobody_reads_samples_are_lost_whole(host: Host) -> None:
     assert host._decoder.discarded == host._decoder.pending == 0
 
 
-def test_a_device_in_configuration_sends_nothing(host: Host) -> None:
+def test_device_in_configuration_sends_no_sample(host: Host) -> None:
     host.device.push(0, IDENTITY)
     assert host.items() == []
     assert host.device.sent == 0

@@ -234,7 +234,7 @@ async def test_configuration_is_the_first_event_and_ticks_continue(
     assert all(later > earlier for earlier, later in itertools.pairwise(ticks))
 
 
-async def test_it_stops_under_load_thirty_times_of_thirty(
+async def test_daemon_stops_under_load_in_thirty_of_thirty_attempts(
     table: dict[str, Any], tmp_path: Path, broker: Broker, fakes: type[FakeImu]
 ) -> None:
     fast = small(table, broker.port)

@@ -113,7 +113,7 @@ async def states(port: int, count: int) -> list[dict[str, Any]]:
     return found
 
 
-async def test_it_runs_stops_and_its_log_replays_byte_for_byte(
+async def test_daemon_log_replays_to_byte_identical_states(
     process: Process, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     process.write(broker.port)
@@ -136,7 +136,9 @@ async def test_it_runs_stops_and_its_log_replays_byte_for_byte(
     assert replayed == live
 
 
-def test_a_bug_ends_it_with_a_traceback_and_exit_code_1(process: Process) -> None:
+def test_unexpected_error_ends_the_daemon_with_a_traceback_and_exit_code_1(
+    process: Process,
+) -> None:
     process.write(1, mood="bug")
     with running(process) as daemon:
         _, said = daemon.communicate(timeout=15)
@@ -144,7 +146,7 @@ def test_a_bug_ends_it_with_a_traceback_and_exit_code_1(process: Process) -> Non
     assert "ZeroDivisionError: a bug" in said
 
 
-def test_a_bad_rig_ends_it_with_all_faults_and_exit_code_2(process: Process) -> None:
+def test_invalid_rig_ends_the_daemon_with_all_faults_and_exit_code_2(process: Process) -> None:
     process.rig.write_text("[rgi]\n")
     with running(process) as daemon:
         out, said = daemon.communicate(timeout=15)
@@ -220,7 +222,9 @@ def test_a_start_with_a_hostile_file_is_a_clear_message(process: Process, conten
     assert str(process.rig) in said
 
 
-def test_damaged_calibrations_are_set_aside_and_the_newest_good_one_used(process: Process) -> None:
+def test_damaged_calibrations_are_set_aside_and_the_newest_valid_one_is_used(
+    process: Process,
+) -> None:
     chain = SimpleNamespace(
         joints=("hip", "knee", "ankle"), segments=("thigh", "shank"), sensors=(("S1",), ("S2",))
     )

@@ -99,7 +99,9 @@ def start(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 
-def test_ten_mistakes_are_told_at_once_and_nothing_starts(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_rig_are_reported_together_and_the_daemon_does_not_start(
+    tmp_path: Path,
+) -> None:
     ended = start(tmp_path, TEN_MISTAKES)
     assert ended.returncode == 2
     lines = ended.stderr.splitlines()
@@ -112,7 +114,7 @@ def test_ten_mistakes_are_told_at_once_and_nothing_starts(tmp_path: Path) -> Non
     assert not (tmp_path / "state").exists()
 
 
-def test_two_sensors_with_one_can_identifier_are_refused_before_anything_opens(
+def test_two_sensors_with_one_can_identifier_are_rejected_before_a_port_is_opened(
     tmp_path: Path,
 ) -> None:
     ended = start(tmp_path, TWINS)

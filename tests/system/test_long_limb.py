@@ -82,7 +82,7 @@ async def errors_deg(scene: Scene, listener: Listener, folder: Path) -> dict[str
 
 
 @pytest.mark.timeout(180)
-async def test_a_chain_of_three_with_six_sensors_is_calibrated_followed_and_put_on_anew(
+async def test_chain_of_three_segments_with_six_sensors_is_calibrated_tracked_and_redonned(
     tmp_path: Path, broker: Broker
 ) -> None:
     station = Station(tmp_path, broker.port)

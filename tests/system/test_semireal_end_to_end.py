@@ -36,7 +36,7 @@ def played(shared_data: Path) -> dict[tuple[str, Method], Played]:
     return recorded_trial.run(shared_data, METHODS)
 
 
-def test_squats_as_bytes_give_the_offline_figures(
+def test_recorded_squats_through_the_daemon_match_the_offline_errors(
     knee: Squats, played: dict[tuple[str, Method], Played]
 ) -> None:
     for method in METHODS:

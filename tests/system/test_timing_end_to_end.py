@@ -25,7 +25,7 @@ MOST_PTP_ERROR_NS = 50_000
 
 
 @pytest.mark.timeout(180)
-async def test_time_is_right_in_every_frame_that_says_so(tmp_path: Path, broker: Broker) -> None:
+async def test_every_synced_frame_has_correct_time(tmp_path: Path, broker: Broker) -> None:
     found = await live(tmp_path, broker.port, ("S1", OPTICAL), rest_s=1.0)
     assert found.replayed
     assert found.unknown < 0.01
@@ -42,7 +42,7 @@ async def test_time_is_right_in_every_frame_that_says_so(tmp_path: Path, broker:
 
 
 @pytest.mark.timeout(180)
-async def test_a_wired_sync_line_takes_even_the_delay_out(tmp_path: Path, broker: Broker) -> None:
+async def test_wired_sync_line_removes_the_transport_delay(tmp_path: Path, broker: Broker) -> None:
     """Stamps of a tied clock are right without anybody knowing what the transport takes."""
     found = await live(tmp_path, broker.port, (), rest_s=9.0, more=("--sync-line",))
     assert found.replayed

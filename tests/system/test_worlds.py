@@ -113,7 +113,7 @@ async def knee_error_deg(listener: Listener, folder: Path) -> float:
 
 
 @pytest.mark.timeout(180)
-async def test_worlds_a_right_angle_apart_are_aligned_or_the_assumption_is_said(
+async def test_sensor_worlds_a_right_angle_apart_are_aligned_or_flagged_as_assumed(
     tmp_path: Path, broker: Broker
 ) -> None:
     station = Station(tmp_path, broker.port)

@@ -276,7 +276,7 @@ def test_wrong_options(
     assert fault_of(words, named)
 
 
-def test_a_misspelt_marker_never_means_one_that_is_asked_for_already() -> None:
+def test_suggestion_for_a_misspelt_marker_is_none_of_the_requested_ones() -> None:
     message = fault_of(["center", "squats.trc", "--parent", "T1,T2,T33", "--markers", "C1"], "T33")
     assert "did you mean 'T3' or 'T4'?" in message or "did you mean 'T3'?" in message
 
@@ -323,7 +323,7 @@ def test_wrong_options_of_the_simulator(
 
 @pytest.mark.system
 @pytest.mark.parametrize("words", [("--config", "none.toml"), ("--config", "xbus.bin"), ()])
-def test_the_daemon_on_a_bad_rig(words: tuple[str, ...]) -> None:
+def test_daemon_rejects_an_invalid_rig(words: tuple[str, ...]) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "jointfit_daemon", *words, "--check"],
         capture_output=True, check=False, text=True,
@@ -333,7 +333,7 @@ def test_the_daemon_on_a_bad_rig(words: tuple[str, ...]) -> None:
     assert (words[-1] if words else "--config") in done.stderr
 
 
-def test_a_refused_connection_is_told_with_its_remedy(tmp_path: Path) -> None:
+def test_refused_connection_is_reported_with_a_remedy(tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
     text = Path("rig.toml").read_text()
     rig.write_text(text.replace("port = 1883", f"port = {free_port()}"))
@@ -341,7 +341,7 @@ def test_a_refused_connection_is_told_with_its_remedy(tmp_path: Path) -> None:
     assert "start the broker" in message
 
 
-def test_refused_credentials_are_told_without_a_number(tmp_path: Path) -> None:
+def test_refused_credentials_are_reported_without_an_error_number(tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
     with closing(socket.create_server(("127.0.0.1", 0))) as server:
         port = server.getsockname()[1]

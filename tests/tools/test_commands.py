@@ -29,9 +29,7 @@ def test_every_command_explains_itself(command: str) -> None:
 
 
 @pytest.mark.parametrize(("module", "name"), [row[1:] for row in ON_DEMAND_ERRORS])
-def test_every_error_that_commands_report_exists_where_they_look_for_it(
-    module: str, name: str
-) -> None:
+def test_every_error_that_commands_report_is_importable(module: str, name: str) -> None:
     assert issubclass(getattr(importlib.import_module(module), name), Exception)
 
 
@@ -42,7 +40,7 @@ def test_the_example_rig_is_right_and_its_sources_are_listed() -> None:
         assert name in result.stdout
 
 
-def test_a_wrong_rig_is_told_with_every_fault_and_exit_code_2(tmp_path: Path) -> None:
+def test_invalid_rig_is_reported_with_every_fault_and_exit_code_2(tmp_path: Path) -> None:
     wrong = tmp_path / "rig.toml"
     text = EXAMPLE.read_text("utf-8")
     wrong.write_text(text.replace('driver = "xbus"', 'driver = "xbuz"').replace("baud =", "bawd ="))
@@ -66,7 +64,7 @@ def test_the_schema_names_the_keys_of_rig_and_drivers() -> None:
         assert key in text
 
 
-def test_calibrating_without_a_broker_says_where_it_looked(tmp_path: Path) -> None:
+def test_calibrate_without_a_broker_reports_its_address(tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
     text = EXAMPLE.read_text("utf-8").replace('host = "127.0.0.1"', 'host = "127.0.0.1"\nport = 9')
     rig.write_text(text)

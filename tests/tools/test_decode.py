@@ -100,7 +100,7 @@ def begun_inside(number: int, from_end: int) -> Callable[[bytes], bytes]:
         pytest.param(1, begun_inside(48, 45), (51, 45), id="begun inside frame 48"),
     ],
 )
-def test_damaged_captures_lose_what_was_damaged_and_no_byte_more(
+def test_damaged_captures_lose_damaged_bytes_only(
     tmp_path: Path,
     shared_data: Path,
     number: int,
@@ -179,14 +179,14 @@ def test_a_candump_log_of_one_sensor_among_others_is_decoded(tmp_path: Path) -> 
 # --- mistakes ---------------------------------------------------------------------------------
 
 
-def test_an_unknown_driver_is_told_with_the_nearest_name(shared_data: Path) -> None:
+def test_unknown_driver_is_reported_with_a_suggestion(shared_data: Path) -> None:
     result = run(app, ["decode", "xbuss", str(xsens(shared_data, 5)), "--summary"])
     assert result.exit_code == 2
     assert "did you mean 'xbus'?" in result.stderr
     assert result.stdout == ""
 
 
-def test_a_missing_file_is_told_by_its_name(tmp_path: Path) -> None:
+def test_missing_capture_file_is_reported_by_name(tmp_path: Path) -> None:
     result = run(app, ["decode", "xbus", str(tmp_path / "gone.bin"), "--summary"])
     assert result.exit_code == 2
     assert "gone.bin" in result.stderr

@@ -43,7 +43,7 @@ def errors_of(heard: Heard) -> list[DeviceEvent]:
         (0x020, bytes(8), "no acknowledgment"),
     ],
 )
-async def test_what_the_controller_reports_comes_past_the_filters_and_is_told_once(
+async def test_controller_errors_pass_the_filters_and_are_reported_once(
     wire: PythonCanWire, kind: int, data: bytes, told: str
 ) -> None:
     async with running(XcdiImu(settings())) as heard:

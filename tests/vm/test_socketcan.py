@@ -135,7 +135,7 @@ async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanW
         ]
 
 
-async def test_the_kernel_passes_only_what_the_devices_want(wire: PythonCanWire) -> None:
+async def test_kernel_filters_pass_only_configured_identifiers(wire: PythonCanWire) -> None:
     driver = XcdiImu(settings())
     other = XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(0x300)))
     async with shared_bus(BUS) as bus, running(driver) as heard:
@@ -203,7 +203,7 @@ async def test_frames_that_the_kernel_dropped_are_counted_exactly(wire: PythonCa
         assert sum(told) == dropped
 
 
-async def test_a_link_that_is_down_is_lost_and_says_how_to_bring_it_up() -> None:
+async def test_link_that_is_down_is_reported_with_a_remedy() -> None:
     ip("set", LINK, "down")
     with pytest.raises(DeviceLostError, match=f"ip link set {LINK} up"):
         async with asyncio.timeout(2):

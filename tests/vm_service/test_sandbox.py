@@ -52,12 +52,12 @@ NEEDED = (
 
 
 @pytest.mark.parametrize("what", FORBIDDEN)
-def test_it_is_refused(found: dict[str, int], what: str) -> None:
+def test_sandbox_denies_the_operation(found: dict[str, int], what: str) -> None:
     assert found[what] != 0
 
 
 @pytest.mark.parametrize("what", NEEDED)
-def test_what_it_needs_works(found: dict[str, int], what: str) -> None:
+def test_sandbox_permits_required_operations(found: dict[str, int], what: str) -> None:
     assert found[what] == 0
 
 

@@ -49,7 +49,7 @@ def online() -> bool:
     return messages("bridge/state", seconds=2) == [{"v": 1, "state": "online"}]
 
 
-def test_installing_gives_a_rig_to_edit_and_starts_nothing() -> None:
+def test_installation_creates_an_example_rig_and_starts_no_service() -> None:
     assert run("dpkg", "-s", "jointfitd").splitlines()[1] == "Status: install ok installed"
     assert Path("/usr/share/jointfitd/examples/knee.toml").is_file()
     assert run("systemctl", "is-enabled", UNIT, check=False) == "disabled"
@@ -95,7 +95,7 @@ def test_angles_arrive_over_tls_from_two_serial_ports_and_two_on_a_bus(service: 
     assert used == {"S1", "S2", "S3", "S4"}
 
 
-def test_the_status_line_counts_what_is_there(service: int) -> None:
+def test_status_line_counts_the_connected_devices(service: int) -> None:
     eventually(lambda: "4 of 4 IMUs" in show("StatusText"), "all four are counted")
 
 
@@ -118,15 +118,13 @@ def test_a_hung_daemon_is_killed_by_the_watchdog_and_starts_again(service: int, 
     eventually(lambda: show("ActiveState") == "active", "active again")
 
 
-def test_kill_9_costs_a_restart_and_nothing_else(service: int) -> None:
+def test_killed_service_is_restarted_without_further_loss(service: int) -> None:
     os.kill(service, signal.SIGKILL)
     eventually(lambda: int(show("MainPID")) not in {0, service}, "a new process")
     eventually(lambda: messages("pose", seconds=3), "poses again")
 
 
-def test_a_reload_keeps_the_process_and_a_bad_file_changes_nothing(
-    service: int, since: str
-) -> None:
+def test_reload_keeps_the_process_and_rejects_an_invalid_file(service: int, since: str) -> None:
     write_rig(lambda text: text.replace("output_rate_hz = 50", "output_rate_hz = 25"))
     run("systemctl", "reload", UNIT)
     eventually(lambda: "reload" in journal(since), "the reload is told")
@@ -139,7 +137,7 @@ def test_a_reload_keeps_the_process_and_a_bad_file_changes_nothing(
     assert messages("pose", seconds=5)
 
 
-def test_a_missing_credential_is_told_and_the_sensors_go_on(since: str) -> None:
+def test_missing_credential_is_reported_and_sensors_remain_in_use(since: str) -> None:
     credential = Path("/etc/credstore/jointfitd.mqtt-password")
     hidden = credential.with_suffix(".away")
     credential.rename(hidden)
@@ -188,7 +186,7 @@ def test_enabled_it_starts_with_the_machine() -> None:
         run("systemctl", "disable", "--now", UNIT)
 
 
-def test_a_wrong_rig_is_told_and_not_tried_again(since: str) -> None:
+def test_invalid_rig_is_reported_and_the_service_is_not_restarted(since: str) -> None:
     write_rig(lambda text: text.replace("output_rate_hz = 50", 'output_rate_hz = "fast"'))
     run("systemctl", "start", UNIT, check=False)
     eventually(lambda: show("ActiveState") == "failed", "failed, not waiting for a restart")
@@ -226,7 +224,7 @@ def test_an_upgrade_restarts_the_service_and_keeps_the_rig(service: int) -> None
     eventually(online, "online")
 
 
-def test_no_secret_is_seen_from_outside(service: int, since: str) -> None:
+def test_no_secret_is_visible_to_other_users(service: int, since: str) -> None:
     eventually(online, "online")
     shown = "".join(
         (
@@ -250,7 +248,7 @@ def test_a_viewer_cannot_ask(service: int) -> None:
     assert messages("calibration", seconds=2)[0]["phase"] != "static"
 
 
-def test_purging_leaves_nothing_and_removing_keeps_the_rig(service: int) -> None:
+def test_purge_removes_all_files_and_removal_keeps_the_rig(service: int) -> None:
     run("dpkg", "-r", "jointfitd")
     assert RIG.is_file()
     assert not Path("/usr/lib/jointfitd").exists()

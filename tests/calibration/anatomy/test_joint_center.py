@@ -50,7 +50,9 @@ def information_bound(points: Array, sigma: float) -> float:
 
 
 @pytest.mark.parametrize("arc", [45, 90])
-def test_error_is_near_the_cramer_rao_bound_and_the_covariance_is_honest(arc: float) -> None:
+def test_joint_center_error_is_near_the_cramer_rao_bound_and_matches_its_covariance(
+    arc: float,
+) -> None:
     rng = np.random.default_rng(1)
     errors, claimed, bounds = [], [], []
     for _ in range(40):

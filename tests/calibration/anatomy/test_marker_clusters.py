@@ -58,7 +58,7 @@ def test_any_three_markers_of_four_give_the_pose(seed: int, hidden: int) -> None
     assert np.max(rms) < 1e-12
 
 
-def test_two_markers_are_not_seen_at_all() -> None:
+def test_cluster_with_two_markers_has_no_pose() -> None:
     _, _, y = moved(np.random.default_rng(0))
     y[10:20, :2] = np.nan
     q, p, rms = rigid_fit(TEMPLATE, y)

@@ -86,7 +86,7 @@ def test_without_foot_markers_a_configured_length_hangs_the_ankle_under_the_knee
     assert np.linalg.norm(ankle.center - truth(subject)["ankle"]) < 5e-3
 
 
-def test_what_nobody_saw_is_unknown_and_said() -> None:
+def test_unobserved_segment_frames_are_unknown_and_reported() -> None:
     found = anatomy(Subject(1), CHAIN, ("thigh", "shank"))
     assert found.joints["hip"] is None
     assert found.joints["ankle"] is None

@@ -71,7 +71,7 @@ def spoiled(part: str, track: OpticalTrack) -> tuple[np.ndarray, list[int]]:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_centers_come_near_the_truth_and_the_error_told_is_honest(seed: int) -> None:
+def test_live_centers_approach_the_truth_within_their_predicted_error(seed: int) -> None:
     static, track = trials(seed)
     assert static.optical is not None
     clusters = {name: static_cluster(static.optical, name, SETTINGS) for name in MARKERS}
@@ -141,7 +141,7 @@ def test_a_marker_that_moved_since_the_static_pose_is_named() -> None:
     assert "static pose" in text
 
 
-def test_a_marker_that_jumps_now_and_then_spoils_nothing() -> None:
+def test_occasional_jumps_of_a_marker_do_not_affect_live_centers() -> None:
     static, track = trials()
     positions, columns = spoiled("shank", track)
     positions[::40, columns[0]] += [0.3, 0.0, 0.0]
@@ -151,7 +151,7 @@ def test_a_marker_that_jumps_now_and_then_spoils_nothing() -> None:
         assert jumped["predicted_error_mm"] == pytest.approx(still["predicted_error_mm"], rel=0.3)
 
 
-def test_without_motion_no_center_is_told_and_every_joint_is_asked_to_move() -> None:
+def test_without_motion_no_center_is_reported_and_movement_of_every_joint_is_requested() -> None:
     static, _ = trials()
     still = record(
         Subject(flaws=Imperfections(skin_m=0.0)), motion(Subject(), 6.0, 400.0, still=True), 3
@@ -162,7 +162,7 @@ def test_without_motion_no_center_is_told_and_every_joint_is_asked_to_move() -> 
     assert all(joint["predicted_error_mm"] is None for joint in look.joints.values())
 
 
-def test_a_hip_that_moves_about_one_axis_is_told_to_swing_sideways() -> None:
+def test_sideways_movement_is_requested_of_a_hip_that_moves_about_one_axis() -> None:
     subject = Subject(flaws=Imperfections(skin_m=0.0))
     bones = motion(subject, 12.0, 400.0)
     q, p = bones.q, bones.p

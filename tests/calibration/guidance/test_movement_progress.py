@@ -18,7 +18,7 @@ def about_x(degrees: float) -> tuple[float, float, float, float]:
     return (math.cos(half), math.sin(half), 0.0, 0.0)
 
 
-def test_the_arc_is_what_the_segments_turn_against_each_other() -> None:
+def test_arc_is_the_relative_rotation_of_the_segments() -> None:
     progress = MovementProgress(CHAIN)
     for degrees in range(-10, 51, 5):  # both turn along by another 20 degrees
         progress.update({"S1": about_x(20 + degrees), "S3": about_x(20 + 2 * degrees)})

@@ -123,7 +123,7 @@ def test_only_marker_of_a_segment_is_kept_and_reported() -> None:
     np.testing.assert_array_equal(found.model.positions[4], THIGH[0])
 
 
-def test_nothing_left_to_move_is_refused() -> None:
+def test_refinement_without_free_markers_is_rejected() -> None:
     model = two_segments()
     held = model.with_locks(dict.fromkeys(model.marker_names, (True, True, True)))
     assert "all coordinates are locked" in refused(trial(), held)

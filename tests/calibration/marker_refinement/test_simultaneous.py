@@ -106,7 +106,9 @@ def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
 
 @pytest.mark.parametrize("method", ["joint", "block"])
 @pytest.mark.parametrize("huber", [None, 0.004])
-def test_cost_never_rises(method: RefinementMethod, huber: float | None) -> None:
+def test_cost_of_the_refinement_never_increases(
+    method: RefinementMethod, huber: float | None
+) -> None:
     settings = RefinementSettings(method, huber_m=huber)
     trial = MotionTrial("walk", seen(0.004), 100.0)
     costs = refine_markers(misplaced(limb(), 0.015), [trial], settings).costs

@@ -109,13 +109,13 @@ def test_q_and_minus_q_mixed_at_random_change_nothing() -> None:
                 assert after[name][method] == pytest.approx(figures[method], abs=1e-6), method
 
 
-def test_without_movement_the_joint_is_named_and_what_to_do() -> None:
+def test_trial_without_movement_names_the_joint_and_the_remedy() -> None:
     still = record(SUBJECT, motion(SUBJECT, 12.0, 400.0, still=True), 7)
     with pytest.raises(CalibrationError, match=r"flex and extend it \(squats\)"):
         fit(lambda _: still)
 
 
-def test_a_sensor_unplugged_half_way_is_told_and_the_rest_is_learned() -> None:
+def test_sensor_unplugged_half_way_is_reported_and_the_rest_is_fitted() -> None:
     found = fit(unplugged(0.5))
     assert any(note.startswith("S2: no data in 50 % of the movement") for note in found.notes)
     assert found.quality["holdout"]["frames"] < 0.25 * 12 * 120
@@ -130,7 +130,7 @@ def test_a_sensor_unplugged_from_the_start_is_refused_by_name(after: float) -> N
     assert "check its connector" in caught.value.reasons[0]
 
 
-def test_one_device_under_two_names_fits_and_is_told() -> None:
+def test_one_device_under_two_names_is_fitted_and_reported() -> None:
     found = fit(one_device_twice, still=True, learning=True)
     told = [note for note in found.notes if "are identical in every frame" in note]
     assert [note[:9] for note in told] == ["S1 and S2"]

@@ -134,7 +134,7 @@ def test_a_part_that_unseen_movement_does_not_like_better_stays() -> None:
     assert KNOCKED not in found.figures.moved_m
 
 
-def test_a_marker_that_is_never_seen_while_moving_stays_in_its_place() -> None:
+def test_marker_occluded_during_movement_keeps_its_position() -> None:
     optical = optical_of(trials()[1])
     positions = optical.positions.copy()
     positions[:, optical.markers.index("shank2")] = np.nan
@@ -149,7 +149,9 @@ def test_a_marker_that_is_never_seen_while_moving_stays_in_its_place() -> None:
     ("one", "other", "said"),
     [("pelvis0", "pelvis1", "look exchanged"), ("foot0", "foot2", "foot: markers not refined: ")],
 )
-def test_exchanged_labels_are_told_and_their_part_stays(one: str, other: str, said: str) -> None:
+def test_exchanged_labels_are_reported_and_their_cluster_is_not_refined(
+    one: str, other: str, said: str
+) -> None:
     part = one[:-1]
     tracks = track_clusters(optical_of(trials()[1]), pose().clusters)
     i, j = MARKERS[part].index(one), MARKERS[part].index(other)
@@ -161,7 +163,7 @@ def test_exchanged_labels_are_told_and_their_part_stays(one: str, other: str, sa
     assert said in found.notes[0]
 
 
-def test_rigid_bodies_show_no_markers_and_that_is_said() -> None:
+def test_refinement_of_rigid_bodies_reports_that_markers_are_missing() -> None:
     bodies = {
         name: replace(c, body=name.title(), markers=()) for name, c in pose().clusters.items()
     }
@@ -173,7 +175,7 @@ def test_rigid_bodies_show_no_markers_and_that_is_said() -> None:
 
 
 @pytest.mark.timeout(90)
-def test_the_worker_stores_and_tells_what_refining_did() -> None:
+def test_worker_stores_and_reports_the_result_of_refinement() -> None:
     static, functional, _ = trials()
     job = FunctionalJob(CHAIN, replace(SETTINGS, method="mean"), static, functional)
     result = run_job(job).to_dict()

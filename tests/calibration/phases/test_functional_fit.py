@@ -69,7 +69,7 @@ def errors_deg(subject: Subject, calibration: Calibration, sensor: str) -> NDArr
     return np.asarray(np.degrees(gap.magnitude()))
 
 
-def test_sensors_say_what_the_bones_do(clean: tuple[Subject, Calibration]) -> None:
+def test_fitted_sensors_reproduce_the_bones(clean: tuple[Subject, Calibration]) -> None:
     subject, calibration = clean
     for sensor in OWNER:
         assert np.median(errors_deg(subject, calibration, sensor)) < 2.5
@@ -97,13 +97,13 @@ def test_a_json_of_something_else_is_refused(
         Calibration.from_dict({**clean[1].to_dict(), **damage})
 
 
-def test_every_alive_set_has_a_model(clean: tuple[Subject, Calibration]) -> None:
+def test_every_set_of_working_sensors_has_a_model(clean: tuple[Subject, Calibration]) -> None:
     assert set(clean[1].segment["thigh"].models) == {
         f"{alive}|{near}" for alive in ("S1+S2", "S1", "S2") for near in ("", "S3+S4", "S3", "S4")
     }
 
 
-def test_the_correction_beats_the_mean_on_worn_sensors_in_three_seconds() -> None:
+def test_correction_has_smaller_errors_than_the_mean_and_is_fitted_in_three_seconds() -> None:
     subject = Subject(12, flaws=WORN)
     static, functional, _ = static_and_functional(subject, 40.0)
     alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
@@ -121,7 +121,7 @@ def test_the_correction_beats_the_mean_on_worn_sensors_in_three_seconds() -> Non
         assert found.lag_ns[sensor] == pytest.approx(15e6, abs=0.5e6)
 
 
-def test_without_an_alignment_the_result_says_so_and_names_turned_worlds() -> None:
+def test_calibration_without_alignment_reports_it_and_names_rotated_worlds() -> None:
     subject = Subject(11)
     static, functional, _ = static_and_functional(subject, 24.0)
     found = fit_calibration(static, functional, None, SETTINGS, CHAIN)
@@ -132,7 +132,7 @@ def test_without_an_alignment_the_result_says_so_and_names_turned_worlds() -> No
     assert {note[:2] for note in found.notes if "seems rotated" in note} >= turned
 
 
-def test_what_is_missing_is_named_all_at_once() -> None:
+def test_all_missing_inputs_of_a_calibration_are_named_together() -> None:
     static, functional, _ = static_and_functional(Subject(1), 12.0)
     sensors = {s: track for s, track in static.sensors.items() if s != "S2"}
     settings = replace(SETTINGS, markers={**MARKERS, "thigh": ("thigh0", "thigh1", "thihg2")})
@@ -225,7 +225,9 @@ def test_without_cameras_the_static_pose_is_the_identity() -> None:
     assert content_faults(found) == []
 
 
-def test_a_worse_calibration_is_never_better(clean: tuple[Subject, Calibration]) -> None:
+def test_worse_or_incomplete_calibration_is_not_preferred(
+    clean: tuple[Subject, Calibration],
+) -> None:
     old = clean[1]
     assert compare_calibrations(old, None).better
     assert compare_calibrations(old, old).better
@@ -241,7 +243,7 @@ def test_a_worse_calibration_is_never_better(clean: tuple[Subject, Calibration])
     assert compare_calibrations(blind, replace(old, joints=("a", "b", "c"))).better
 
 
-def test_the_digest_tells_trials_apart(clean: tuple[Subject, Calibration]) -> None:
+def test_digest_differs_between_trials(clean: tuple[Subject, Calibration]) -> None:
     subject, calibration = clean
     static, functional, _ = static_and_functional(subject, 24.0)
     track = functional.sensors["S1"]

@@ -80,7 +80,7 @@ def static_job(
     return Calibration.from_dict(result.to_dict()["calibration"])
 
 
-def test_a_new_alignment_counts_when_sensors_are_put_on_anew() -> None:
+def test_new_alignment_is_used_at_redonning() -> None:
     """All sensors were switched off and on: their headings are others, and the plate says which."""
     before, worn = worlds(dict.fromkeys(SENSORS, 0.3)), mounts()
     pose = fit_static(standing(before, worn), SETTINGS, CHAIN)
@@ -123,7 +123,7 @@ def test_a_sensor_that_is_silent_on_the_plate_is_named_at_once() -> None:
     assert "S3" in str(result.refused)
 
 
-def test_a_sensor_that_alone_was_moved_is_told_when_a_new_pose_is_taken() -> None:
+def test_single_moved_sensor_is_reported_at_a_new_static_pose() -> None:
     room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
     before = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), room, CHAIN)
     moved = {**worn, "S4": rotation.multiply(worn["S4"], rotation.exp(np.array([0.2, 0.0, 0.0])))}

@@ -53,7 +53,7 @@ def test_only_models_memory_and_figures_change(learned: Calibration) -> None:
     assert all(online["after_rad"][k] <= was for k, was in online["before_rad"].items())
 
 
-def test_more_of_what_is_known_teaches_nothing(learned: Calibration) -> None:
+def test_repeated_movement_does_not_change_the_model(learned: Calibration) -> None:
     result = refit_models(learned, fresh(moving(400, 0.5, 3)), CHAIN)
     assert result.calibration is None
     assert "newest frames" in str(result.kept)
@@ -78,7 +78,7 @@ def spoilt(kind: str) -> OnlineFrames:
 @pytest.mark.parametrize(
     "kind", ["two names swapped", "a marker knocked off", "cluster turned", "segments swapped"]
 )
-def test_nothing_is_learned_from_wrong_cameras(kind: str) -> None:
+def test_wrong_camera_data_are_rejected_by_online_learning(kind: str) -> None:
     with pytest.raises(CalibrationError, match="marker"):
         refit_models(calibration(), spoilt(kind), CHAIN)
 
@@ -113,7 +113,7 @@ def test_memory_of_another_chain_is_none() -> None:
     assert unpack(CHAIN, "") is None
 
 
-def test_memory_is_bounded_and_keeps_what_is_rare() -> None:
+def test_memory_is_bounded_and_retains_rare_postures() -> None:
     rare, common = moving(20, 2.0), moving(5000, 0.3)
     kept = evenly(CHAIN, joined(rare, common))
     assert len(kept) == MOST
@@ -130,7 +130,7 @@ def test_of_one_posture_the_newest_frames_stay() -> None:
     assert np.mean(kept.trials == 1) > 0.95
 
 
-def test_only_three_kinds_of_movement_are_told_apart() -> None:
+def test_memory_distinguishes_at_most_three_kinds_of_movement() -> None:
     taught = moving(10, 0.5)
     for _ in range(4):
         taught = joined(taught, moving(10, 0.5))

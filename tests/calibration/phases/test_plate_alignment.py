@@ -43,14 +43,14 @@ def test_worlds_up_to_90_degrees_apart_are_aligned_in_spite_of_a_lag() -> None:
         assert item.quality.lag_ns == pytest.approx(20e6, abs=2e6)
 
 
-def test_a_lag_handed_in_is_believed() -> None:
+def test_given_lag_is_used_by_the_plate_alignment() -> None:
     subject = Subject(5, flaws=Imperfections(lag_s=0.05))
     lags = dict.fromkeys(subject.worlds(), 50_000_000)
     found = fit_plate_alignment(plate_trial(subject), SETTINGS, lag_ns=lags)
     assert max(errors_deg(found, subject)) < 0.1
 
 
-def test_a_plate_of_markers_serves_as_well() -> None:
+def test_plate_of_markers_aligns_like_a_rigid_body() -> None:
     subject = Subject(6)
     trial = plate_trial(subject)
     assert trial.optical is not None
@@ -64,7 +64,7 @@ def test_a_plate_of_markers_serves_as_well() -> None:
     assert max(errors_deg(found, subject)) < 0.2
 
 
-def test_turning_about_one_horizontal_axis_gives_the_heading_and_says_so() -> None:
+def test_rotation_about_one_horizontal_axis_yields_the_heading_only_and_reports_it() -> None:
     subject = Subject(7)
     found = fit_plate_alignment(plate_trial(subject, axes=1), SETTINGS)
     assert {item.quality.kind for item in found.sensors.values()} == {"heading"}

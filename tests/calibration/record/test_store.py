@@ -79,7 +79,7 @@ def test_a_damaged_version_is_named_and_the_one_before_is_used(
     assert (again.version, again.notes) == (3, ())
 
 
-def test_nothing_readable_is_no_silence(tmp_path: Path) -> None:
+def test_store_without_readable_version_reports_it(tmp_path: Path) -> None:
     store = CalibrationStore(tmp_path, "s")
     store.save(PLAIN)
     store.path(1).write_text("x", encoding="utf-8")
@@ -111,7 +111,7 @@ def test_a_stop_at_any_step_leaves_the_version_before(
     assert store.save(numbered("after")) == 2
 
 
-def test_a_version_of_another_process_is_never_overwritten(
+def test_version_written_by_another_process_is_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours, theirs = CalibrationStore(tmp_path, "s"), CalibrationStore(tmp_path, "s")
@@ -248,7 +248,7 @@ def test_wrong_content_is_set_aside_even_with_a_matching_checksum(
     assert "renamed to 0002.json.bad" in latest.notes[0]
 
 
-def test_an_edit_by_hand_is_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_manually_edited_calibration_is_rejected_with_a_remedy(tmp_path: Path) -> None:
     store = CalibrationStore(tmp_path, "s")
     path = store.path(store.save(PLAIN))
     path.write_text(path.read_text().replace("0.42", "0.43"))

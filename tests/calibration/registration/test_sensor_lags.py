@@ -30,7 +30,7 @@ def test_a_plate_beats_skin_and_both_are_surer_than_either() -> None:
     assert chosen.sigma_ns < 0.2 * MS
 
 
-def test_flesh_keeps_a_lag_on_skin_from_looking_sure() -> None:
+def test_soft_tissue_artefact_increases_the_deviation_of_a_lag() -> None:
     chosen = segment_lags({"S1": said(9.0, 0.05)}, {})["S1"]
     assert chosen.source == "movement"
     assert chosen.lag_ns == 9 * MS
@@ -50,7 +50,7 @@ def test_a_lag_smaller_than_its_deviation_is_noise_and_not_used() -> None:
     assert with_plate["S1"].source == "plate and movement"
 
 
-def test_a_sensor_known_from_the_plate_tells_the_markers_flesh_to_its_neighbor() -> None:
+def test_sensor_with_a_plate_lag_corrects_the_soft_tissue_lag_of_its_neighbor() -> None:
     moving = {"S1": said(9.0, 0.5), "S2": said(14.0, 0.5)}
     alone = segment_lags(moving, {})["S2"]
     taught = segment_lags(moving, {"S1": (round(5 * MS), 0.1 * MS)})["S2"]
@@ -61,7 +61,7 @@ def test_a_sensor_known_from_the_plate_tells_the_markers_flesh_to_its_neighbor()
     assert taught.sigma_ns < alone.sigma_ns
 
 
-def test_what_refuses_is_left_to_the_plate_and_a_changed_clock_to_the_movement() -> None:
+def test_rejected_movement_lag_is_replaced_by_the_plate_lag_unless_the_clock_changed() -> None:
     plate = {"S1": (round(5 * MS), 0.1 * MS), "S2": (round(5 * MS), 0.1 * MS)}
     chosen = segment_lags({"S1": said(9.0, 1.0, "no"), "S2": said(40.0, 1.0)}, plate)
     assert chosen["S1"] == SensorLag(round(5 * MS), 0.1 * MS, "plate")
@@ -71,7 +71,9 @@ def test_what_refuses_is_left_to_the_plate_and_a_changed_clock_to_the_movement()
 
 
 @pytest.mark.parametrize("name", ["squats1", "DJ1"])
-def test_lags_on_real_skin_are_within_what_they_claim(name: str, shared_data: Path) -> None:
+def test_lag_errors_on_recorded_skin_are_within_their_deviation(
+    name: str, shared_data: Path
+) -> None:
     """Truth is the lag put in; flesh moves what is found by milliseconds."""
     trial = load(shared_data, name)
     period = 20_000_000 if name == "squats1" else 10_000_000

@@ -67,7 +67,7 @@ def test_weights_count() -> None:
     assert float(rot.heading_of(robust_mean(q, [3.0, 1.0]).q)) == pytest.approx(0.0005, rel=0.01)
 
 
-def test_a_pose_is_refused_by_sentences_that_say_what_to_do() -> None:
+def test_rejected_static_pose_is_reported_with_a_remedy() -> None:
     good = {"S1": still(0.2 * DEG), "S2": still(0.9 * DEG)}
     assert static_problems(good, 5.0) == ()
     (short,) = static_problems(good, 2.0)
@@ -80,7 +80,7 @@ def test_a_pose_is_refused_by_sentences_that_say_what_to_do() -> None:
     assert static_problems(slack, 5.0, StaticLimits(spread=2 * DEG)) == ()
 
 
-def test_a_sensor_that_slipped_is_told_from_a_pose_that_changed() -> None:
+def test_slipped_sensor_is_distinguished_from_a_changed_pose() -> None:
     before = {"S1": rot.exp([0.1, 0.2, 0.3]), "S2": rot.exp([-0.4, 0.0, 1.0])}
     segments = {"thigh": ("S1", "S2", "S9")}
     stooped = rot.exp([0.2, 0.0, 0.0])

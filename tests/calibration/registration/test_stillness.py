@@ -55,7 +55,7 @@ def test_rest_is_found_and_motion_is_not_rest() -> None:
         assert not still[SWING].any()
 
 
-def test_a_rest_shorter_than_one_and_a_half_seconds_is_not_believed() -> None:
+def test_rest_shorter_than_one_and_a_half_seconds_is_not_stillness() -> None:
     gyr, acc, _ = swinging()
     assert not still_from_rates(gyr, acc, RATE)[1000:].any()
     eager = still_from_rates(gyr, acc, RATE, StillnessLimits(shortest_s=0.1))
@@ -68,7 +68,7 @@ def test_a_gyro_bias_is_no_movement() -> None:
     assert np.array_equal(still_from_rates(gyr, acc, RATE), still_from_rates(biased, acc, RATE))
 
 
-def test_linear_shaking_is_movement_although_nothing_turns() -> None:
+def test_linear_shaking_without_rotation_is_movement() -> None:
     gyr, acc, _ = swinging()
     shaken = acc + np.outer(0.3 * np.sin(np.arange(1100)), [1.0, 0.0, 0.0])
     assert not still_from_rates(gyr, shaken, RATE).any()
@@ -122,7 +122,7 @@ def test_unknown_orientations_are_not_still() -> None:
 @pytest.mark.parametrize(
     "name", ["02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B"]
 )
-def test_a_real_boards_motion_is_never_still(shared_data: Path, name: str) -> None:
+def test_motion_of_a_recorded_board_is_never_stillness(shared_data: Path, name: str) -> None:
     with np.load(shared_data / "broad_excerpts" / f"{name}_60s.npz", allow_pickle=False) as trial:
         moving, rate = trial["movement"].astype(bool), float(trial["sampling_rate"])
         from_rates = still_from_rates(trial["imu_gyr"], trial["imu_acc"], rate)

@@ -45,7 +45,7 @@ def limb(alike: float, seed: int = 1) -> LimbTraining:
 
 
 @pytest.mark.parametrize("alike", [-0.8, 0.0, 0.8])
-def test_what_is_found_on_held_out_frames_holds_on_later_ones(alike: float) -> None:
+def test_error_correlation_of_held_out_frames_applies_to_later_frames(alike: float) -> None:
     training, later = limb(alike), limb(alike, seed=2)
     found = joint_error_correlations(CHAIN, training, "anchored")
     assert found.keys() == {"knee"}
@@ -58,14 +58,14 @@ def test_what_is_found_on_held_out_frames_holds_on_later_ones(alike: float) -> N
     assert abs(found["knee"] - float(np.asarray(actual)[0, 1])) < 0.15
 
 
-def test_errors_that_are_the_same_are_not_quite_believed() -> None:
+def test_correlation_of_identical_errors_is_limited() -> None:
     training = limb(0.0)
     a, b = training.sensors["S1"], training.sensors["S2"]
     same = SegmentTraining.of([a, b], training.sensors["S3"], training.reference["thigh"])
     assert error_correlation(same, same) == 0.9
 
 
-def test_a_joint_that_was_hardly_seen_whole_has_none() -> None:
+def test_joint_with_few_complete_frames_has_no_error_correlation() -> None:
     training = limb(0.5)
     hidden = training.reference["shank"].copy()
     hidden[29:] = np.nan
@@ -89,7 +89,7 @@ def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
     assert sd(0.5) == pytest.approx(sqrt(0.0025 - 0.0012))
 
 
-def test_what_no_model_says_is_independent_however_alike_the_models_err() -> None:
+def test_errors_of_held_or_inconsistent_segments_are_independent() -> None:
     """Held orientations, plain means and doubts of a watch come from elsewhere than the models."""
     above = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
     below = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.4, (), ("held:shank",))

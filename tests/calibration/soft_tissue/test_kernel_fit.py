@@ -169,7 +169,7 @@ def test_one_frame_is_that_of_many_wherever_it_lies() -> None:
         assert rot.angle_between(one.q, many[i]) < 1e-9
 
 
-def test_what_always_holds_is_kept_far_outside_of_the_training() -> None:
+def test_constant_offset_is_corrected_far_outside_the_training_range() -> None:
     """Sensors that stood 4 deg off the bone all the time do so in a bend nobody trained, too."""
     off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
     near, far = Knee(bend=0.6), Knee(bend=2.4)
@@ -211,7 +211,7 @@ def test_a_stored_model_with_wrong_types_is_found_wherever_they_are() -> None:
     assert found == {"mean_sd", "tilted.tilted", "tilted.carried"}
 
 
-def test_who_stands_still_and_straight_for_most_of_the_time_still_gets_a_fit() -> None:
+def test_trial_with_much_upright_standing_is_fitted() -> None:
     """Left out are the only frames that move: of what is left no leverage is above zero."""
     knee = Knee()
     for q in (*knee.sensors, knee.other, knee.bone):
@@ -222,7 +222,7 @@ def test_who_stands_still_and_straight_for_most_of_the_time_still_gets_a_fit() -
     assert np.isfinite((*model.spread.inside, *model.spread.outside)).all()
 
 
-def test_nothing_is_corrected_upright_and_straight_however_far_off_all_training_was() -> None:
+def test_correction_is_zero_in_the_static_pose_for_any_training() -> None:
     """The trend knows a constant; its weight is zero there, for no feature shows anything."""
     knee = Knee(bend=2.0)
     off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))

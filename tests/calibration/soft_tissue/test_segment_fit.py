@@ -54,7 +54,7 @@ class Limb:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("sensors", [1, 2, 3])
-def test_one_frame_says_what_the_array_says(method: Method, sensors: int) -> None:
+def test_single_frame_result_equals_the_array_result(method: Method, sensors: int) -> None:
     limb = Limb(sensors=sensors)
     model = limb.fit(method)
     array = model.predict(limb.sensors, limb.other)
@@ -85,7 +85,7 @@ def test_an_unknown_kind_of_model_is_refused_by_name() -> None:
         SegmentModel.from_dict({"kind": "oracle"})
 
 
-def test_the_mean_weighs_sensors_alike_however_bad_one_is() -> None:
+def test_mean_weights_all_sensors_equally() -> None:
     limb = Limb()
     limb.sensors[1] = rot.multiply(limb.sensors[1], rot.exp(np.array([0.3, 0.0, 0.0])))
     said = limb.fit("mean").predict(limb.sensors)
@@ -105,7 +105,7 @@ def test_the_single_is_the_sensor_that_was_nearest_in_training_bit_for_bit() -> 
     assert np.max(rot.angle_between(said, limb.sensors[best])) < 1e-12
 
 
-def test_markley_takes_out_constant_worlds_and_mounts_and_weighs_what_is_left() -> None:
+def test_markley_removes_constant_rotations_and_weights_the_residuals() -> None:
     """An oracle by construction: constants in, constants out, whatever the signs."""
     rng = np.random.default_rng(3)
     limb = Limb()
@@ -131,7 +131,7 @@ def test_corrections_beat_the_mean_on_movement_they_did_not_see() -> None:
 
 @pytest.mark.parametrize("method", ["anchored", "mean", "single"])
 @pytest.mark.parametrize("turn", [0.2, 1.5, 3.1])
-def test_a_turned_world_turns_the_answer_and_nothing_else(method: Method, turn: float) -> None:
+def test_rotated_world_only_rotates_the_result(method: Method, turn: float) -> None:
     limb = Limb()
     model = limb.fit(method)
     world = rot.exp([0.0, 0.0, turn] if method == "anchored" else [0.3, -0.2, turn])
@@ -142,13 +142,13 @@ def test_a_turned_world_turns_the_answer_and_nothing_else(method: Method, turn: 
     assert np.max(rot.angle_between(turned, rot.multiply(world, straight))) < 1e-11
 
 
-def test_the_anchored_correction_is_nothing_in_the_static_pose() -> None:
+def test_anchored_correction_is_zero_in_the_static_pose() -> None:
     model = Limb().fit("anchored")
     pose = (0.6, 0.0, 0.0, 0.8)  # upright, whatever the heading
     assert rot.angle_between(model.predict_one([pose, pose], pose).q, pose) < 1e-12
 
 
-def test_far_outside_training_the_correction_fades_and_says_so() -> None:
+def test_correction_fades_outside_the_training_range_with_a_flag() -> None:
     limb = Limb(range_rad=0.6)
     model = limb.fit("anchored")
     assert isinstance(model, KernelModel)
@@ -174,7 +174,7 @@ def test_without_the_neighbor_the_anchored_model_is_the_mean() -> None:
     assert isinstance(untaught, MeanModel)
 
 
-def test_the_claimed_deviation_is_what_later_frames_show() -> None:
+def test_predicted_deviation_matches_the_errors_of_later_frames() -> None:
     limb = Limb()
     for method in METHODS:
         model = limb.fit(method)
@@ -192,7 +192,7 @@ def test_axes_are_claimed_apart_and_together() -> None:
     assert np.sqrt(np.mean(np.square(said.axis_sd))) == pytest.approx(said.sd)
 
 
-def test_where_nothing_can_be_learned_the_mean_stays() -> None:
+def test_model_without_information_is_the_mean() -> None:
     rng = np.random.default_rng(3)
     limb = Limb()
     limb.sensors = [
@@ -252,7 +252,7 @@ def test_unknown_frames_are_left_out_of_the_fit_and_unknown_in_the_answer(method
     assert np.isnan(model.predict(holes, limb.other)[60]).all()
 
 
-def test_too_little_is_said_not_fitted() -> None:
+def test_too_few_frames_are_rejected() -> None:
     limb = Limb()
     with pytest.raises(ValueError, match="12 complete frames"):
         limb.fit("mean", slice(0, 12))
@@ -260,7 +260,7 @@ def test_too_little_is_said_not_fitted() -> None:
         fit_segment("mean", [], None, limb.segment)
 
 
-def test_hold_out_blocks_are_contiguous_and_cover_everything_once() -> None:
+def test_hold_out_blocks_are_contiguous_and_cover_each_frame_once() -> None:
     limb = Limb()
     for labels, blocks in ((np.zeros(N, int), 5), (np.arange(N) // 300, 6)):
         training = SegmentTraining.of(limb.sensors, limb.other, limb.segment, labels)

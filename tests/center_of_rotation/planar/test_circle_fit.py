@@ -287,7 +287,7 @@ def test_published_ellipses_cover_95_percent_whatever_the_true_conditioning(trut
 
 
 @pytest.mark.parametrize("n", [5, 8, 20, 100])
-def test_few_frames_widen_the_ellipse_as_fisher_says(n: int) -> None:
+def test_ellipse_of_few_frames_has_the_quantile_of_fisher(n: int) -> None:
     assert ellipse_scale(n, 1e9) == pytest.approx(2.0 * f.ppf(0.95, 2, n - 3), rel=1e-9)
     assert ellipse_scale(n, 5.9) == inf
     assert ellipse_scale(3.0, 10.0) == inf

@@ -104,7 +104,7 @@ def test_equal_steps_have_the_known_errors(step: Any, factor: Any) -> None:
     assert found == pytest.approx(float(arbitrary_error(angles, 1.0)), rel=1e-12)
 
 
-def test_no_turn_and_half_turns_show_nothing() -> None:
+def test_three_frames_without_rotation_or_with_half_turns_are_rejected() -> None:
     assert equal_step_error(0.0, 0.001) == inf
     assert equal_step_error(np.pi, 0.001) == inf
     assert arbitrary_error([0.0, 0.0, 1.0], 0.001) == inf

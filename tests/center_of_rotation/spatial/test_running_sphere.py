@@ -54,7 +54,9 @@ def test_streaming_equals_all_frames_at_once(forgetting: float, gaps: float) -> 
 
 @given(st.integers(0, 10_000), st.tuples(*[st.floats(-0.6, 0.6)] * 3))
 @settings(max_examples=15, deadline=None)
-def test_where_the_first_sample_was_changes_nothing(seed: int, away: tuple[float, ...]) -> None:
+def test_position_of_the_first_sample_does_not_affect_the_sphere(
+    seed: int, away: tuple[float, ...]
+) -> None:
     points = ball(np.random.default_rng(seed), n=120)
     stream = RunningSphere(4, robust=False)
     stream.feed(points[0] + away, np.zeros(4))
@@ -171,7 +173,7 @@ def some_points(kind: str, rng: np.random.Generator, noise: float) -> Array:
     st.floats(0.0, 1.0),
 )
 @settings(max_examples=60, deadline=None)
-def test_never_nan_without_a_refusal(seed: int, kind: str, noise: float, hidden: float) -> None:
+def test_nan_center_is_always_rejected(seed: int, kind: str, noise: float, hidden: float) -> None:
     rng = np.random.default_rng(seed)
     points = some_points(kind, rng, noise)
     points = points + rng.normal(0, noise, points.shape) if noise else points.astype(np.float64)

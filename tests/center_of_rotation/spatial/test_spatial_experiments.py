@@ -18,7 +18,7 @@ def test_spatial_experiment_meets_its_targets(experiment: Experiment) -> None:
 
 
 @pytest.mark.parametrize(("rom", "goals"), [(20.0, AT_20), (45.0, AT_45)])
-def test_a_ball_joint_between_two_noisy_bodies_is_found_as_well_in_fewer_runs(
+def test_ball_joint_between_two_noisy_bodies_meets_its_targets_in_fewer_runs(
     rom: float, goals: tuple[float, ...]
 ) -> None:
     figures = ball_joint(rom, goals, runs=40)

@@ -55,7 +55,7 @@ def test_a_name_that_two_bodies_have_must_be_written_with_its_body() -> None:
     assert got.markers[0].tolist() == [1.0, 2.0, 3.0]
 
 
-def test_unknown_names_are_said_all_at_once_with_the_nearest_and_what_there_is() -> None:
+def test_unknown_names_are_reported_together_with_suggestions() -> None:
     feeder = ready(
         markers={"thigh": ["T1", "T9", "Q"]}, rigid_body={"shank": "Shink"}, plate="Plate"
     )
@@ -144,7 +144,7 @@ def test_an_id_that_occurs_twice_in_a_frame_is_absent_twice() -> None:
         assert np.isnan(got.markers).all()
 
 
-def test_ids_the_model_does_not_have_are_dropped_counted_and_said_once() -> None:
+def test_identifiers_outside_the_model_are_dropped_counted_and_reported_once() -> None:
     feeder = ready()
     strange = frame(
         1, markers=(marker(9 << 16 | 1, (1.0, 1.0, 1.0)), marker(77, (1.0, 1.0, 1.0), 18))

@@ -133,14 +133,14 @@ def test_ticks_are_the_exposure_and_the_clock_is_the_servers() -> None:
     assert feeder.frame(frame(5, ticks=123456789)).ticks == 123456789
 
 
-def test_without_exposure_stamps_the_configured_latency_is_taken_and_said_once() -> None:
+def test_without_exposure_stamps_the_configured_latency_is_used_and_reported_once() -> None:
     feeder = ready(latency_ms=8.0)
     got = [feeder.frame(frame(n, exposure=0, ticks=10**6 + n)) for n in (1, 2)]
     assert got[0].ticks == 10**6 + 1 + 2 - 80_000
     assert len(told(feeder.events, "warning")) == 1
 
 
-def test_an_echo_gives_both_host_stamps_and_an_old_or_foreign_one_nothing() -> None:
+def test_echo_yields_both_host_stamps_and_foreign_echoes_are_ignored() -> None:
     feeder = ready()
     events = feeder(EchoResponse(1_000, 77), t_ns=500_000)
     assert events == [ClockEcho(1_000, 500_000, 77)]
@@ -170,7 +170,7 @@ def test_a_falling_number_or_clock_is_a_restart(after: FrameOfData) -> None:
     assert isinstance(feeder.events[-1], MocapFrame)
 
 
-def test_a_short_loop_is_a_restart_and_not_late_for_ever() -> None:
+def test_loop_of_a_short_recording_is_a_restart() -> None:
     feeder = ready()
     feeder(*(frame(n % 40) for n in range(200)))
     assert len(told(feeder.events, "restart")) == 4
@@ -198,7 +198,7 @@ def test_frames_before_the_model_are_counted_and_not_published() -> None:
     assert isinstance(feeder(frame(3))[0], MocapFrame)
 
 
-def test_edit_mode_is_said_at_its_edges_and_frames_are_not_live() -> None:
+def test_edit_mode_is_reported_at_begin_and_end_and_its_frames_are_not_live() -> None:
     feeder = ready()
     got = [feeder.frame(frame(n, params=p)) for n, p in ((1, 0), (2, 4), (3, 4), (4, 0))]
     assert [one.live for one in got] == [True, False, False, True]
@@ -222,7 +222,7 @@ def test_the_bitstream_follows_the_response_and_the_frames_stay_readable() -> No
     assert isinstance(first, MocapFrame)
 
 
-def test_frames_in_the_bitstream_asked_for_are_read_though_nobody_confirmed() -> None:
+def test_frames_in_the_requested_bitstream_are_decoded_without_confirmation() -> None:
     feeder = ready(bitstream="4.1")
     feeder.version = (4, 1)
     out = feeder(frame(1, markers=(marker(65537, (1.0, 2.0, 3.0)),)))
@@ -236,7 +236,7 @@ def test_a_server_of_bitstream_2_is_refused_by_name() -> None:
     assert isinstance(feeder(frame(1))[0], Corrupt)
 
 
-def test_what_a_client_says_has_no_effect() -> None:
+def test_messages_of_clients_are_ignored() -> None:
     feeder = ready()
     before = feeder.decoder.messages
     assert (

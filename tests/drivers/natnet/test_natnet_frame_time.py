@@ -69,7 +69,7 @@ def test_a_clock_on_ptp_is_unix_time_less_the_leap_seconds() -> None:
     assert ahead - behind == 37 * NS
 
 
-def test_without_precision_timestamps_frames_have_no_time_and_a_warning_says_why() -> None:
+def test_frames_without_precision_timestamps_have_no_time_and_a_warning() -> None:
     feeder = streamed([None] * FRAMES, time="ptp")
     assert {found.ticks for found in frames_of(feeder)} == {None}
     assert feeder.decoder.tick_clock is None
@@ -99,7 +99,7 @@ def test_any_timestamp_is_read_or_left_out(stamps: list[tuple[int, int]]) -> Non
         assert found is None or 0 <= found - stamp[0] * NS < NS
 
 
-def test_a_timecode_is_told_when_it_comes_and_when_it_goes() -> None:
+def test_begin_and_end_of_a_timecode_are_reported() -> None:
     feeder = Feeder()
     feeder(INFO, MODEL)
     for number, code in enumerate([0, 0x0A141E04, 0x0A141E05, 0], 1):

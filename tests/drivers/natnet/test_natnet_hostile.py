@@ -75,7 +75,7 @@ def test_the_latency_of_usb_cameras_does_not_lead_before_the_start_of_the_counte
 
 
 @pytest.mark.parametrize("far", [1e38, -20_000.0, float("inf"), float("nan")])
-def test_a_position_that_no_camera_sees_is_not_seen(far: float) -> None:
+def test_position_of_an_occluded_marker_is_unknown(far: float) -> None:
     got = ready().frame(frame(1, markers=(marker(65537, (0.0, far, 0.0)),)))
     assert np.isnan(got.markers).all()
 

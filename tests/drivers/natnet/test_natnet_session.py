@@ -162,7 +162,7 @@ async def test_keepalives_keep_a_unicast_client() -> None:
         assert not task.done()
 
 
-async def test_a_server_that_is_left_is_told_so() -> None:
+async def test_server_drops_a_client_whose_driver_stops() -> None:
     server = serve()
     async with at_work(server) as (heard, task):
         await until(lambda: heard.measurements, server)
@@ -171,7 +171,7 @@ async def test_a_server_that_is_left_is_told_so() -> None:
         await until(lambda: not server.clients, None)
 
 
-async def test_a_port_where_nobody_listens_is_lost_at_once_and_named() -> None:
+async def test_port_without_listener_is_reported_as_lost_at_once() -> None:
     server = serve()
     server.unplug()
     driver = NatNetMocap(
@@ -228,7 +228,7 @@ class Claimant(NatNetServer):
         ),
     ],
 )
-async def test_a_server_that_can_never_work_is_refused_with_a_remedy(
+async def test_incompatible_server_is_rejected_with_a_remedy(
     claims: ServerInfo, settings: dict[str, Any], words: str
 ) -> None:
     server = Claimant()

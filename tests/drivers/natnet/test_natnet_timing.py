@@ -117,7 +117,7 @@ def test_arrivals_are_less_regular(traffic: Traffic) -> None:
     assert steps_ms.max() == pytest.approx(12.789, abs=0.001)
 
 
-def test_nine_echoes_say_how_the_servers_clock_runs(traffic: Traffic) -> None:
+def test_nine_echoes_determine_the_rate_of_the_server_clock(traffic: Traffic) -> None:
     echoes = traffic.echoes
     trips_ms = np.array([echo.received_ns - echo.sent_ns for echo in echoes]) * MS
     assert trips_ms == pytest.approx(

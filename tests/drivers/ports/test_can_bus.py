@@ -182,7 +182,9 @@ async def test_an_unplugged_adapter_loses_all_and_gives_all_back(tmp_path: Path)
             await run.cancel()
 
 
-async def test_a_silent_sensor_is_lost_alone_and_told_what_else_came(tmp_path: Path) -> None:
+async def test_only_the_silent_sensor_is_lost_and_its_report_lists_received_identifiers(
+    tmp_path: Path,
+) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     talks, _ = two_sensors(adapter)
     async with serving(talks):
@@ -215,7 +217,7 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
     assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
 
 
-async def test_a_quaternion_that_never_comes_is_missed_though_time_and_counter_do(
+async def test_missing_quaternion_is_reported_while_time_and_counter_arrive(
     tmp_path: Path,
 ) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
@@ -318,7 +320,7 @@ async def test_a_bug_behind_one_device_hurts_no_other(tmp_path: Path) -> None:
         await good.cancel()
 
 
-async def test_the_adapter_is_told_the_bit_rate(tmp_path: Path) -> None:
+async def test_bit_rate_is_sent_to_the_adapter(tmp_path: Path) -> None:
     adapter = SlcanAdapter(tmp_path / "adapter")
     async with serving(adapter):
         run = Running(driver_of("S3", bus_at(tmp_path, bitrate=250_000)))

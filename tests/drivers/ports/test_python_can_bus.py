@@ -101,7 +101,7 @@ class Broken(can.BusABC):
         (ZeroDivisionError(), ZeroDivisionError),
     ],
 )
-async def test_what_a_pump_thread_meets_reaches_the_driver(
+async def test_error_of_the_receive_thread_is_raised_in_the_driver(
     monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception]
 ) -> None:
     monkeypatch.setattr(can, "Bus", lambda **_: Broken(error))
@@ -182,7 +182,7 @@ class Filtered(can.BusABC):
         self.far.close()
 
 
-async def test_a_link_that_goes_down_is_told_once_and_frames_before_it_count(
+async def test_link_down_is_reported_once_after_the_frames_before_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made: list[Filtered] = []

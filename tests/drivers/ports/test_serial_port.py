@@ -172,7 +172,7 @@ def test_a_taken_port_may_become_free(pty: Pty) -> None:
         pass
 
 
-def test_a_file_is_not_a_port_and_never_will_be(tmp_path: Path) -> None:
+def test_regular_file_is_rejected_as_a_port(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with (
         pytest.raises(DeviceMisconfiguredError, match="not a serial port"),

@@ -113,7 +113,7 @@ def test_arrivals_never_run_backwards_on_a_line_faster_than_its_speed() -> None:
     assert first[0].arrival_ns <= more[0].arrival_ns <= more[1].arrival_ns
 
 
-def test_silence_gives_up_what_waits_before_new_bytes_are_read() -> None:
+def test_incomplete_message_is_dropped_after_a_silence() -> None:
     events = decoder()
     events.feed(Chunk(0, bytes.fromhex("faff36ff07d0")))  # waits for 2000 bytes
     found = events.feed(Chunk(300_000_000, message(1, 100)))
@@ -148,7 +148,7 @@ def test_the_counter_wraps() -> None:
 @pytest.mark.parametrize(
     ("product", "modulus"), [("MTi-3-8A7G6", 2**32), ("MTi-300", 864_000_000), (None, None)]
 )
-def test_the_clock_wraps_where_the_model_says_or_where_it_is_seen(
+def test_clock_wraps_at_the_limit_of_the_model_or_at_the_observed_one(
     product: str | None, modulus: int | None
 ) -> None:
     for turn in (2**32, 864_000_000) if modulus is None else (modulus,):
@@ -202,9 +202,7 @@ def test_whatever_is_lost_is_counted_exactly(counter: int, ticks: int, losses: l
 
 
 @given(st.integers(0, 10_000), st.integers(13_000, 2**31))
-def test_a_reset_clock_is_a_restart_as_soon_as_a_second_message_says_so(
-    after: int, before: int
-) -> None:
+def test_clock_reset_is_a_restart_after_a_second_message(after: int, before: int) -> None:
     follow = XbusContinuity(100.0)
     ticks = (before - 100, before, after, after + 100)
     steps = [follow.orientation(counter, at, 0) for counter, at in enumerate(ticks)]
@@ -304,7 +302,7 @@ def test_a_quaternion_that_is_no_number_is_refused(bad: float) -> None:
     assert samples(fed(decoder(), message(1, 100, (bad, 0.0, 0.0, 0.0)))) == []
 
 
-def test_a_wrong_scale_is_said_once_with_the_norm_measured() -> None:
+def test_wrong_scale_is_reported_once_with_the_measured_norm() -> None:
     events = fed(decoder(), *(message(n, 100 * n, (0.25, 0.0, 0.0, 0.0)) for n in range(300)))
     assert told(events) == [("warning", {"median_norm": 0.25})]
 
@@ -323,14 +321,14 @@ def test_a_quaternion_of_the_wrong_size_makes_it_corrupt() -> None:
     assert isinstance(found, Corrupt)
 
 
-def test_the_sign_never_jumps() -> None:
+def test_quaternion_sign_is_continuous() -> None:
     q = (0.5, 0.5, 0.5, 0.5)
     found = samples(fed(decoder(), message(1, 100, q), message(2, 200, tuple(-x for x in q))))
     assert found[0].q_world_sensor == pytest.approx(found[1].q_world_sensor)
     assert found[1].q_native == tuple(-x for x in q)
 
 
-def test_what_the_device_says_of_itself_is_information() -> None:
+def test_device_description_is_reported_as_information() -> None:
     found = fed(
         decoder(),
         encode(XbusMessageId.DEVICE_ID, bytes.fromhex("0360a1b2")),

@@ -90,7 +90,7 @@ def mids(chunks: list[Chunk]) -> list[int]:
     ]
 
 
-async def test_what_is_emitted_begins_with_the_acknowledgement_and_holds_all_replies(
+async def test_emitted_bytes_begin_with_the_acknowledgement_and_contain_all_replies(
     tmp_path: Path,
 ) -> None:
     options = XbusDeviceOptions(measures_at_once=True, config_delay_s=0.1)
@@ -187,7 +187,7 @@ async def test_a_rate_the_device_rounds_is_named(tmp_path: Path) -> None:
     assert "set rate_hz = 100" in said
 
 
-async def test_an_error_of_the_device_is_told_in_words(tmp_path: Path) -> None:
+async def test_device_error_code_is_reported_as_text(tmp_path: Path) -> None:
     class Refusing(XbusDevice):
         @override
         def _output_configuration(self, data: bytes) -> tuple[int, bytes]:
@@ -247,7 +247,7 @@ async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
         assert device.asked == 1 or not streams, "one request at a time"
 
 
-async def test_a_device_that_begins_anew_with_every_request_comes_up(tmp_path: Path) -> None:
+async def test_device_that_restarts_at_every_request_is_configured(tmp_path: Path) -> None:
     options = XbusDeviceOptions(measures_at_once=True, config_delay_s=1.5)
     async with powered(XbusDevice(tmp_path / "imu", options=options), feeding=True):
         assert len(await chunks_of(make(tmp_path))) >= 5

@@ -135,7 +135,7 @@ def test_a_short_gap_is_interpolated(lost: int) -> None:
     assert not [e for e in gapped if isinstance(e, DeviceEvent) and "anew" in e.text]
 
 
-def test_a_long_gap_begins_anew_at_the_same_heading_and_says_so() -> None:
+def test_filter_restarts_with_the_same_heading_after_a_long_gap() -> None:
     wires = [message(k, 100 * k, *items) for k, items in enumerate(turning(300))]
     events = decoded(wires[:150] + wires[160:])
     told = [e for e in events if isinstance(e, DeviceEvent) and "filter restarted" in e.text]
@@ -156,7 +156,7 @@ def test_a_tilt_after_a_long_gap_comes_from_the_accelerometer() -> None:
     assert angle(last, (cos(0.25), sin(0.25), 0.0, 0.0)) < 1e-3
 
 
-def test_increments_serve_as_well_as_rates() -> None:
+def test_increments_yield_the_same_orientation_as_rates() -> None:
     half = 0.5 * 1.0 * 0.01
     items = (
         (Item.DELTA_Q, (cos(half), 0.0, 0.0, sin(half))),
@@ -179,7 +179,7 @@ def tumbling(n: int) -> list[tuple[tuple[int, Any], ...]]:
 
 
 @pytest.mark.parametrize(("contents", "first_s"), [(tumbling(600), 3.0), (turning(600, 0.1), 3.0)])
-def test_nothing_is_given_out_before_the_filter_has_settled(
+def test_no_sample_is_emitted_before_the_filter_has_settled(
     contents: list[tuple[tuple[int, Any], ...]], first_s: float
 ) -> None:
     wires = [message(k, 100 * k, *items) for k, items in enumerate(contents)]
@@ -232,7 +232,7 @@ def test_every_precision_of_raw_items_is_understood(precision: Precision) -> Non
     assert found[-1].acceleration == pytest.approx(UP, abs=1e-6)
 
 
-def test_a_sample_carries_what_it_felt_and_no_mean_rate_for_that_of_its_instant() -> None:
+def test_sample_of_the_raw_filter_has_acceleration_and_field_but_no_mean_rate() -> None:
     """Interpolated with rates half a period old, fast motion is met four times worse."""
     bias = (0.01, -0.02, 0.005)
     items = ((Item.RATE_OF_TURN, bias), (Item.ACCELERATION, UP), (Item.MAGNETIC_FIELD, (1.0, 0, 0)))
@@ -242,7 +242,7 @@ def test_a_sample_carries_what_it_felt_and_no_mean_rate_for_that_of_its_instant(
     assert found[-1].acceleration == pytest.approx(UP, abs=1e-6)
 
 
-def test_rest_and_bias_are_told_every_ten_seconds() -> None:
+def test_rest_and_bias_are_reported_every_ten_seconds() -> None:
     items = ((Item.RATE_OF_TURN, (0.01, 0.0, 0.0)), (Item.ACCELERATION, UP))
     events = decoded([message(k, 100 * k, *items) for k in range(3000)])
     states: list[Any] = [
@@ -256,7 +256,7 @@ def test_rest_and_bias_are_told_every_ten_seconds() -> None:
     assert states[-1]["period_ms"] == 10.0
 
 
-def test_a_drifting_heading_is_told_at_the_start_and_north_is_not() -> None:
+def test_heading_without_magnetometer_is_reported_at_the_start() -> None:
     field = (Item.MAGNETIC_FIELD, (0.0, 0.4, -0.9))
     free = decoded([message(k, 100 * k, *items) for k, items in enumerate(turning(20))])
     north = decoded(
@@ -305,7 +305,7 @@ def test_a_device_that_restarts_begins_a_new_filter() -> None:
     assert samples(events)[-1].q_world_sensor == samples(decoded(again))[-1].q_world_sensor
 
 
-def test_a_clipped_reading_is_told_once() -> None:
+def test_clipped_reading_is_reported_once() -> None:
     wires = [
         message(k, 100 * k, *items, (Item.STATUS_WORD, mtdata2.CLIPPING))
         for k, items in enumerate(turning(50))

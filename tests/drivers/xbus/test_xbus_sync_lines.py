@@ -95,7 +95,7 @@ async def test_edges_come_out_as_pulses_at_the_time_of_the_edge(tmp_path: Path) 
     assert info["sync"] == ["trigger_indication on in1 rising"]
 
 
-async def test_what_is_not_asked_is_neither_read_nor_told(tmp_path: Path) -> None:
+async def test_unconfigured_sync_lines_are_neither_read_nor_reported(tmp_path: Path) -> None:
     driver = XbusImu(settings(tmp_path))
     async with serving(tmp_path, outputs=TOLD, sync=(STORED,)) as device:
         found = await told(driver, device)
@@ -113,7 +113,7 @@ async def test_settings_that_differ_are_not_written_unasked(tmp_path: Path) -> N
         assert (device.sync, device.flash_writes) == ((STORED,), 0)
 
 
-async def test_only_what_differs_is_written_and_once(tmp_path: Path) -> None:
+async def test_only_changed_sync_settings_are_written(tmp_path: Path) -> None:
     driver = XbusImu(settings(tmp_path, sync=[TRIGGER, OUT], persist=True))
     async with serving(tmp_path) as device:
         found = await told(driver, device)
@@ -124,14 +124,14 @@ async def test_only_what_differs_is_written_and_once(tmp_path: Path) -> None:
         assert device.flash_writes == 2
 
 
-async def test_an_empty_list_turns_everything_off(tmp_path: Path) -> None:
+async def test_empty_list_disables_all_sync_lines(tmp_path: Path) -> None:
     driver = XbusImu(settings(tmp_path, sync=[], persist=True))
     async with serving(tmp_path, sync=(STORED,)) as device:
         await told(driver, device)
         assert device.sync == ()
 
 
-def test_a_request_is_what_the_vendor_would_send() -> None:
+def test_sync_request_equals_that_of_the_vendor() -> None:
     asked = sync_entries([XbusSyncSettings(**CLOCKED)], "MTi-630-8A1G6")
     wire = encode(XbusMessageId.SYNC_SETTINGS, setup.encode_sync(asked))
     assert wire.hex() == "faff2c0c0902010000000000000003e8d2"
@@ -154,7 +154,7 @@ def test_the_output_line_has_the_number_of_its_series(product: str, line: int) -
         TRIGGER | {"skip_factor": 70_000},
     ],
 )
-def test_what_no_line_can_do_is_refused(wrong: dict[str, Any]) -> None:
+def test_impossible_sync_settings_are_rejected(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         XbusSyncSettings(**wrong)
 

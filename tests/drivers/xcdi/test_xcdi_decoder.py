@@ -105,7 +105,7 @@ def test_a_sample_has_the_first_frames_stamp_and_the_devices_time() -> None:
 
 
 @pytest.mark.parametrize(("unit", "tick_ns"), [("100us", 100_000), ("1us", 1_000)])
-def test_the_unit_is_found_and_told(unit: str, tick_ns: int) -> None:
+def test_unit_of_the_sample_time_is_detected_and_reported(unit: str, tick_ns: int) -> None:
     tape, decoder = Tape(), events("auto")
     tape.play(XcdiDevice(tape, XcdiDeviceOptions(sample_time_unit=unit)), range(12))
     clocks = []
@@ -119,7 +119,7 @@ def test_the_unit_is_found_and_told(unit: str, tick_ns: int) -> None:
     assert told[0].data["sample_time_unit"] == unit
 
 
-def test_a_wrongly_configured_unit_is_told_and_kept() -> None:
+def test_wrong_configured_unit_is_reported_and_used() -> None:
     tape, decoder = Tape(), events("1us")
     tape.play(XcdiDevice(tape), range(20))
     (told,) = of_kind(decoded(tape, decoder), "warning")
@@ -204,7 +204,7 @@ def test_a_power_cycle_is_one_restart() -> None:
         assert len(samples(found)) == 100
 
 
-def test_a_device_without_sample_time_works_and_says_so_once() -> None:
+def test_device_without_sample_time_is_decoded_and_reported_once() -> None:
     tape = Tape()
     tape.play(XcdiDevice(tape, XcdiDeviceOptions(ids=XcdiIds(sample_time=None))), range(100))
     found = decoded(tape, events("auto"))
@@ -297,7 +297,7 @@ def test_a_wrong_byte_order_is_named_after_a_hundred_samples() -> None:
     assert len(told) == 1
 
 
-def test_an_overflow_is_told_once_a_second() -> None:
+def test_overflow_is_reported_once_a_second() -> None:
     tape = Tape()
     device = XcdiDevice(tape)
     for number in range(30):
@@ -308,7 +308,7 @@ def test_an_overflow_is_told_once_a_second() -> None:
     assert "overflowed" in told[0].text
 
 
-def test_notes_of_the_host_are_told_and_counted() -> None:
+def test_error_frames_of_the_host_are_reported_and_counted() -> None:
     decoder = events()
     notes = [host_dropped(0, 4722), host_corrupt(0, 33), CanFrame(0, 0x40, bytes(8), error=True)]
     dropped, corrupt, bus_off = decoder.feed(Chunk(0, pack_frames(notes)))

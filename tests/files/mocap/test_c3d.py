@@ -137,7 +137,7 @@ def test_a_file_other_than_c3d_is_rejected(tmp_path: Path) -> None:
         read_marker_trial(tmp_path / "trial.csv")
 
 
-def test_a_broken_c3d_is_named_never_a_traceback(
+def test_damaged_c3d_file_is_reported_by_name(
     tmp_path: Path, positions: NDArray[np.float64]
 ) -> None:
     write_c3d(tmp_path / "whole.c3d", positions)

@@ -129,7 +129,7 @@ def test_the_least_squares_are_those_of_an_independent_solver() -> None:
         assert cost == pytest.approx(2 * best.cost, rel=1e-9)
 
 
-def test_one_marker_missing_on_every_segment_changes_nothing() -> None:
+def test_one_missing_marker_per_segment_does_not_change_the_noise_free_pose() -> None:
     model = leg()
     truth = walk(model)
     y = marker_positions(model, truth)

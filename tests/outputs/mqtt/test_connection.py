@@ -197,7 +197,7 @@ async def test_online_is_published_last(broker: Broker) -> None:
     assert order[-1] == LIFE
 
 
-async def test_will_reports_a_dead_daemon_offline(broker: Broker) -> None:
+async def test_will_marks_a_killed_daemon_offline(broker: Broker) -> None:
     will = Outgoing(LIFE, OFFLINE, 1, retain=True)
 
     async def vanish() -> None:
@@ -282,7 +282,7 @@ async def test_unresponsive_broker_is_detected_and_the_queue_stays_limited(
         await until(lambda: link.publisher.connected, 8)
 
 
-async def test_it_stops_under_load_thirty_times_of_thirty(broker: Broker) -> None:
+async def test_daemon_stops_under_load_in_thirty_of_thirty_attempts(broker: Broker) -> None:
     for number in range(30):
         link = Link(broker.port)
         task = asyncio.create_task(link.publisher.run(), name="publisher")

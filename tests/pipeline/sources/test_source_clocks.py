@@ -90,7 +90,7 @@ def sample(t_ns: int, ticks: int) -> ImuSample:
     return ImuSample(t_ns, UNIT, UNIT, ticks, None)
 
 
-def test_restart_seen_only_in_the_clock_is_published_and_counted() -> None:
+def test_restart_detected_by_the_clock_alone_is_published_and_counted() -> None:
     rig = Rig()
     for k in range(1000):
         t = START + k * PERIOD

@@ -37,7 +37,7 @@ can_frames = standard | extended | errors
 
 
 @given(st.lists(can_frames))
-def test_what_is_packed_is_unpacked(frames: list[CanFrame]) -> None:
+def test_packed_can_frame_unpacks_to_itself(frames: list[CanFrame]) -> None:
     wire = pack_frames(frames)
     assert len(wire) == RECORD_BYTES * len(frames)
     assert unpack_frames(wire) == frames

@@ -98,7 +98,7 @@ def test_an_answer_inside_a_line_ends_it() -> None:
     )
 
 
-def test_commands_are_told_from_answers() -> None:
+def test_slcan_commands_are_distinguished_from_answers() -> None:
     wire = b"C\rS8\rO\rV\r"
     assert decoded([wire], "adapter")[0] == [
         SlcanLine("C"), SlcanLine("S", "8"), SlcanLine("O"), SlcanLine("V"),

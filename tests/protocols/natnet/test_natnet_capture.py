@@ -46,7 +46,7 @@ def test_a_captured_message_is_written_back_byte_for_byte(capture: Path, name: s
     assert encode(message) == wire
 
 
-def test_the_captured_server_says_who_it_is(capture: Path) -> None:
+def test_captured_server_info_is_decoded(capture: Path) -> None:
     assert decode((capture / "serverinfo_packet_v3.bin").read_bytes(), (3, 0)) == ServerInfo(
         "Motive", (2, 1, 0, 0), (3, 0, 0, 0), 3_312_787, 1511, True, "239.255.42.99"
     )
@@ -102,7 +102,7 @@ def test_frames_are_written_back_to_the_hash_of_the_capture(frames: list[FrameOf
     )
 
 
-def test_the_first_and_last_frame_hold_what_two_other_parsers_found(
+def test_first_and_last_captured_frame_match_two_other_parsers(
     frames: list[FrameOfData],
 ) -> None:
     first, last = frames[0], frames[-1]

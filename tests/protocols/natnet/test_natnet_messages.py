@@ -151,7 +151,7 @@ messages = st.one_of(frames(), models(), plain.map(lambda message: (message, (3,
 
 @settings(max_examples=50)
 @given(messages)
-def test_what_is_written_is_read_back(case: tuple[Message, tuple[int, int]]) -> None:
+def test_encoded_natnet_message_decodes_to_itself(case: tuple[Message, tuple[int, int]]) -> None:
     message, version = case
     assert decode(encode(message, version), version) == message
 
@@ -170,7 +170,7 @@ def test_any_payload_gives_a_message_or_corrupt(
 
 @settings(max_examples=50)
 @given(messages, st.data(), versions)
-def test_a_damaged_message_never_raises_and_corrupt_counts_all_of_it(
+def test_damaged_message_is_counted_as_corrupt_completely(
     case: tuple[Message, tuple[int, int]], data: st.DataObject, read_as: tuple[int, int]
 ) -> None:
     wire = bytearray(encode(*case))
@@ -215,7 +215,7 @@ def test_a_hostile_count_is_corrupt(place: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [-1, 3, 2**31 - 1])
-def test_no_count_is_believed_that_the_bytes_left_cannot_hold(count: int) -> None:
+def test_count_beyond_the_remaining_bytes_is_rejected(count: int) -> None:
     with pytest.raises(MalformedError):
         Cursor(struct.pack("<iii", count, 0, 0)).count(4)
 
@@ -260,7 +260,7 @@ def test_a_section_that_a_later_bitstream_added_is_skipped() -> None:
     assert (found.number, found.transmit, found.skipped) == (7, 3, ("unknown",))
 
 
-def test_below_4_1_an_unknown_description_ends_the_model_and_says_so() -> None:
+def test_unknown_description_below_4_1_ends_the_model_with_a_note() -> None:
     known = MarkerSetDescription("a", ("b",))
     wire = encode(ModelDefinition((known, known)))
     second = wire.rindex(b"\0\0\0\0a")

@@ -123,7 +123,7 @@ def test_utc_time_comes_back() -> None:
 
 
 @given(st.integers(0, 0xFFFF), st.binary(max_size=120))
-def test_decoding_an_item_never_raises(data_id: int, raw: bytes) -> None:
+def test_decoding_any_item_does_not_raise(data_id: int, raw: bytes) -> None:
     mtdata2.decode_item(data_id, raw)
 
 
@@ -238,7 +238,7 @@ def test_the_matrix_sent_is_the_rotation_of_the_quaternion_column_by_column(
     assert checked == 92
 
 
-def test_free_acceleration_is_what_gravity_leaves_in_the_world(shared_data: Path) -> None:
+def test_free_acceleration_is_acceleration_without_gravity_in_the_world(shared_data: Path) -> None:
     norms = [
         math.hypot(*value(items, Item.QUATERNION))
         for items in messages(shared_data, "5")

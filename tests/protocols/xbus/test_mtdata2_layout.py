@@ -84,5 +84,5 @@ def test_the_world_is_that_of_the_quaternion() -> None:
     assert layout.read(wire.replace(b"\x20\x14", b"\x20\x10")) is None
 
 
-def test_nothing_has_no_layout() -> None:
+def test_empty_output_list_has_no_layout() -> None:
     assert MTData2Layout.of([], WANTED) is None

@@ -43,19 +43,21 @@ PAIRS: list[tuple[Any, Any, Any]] = [
 
 @pytest.mark.parametrize(("write", "read", "values"), PAIRS)
 @given(data=st.data())
-def test_what_is_written_is_read(write: Any, read: Any, values: Any, data: st.DataObject) -> None:
+def test_encoded_configuration_decodes_to_itself(
+    write: Any, read: Any, values: Any, data: st.DataObject
+) -> None:
     value = data.draw(values)
     assert read(write(value)) == value
 
 
 @pytest.mark.parametrize("read", [pair[1] for pair in PAIRS])
 @given(data=st.binary(max_size=40))
-def test_reading_never_raises(read: Any, data: bytes) -> None:
+def test_reading_any_configuration_does_not_raise(read: Any, data: bytes) -> None:
     read(data)
 
 
 @given(st.binary(max_size=40))
-def test_reading_text_never_raises(data: bytes) -> None:
+def test_reading_any_text_does_not_raise(data: bytes) -> None:
     setup.decode_text(data)
     setup.decode_device_id(data)
     setup.decode_filter_profile(data)
@@ -101,7 +103,7 @@ def test_both_forms_of_the_device_id_read_as_on_the_label() -> None:
         ("", None),
     ],
 )
-def test_the_model_says_when_its_clock_wraps(product: str, modulus: int | None) -> None:
+def test_clock_wrap_follows_from_the_device_model(product: str, modulus: int | None) -> None:
     assert setup.fine_time_modulus(product) == modulus
 
 

@@ -46,7 +46,7 @@ def cut(wire: bytes, cuts: list[int]) -> list[bytes]:
 
 
 @given(wires, st.lists(st.integers(0, 5000), max_size=10))
-def test_the_cut_changes_nothing(wire: bytes, cuts: list[int]) -> None:
+def test_chunk_boundaries_do_not_change_the_messages(wire: bytes, cuts: list[int]) -> None:
     whole, _ = decode([wire])
     assert decode(cut(wire, cuts))[0] == whole
     assert decode([bytes([byte]) for byte in wire])[0] == whole
@@ -104,7 +104,7 @@ def test_a_length_no_message_has_is_not_waited_for(length: int) -> None:
 
 
 @given(st.integers(0, 255), st.binary(max_size=2048), st.integers(0, 255))
-def test_what_is_encoded_is_decoded(mid: int, data: bytes, bid: int) -> None:
+def test_encoded_xbus_message_decodes_to_itself(mid: int, data: bytes, bid: int) -> None:
     wire = encode(mid, data, bid)
     assert decode([wire])[0] == [XbusMessage(mid, data, bid, len(wire))]
 
@@ -124,7 +124,7 @@ def test_a_message_inside_a_broken_one_is_found() -> None:
     assert decoder.discarded == 44
 
 
-def test_the_end_says_where_in_the_stream_a_message_ended() -> None:
+def test_message_end_is_its_offset_in_the_stream() -> None:
     wire = b"\x00\x01" + encode(0x31) + encode(0x36, b"abc")
     ends = [event.end for event in decode([wire])[0] if isinstance(event, XbusMessage)]
     assert ends == [7, 15]
@@ -214,7 +214,7 @@ def test_a_recording_decodes_whole(shared_data: Path, number: str) -> None:
     ],
 )
 @pytest.mark.parametrize("size", [1, 7, 64, 100_000])
-def test_a_damaged_recording_loses_only_what_was_damaged(
+def test_damaged_recording_loses_damaged_messages_only(
     shared_data: Path, number: str, case: str, expected: tuple[int, int, int], size: int
 ) -> None:
     whole = (shared_data / "imu" / "xsens" / f"{number}.output.bin").read_bytes()

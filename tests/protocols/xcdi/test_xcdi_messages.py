@@ -154,7 +154,7 @@ def test_a_quaternion_without_sample_time_has_its_own_stamp_and_no_ticks() -> No
     assert decoder.ungrouped == 1
 
 
-def test_a_new_counter_never_joins_an_older_time() -> None:
+def test_new_counter_is_not_combined_with_an_older_time() -> None:
     decoder = XcdiCodec(XcdiIds())
     frames = group(0, XcdiIds())[:2] + group(1, XcdiIds())[1:]
     (found,) = groups_of(decoder, frames)
@@ -169,7 +169,7 @@ def test_status_belongs_to_its_group() -> None:
     assert [g.status for g in groups_of(decoder, frames + group(1, XcdiIds()))] == [2, None]
 
 
-def test_an_error_is_told() -> None:
+def test_xcdi_error_message_is_reported() -> None:
     assert XcdiCodec(XcdiIds()).feed(CanFrame(5, 1, b"\1")) == XcdiError(5, 1)
 
 

@@ -274,7 +274,7 @@ def test_a_stream_that_is_always_late_is_waited_for_while_it_is_the_only_one(del
     assert len(frames) > 290
 
 
-def test_nothing_is_interpolated_across_an_epoch() -> None:
+def test_frames_are_not_interpolated_across_an_epoch() -> None:
     a, other = aligner(A=10 * MS), (0.0, 1.0, 0.0, 0.0)
     seen = []
     for k in range(20):
@@ -287,7 +287,7 @@ def test_nothing_is_interpolated_across_an_epoch() -> None:
     assert assert_accounted(a, "A")["dropped"] <= 2
 
 
-def test_nothing_is_interpolated_across_a_gap() -> None:
+def test_frames_are_not_interpolated_across_a_gap() -> None:
     """A comes late, so B's next sample is there when the frames of its gap go out."""
     a = aligner(A=10 * MS, B=10 * MS)
     pushes = stream("A", 10 * MS, 100, delay=120 * MS)
@@ -436,7 +436,7 @@ def sent(name: str, given_by: dict[str, Any], dice: Random) -> list[tuple[int, s
     st.sampled_from([4 * MS, 10 * MS, 25 * MS]),
     st.integers(0, 2**32),
 )
-def test_every_sample_of_any_device_gets_one_verdict_and_frames_are_right(
+def test_every_sample_has_one_outcome_and_frames_are_correct_for_any_device(
     given_by: list[dict[str, Any]], mode: str, period: int, seed: int
 ) -> None:
     named, dice = dict(zip("ABCD", given_by, strict=False)), Random(seed)

@@ -40,7 +40,7 @@ def test_delays_older_than_a_minute_are_excluded() -> None:
     assert found.max_ns == S // 1000
 
 
-def test_after_a_long_silence_the_rate_is_that_of_what_came_since() -> None:
+def test_rate_after_a_long_silence_uses_later_samples_only() -> None:
     minute = DelayStatistics()
     for start in (0, 3 * HALF_NS):
         for k in range(101):
@@ -48,7 +48,7 @@ def test_after_a_long_silence_the_rate_is_that_of_what_came_since() -> None:
     assert minute.rate_hz == pytest.approx(100)
 
 
-def test_nothing_is_known_of_nothing() -> None:
+def test_delay_statistics_without_samples_are_unknown() -> None:
     minute = DelayStatistics()
     assert minute.delays is None
     minute.feed(5, 7)

@@ -224,7 +224,7 @@ def restarted(first: int, use: str = "ticks", gap: float = 0.4) -> tuple[DeviceC
 @pytest.mark.parametrize(
     "first", [0, 10_000, 79_000_000, 81_000_000, 100_000_000, 1 << 30, 3 << 30]
 )
-def test_after_a_restart_nothing_is_synced_before_it_has_settled(first: int) -> None:
+def test_clock_is_not_synced_after_a_restart_until_it_has_settled(first: int) -> None:
     clock, stamps = restarted(first)
     assert clock.epoch == 1
     assert not any(stamp.synced for stamp in stamps[:150])
@@ -322,7 +322,7 @@ inputs = st.tuples(
 
 
 @given(st.lists(inputs, max_size=60))
-def test_time_never_runs_backwards(
+def test_mapped_time_is_monotonic(
     samples: list[tuple[int | None, int | None, int]],
 ) -> None:
     clock, arrival, newest = DeviceClock(PERIOD), START, 0

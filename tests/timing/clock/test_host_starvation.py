@@ -84,7 +84,7 @@ def test_a_clock_settles_on_a_starved_host() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_jam_of_changing_length_moves_nothing(seed: int) -> None:
+def test_delivery_stalls_of_varying_length_do_not_move_the_clock(seed: int) -> None:
     """Ten seconds in which nothing is on time: the queue grows and shrinks, the clock goes on."""
     rng = np.random.default_rng(seed)
     arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
@@ -95,7 +95,7 @@ def test_a_jam_of_changing_length_moves_nothing(seed: int) -> None:
     assert all(abs(stamp.t_ns - true) < MS for true, stamp in out[300:])
 
 
-def test_a_burst_from_before_the_start_settles_nothing() -> None:
+def test_burst_from_before_the_start_does_not_settle_the_clock() -> None:
     """Three seconds from a full buffer, read at once: one arrival, and no line through it."""
     arrivals = read_late([(100.0, 0.0)], 12.0, 0.0)
     arrivals[:300] = START + 3 * S + 2_000 * np.arange(300)

@@ -74,7 +74,7 @@ def test_the_edge_is_the_best_line_under_all_points(
 
 
 @given(points, st.data())
-def test_delaying_a_point_off_the_hull_changes_nothing(
+def test_delay_of_a_point_above_the_hull_does_not_change_the_line(
     cloud: list[tuple[int, int]], data: st.DataObject
 ) -> None:
     hull = lower_hull(cloud)

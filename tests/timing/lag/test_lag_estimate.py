@@ -356,7 +356,7 @@ def test_overlapping_windows_are_not_counted_twice() -> None:
     assert overlapping.sigma_ns > 1.5 * apart.sigma_ns
 
 
-def test_a_refused_window_changes_nothing() -> None:
+def test_rejected_window_does_not_change_the_lag() -> None:
     tracker = LagTracker()
     assert tracker.feed(0, LagEstimate(0.0, 0.0, 0.0, "at rest")) is None
     before = tracker.feed(0, LagEstimate(4e6, 5e4, 0.999, None))

@@ -116,7 +116,7 @@ def test_gaps_in_every_marker_change_little(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["center_parent_m"], expected_in_parent(), atol=0.003)
 
 
-def test_c3d_and_trc_of_one_trial_say_the_same(tmp_path: Path, trc: Path) -> None:
+def test_c3d_and_trc_of_one_trial_give_the_same_center(tmp_path: Path, trc: Path) -> None:
     pytest.importorskip("c3d", reason="c3d is not installed")
     ezc3d: Any = pytest.importorskip("ezc3d", reason="ezc3d is not installed")
     file = ezc3d.c3d()

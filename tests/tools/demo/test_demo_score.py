@@ -86,7 +86,7 @@ def test_a_promise_that_is_broken_or_unknown_is_named(worse: dict[str, object]) 
     assert len(missed_targets(figures(**worse))) == 1
 
 
-def test_percentiles_of_nothing_are_unknown() -> None:
+def test_percentiles_of_an_empty_list_are_unknown() -> None:
     assert percentile([], 0.5) is None
     assert RmsAccumulator().rms is None
     assert percentile([3.0, 1.0, 2.0], 0.99) == 3.0

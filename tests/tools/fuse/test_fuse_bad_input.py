@@ -77,7 +77,7 @@ def test_a_reference_missing_half_of_the_time_still_teaches(files: Path) -> None
     assert frames["h0", "mean"]["frames"] == N // 2  # told is what was judged, not what was there
 
 
-def test_where_nothing_is_left_to_judge_that_is_told(files: Path) -> None:
+def test_trial_without_evaluation_frames_is_reported(files: Path) -> None:
     trial = movement()
     trial.bones["shank"][N // 2 :] = np.nan
     rewrite(files, "begun", trial)
@@ -103,7 +103,7 @@ def test_a_sensor_unplugged_half_of_the_time_still_teaches(files: Path) -> None:
     assert found["m1", "anchored"]["thigh"] < 0.5 * found["m1", "mean"]["thigh"]
 
 
-def test_identical_sensors_fit_and_are_told(files: Path) -> None:
+def test_identical_sensors_are_fitted_and_reported(files: Path) -> None:
     for k in range(3):
         trial = movement(k)
         turned = rotation.exp(np.array((0.1, 0.4, -0.2)))
@@ -119,7 +119,7 @@ def test_identical_sensors_fit_and_are_told(files: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["evaluate", "fit"])
-def test_without_movement_there_is_nothing_to_learn(files: Path, command: str) -> None:
+def test_fit_without_movement_is_rejected(files: Path, command: str) -> None:
     out = ["--out", files / "model.json"] if command == "fit" else []
     text = said(run(command, files / "still.npz", *LIMB, *out))
     assert "knee rotates by only 0.0 deg" in text
@@ -131,7 +131,7 @@ def test_the_mean_needs_no_movement(files: Path) -> None:
     assert run("fit", files / "still.npz", *LIMB, *out).exit_code == 0
 
 
-def test_a_trial_without_reference_says_where_one_could_come_from(files: Path) -> None:
+def test_trial_without_reference_is_rejected_with_a_remedy(files: Path) -> None:
     trial = movement(1)
     rewrite(files, "m1", OrientationTrial(trial.t_s, trial.sensors, {}, {}))
     text = said(run("evaluate", *trials(files, 2), *LIMB))
@@ -167,7 +167,7 @@ def test_a_file_may_hold_the_reference_alone(files: Path) -> None:
     assert result.exit_code == 0, result.output
 
 
-def test_arrays_of_another_length_or_width_are_told_by_name(files: Path) -> None:
+def test_arrays_of_wrong_shape_are_reported_by_name(files: Path) -> None:
     with np.load(files / "m0.npz", allow_pickle=False) as found:
         held = {name: found[name] for name in found.files}
     for odd in (held["A_quat"][:-5], held["A_quat"][:, :3]):
@@ -177,7 +177,7 @@ def test_arrays_of_another_length_or_width_are_told_by_name(files: Path) -> None
 
 
 @pytest.mark.parametrize("length", [0, 100, 5000])
-def test_a_file_that_is_cut_off_is_told_by_name(files: Path, length: int) -> None:
+def test_truncated_file_is_reported_by_name(files: Path, length: int) -> None:
     whole = (files / "m0.npz").read_bytes()
     assert len(whole) > length
     (files / "cut.npz").write_bytes(whole[:length])

@@ -64,7 +64,7 @@ def test_a_single_trial_is_judged_on_its_end(files: Path) -> None:
     assert {row["frames"] for row in rows(result).values()} == {50}
 
 
-def test_what_is_judged_was_not_fitted_to(files: Path) -> None:
+def test_evaluation_uses_frames_that_were_not_fitted(files: Path) -> None:
     """A trial whose reference is nonsense spoils its own row and the others' by training only."""
     spoiled = movement(2)
     turned = rotation.multiply(spoiled.bones["thigh"], rotation.exp(np.array((1.0, 0, 0))))
@@ -169,7 +169,7 @@ def test_every_method_may_be_fitted_and_applied(
     assert "shank: known in 100 %" in result.stdout
 
 
-def test_the_three_formats_say_the_same(files: Path, fitted: Callable[..., Path]) -> None:
+def test_three_output_formats_have_equal_content(files: Path, fitted: Callable[..., Path]) -> None:
     model = fitted()
     for ending in ("npz", "sto", "csv"):
         result = run("apply", model, files / "m0.npz", "--out", files / f"out.{ending}")
@@ -195,7 +195,7 @@ def test_a_bent_knee_is_positive_flexion(files: Path, fitted: Callable[..., Path
         assert np.rad2deg(arrays["angles_knee"][:, 0].max()) > 60.0
 
 
-def test_a_sensor_that_is_missing_is_told_and_fused_around(
+def test_missing_sensor_is_reported_and_the_others_are_fused(
     files: Path, fitted: Callable[..., Path]
 ) -> None:
     trial = movement(0)
@@ -301,7 +301,7 @@ def test_implausible_values_are_rejected(
     assert expected in said(run("evaluate", rewritten(files, **change), *LIMB))
 
 
-def test_clocks_that_do_not_meet_are_told_with_both_spans(files: Path) -> None:
+def test_trials_without_common_time_are_reported_with_both_spans(files: Path) -> None:
     late = movement()
     shifted = OrientationTrial(late.t_s + 1000.0, late.sensors, late.bones, {})
     write_orientations_npz(files / "late.npz", shifted)

@@ -84,7 +84,7 @@ def test_training_and_validation_trials_are_reported_separately(folder: Path, me
     assert found["method"] == method
 
 
-def test_the_search_says_how_often_it_ran_inverse_kinematics(folder: Path) -> None:
+def test_coordinate_search_reports_its_inverse_kinematics_runs(folder: Path) -> None:
     found = answer(folder, "--method", "search", "--frames", "10")
     assert found["runs"] > 50
     assert found["trials"][0]["after"]["rms_m"] < found["trials"][0]["before"]["rms_m"]
@@ -107,7 +107,7 @@ def test_a_lock_on_a_marker_with_a_dot_in_its_name_holds_it_whole(folder: Path) 
     assert held["T3.x"] == [True, True, True]
 
 
-def test_what_the_model_locks_can_be_let_go(folder: Path) -> None:
+def test_markers_locked_in_the_model_can_be_freed(folder: Path) -> None:
     model = read_model(folder / "leg.toml")
     write_model(folder / "leg.toml", model.with_locks({"S1": (True, True, True)}))
     held = {m["name"]: m["held"] for m in answer(folder)["markers"]}
@@ -152,7 +152,7 @@ def test_opensim_reads_the_marker_set(folder: Path) -> None:
         (["--validate", "nowhere.trc"], 2, ["nowhere.trc"]),
     ],
 )
-def test_a_wrong_question_is_answered_with_what_to_change(
+def test_invalid_options_of_the_markers_command_are_rejected_with_a_remedy(
     folder: Path, options: list[str], code: int, words: list[str]
 ) -> None:
     result = run(app, asked(folder, *options))

@@ -21,7 +21,7 @@ run = CliRunner().invoke
 SHORT = ["report", "--cor-study", "--repeats", "4"]
 
 
-def test_the_report_says_its_setup_both_tables_and_every_caveat(tmp_path: Path) -> None:
+def test_report_contains_its_setup_both_tables_and_every_limitation(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     out = tmp_path / "made" / "here"
     asked = [*SHORT, "--seed", "7", "--out", str(out), "--json", str(tmp_path / "a.json")]
