@@ -62,11 +62,10 @@ class ClusterPoint:
         """Return the point in the optical world, m, or None if too few markers are visible."""
         if self._columns is None:
             return None
-        if self._cluster.body is not None:
-            return self._locate_by_body(frame, self._columns[0])
-        return self._locate_by_markers(frame.markers[self._columns])
+        if self._cluster.body is None:
+            return self._locate_by_markers(frame.markers[self._columns])
 
-    def _locate_by_body(self, frame: MocapFrame, column: int) -> Vector | None:
+        column = self._columns[0]
         x, y, z = frame.body_positions[column].tolist()
         q_body = as_quaternion(frame.body_orientations[column].tolist())
         q = multiply_one(q_body, conjugate_one(as_quaternion(self._cluster.q_body)))

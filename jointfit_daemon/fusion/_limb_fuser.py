@@ -15,10 +15,7 @@ from jointfit_daemon.fusion._forward_kinematics import (
     joint_angle_estimate,
     joint_positions,
 )
-from jointfit_daemon.fusion._heading_uncertainty import (
-    add_joint_heading_sd,
-    add_segment_heading_sd,
-)
+from jointfit_daemon.fusion._heading_uncertainty import add_heading_sd
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
 from jointfit_daemon.fusion.faults import ConsistencyMonitor, SensorMonitor
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
@@ -72,20 +69,18 @@ class LimbFuser:
         self._calibration = calibration if usable else None
         self._base_flags: tuple[str, ...] = (FrameFlag.UNCALIBRATED,)
         if calibration is not None and not usable:
-            self._base_flags = (FrameFlag.UNCALIBRATED, FrameFlag.OTHER_CHAIN)
+            self._base_flags += (FrameFlag.OTHER_CHAIN,)
         self._fusers: list[SegmentFuser] = []
         self._lengths: list[SegmentLength] = []
         self._alignments: list[tuple[str, Quaternion, Quaternion]] = []
         """Sensor, q_optical_world and q_sensor_segment."""
         self.consistency: ConsistencyMonitor | None = None
         self._rates = AngleRates()
-        if self._calibration is not None:
-            self._prepare(self._calibration)
+        if calibration is None or not usable:
+            return
 
-    def _prepare(self, calibration: Calibration) -> None:
-        chain = self._chain
         self._base_flags = calibration.flags
-        self.consistency = ConsistencyMonitor(chain, calibration, self._drifting)
+        self.consistency = ConsistencyMonitor(chain, calibration, drifting)
         self._alignments = [
             (name, item.q_optical_world, item.q_sensor_segment)
             for name, item in calibration.sensor.items()
@@ -143,7 +138,16 @@ class LimbFuser:
         """
         orientations, stuck = self.sensor_monitor.update(t_ns, completed_ns, orientations)
         if self._calibration is None:
-            return self._uncalibrated(t_ns, completed_ns, seq, sync)
+            return LimbState(
+                seq,
+                t_ns,
+                completed_ns,
+                FusionMode.UNCALIBRATED,
+                sync,
+                self._base_flags,
+                tuple(SegmentState(name, None, None, ()) for name in self._chain.segments),
+                tuple(JointState(name, None, None) for name in self._chain.joints),
+            )
 
         # Chain of rotations: optical world, world, sensor, segment.
         inputs = {
@@ -172,10 +176,7 @@ class LimbFuser:
             ]
         )
         if self.consistency is not None and (sd := self.consistency.common_heading_sd) > 0.0:
-            segments, joints = (
-                add_segment_heading_sd(segments, sd),
-                add_joint_heading_sd(joints, sd),
-            )
+            segments, joints = add_heading_sd(segments, joints, sd)
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
     def replace_models(self, calibration: Calibration) -> None:
@@ -198,7 +199,10 @@ class LimbFuser:
         Drift corrections, faults and fading continue, so a reload does not change the output.
         """
         old, new = before._calibration, self._calibration
-        if old is None or new is None or not _same_alignment(old, new):
+        if old is None or new is None or not old.fits(self._chain):
+            return
+        poses = [{n: s.q_static for n, s in one.segment.items()} for one in (old, new)]
+        if (poses[0], old.sensor, old.links) != (poses[1], new.sensor, new.links):
             return
         if set(before._drifting) != set(self._drifting):
             return
@@ -234,7 +238,11 @@ class LimbFuser:
             for fuser, near in zip(self._fusers, self._neighbors, strict=True)
         ]
         if any(spread):
-            fused = [_add_sd(segment, sd) for segment, sd in zip(fused, spread, strict=True)]
+            # Inconsistent sensors: an independent error with a standard deviation per axis, rad.
+            fused = [
+                one if one.sd is None else one._replace(sd=hypot(one.sd, sd), fault_sd=sd)
+                for one, sd in zip(fused, spread, strict=True)
+            ]
         return fused, flags
 
     def _joints(
@@ -273,28 +281,3 @@ class LimbFuser:
             rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
             joints.append(JointState(name, position, sd, angles, inner, flexion_sd, rates))
         return tuple(joints)
-
-    def _uncalibrated(self, t_ns: int, completed_ns: int, seq: int, sync: SyncState) -> LimbState:
-        segments = tuple(SegmentState(name, None, None, ()) for name in self._chain.segments)
-        joints = tuple(JointState(name, None, None) for name in self._chain.joints)
-        mode = FusionMode.UNCALIBRATED
-        return LimbState(seq, t_ns, completed_ns, mode, sync, self._base_flags, segments, joints)
-
-
-def _same_alignment(old: Calibration, new: Calibration) -> bool:
-    """Return whether two calibrations have the same limb, static pose, alignments and links."""
-    if (old.joints, old.segments, old.chain_sensors) != (
-        new.joints,
-        new.segments,
-        new.chain_sensors,
-    ):
-        return False
-    poses = all(old.segment[name].q_static == new.segment[name].q_static for name in new.segments)
-    return poses and old.sensor == new.sensor and old.links == new.links
-
-
-def _add_sd(segment: FusedSegment, sd: float) -> FusedSegment:
-    """Return a segment with an independent error added, standard deviation per axis, rad."""
-    if segment.sd is None:
-        return segment
-    return segment._replace(sd=hypot(segment.sd, sd), fault_sd=sd)

@@ -129,18 +129,22 @@ class SegmentFuser:
         self._start_fade(t_ns, alive, near, inputs, prediction.q)
         q = self._faded(t_ns, prediction.q)
 
+        # Variance of the model, and of the heading for one axis of three: it grows with time.
         if self._calibrated_ns is None:
             self._calibrated_ns = t_ns
-        flexion_sd, sd = _standard_deviations(prediction, (t_ns - self._calibrated_ns) / MINUTE_NS)
+        minutes = (t_ns - self._calibrated_ns) / MINUTE_NS
+        heading = _HEADING_VAR + _WALK_VAR * max(minutes, 0.0)
+        sd = max(prediction.sd, MIN_SD)
+        sd = sqrt(sd * sd + heading / 3.0)
+        flexion_sd = None if prediction.axis_sd is None else max(prediction.axis_sd[0], MIN_SD)
         self._last, self._before = (t_ns, q, sd), (alive, near, inputs)
-        return FusedSegment(q, sd, alive, self._flags(alive, prediction.extrapolating), flexion_sd)
 
-    def _flags(self, alive: tuple[str, ...], extrapolating: bool) -> tuple[str, ...]:
-        single = len(alive) == 1 and len(self._sensors) > 1
-        if not single and not extrapolating:
-            return ()
-        flags = (FrameFlag.ONE_SENSOR.of(self._name),) if single else ()
-        return (*flags, FrameFlag.UNTRAINED.of(self._name)) if extrapolating else flags
+        flags: tuple[str, ...] = ()
+        if len(alive) == 1 and len(self._sensors) > 1:
+            flags = (FrameFlag.ONE_SENSOR.of(self._name),)
+        if prediction.extrapolating:
+            flags += (FrameFlag.UNTRAINED.of(self._name),)
+        return FusedSegment(q, sd, alive, flags, flexion_sd)
 
     def _hold(self, t_ns: int) -> FusedSegment:
         if self._last is None or t_ns - self._last[0] > HOLD_NS:
@@ -155,7 +159,14 @@ class SegmentFuser:
         """Return the prediction of the chosen model, or the mean if there is none."""
         chosen = self._chosen.get((alive, near))
         if chosen is None:
-            chosen = self._chosen[alive, near] = self._choose(alive, near)
+            # A model for these sensors and the largest known set of neighbor sensors.
+            chosen = None, ()
+            for others in (near, near[:1], ()):
+                model = self._models.get(model_key(alive, "+".join(others) or None))
+                if model is not None:
+                    chosen = model, others
+                    break
+            self._chosen[alive, near] = chosen
         model, others = chosen
         sensors = [inputs[s] for s in alive]
         if model is None:
@@ -163,14 +174,6 @@ class SegmentFuser:
         if not others:
             return model.predict_one(sensors)
         return model.predict_one(sensors, mean_one([inputs[s] for s in others]))
-
-    def _choose(self, alive: Names, near: Names) -> tuple[SegmentModel | None, Names]:
-        """Return the model for a set of sensors, and the neighbor sensors that it uses."""
-        for others in (near, near[:1], ()):
-            model = self._models.get(model_key(alive, "+".join(others) or None))
-            if model is not None:
-                return model, others
-        return None, ()
 
     def _start_model_fade(self, t_ns: int, alive: Names, near: Names, inputs: Inputs) -> None:
         """Start a fade from the prediction of the replaced models to that of the new ones."""
@@ -232,19 +235,6 @@ def _present(names: Names, inputs: Inputs) -> Names:
         if name not in inputs:
             return tuple([s for s in names if s in inputs])
     return names
-
-
-def _standard_deviations(prediction: Prediction, minutes: float) -> tuple[float | None, float]:
-    r"""Return the standard deviations about x and per axis, including heading uncertainty, rad.
-
-    .. math:: \sigma^2 = \sigma_{model}^2 + \tfrac13 (\sigma_h^2 + w^2 t)
-
-    Heading is one axis of three. `minutes` is the time since the static pose.
-    """
-    sd = max(prediction.sd, MIN_SD)
-    heading = _HEADING_VAR + _WALK_VAR * max(minutes, 0.0)
-    sd = sqrt(sd * sd + heading / 3.0)
-    return None if prediction.axis_sd is None else max(prediction.axis_sd[0], MIN_SD), sd
 
 
 def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:

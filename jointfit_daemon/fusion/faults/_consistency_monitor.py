@@ -19,7 +19,7 @@ Invariant: the cost per frame is O(1).
 from __future__ import annotations
 
 from itertools import combinations
-from math import cos, degrees, hypot, radians, sin, sqrt
+from math import cos, degrees, hypot, radians, sin, sqrt, tau
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.fusion.faults._fault_reports import drift_report, heading_report, slip_report
@@ -95,10 +95,11 @@ class ConsistencyMonitor:
             for pair in pairs
             if (pair.link.a, pair.link.b) in links
         }
+        poses = [calibration.segment[name].q_static for name in chain.segments]
         self._joints = [
             JointHeadingMonitor(
                 [links[a, b] for a in above for b in below if (a, b) in links],
-                _static_heading(calibration, chain.segments[i], chain.segments[i + 1]),
+                axis_heading_one(poses[i], poses[i + 1]) or 0.0,
                 drifts=any(name in drifting for name in (*above, *below)),
             )
             for i, (above, below) in enumerate(zip(chain.sensors, chain.sensors[1:], strict=False))
@@ -134,19 +135,22 @@ class ConsistencyMonitor:
         """Return the orientations with drift and magnetic disturbances removed."""
         if not self._half_turns:
             return inputs
-        return {
-            name: q if (half := self._half_turns.get(name)) is None else _turn_heading(half, q)
-            for name, q in inputs.items()
-        }
+        corrected = inputs.copy()
+        for name, (c, s) in self._half_turns.items():
+            if name in inputs:
+                w, x, y, z = inputs[name]
+                corrected[name] = (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
+        return corrected
 
     def correct_pairs(self, inputs: Inputs) -> Inputs:
         """Return the orientations with pair differences limited; call after ``update``."""
         if not self._corrections:
             return inputs
-        return {
-            name: q if (turn := self._corrections.get(name)) is None else multiply_one(q, turn)
-            for name, q in inputs.items()
-        }
+        corrected = inputs.copy()
+        for name, turn in self._corrections.items():
+            if name in inputs:
+                corrected[name] = multiply_one(inputs[name], turn)
+        return corrected
 
     def update(self, t_ns: int, inputs: Inputs) -> ConsistencyResult:
         """Compare the sensors if the interval has passed; return the latest result.
@@ -169,12 +173,22 @@ class ConsistencyMonitor:
         changed = self._disturbances.update(t_ns, differences)
         self._report_pairs()
 
-        if self._step_drifts(t_ns):
+        # Every filter is stepped; all are renewed in the same frame.
+        filters = [*self._pair_drifts.values(), *(joint.drift for joint in self._joints)]
+        if self._common is not None:
+            filters.append(self._common)
+        if any([drift.step(t_ns) for drift in filters]):  # noqa: C419 - no short circuit
             self._distribute_drifts()
             self._report_drifts()
             changed = True
+
         if changed:
-            self._update_half_turns()
+            disturbances = self._disturbances.corrections
+            self._half_turns = {}
+            for name, drift in self._sensor_drift.items():
+                turn = drift + disturbances.get(name, 0.0)
+                if turn:
+                    self._half_turns[name] = (cos(0.5 * turn), -sin(0.5 * turn))
         self._result = self._evaluate(inputs)
         return self._result
 
@@ -236,7 +250,8 @@ class ConsistencyMonitor:
             if heading is None:
                 continue
             (expected,), sd = link.expected(verticals[link.a], verticals[link.b])
-            residual = _wrapped(heading - joint.standing - expected)
+            residual = heading - joint.standing - expected
+            residual -= tau * round(residual / tau)
             differences.append(HeadingDifference(link.a, link.b, residual, sd))
             if consistent:  # one link represents all
                 break
@@ -284,13 +299,6 @@ class ConsistencyMonitor:
 
     # --- heading drift, once a second --------------------------------------------------------
 
-    def _step_drifts(self, t_ns: int) -> bool:
-        renewed = [drift.step(t_ns) for drift in self._pair_drifts.values()]
-        renewed += [joint.drift.step(t_ns) for joint in self._joints]
-        if self._common is not None:
-            renewed.append(self._common.step(t_ns))
-        return any(renewed)
-
     def _distribute_drifts(self) -> None:
         """Compute the drift of each sensor: sums along the chain, with mean 0."""
         along = [0.0]
@@ -313,15 +321,6 @@ class ConsistencyMonitor:
     def _pair_drift(self, first: str, name: str) -> float:
         drift = self._pair_drifts.get((first, name))
         return 0.0 if drift is None else drift.heading
-
-    def _update_half_turns(self) -> None:
-        corrections = self._disturbances.corrections
-        turns = {
-            name: drift + corrections.get(name, 0.0) for name, drift in self._sensor_drift.items()
-        }
-        self._half_turns = {
-            name: (cos(0.5 * turn), -sin(0.5 * turn)) for name, turn in turns.items() if turn
-        }
 
     def _report_drifts(self) -> None:
         for i, joint in enumerate(self._joints):
@@ -422,20 +421,3 @@ class ConsistencyMonitor:
             for i, joint in enumerate(self._joints)
         }
         return {"pairs": pairs, "headings": headings}
-
-
-def _static_heading(calibration: Calibration, proximal: str, distal: str) -> float:
-    segment = calibration.segment
-    return axis_heading_one(segment[proximal].q_static, segment[distal].q_static) or 0.0
-
-
-def _turn_heading(half: tuple[float, float], q: Quaternion) -> Quaternion:
-    """Return an orientation turned about the vertical of the world."""
-    c, s = half
-    w, x, y, z = q
-    return (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
-
-
-def _wrapped(angle: float) -> float:
-    turn = 6.283185307179586
-    return angle - turn * round(angle / turn)

@@ -75,15 +75,8 @@ class HeadingDriftFilter:
         if dt < BLOCK_S:
             return False
 
+        # Prediction over dt.
         self._t_ns = t_ns
-        self._predict(dt)
-        if self._count >= MIN_MEASUREMENTS:
-            self._update(self._sum / self._count)
-        self._sum, self._count = 0.0, 0
-        self.heading, self.sd = float(self._x[0]), sqrt(float(self._p[0, 0]))
-        return True
-
-    def _predict(self, dt: float) -> None:
         rate_decay, bias_decay = exp(-dt / RATE_S), exp(-dt / BIAS_S)
         transition = np.array([[1.0, dt, 0.0], [0.0, rate_decay, 0.0], [0.0, 0.0, bias_decay]])
         noise = np.diag(
@@ -91,6 +84,12 @@ class HeadingDriftFilter:
         )
         self._x = transition @ self._x
         self._p = transition @ self._p @ transition.T + noise
+
+        if self._count >= MIN_MEASUREMENTS:
+            self._update(self._sum / self._count)
+        self._sum, self._count = 0.0, 0
+        self.heading, self.sd = float(self._x[0]), sqrt(float(self._p[0, 0]))
+        return True
 
     def _update(self, heading: float) -> None:
         h = np.array([1.0, 0.0, 1.0])  # a measurement is heading error plus bias

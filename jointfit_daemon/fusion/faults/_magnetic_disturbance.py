@@ -17,6 +17,7 @@ Only differences are observable: a disturbance that turns all sensors alike is n
 
 from __future__ import annotations
 
+from collections import Counter
 from math import exp
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -147,10 +148,13 @@ class MagneticDisturbanceDetector:
     ) -> tuple[dict[str, float], float]:
         targets, ambiguity = {}, 0.0
         for headings, sd in _connected_headings(edges):
-            if len({self._segment[name] for name in headings}) < 2:  # noqa: PLR2004 - no joint
+            # Every segment has the same weight, shared by its sensors.
+            sizes = Counter(self._segment[name] for name in headings)
+            if len(sizes) < 2:  # noqa: PLR2004 - no joint
                 continue
+            weighted = [(h, 1.0 / sizes[self._segment[name]]) for name, h in headings.items()]
 
-            low, high = _weighted_median(self._segment_weights(headings))
+            low, high = _weighted_median(weighted)
             middle = 0.5 * (low + high)
             for name, heading in headings.items():
                 self._deviations[name] = heading - middle
@@ -161,13 +165,6 @@ class MagneticDisturbanceDetector:
                     ambiguity = max(ambiguity, min(abs(correction), sd))
             ambiguity = max(ambiguity, _ramp(0.5 * (high - low), sd))
         return targets, ambiguity
-
-    def _segment_weights(self, headings: Mapping[str, float]) -> list[tuple[float, float]]:
-        counts: dict[int, int] = {}
-        for name in headings:
-            segment = self._segment[name]
-            counts[segment] = counts.get(segment, 0) + 1
-        return [(heading, 1.0 / counts[self._segment[name]]) for name, heading in headings.items()]
 
 
 def _connected_headings(

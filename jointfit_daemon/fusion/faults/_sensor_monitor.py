@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 
 SensorState = Literal["absent", "ok", "lost", "stuck"]
 
-LOSS_REPORT_NS = 200_000_000
-"""Silence after which a sensor is reported as lost, ns."""
-RECOVERY_REPORT_NS = 2_000_000_000
-"""Time without fault after which a sensor is reported as ok again, ns."""
+REPORT_DELAY_NS: dict[SensorState, int] = {"lost": 200_000_000, "ok": 2_000_000_000}
+"""Time in a state after which it is reported, ns; other states are reported at once."""
 
 
 class SensorReport(NamedTuple):
@@ -103,7 +101,7 @@ class SensorMonitor:
             self._report(name, sensor)
             for name, sensor in self._items
             if sensor.state != sensor.reported
-            and now_ns - sensor.since_ns >= _report_delay_ns(sensor)
+            and now_ns - sensor.since_ns >= REPORT_DELAY_NS.get(sensor.state, 0)
         ]
         self._unreported = any(sensor.state != sensor.reported for _, sensor in self._items)
         return reports
@@ -121,9 +119,3 @@ class SensorMonitor:
         working = [other for other in sensor.partners if self._sensors[other].state == "ok"]
         rest = f"uses {', '.join(working)}" if working else "has no working sensor"
         return SensorReport(name, sensor.state, f"{fault}; {sensor.segment} {rest}", "warning")
-
-
-def _report_delay_ns(sensor: _SensorStatus) -> int:
-    if sensor.state == "lost":
-        return LOSS_REPORT_NS
-    return RECOVERY_REPORT_NS if sensor.state == "ok" else 0

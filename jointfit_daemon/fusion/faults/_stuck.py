@@ -76,9 +76,13 @@ class _SensorHistory:
     def update(self, t_ns: int, q: Quaternion, orientations: Orientations) -> bool:
         """Add one orientation; return whether it repeats the one before."""
         since_ns = self.since_ns
-        if since_ns is not None and _repeats(self.q, q):
-            self.repeated_ns = t_ns
-            return True
+        if since_ns is not None:
+            # One component mostly decides whether the two orientations differ by rounding only.
+            (aw, ax, ay, az), (bw, bx, by, bz) = self.q, q
+            x = aw * bx - ax * bw - ay * bz + az * by
+            if x * x < _ROUNDING and _squared_half_sine(self.q, q) < _ROUNDING:
+                self.repeated_ns = t_ns
+                return True
 
         if since_ns is None:
             self.first_ns = t_ns
@@ -193,18 +197,9 @@ class StuckSensorDetector:
                 sensor.lagging = before and sensor.still
 
 
-def _repeats(a: Quaternion, b: Quaternion) -> bool:
-    """Return whether two orientations differ by rounding only; one component mostly decides."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    x = aw * bx - ax * bw - ay * bz + az * by
-    return x * x < _ROUNDING and _squared_half_sine(a, b) < _ROUNDING
-
-
 def _squared_half_sine(a: Quaternion, b: Quaternion) -> float:
     """Return the squared sine of half the rotation between two orientations."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
+    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
     x = aw * bx - ax * bw - ay * bz + az * by
     y = aw * by + ax * bz - ay * bw - az * bx
     z = aw * bz - ax * by + ay * bx - az * bw
