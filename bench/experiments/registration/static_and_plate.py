@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.baselines.recorded_stillness import still_from_rates
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import BOARD, SEEDED
 from jointfit_daemon.calibration.registration import (
     fit_observable_alignment,
     fit_sensor_alignment,
     robust_mean,
-    still_from_rates,
 )
 from jointfit_daemon.kinematics import rotation
 

@@ -43,7 +43,8 @@ ON_SKIN = SphereOptions(
     smallest_scale=1e-4, hold=0.003, min_direction=MIN_DIRECTION_RAD, keep_one=True
 )
 """Options of the sphere fit for skin markers."""
-_STEEP = 0.5  # smallest horizontal part of an unobserved direction to slide along
+_STEEP = 0.5
+"""Smallest horizontal part of an unobserved direction along which a center is moved."""
 
 
 def fit_center(points: Array, start: Array) -> CenterEstimate:
@@ -111,14 +112,12 @@ def align_vertically(found: CenterEstimate, above: Array | None) -> CenterEstima
     """
     if len(found.unseen) == 0 or above is None:
         return found
-    steps = _pinv(found.unseen[:, :2].T) @ (above - found.center[:2])
-    return replace(found, center=found.center + steps @ found.unseen)
 
-
-def _pinv(A: Array) -> Array:
-    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    # Least-squares steps; directions with a small horizontal part get none.
+    U, s, Vt = np.linalg.svd(found.unseen[:, :2].T, full_matrices=False)
     inverse = np.where(s > _STEEP, 1.0 / np.maximum(s, _STEEP), 0.0)
-    return np.asarray(Vt.T @ (inverse[:, None] * U.T))
+    steps = (Vt.T @ (inverse[:, None] * U.T)) @ (above - found.center[:2])
+    return replace(found, center=found.center + steps @ found.unseen)
 
 
 def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> CenterEstimate:

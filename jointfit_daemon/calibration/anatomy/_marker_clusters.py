@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointfit_daemon.calibration._errors import CalibrationError, unknown_name
 from jointfit_daemon.kinematics import rotation
@@ -35,14 +34,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.calibration._trial import CalibrationSettings
-    from jointfit_daemon.model import Chain
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration._trial import CalibrationSettings, OpticalTrack
+    from jointfit_daemon.model import Chain
 
 
 MIN_SEEN_STATIC = 20

@@ -187,7 +187,16 @@ def _fit_centers(
     for joint, fit in settled.items():
         gap = carried_center_gap(*jointed[joint], fit.center)
         out[joint] = JointCenter(fit.center, on_skin(fit), "fit", fit, gap)
-    return _plumbed(out), notes
+
+    # Combine the centers with the prior that the subject stood upright in the static pose.
+    straight = apply_standing_prior(
+        [None if joint is None else joint.center for joint in out.values()],
+        [None if joint is None else joint.covariance for joint in out.values()],
+    )
+    for name, pair in zip(chain.joints, straight, strict=True):
+        if (center := out[name]) is not None and pair is not None:
+            out[name] = replace(center, center=pair[0], covariance=pair[1])
+    return out, notes
 
 
 def place_unobserved(
@@ -200,9 +209,18 @@ def place_unobserved(
     """
     whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
     settled = {joint: found[joint] for joint in whole}
+    place = {joint: i for i, joint in enumerate(chain.joints)}
+
+    def distance(joint: str) -> int:
+        return min((abs(place[joint] - place[other]) for other in whole), default=0)
+
     hinges = [joint for joint in chain.joints if joint in found and joint not in settled]
-    for joint in sorted(hinges, key=lambda j: _distance(chain, j, whole)):
-        settled[joint] = align_vertically(found[joint], _beside(chain, joint, settled))
+    for joint in sorted(hinges, key=distance):
+        # Mean horizontal position of the neighbors, (x, y), m.
+        near = [other for other in chain.joints if abs(place[other] - place[joint]) == 1]
+        beside = [settled[other].center for other in near if other in settled]
+        above = np.mean(beside, axis=0)[:2] if beside else None
+        settled[joint] = align_vertically(found[joint], above)
     return settled
 
 
@@ -215,34 +233,6 @@ def on_skin(fit: CenterEstimate) -> Array:
     """
     whole = fit.covariance + UNSEEN_SD_M**2 * fit.unseen.T @ fit.unseen
     return whole if fit.leverage is None else whole + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
-
-
-def _plumbed(found: dict[str, JointCenter | None]) -> dict[str, JointCenter | None]:
-    """Combine the centers with the prior that the subject stood upright in the static pose."""
-    straight = apply_standing_prior(
-        [None if joint is None else joint.center for joint in found.values()],
-        [None if joint is None else joint.covariance for joint in found.values()],
-    )
-    return {
-        name: joint
-        if joint is None or pair is None
-        else replace(joint, center=pair[0], covariance=pair[1])
-        for (name, joint), pair in zip(found.items(), straight, strict=True)
-    }
-
-
-def _distance(chain: Chain, joint: str, others: list[str]) -> int:
-    """Return the number of joints to the nearest of `others`."""
-    i = chain.joints.index(joint)
-    return min((abs(i - chain.joints.index(other)) for other in others), default=0)
-
-
-def _beside(chain: Chain, joint: str, settled: Mapping[str, CenterEstimate]) -> Array | None:
-    """Return the mean horizontal position of the neighbors of a joint, (x, y), m."""
-    i = chain.joints.index(joint)
-    near = [chain.joints[k] for k in (i - 1, i + 1) if 0 <= k < len(chain.joints)]
-    beside = [settled[k].center for k in near if k in settled]
-    return np.mean(beside, axis=0)[:2] if beside else None
 
 
 def _with_lengths(

@@ -112,8 +112,14 @@ class LiveClusters:
         self.placed = ok & ~wrong
         self._good += self.placed
         for i in np.flatnonzero(wrong).tolist():
+            # The marker whose distances to the others changed most.
+            known = np.where(seen[i, :, None], y[i], 0.0)
+            now, then = (
+                np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, self._template[i])
+            )
+            change = (np.abs(now - then) * np.outer(seen[i], seen[i])).sum(axis=1)
             self._bad[i] += 1
-            self._blamed[i, _most_deviating(self._template[i], y[i], seen[i])] += 1
+            self._blamed[i, int(change.argmax())] += 1
             y[i] = np.nan
 
     def _read(self, layout: MocapLayout) -> None:
@@ -193,10 +199,3 @@ class LiveClusters:
                 absent,
             )
         return found
-
-
-def _most_deviating(template: Array, y: Array, seen: Mask) -> int:
-    """Return the marker whose distances to the others changed most."""
-    known = np.where(seen[:, None], y, 0.0)
-    now, then = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, template))
-    return int((np.abs(now - then) * np.outer(seen, seen)).sum(axis=1).argmax())

@@ -135,8 +135,8 @@ class LiveJointCenters:
         if self.joints:
             k = self._turn = (self._turn + 1) % len(self.joints)
             with np.errstate(all="ignore"):  # markers at rest leave zeros
-                found = self._spheres[k].estimate()
-            self._latest[self.joints[k]] = self._observed_estimate(k, found)
+                estimate = self._spheres[k].estimate()
+            self._latest[self.joints[k]] = self._observed_estimate(k, estimate)
 
         # Unobserved directions and the standing prior need all joints together.
         fits = {joint: fit for joint, (_, fit) in self._latest.items() if fit is not None}
@@ -148,7 +148,13 @@ class LiveJointCenters:
             [on_skin(settled[j]) if j in settled else None for j in order],
         )
         placed = dict(zip(order, straight, strict=True))
-        return {joint: _placed(one, placed[joint]) for joint, (one, _) in self._latest.items()}
+        found = {joint: one for joint, (one, _) in self._latest.items()}
+        for joint, one in found.items():
+            if (pair := placed[joint]) is not None:
+                center, covariance = pair
+                total = sqrt(max(float(np.trace(covariance)), 0.0) / 3.0 + SKIN_SD_M**2)
+                found[joint] = replace(one, center=center, total=total)
+        return found
 
     def _observed_estimate(
         self, k: int, fit: CenterEstimate
@@ -199,11 +205,3 @@ def _finite(value: float) -> float:
 
 def _unknown(joint: str, frames: int, arc: float, unseen: int, reason: str) -> LiveJointCenter:
     return LiveJointCenter(joint, None, inf, inf, inf, arc, 0.0, frames, unseen, reason)
-
-
-def _placed(one: LiveJointCenter, pair: tuple[Array, Array] | None) -> LiveJointCenter:
-    """Return an estimate with the position and covariance from all joints together."""
-    if pair is None:
-        return one
-    total = sqrt(max(float(np.trace(pair[1])), 0.0) / 3.0 + SKIN_SD_M**2)
-    return replace(one, center=pair[0], total=total)

@@ -20,6 +20,8 @@ from jointfit_daemon.calibration.guidance._live_joint_centers import (
 )
 from jointfit_daemon.calibration.guidance._movement_instructions import instructions_for
 from jointfit_daemon.calibration.guidance._movement_progress import MovementProgress
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import configured_length
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -80,7 +82,15 @@ class MovementGuide:
         optical = None if standing is None else standing.optical
         clusters, self._faults = _clusters(chain, settings, optical)
         self._centers = LiveJointCenters(chain, clusters)
-        self._movement = MovementProgress(chain, _last_orientations(standing))
+
+        # The last orientation of each sensor in the static pose is the zero of its flexion.
+        tracks = {} if standing is None else standing.sensors
+        zeros = {
+            sensor: as_quaternion(track.q_world_sensor[-1].tolist())
+            for sensor, track in tracks.items()
+            if len(track.t_ns)
+        }
+        self._movement = MovementProgress(chain, zeros)
 
     def add_mocap(self, frame: MocapFrame) -> None:
         """Process one camera frame."""
@@ -135,14 +145,11 @@ class MovementGuide:
     ) -> dict[str, object]:
         """Return the figures of a joint without a center from markers."""
         i = self._chain.joints.index(joint)
-        beside = [k for k in (i - 1, i) if 0 <= k < len(self._chain.segments)]
-        lengths = self._chain.lengths
-        if 0 < i < len(self._chain.segments):
+        count = len(self._chain.segments)
+        beside = [configured_length(self._chain, k) for k in (i - 1, i) if 0 <= k < count]
+        source = "unknown" if beside == [None] * len(beside) else "configured"
+        if 0 < i < count:
             source = "sensors"
-        elif any(k < len(lengths) and lengths[k] is not None for k in beside):
-            source = "configured"
-        else:
-            source = "unknown"
         return {
             "source": source,
             "predicted_error_mm": _mm(error),
@@ -151,13 +158,6 @@ class MovementGuide:
             "conditioning": None,
             "frames": 0,
         }
-
-
-def _last_orientations(standing: CalibrationTrial | None) -> dict[str, Quaternion]:
-    """Return the last orientation of each sensor in the static pose."""
-    said = {} if standing is None else standing.sensors
-    last = {s: track.q_world_sensor[-1].tolist() for s, track in said.items() if len(track.t_ns)}
-    return {sensor: (w, x, y, z) for sensor, (w, x, y, z) in last.items()}
 
 
 def _clusters(
@@ -203,9 +203,7 @@ def _missing_movement(one: LiveJointCenter, target: float) -> str | None:
     if one.unseen == 1 and not words.hinge:
         return f"no circumduction, movement about one axis only: {words.sideways}"
     noise = _noise(one)
-    if noise <= target and one.refused is None:
-        return None
-    if one.refused is not None and noise <= target:
+    if noise <= target:
         return one.refused
     more = words.bend if words.hinge else f"{words.bend}, and {words.sideways}"
     return f"error of {1e3 * noise:.1f} mm, target {1e3 * target:g} mm: {more}"

@@ -24,8 +24,11 @@ SKIN_NOISE_M = 0.005
 CORRELATION_S = 0.5
 """Correlation time of the soft-tissue artefact, s: one second has two independent samples."""
 
+MIN_ARC_RAD = math.radians(5.0)
+"""Smallest arc from which the error of a joint center is predicted, rad."""
+
 BENT_RAD = math.radians(30.0)
-"""Rotation from the static pose below which a joint is extended again, rad."""
+"""Rotation from the static pose above which a joint is flexed, rad."""
 STRAIGHT_RAD = math.radians(15.0)
 """Rotation from the static pose below which a joint is extended again, rad."""
 
@@ -76,12 +79,13 @@ class MovementProgress:
         ):
             a = next((sensor for sensor in above if sensor in latest), None)
             b = next((sensor for sensor in below if sensor in latest), None)
-            if a is not None and b is not None:
-                reach = self._seen.get((joint, a, b))
-                if reach is None:
-                    zero = self.standing if {a, b} <= self.standing.keys() else latest
-                    reach = self._seen[joint, a, b] = _RotationRange(_between(zero[a], zero[b]))
-                reach.take(_between(latest[a], latest[b]))
+            if a is None or b is None:
+                continue
+            reach = self._seen.get((joint, a, b))
+            if reach is None:
+                zero = self.standing if {a, b} <= self.standing.keys() else latest
+                reach = self._seen[joint, a, b] = _RotationRange(_between(zero[a], zero[b]))
+            reach.take(_between(latest[a], latest[b]))
 
     def arcs(self) -> dict[str, float]:
         """Return the largest arc of each inner joint so far, rad."""
@@ -99,16 +103,14 @@ class MovementProgress:
 
     def predicted_center_errors(self, elapsed_s: float) -> dict[str, float | None]:
         """Return the expected RMS error of each inner joint center, m; None for a small arc."""
-        looks = max(1.0, elapsed_s / CORRELATION_S)
-        return {joint: _predicted(arc, looks) for joint, arc in self.arcs().items()}
+        samples = max(1.0, elapsed_s / CORRELATION_S)
+        return {
+            joint: SKIN_NOISE_M * max(26.8 / arc**2, 2.0) / math.sqrt(samples)
+            if arc >= MIN_ARC_RAD
+            else None
+            for joint, arc in self.arcs().items()
+        }
 
 
 def _between(proximal: Quaternion, distal: Quaternion) -> np.ndarray:
     return rotation.multiply(rotation.conjugate(np.asarray(proximal)), np.asarray(distal))
-
-
-def _predicted(arc: float, looks: float) -> float | None:
-    if arc < math.radians(5):
-        return None
-    factor = max(26.8 / arc**2, 2.0)
-    return SKIN_NOISE_M * factor / math.sqrt(looks)

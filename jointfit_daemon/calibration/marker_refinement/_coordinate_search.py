@@ -101,20 +101,16 @@ class _Walk:
 
     def along(self, marker: int, axis: int, step: float, least_gain: float) -> bool:
         """Go in one direction while that helps, else in the other; return whether either did."""
+        accepted = len(self.errors)
         for signed in (step, -step):
-            moved = False
-            while self._try(marker, axis, signed, least_gain):
-                moved = True
-            if moved:
+            while True:
+                trial = self.positions.copy()
+                trial[marker, axis] += signed
+                error = self._measure(trial)
+                if not error < self.errors[-1] - least_gain:
+                    break
+                self.positions = trial
+                self.errors.append(error)
+            if len(self.errors) > accepted:
                 return True
-        return False
-
-    def _try(self, marker: int, axis: int, signed: float, least_gain: float) -> bool:
-        trial = self.positions.copy()
-        trial[marker, axis] += signed
-        error = self._measure(trial)
-        if error < self.errors[-1] - least_gain:
-            self.positions = trial
-            self.errors.append(error)
-            return True
         return False

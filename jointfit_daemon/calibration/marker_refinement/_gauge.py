@@ -67,13 +67,10 @@ def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float)
     weak = int((values < _WEAK).sum()) - free
     held = "locks" if free == 0 else "prior" if prior > 0.0 else "nothing"
 
-    return Gauge(values, free, weak, _involved(vectors[:, :free], coordinates), held)
-
-
-def _involved(null: Array, coordinates: Sequence[str]) -> tuple[str, ...]:
-    """Return the markers whose coordinates lie most in the null space."""
+    # Markers whose coordinates lie most in the null space.
     shares: dict[str, float] = {}
-    for name, share in zip(coordinates, (null**2).sum(axis=1), strict=True):
+    for name, share in zip(coordinates, (vectors[:, :free] ** 2).sum(axis=1), strict=True):
         shares[name] = shares.get(name, 0.0) + float(share)
     named = [name for name, share in shares.items() if share >= _NAMED]
-    return tuple(sorted(named, key=lambda name: -shares[name]))
+    involved = tuple(sorted(named, key=lambda name: -shares[name]))
+    return Gauge(values, free, weak, involved, held)

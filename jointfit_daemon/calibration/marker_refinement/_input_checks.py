@@ -66,7 +66,11 @@ def check(
     if not trials:
         faults.append("no training trial given")
     elif not free.any():
-        faults.append(_why_nothing_moves(model))
+        faults.append(
+            "all coordinates are locked: nothing to refine"
+            if model.locked.all()
+            else "no unlocked marker can be refined: each is locked, unseen or alone on its segment"
+        )
 
     if faults:
         raise RefinementError("; ".join(faults))
@@ -152,12 +156,6 @@ def _movable(
         if only and not all(m.locked)
     ]
     return free, notes
-
-
-def _why_nothing_moves(model: ChainModel) -> str:
-    if model.locked.all():
-        return "all coordinates are locked: nothing to refine"
-    return "no unlocked marker can be refined: each is locked, unseen or alone on its segment"
 
 
 def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:

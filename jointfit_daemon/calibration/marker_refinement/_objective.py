@@ -100,9 +100,3 @@ class RefinementProblem:
             loss = np.where(distances > c, c * (distances - 0.5 * c), loss)
         away = positions - self.model.positions
         return float((self.weights * loss).sum() + 0.5 * (self.pull * away**2).sum())
-
-
-def rms(distances: Array, present: NDArray[np.bool_]) -> float:
-    """Return the RMS over the present markers, m; NaN if there are none."""
-    seen = distances[present]
-    return float(np.sqrt(np.mean(seen**2))) if seen.size else float("nan")

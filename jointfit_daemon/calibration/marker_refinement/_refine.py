@@ -81,6 +81,11 @@ def refine_markers(
         for n, t in enumerate((*checked.trials, *unseen))
     )
 
+    rates = sorted({round(trial.rate_hz, 6) for trial in (*trials, *validation)})
+    notes = checked.notes
+    if len(rates) > 1:
+        listed = ", ".join(f"{rate:g}" for rate in rates)
+        notes += (f"recorded at {listed} Hz: trials are weighted by frames, not by duration",)
     return Refinement(
         after,
         settings.method,
@@ -91,16 +96,8 @@ def refine_markers(
         ended.runs,
         ended.stopped,
         _gauge(task, ended.positions, settings),
-        (*checked.notes, *_rates([*trials, *validation])),
+        notes,
     )
-
-
-def _rates(trials: Sequence[MotionTrial]) -> list[str]:
-    rates = sorted({round(trial.rate_hz, 6) for trial in trials})
-    if len(rates) == 1:
-        return []
-    listed = ", ".join(f"{rate:g}" for rate in rates)
-    return [f"recorded at {listed} Hz: trials are weighted by frames, not by duration"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,24 +135,18 @@ def _task(
     options = IkOptions(huber_m=settings.huber_m, limit_m2=settings.limit_m2)
     first = solve_frames(model, targets, weights, options=options)
     if settings.evenness > 0.0:
+        # A weight for every frame: the error of its trial to a power, one on average.
         lengths = [len(part.targets) for part, _ in parts]
-        problem = replace(
-            problem, weights=weights * _even(first, lengths, settings.evenness)[:, None]
-        )
+        each = np.split(first.residuals, np.cumsum(lengths)[:-1])
+        errors = np.array([tracking_error(part) for part in each])
+        even = np.repeat(errors**settings.evenness, lengths)
+        problem = replace(problem, weights=weights * np.asarray(even / even.mean())[:, None])
 
     held = [part.targets for _, part in parts if len(part.targets)]
     within = IkOptions(limit_m2=settings.limit_m2)
     return _RefinementTask(
         problem, first, _HoldOut(model, np.concatenate(held), within) if held else None
     )
-
-
-def _even(first: IkResult, lengths: Sequence[int], power: float) -> Array:
-    """Return a weight for every frame: its trial's error to a power, one on average."""
-    ends = np.cumsum(lengths)[:-1]
-    errors = np.array([tracking_error(part) for part in np.split(first.residuals, ends)])
-    weights = np.repeat(errors**power, lengths)
-    return np.asarray(weights / weights.mean())
 
 
 class _HoldOut:

@@ -31,13 +31,12 @@ from jointfit_daemon.calibration.phases._static_pose import (
     fit_static,
     sensor_calibration,
 )
-from jointfit_daemon.calibration.phases._training_set import MIN_FRAMES, limb_training
+from jointfit_daemon.calibration.phases._training_set import MIN_FRAMES, MISALIGNED, limb_training
 from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
     NO_LAG,
     SKIN,
     SensorLag,
-    configured_lag,
     fit_sensor_alignment,
     segment_lags,
     sensor_lags,
@@ -82,8 +81,6 @@ PLATE_SD_NS = 500_000.0
 STORED_SD_NS = 3e6
 """Standard deviation of a lag of the calibration in force, ns; it may have been estimated on
 skin."""
-MISALIGNED = np.deg2rad(25.0)
-"""Heading difference that soft tissue does not explain, rad."""
 
 
 def fit_calibration(
@@ -268,7 +265,7 @@ def _lags_in_use(
             {name: moving[name] for name in group if name in moving},
             {name: prior[name] for name in group if name in prior},
         )
-    return lags | {name: configured_lag(lag) for name, lag in known.items()}
+    return lags | {n: SensorLag(lag, None, "known") for n, lag in known.items()}
 
 
 def _sensors(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.calibration.phases._training_set import identical_sensors
+from jointfit_daemon.calibration.phases._training_set import MISALIGNED, identical_sensors
 from jointfit_daemon.calibration.registration import fit_sensor_alignment, robust_mean
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import joint_rotation
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
 
 
-MISALIGNED = np.deg2rad(25.0)
-"""Heading difference that soft tissue does not explain, rad."""
 HEADING_SEPARABLE = 0.98
 """Ratio of singular values above which heading and mount are indistinguishable."""
 FAR = np.deg2rad(45.0)
@@ -36,7 +34,12 @@ rad."""
 
 def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
     """Return a message on a joint (or single segment) that does not move; None if all move."""
-    for name, q in _movements(chain, trials):
+    reference = {s: np.concatenate([t.reference[s] for t in trials]) for s in chain.segments}
+    inner = zip(chain.joints[1:-1], chain.segments, chain.segments[1:], strict=False)
+    movements = {
+        joint: joint_rotation(reference[above], reference[below]) for joint, above, below in inner
+    }
+    for name, q in (movements or reference).items():  # a single segment has no inner joint
         known = q[np.isfinite(q).all(axis=1)]
         turned = rotation.angle_between(robust_mean(known).q, known)
         most = float(np.quantile(turned, 0.95))
@@ -60,15 +63,6 @@ def trial_warnings(
         *_turned_worlds(chain, trials),
         *identical_sensors(chain, sensors),
     ]
-
-
-def _movements(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[tuple[str, Array]]:
-    reference = {s: np.concatenate([t.reference[s] for t in trials]) for s in chain.segments}
-    inner = zip(chain.joints[1:-1], chain.segments, chain.segments[1:], strict=False)
-    for joint, above, below in inner:
-        yield joint, joint_rotation(reference[above], reference[below])
-    if len(chain.segments) == 1:
-        yield chain.segments[0], reference[chain.segments[0]]
 
 
 def _far_sensors(

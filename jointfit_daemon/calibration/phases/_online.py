@@ -118,7 +118,7 @@ def refit_models(
         known_after_rad=_figures(chain, candidate, known),
     )
 
-    kept = _rejection(figures) or _too_far(chain, in_force, candidate, known)
+    kept = _rejection(figures) or _large_change(chain, in_force, candidate, known)
     if kept is not None:
         return FitResult({"online": quality_table(figures)}, kept=kept)
 
@@ -246,7 +246,7 @@ def _rejection(figures: OnlineQuality) -> str | None:
     return None
 
 
-def _too_far(chain: Chain, old: Models, new: Models, known: LimbTraining) -> str | None:
+def _large_change(chain: Chain, old: Models, new: Models, known: LimbTraining) -> str | None:
     was, now = _predictions(chain, old, known), _predictions(chain, new, known)
     for name in chain.segments:
         moved = float(np.quantile(rotation.angle_between(was[name], now[name]), 0.95))

@@ -19,7 +19,6 @@ from jointfit_daemon.calibration.registration import (
     fit_observable_alignment,
     sensor_at,
     sensor_lags,
-    usable_ns,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
@@ -138,7 +137,8 @@ def fit_plate_alignment(
     t_ns, q_plate = plate_track(trial.optical, settings)
     unknown = {n: track for n, track in trial.sensors.items() if n not in (lag_ns or {})}
     turning = sensor_lags(t_ns, q_plate, unknown)
-    lags = {**usable_ns(turning), **(lag_ns or {})}
+    accepted = {n: round(lag.lag_ns) for n, lag in turning.items() if lag.refused is None}
+    lags = accepted | dict(lag_ns or {})
 
     reasons: list[str] = []
     found: dict[str, AlignedSensor] = {}

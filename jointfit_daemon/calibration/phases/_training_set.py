@@ -30,6 +30,8 @@ MAX_FRAMES = 2000
 """Frames of one movement used at most; longer movements are decimated."""
 MIN_FRAMES = 300
 """Smallest number of complete frames."""
+MISALIGNED = np.deg2rad(25.0)
+"""Heading difference of a sensor and its reference that soft tissue does not explain, rad."""
 SILENT = 0.1
 """Share of the movement without data of a sensor above which a note is published."""
 TWINS = np.deg2rad(0.01)
@@ -69,9 +71,20 @@ def limb_training(
 
     whole = np.all([visible(q) for q in (*raw.values(), *reference.values())], axis=0)
     rows = np.flatnonzero(whole)
-    silent = _silent(raw)
+    shares = {name: 1.0 - float(visible(q).mean()) for name, q in raw.items()}
+    silent = [
+        f"{name}: no data in {100 * share:.0f} % of the movement; this part was ignored for all "
+        "sensors: check its connector or battery, and repeat"
+        for name, share in shares.items()
+        if share > SILENT
+    ]
     if rows.size < MIN_FRAMES:
-        raise CalibrationError(*silent, _too_few(rows.size, raw | reference))
+        counts = {name: int(visible(q).sum()) for name, q in (raw | reference).items()}
+        raise CalibrationError(
+            *silent,
+            f"functional: {rows.size} frames with all sensors and segments, at least {MIN_FRAMES} "
+            f"are needed; frames of each: {counts}",
+        )
     rows = rows[:: -(-rows.size // MAX_FRAMES)]
 
     aligned = {
@@ -107,22 +120,3 @@ def identical_sensors(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
                     "device or recording under two names; a second sensor has no benefit then"
                 )
     return found
-
-
-def _silent(raw: Mapping[str, Array]) -> list[str]:
-    """Return notes on sensors without data in a part of the movement."""
-    shares = {name: 1.0 - float(visible(q).mean()) for name, q in raw.items()}
-    return [
-        f"{name}: no data in {100 * share:.0f} % of the movement; this part was ignored for all "
-        "sensors: check its connector or battery, and repeat"
-        for name, share in shares.items()
-        if share > SILENT
-    ]
-
-
-def _too_few(count: int, known: Mapping[str, Array]) -> str:
-    counts = {name: int(visible(q).sum()) for name, q in known.items()}
-    return (
-        f"functional: {count} frames with all sensors and segments, at least {MIN_FRAMES} "
-        f"are needed; frames of each: {counts}"
-    )

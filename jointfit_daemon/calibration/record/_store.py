@@ -117,7 +117,12 @@ class CalibrationStore:
             version = self._link(aside)
         finally:
             aside.unlink(missing_ok=True)
-        self._flush_directory()
+
+        descriptor = os.open(self._directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
         return version
 
     def _link(self, aside: Path) -> int:
@@ -141,13 +146,6 @@ class CalibrationStore:
                 return version
             else:
                 return version
-
-    def _flush_directory(self) -> None:
-        descriptor = os.open(self._directory, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
     def load(self, version: int) -> Calibration:
         """Return one version.
@@ -224,10 +222,10 @@ def _calibration_of(data: bytes) -> Calibration:
         The content cannot be used; includes `CalibrationSchemaError`.
     """
     table = parse_json(data.decode("utf-8-sig"))
-    if not isinstance(table, dict):
-        raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - file content
-    content: object = table if "schema" in table else table.get("calibration")
-    if not isinstance(content, dict):
+    content = None
+    if isinstance(table, dict):
+        content = table if "schema" in table else table.get("calibration")
+    if not isinstance(table, dict) or not isinstance(content, dict):
         raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - file content
     # A bare calibration was written before there were checksums.
     if content is not table and table.get("sha256") != checksum(content):

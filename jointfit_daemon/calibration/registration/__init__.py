@@ -4,11 +4,9 @@ from jointfit_daemon.calibration.registration._lags import (
     NO_LAG,
     SKIN,
     SensorLag,
-    configured_lag,
     segment_lags,
     sensor_lags,
     tracked_lags,
-    usable_ns,
 )
 from jointfit_daemon.calibration.registration._resampling import orientations_at, sensor_at
 from jointfit_daemon.calibration.registration._sensor_mount import (
@@ -23,7 +21,7 @@ from jointfit_daemon.calibration.registration._static_mean import (
     static_mount,
     static_problems,
 )
-from jointfit_daemon.calibration.registration._stillness import StillnessMonitor, still_from_rates
+from jointfit_daemon.calibration.registration._stillness import StillnessMonitor
 
 __all__ = [
     "NO_LAG",
@@ -32,7 +30,6 @@ __all__ = [
     "SensorLag",
     "StaticLimits",
     "StillnessMonitor",
-    "configured_lag",
     "fit_observable_alignment",
     "fit_sensor_alignment",
     "orientations_at",
@@ -43,7 +40,5 @@ __all__ = [
     "sensor_lags",
     "static_mount",
     "static_problems",
-    "still_from_rates",
     "tracked_lags",
-    "usable_ns",
 ]

@@ -70,11 +70,6 @@ class SensorLag(NamedTuple):
 NO_LAG = SensorLag(0, None, "none")
 
 
-def configured_lag(lag_ns: int) -> SensorLag:
-    """Return a configured lag."""
-    return SensorLag(lag_ns, None, "known")
-
-
 def segment_lags(
     moving: Mapping[str, LagEstimate], prior: Mapping[str, tuple[int, float]]
 ) -> dict[str, SensorLag]:
@@ -108,7 +103,9 @@ def segment_lags(
         name: prior[name]
         for name, lag, own in zip(names, found, sigma, strict=True)
         if name in prior
-        and abs(lag - prior[name][0]) <= MAX_PRIOR_DEVIATION * _apart_sd(own, prior[name][1])
+        and abs(lag - prior[name][0])
+        <= MAX_PRIOR_DEVIATION
+        * hypot(own, prior[name][1], SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS)
     }
 
     # Precision-weighted combination, equation above.
@@ -137,10 +134,6 @@ def tracked_lags(tracked: Mapping[str, tuple[float, float]]) -> dict[str, Sensor
     }
 
 
-def _apart_sd(sigma_ns: float, prior_sd_ns: float) -> float:
-    return hypot(sigma_ns, prior_sd_ns, SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS)
-
-
 def sensor_lags(
     t_ns: NDArray[np.int64],
     q: NDArray[np.float64],
@@ -162,8 +155,3 @@ def sensor_lags(
         name: estimate_lag(track.t_ns, track.q_world_sensor, t_ns, q, settings)
         for name, track in sensors.items()
     }
-
-
-def usable_ns(lags: Mapping[str, LagEstimate]) -> dict[str, int]:
-    """Return the accepted lags, ns."""
-    return {name: round(lag.lag_ns) for name, lag in lags.items() if lag.refused is None}

@@ -32,17 +32,14 @@ if TYPE_CHECKING:
 
 AlignmentKind = Literal["full", "heading", "mount"]
 
-_SAME = 1e-9  # singular values closer than this, relatively, are equal
-
-
-@dataclass(frozen=True, slots=True)
-class AlignmentLimits:
-    """Limits for accepting a rotation between the worlds."""
-
-    kappa_full: float = 0.95
-    kappa_heading: float = 0.98
-    weak_error: float = np.deg2rad(1.0)
-    """Largest standard error of the weakest direction of the full problem, rad."""
+MAX_KAPPA_FULL = 0.95
+"""Largest kappa of an accepted full alignment."""
+MAX_KAPPA_HEADING = 0.98
+"""Largest kappa of an accepted heading alignment."""
+MAX_WEAK_ERROR = np.deg2rad(1.0)
+"""Largest standard error of the weakest direction of the full problem, rad."""
+_SAME = 1e-9
+"""Singular values with a smaller relative difference are equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +60,12 @@ class SensorAlignment:
     """RMS angle between model and reference, rad, all frames."""
     residual_scale: float
     """Robust scale of the residual angles, rad; insensitive to outliers."""
-    effective_count: float
-    """Number of independent frames."""
     refused: tuple[str, ...] = ()
     """Reasons for rejecting each richer kind of alignment."""
 
 
 def fit_observable_alignment(
-    q_world_sensor: ArrayLike, q_optical_body: ArrayLike, limits: AlignmentLimits | None = None
+    q_world_sensor: ArrayLike, q_optical_body: ArrayLike
 ) -> SensorAlignment:
     """Return the richest alignment that the movement supports: full, else heading, else mount only.
 
@@ -87,25 +82,23 @@ def fit_observable_alignment(
     ValueError
         Fewer than four complete frames.
     """
-    limits = limits or AlignmentLimits()
-    refused: list[str] = []
     full = fit_sensor_alignment("full", q_world_sensor, q_optical_body)
-    if full.kappa <= limits.kappa_full and full.weak_error <= limits.weak_error:
+    if full.kappa <= MAX_KAPPA_FULL and full.weak_error <= MAX_WEAK_ERROR:
         return full
-
-    refused.append(
-        f"full world alignment: kappa {full.kappa:.3f} (at most {limits.kappa_full}), error of the "
+    no_full = (
+        f"full world alignment: kappa {full.kappa:.3f} (at most {MAX_KAPPA_FULL}), error of the "
         f"weakest direction {np.rad2deg(full.weak_error):.2f} deg: rotate about two or more axes"
     )
 
     heading = fit_sensor_alignment("heading", q_world_sensor, q_optical_body)
-    if heading.kappa <= limits.kappa_heading:
-        return _with_refused(heading, refused)
-    refused.append(
-        f"heading alignment: kappa {heading.kappa:.3f} (at most {limits.kappa_heading}): rotate "
+    if heading.kappa <= MAX_KAPPA_HEADING:
+        return replace(heading, refused=(no_full,))
+    no_heading = (
+        f"heading alignment: kappa {heading.kappa:.3f} (at most {MAX_KAPPA_HEADING}): rotate "
         "about a horizontal axis, too"
     )
-    return _with_refused(fit_sensor_alignment("mount", q_world_sensor, q_optical_body), refused)
+    mount = fit_sensor_alignment("mount", q_world_sensor, q_optical_body)
+    return replace(mount, refused=(no_full, no_heading))
 
 
 def fit_sensor_alignment(
@@ -200,13 +193,8 @@ def _judged(
     # Outliers have small weights in the fit, so they have small weights in its error, too.
     weights = huber_weights(angles, scale)
     weighted_rms = float(np.sqrt(np.sum(weights**2 * angles**2) / np.sum(weights)))
-    count = effective_count(residuals * weights[:, None])
-    apart = count * (1.0 - kappa)
+    apart = effective_count(residuals * weights[:, None]) * (1.0 - kappa)
     weak = weighted_rms / np.sqrt(apart) if kappa < 1.0 - _SAME else np.inf
     q_world = rotation.align_hemisphere(q_world, rotation.IDENTITY)
     q_mount = rotation.align_hemisphere(q_mount, rotation.IDENTITY)
-    return SensorAlignment(kind, q_world, q_mount, kappa, float(weak), rms, scale, count)
-
-
-def _with_refused(found: SensorAlignment, refused: list[str]) -> SensorAlignment:
-    return replace(found, refused=tuple(refused))
+    return SensorAlignment(kind, q_world, q_mount, kappa, float(weak), rms, scale)

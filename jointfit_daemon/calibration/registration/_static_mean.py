@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 
+MAX_DISAGREEMENT = np.deg2rad(3.0)
+"""Largest difference between the changes of two sensors of one segment since the last pose, rad."""
+
+
 @dataclass(frozen=True, slots=True)
 class RobustMean:
     """Mean rotation with its scatter."""
@@ -32,10 +36,6 @@ class RobustMean:
     """The mean, shape (4,), unit, w >= 0."""
     spread: float
     """Robust scale of the angles to the mean, rad."""
-    count: int
-    """Number of finite rotations."""
-    inlier_share: float
-    """Share of rotations with full weight (within 1.5 scales)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +47,6 @@ class StaticLimits:
     spread: float = np.deg2rad(1.5)
     """Largest robust scatter of one sensor, rad. A standing subject moves by less than 1 degree; a
     good orientation filter drifts by up to 1 degree."""
-    disagreement: float = np.deg2rad(3.0)
-    """Largest difference between the changes of two sensors of one segment since the last pose,
-    rad."""
 
 
 def robust_mean(q: ArrayLike, weights: ArrayLike | None = None) -> RobustMean:
@@ -86,7 +83,7 @@ def robust_mean(q: ArrayLike, weights: ArrayLike | None = None) -> RobustMean:
         mean = rotation.average(good, prior * weight)
         if float(np.max(np.abs(weight - before))) < SETTLED:
             break
-    return RobustMean(mean, scale, len(good), float(np.mean(weight >= 1.0)))
+    return RobustMean(mean, scale)
 
 
 def static_mount(
@@ -142,7 +139,6 @@ def redonning_notes(
     before: Mapping[str, ArrayLike],
     after: Mapping[str, ArrayLike],
     segments: Mapping[str, Sequence[str]],
-    limits: StaticLimits | None = None,
 ) -> tuple[str, ...]:
     """Return the sensors of one segment that moved differently between two static poses.
 
@@ -156,7 +152,6 @@ def redonning_notes(
     segments : mapping
         Sensors of each segment.
     """
-    limits = limits or StaticLimits()
     found = []
     for segment, sensors in segments.items():
         known = [s for s in sensors if s in before and s in after]
@@ -164,7 +159,7 @@ def redonning_notes(
         changes = [rotation.multiply(rotation.conjugate(before[s]), after[s]) for s in known]
         for sensor, change in zip(known[1:], changes[1:], strict=True):
             apart = float(rotation.angle_between(changes[0], change))
-            if apart > limits.disagreement:
+            if apart > MAX_DISAGREEMENT:
                 found.append(
                     f"{segment}: {known[0]} and {sensor} differ by {np.rad2deg(apart):.1f} deg in "
                     "their change since the last static pose: one sensor was moved, or its heading "

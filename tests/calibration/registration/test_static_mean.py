@@ -27,7 +27,7 @@ DEG = np.deg2rad(1.0)
 
 
 def still(spread: float) -> RobustMean:
-    return RobustMean(np.asarray(rot.IDENTITY), spread, 500, 1.0)
+    return RobustMean(np.asarray(rot.IDENTITY), spread)
 
 
 def test_a_fifth_of_wild_frames_moves_a_robust_mean_less_than_a_plain_one() -> None:
@@ -40,14 +40,11 @@ def test_a_fifth_of_wild_frames_moves_a_robust_mean_less_than_a_plain_one() -> N
     assert rot.angle_between(robust.q, truth) < 1.2 * DEG
     assert rot.angle_between(rot.average(q), truth) > 5 * DEG
     assert robust.spread < 3 * DEG
-    assert 0.5 < robust.inlier_share < 0.9
-    assert robust.count == 500
 
 
 def test_frames_that_are_unknown_are_left_out() -> None:
     q = np.tile(rot.exp([0.1, 0.2, 0.3]), (10, 1))
     q[3] = np.nan
-    assert robust_mean(q).count == 9
     assert rot.angle_between(robust_mean(q).q, q[0]) < 1e-12
     with pytest.raises(ValueError, match="no rotations"):
         robust_mean(np.full((5, 4), np.nan))

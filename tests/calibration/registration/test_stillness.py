@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.calibration.registration import StillnessMonitor, still_from_rates
-from jointfit_daemon.calibration.registration._stillness import (
-    StillnessLimits,
+from bench.baselines.recorded_stillness import (
+    RecordedStillnessLimits,
     still_from_orientation,
+    still_from_rates,
 )
+from jointfit_daemon.calibration.registration import StillnessMonitor
 from jointfit_daemon.kinematics import rotation as rot
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 
@@ -58,7 +59,7 @@ def test_rest_is_found_and_motion_is_not_rest() -> None:
 def test_rest_shorter_than_one_and_a_half_seconds_is_not_stillness() -> None:
     gyr, acc, _ = swinging()
     assert not still_from_rates(gyr, acc, RATE)[1000:].any()
-    eager = still_from_rates(gyr, acc, RATE, StillnessLimits(shortest_s=0.1))
+    eager = still_from_rates(gyr, acc, RATE, RecordedStillnessLimits(shortest_s=0.1))
     assert eager[1060:].all()
 
 

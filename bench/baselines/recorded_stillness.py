@@ -1,0 +1,147 @@
+"""Detection of rest in recordings, from angular rates or orientations over centered windows.
+
+Only variances and relative rotations are used, so a constant gyro bias or an arbitrary heading has
+no influence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedStillnessLimits:
+    """Thresholds of rest. For a noisier sensor use three times its values on a table."""
+
+    window_s: float = 1.0
+    """Length of the window that must be at rest, s."""
+    shortest_s: float = 1.5
+    """Shorter periods of rest are ignored, s."""
+    gyr: float = np.deg2rad(1.0)
+    """Root of the summed variances of the three rates, rad/s."""
+    acc: float = 0.15
+    """Root of the summed variances of the three specific forces, m/s^2."""
+    turn: float = np.deg2rad(1.0)
+    """Largest rotation from the first step of a window to any later step, rad."""
+    step_s: float = 0.05
+    """Averaging interval of the orientations, s."""
+
+
+def still_from_rates(
+    gyr: ArrayLike, acc: ArrayLike, rate_hz: float, limits: RecordedStillnessLimits | None = None
+) -> Mask:
+    """Return the samples at rest, from raw data over centered windows.
+
+    A sample is a candidate if the root of the summed variances over its window is below both
+    limits. Runs of candidates shorter than ``shortest_s`` are dropped.
+
+    Parameters
+    ----------
+    gyr : array_like, shape (n, 3)
+        Angular rate, rad/s.
+    acc : array_like, shape (n, 3)
+        Specific force, m/s^2.
+    rate_hz : float
+        Sampling rate, Hz.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    limits = limits or RecordedStillnessLimits()
+    size = max(2, round(limits.window_s * rate_hz))
+    candidate = (_moving_spread(gyr, size) < limits.gyr) & (_moving_spread(acc, size) < limits.acc)
+    return _long_runs(candidate, round(limits.shortest_s * rate_hz))
+
+
+def still_from_orientation(
+    q_world_sensor: ArrayLike, rate_hz: float, limits: RecordedStillnessLimits | None = None
+) -> Mask:
+    """Return the samples at rest, from orientations only.
+
+    A window is at rest if the rotation from its first 0.05 s step to every later one is below the
+    limit. The center of the window is then a candidate, and runs shorter than ``shortest_s`` are
+    dropped. A step is the mean of its samples, so that white noise of a third of a degree is no
+    movement.
+
+    Parameters
+    ----------
+    q_world_sensor : array_like, shape (n, 4)
+        Evenly sampled; a window with NaN is not at rest.
+    rate_hz : float
+        Sampling rate, Hz.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        Half a window at either end has the value of the first or last complete window.
+    """
+    limits = limits or RecordedStillnessLimits()
+    q = rotation.continuous(q_world_sensor)
+    count = len(q)
+
+    size, step = round(limits.window_s * rate_hz), max(1, round(limits.step_s * rate_hz))
+    q = _step_means(q, step)
+    starts = len(q) - size
+    if starts <= 0:
+        return np.zeros(count, dtype=bool)
+
+    # Rotation from the first step of every window to each of its later steps.
+    calm = np.ones(starts, dtype=bool)
+    for later in range(step, size + 1, step):
+        turned = rotation.angle_between(q[:starts], q[later : later + starts])
+        calm &= np.nan_to_num(turned, nan=np.inf) < limits.turn
+
+    before = (size + step) // 2
+    candidate = np.pad(calm, (before, count - starts - before), mode="edge")
+    return _long_runs(candidate, round(limits.shortest_s * rate_hz))
+
+
+def _step_means(q: NDArray[np.float64], step: int) -> NDArray[np.float64]:
+    """Return the normalized mean of every `step` successive rows; `step` - 1 rows fewer."""
+    count = max(0, len(q) - step + 1)
+    total = np.zeros((count, 4))
+    for offset in range(step):
+        total += q[offset : offset + count]
+    return rotation.normalize(total)
+
+
+def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
+    values = np.array(samples, dtype=np.float64)
+    values -= values.mean(axis=0)  # variances about a large offset would lose digits
+    mean, square = _moving_mean(values, size), _moving_mean(values**2, size)
+    spread: NDArray[np.float64] = np.sqrt(np.maximum(square - mean**2, 0.0).sum(axis=1))
+    return spread
+
+
+def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the means over windows of `size` rows about each row; end rows are repeated beyond.
+
+    Running sums instead of a scipy filter: importing scipy would double the start time of the
+    daemon.
+    """
+    before = size // 2
+    padded = np.pad(values, ((before + 1, size - 1 - before), (0, 0)), mode="edge")
+    padded[0] = 0.0  # the sum of no rows
+    total = np.cumsum(padded, axis=0)
+    means: NDArray[np.float64] = (total[size:] - total[:-size]) / size
+    return means
+
+
+def _long_runs(mask: Mask, shortest: int) -> Mask:
+    """Return only runs of at least `shortest` samples."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0]))))
+    kept = np.zeros_like(mask)
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        kept[begin:end] = end - begin >= shortest
+    return kept
