@@ -18,7 +18,6 @@ from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.mocap import read_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_model, read_osim
-from jointfit_daemon.files.models._osim import read_marker_set
 from jointfit_daemon.files.orientations import (
     read_orientations_npz,
     read_orientations_sto,
@@ -131,9 +130,6 @@ TARGETS = (
     Target("npz", reading(".npz", read_orientations_npz), seeds_npz, _FILES, 0.3),
     Target("npz-members", run_npz_members, seeds_npz_members, _FILES, 0.3),
     Target("osim", reading(".osim", read_osim), lambda: lines_of(".osim", 400), _FILES, 0.3),
-    Target(
-        "osim-set", reading(".xml", read_marker_set), lambda: lines_of(".osim", 400), _FILES, 0.3
-    ),
     Target(
         "model-toml", reading(".toml", read_model), lambda: lines_of("leg.toml", 90), _FILES, 0.3
     ),

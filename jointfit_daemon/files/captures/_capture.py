@@ -65,7 +65,11 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
                 f"{path}: a network capture, where a {wire} is expected: name the driver of the"
                 " device that was recorded"
             )
-        return _datagrams(data, port)
+        return (
+            Chunk(packet.t_ns, packet.payload)
+            for packet in read_udp(data)
+            if port is None or port in (packet.source_port, packet.target_port)
+        )
 
     if is_candump(data):
         if wire != "can":
@@ -75,31 +79,15 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
             )
         return read_candump(data)
 
-    return _raw(data, wire, path)
-
-
-def _datagrams(data: bytes, port: int | None) -> Iterator[Chunk]:
-    for packet in read_udp(data):
-        if port is None or port in (packet.source_port, packet.target_port):
-            yield Chunk(packet.t_ns, packet.payload)
-
-
-def _raw(data: bytes, wire: Wire, path: Path) -> Iterator[Chunk]:
     if wire == "datagram":
         return _walk(data)
-    if wire == "stream":
-        return _pieces(data, PIECE)
-    if len(data) % RECORD_BYTES:
+    if wire == "can" and len(data) % RECORD_BYTES:
         raise UnreadableCaptureError(
             f"{path}: neither `candump -L` text nor CAN records of {RECORD_BYTES} bytes: record"
             " with `candump -L can0`"
         )
-    return _pieces(data, PIECE // RECORD_BYTES * RECORD_BYTES)
-
-
-def _pieces(data: bytes, size: int) -> Iterator[Chunk]:
-    for at in range(0, len(data), size):
-        yield Chunk(at * NS_PER_BYTE, data[at : at + size])
+    size = PIECE // RECORD_BYTES * RECORD_BYTES if wire == "can" else PIECE
+    return (Chunk(at * NS_PER_BYTE, data[at : at + size]) for at in range(0, len(data), size))
 
 
 def _walk(data: bytes) -> Iterator[Chunk]:

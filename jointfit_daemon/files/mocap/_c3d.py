@@ -17,21 +17,18 @@ from jointfit_daemon.files.mocap._trc import METRES, MarkerTrajectories
 from jointfit_daemon.files.text import MalformedFileError, reject_device
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 class MissingPackageError(ImportError):
     """The optional package for this file format is not installed; the message names it."""
 
 
-def read_c3d(path: Path) -> MarkerTrajectories:
-    """Return the points of a C3D file; analog channels are ignored.
+def read_c3d(path: Path) -> tuple[MarkerTrajectories, str | None]:
+    """Return the points of a C3D file, and the vertical screen axis "x", "y" or "z" if declared.
 
     Labels are returned as written (``Subject:LASI``). Frame numbers and `t_s` start at the first
-    frame of the trial, which is rarely 1.
+    frame of the trial, which is rarely 1. Analog channels are ignored.
 
     Raises
     ------
@@ -40,15 +37,6 @@ def read_c3d(path: Path) -> MarkerTrajectories:
     MalformedFileError
         Not a C3D file, damaged, without points, or with an unknown unit of length.
     """
-    return _open(path)[0]
-
-
-def read_c3d_with_up(path: Path) -> tuple[MarkerTrajectories, str | None]:
-    """Return `read_c3d` and the vertical screen axis "x", "y" or "z"; None if not declared."""
-    return _open(path)
-
-
-def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
     try:
         import c3d  # noqa: PLC0415 - optional, and slow to import
     except ModuleNotFoundError as missing:
@@ -69,7 +57,14 @@ def _open(path: Path) -> tuple[MarkerTrajectories, str | None]:
 
 
 def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
-    names = tuple(_labels(reader))[: reader.point_used]
+    # More than 255 labels continue in LABELS2, LABELS3, ...
+    names: tuple[str, ...] = ()
+    for suffix in ("", *map(str, range(2, 257))):
+        found = reader.get(f"POINT:LABELS{suffix}")
+        if found is None:
+            break
+        names += tuple(str(label).strip() for label in found.string_array)
+    names = names[: reader.point_used]
     if not names:
         raise MalformedFileError(
             f"{path}: no points with labels in this C3D file: export it with markers"
@@ -90,43 +85,24 @@ def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
             f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
         )
 
+    positions = cells[..., :3].copy()
+    positions[cells[..., 3] < 0.0] = np.nan
     numbers = np.arange(first, first + len(cells), dtype=np.int64)
+    declared = int(reader.last_frame) - first + 1
     trajectories = MarkerTrajectories(
         names,
         (numbers - 1) / rate_hz,
         numbers,
-        _positions(cells) * METRES[unit],
+        positions * METRES[unit],
         rate_hz,
-        _doubts(len(cells), int(reader.last_frame) - first + 1),
+        ()
+        if len(cells) == declared
+        else (f"header declares {declared} frames, counted {len(cells)}",),
     )
-    return trajectories, _up(reader)
-
-
-def _positions(cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions (n, k, 3) from x, y, z, residual (n, k, 4); NaN where missing."""
-    positions: NDArray[np.float64] = cells[..., :3].copy()
-    positions[cells[..., 3] < 0.0] = np.nan
-    return positions
-
-
-def _labels(reader: Any) -> Iterator[str]:
-    """Yield point labels; more than 255 continue in LABELS2, LABELS3, ..."""
-    for suffix in ("", *(str(i) for i in range(2, 257))):
-        found = reader.get(f"POINT:LABELS{suffix}")
-        if found is None:
-            return
-        yield from (str(label).strip() for label in found.string_array)
-
-
-def _up(reader: Any) -> str | None:
     screen = _text(reader, "POINT:Y_SCREEN").lstrip("+").lower()
-    return screen if screen in ("x", "y", "z") else None
+    return trajectories, screen if screen in ("x", "y", "z") else None
 
 
 def _text(reader: Any, key: str) -> str:
     found = reader.get(key)
     return "" if found is None else str(found.string_value).strip().strip("\0")
-
-
-def _doubts(counted: int, claimed: int) -> tuple[str, ...]:
-    return () if counted == claimed else (f"header declares {claimed} frames, counted {counted}",)

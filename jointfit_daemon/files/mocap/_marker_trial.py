@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
-from jointfit_daemon.files.mocap._c3d import read_c3d_with_up
+from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.nearest_name import did_you_mean
@@ -54,9 +54,21 @@ class MarkerTrial:
         """
         wanted = [self._index(name) for name in names]
         unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
-        if unknown:
-            raise UnknownMarkerError(self._explain(unknown, taken=set(names)))
-        return self.trajectories.positions[:, [at for at in wanted if at is not None]]
+        if not unknown:
+            return self.trajectories.positions[:, [at for at in wanted if at is not None]]
+
+        # Name the nearest markers of each, or all once. Requested markers are not candidates.
+        taken = set(names)
+        free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
+        spellings = [*free, *map(_bare, free)]
+        hints = [did_you_mean(name, spellings, count=3) for name in unknown]
+        problems = [
+            f"no marker {name!r}" + (f": {hint}" if hint else "")
+            for name, hint in zip(unknown, hints, strict=True)
+        ]
+        if not all(hints):
+            problems.append(f"there are: {', '.join(self.trajectories.names)}")
+        raise UnknownMarkerError("; ".join(problems))
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
         """Return an axis of the file in the world with z up, shape (3,)."""
@@ -72,22 +84,6 @@ class MarkerTrial:
         bare = [at for at, full in enumerate(self.trajectories.names) if _bare(full) == name]
         return bare[0] if len(bare) == 1 else None
 
-    def _explain(self, unknown: Sequence[str], taken: set[str]) -> str:
-        """Name the nearest of each, and all there are, once, where one has none near.
-
-        Requested markers (`taken`) are not candidates for a misspelt name.
-        """
-        free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
-        spellings = [*free, *map(_bare, free)]
-        hints = [did_you_mean(name, spellings, count=3) for name in unknown]
-        problems = [
-            f"no marker {name!r}" + (f": {hint}" if hint else "")
-            for name, hint in zip(unknown, hints, strict=True)
-        ]
-        if not all(hints):
-            problems.append(f"there are: {', '.join(self.trajectories.names)}")
-        return "; ".join(problems)
-
 
 def _bare(name: str) -> str:
     return name.rpartition(":")[2]
@@ -101,7 +97,7 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     path
         File in mm, cm or m.
     up_axis
-            Vertical axis of the file. Default: as declared in a C3D file, else z; for TRC y, the
+        Vertical axis of the file. Default: as declared in a C3D file, else z; for TRC y, the
         convention of OpenSim.
 
     Raises
@@ -115,8 +111,7 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     if kind == ".trc":
         trajectories, declared, custom = read_trc(path), None, "y"
     elif kind == ".c3d":
-        trajectories, declared = read_c3d_with_up(path)
-        custom = "z"
+        (trajectories, declared), custom = read_c3d(path), "z"
     else:
         raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d")
 

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEADER_ROWS = 5
-_MOST_FRAMES = 2.0**53
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres per unit of length in marker files."""
 _KEYS = (
@@ -79,11 +78,20 @@ def read_trc(path: Path) -> MarkerTrajectories:
             f"{path}: not a TRC file (its first cell must be PathFileType): export it again"
         )
     separator = separator_of(lines[3])
-    header, rate_hz = _header(path, lines)
     names = tuple(strip_trailing_empty(cells_of(lines[3], separator))[2::3])
     if not names:
         raise MalformedFileError(
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
+        )
+
+    header_separator = separator_of(lines[1])
+    keys, values = (cells_of(line, header_separator) for line in lines[1:3])
+    header = dict(zip(keys, values, strict=False))
+    rate_hz = number(path, 3, header.get("DataRate", ""))
+    if not 0.0 < rate_hz < math.inf:
+        found = header.get("DataRate", "missing")
+        raise MalformedFileError(
+            f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)"
         )
 
     body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)
@@ -97,35 +105,19 @@ def read_trc(path: Path) -> MarkerTrajectories:
         raise MalformedFileError(
             f"{path}: the first column must hold frame numbers: export it again"
         )
+    counted = {"NumFrames": len(rows), "NumMarkers": len(names)}
+    warnings = tuple(
+        f"header {key} is {header.get(key, 'missing')}, counted {count}"
+        for key, count in counted.items()
+        if header.get(key, "") != str(count)
+    )
     return MarkerTrajectories(
         names,
         rows[:, 1],
         np.clip(np.nan_to_num(rows[:, 0]), -_MOST_FRAMES, _MOST_FRAMES).astype(np.int64),
         rows[:, 2:].reshape(-1, len(names), 3) * METRES[unit],
         rate_hz,
-        _doubts(header, rows=len(rows), markers=len(names)),
-    )
-
-
-def _header(path: Path, lines: list[str]) -> tuple[dict[str, str], float]:
-    """Return the values by key, and the rate, Hz."""
-    separator = separator_of(lines[1])
-    header = dict(zip(cells_of(lines[1], separator), cells_of(lines[2], separator), strict=False))
-    rate_hz = number(path, 3, header.get("DataRate", ""))
-    if not 0.0 < rate_hz < math.inf:
-        found = header.get("DataRate", "missing")
-        raise MalformedFileError(
-            f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)"
-        )
-    return header, rate_hz
-
-
-def _doubts(header: dict[str, str], *, rows: int, markers: int) -> tuple[str, ...]:
-    counted = {"NumFrames": rows, "NumMarkers": markers}
-    return tuple(
-        f"header {key} is {header.get(key, 'missing')}, counted {count}"
-        for key, count in counted.items()
-        if header.get(key, "") != str(count)
+        warnings,
     )
 
 

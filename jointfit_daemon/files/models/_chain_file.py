@@ -7,6 +7,7 @@ file are reported at once. The format is described in docs/kinematics.md.
 from __future__ import annotations
 
 import json
+from itertools import compress
 from typing import TYPE_CHECKING, Any, get_args
 
 from jointfit_daemon.files.models._units import require_metres
@@ -50,7 +51,7 @@ def read_model(path: Path) -> ChainModel:
     Raises
     ------
     MalformedFileError
-            Damaged file, unknown keys, values of the wrong type, segments that do not form a chain,
+        Damaged file, unknown keys, values of the wrong type, segments that do not form a chain,
         or lengths that cannot be metres.
     """
     data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
@@ -81,10 +82,17 @@ def write_model(path: Path, model: ChainModel) -> None:
 
 def as_data(model: ChainModel) -> dict[str, Any]:
     """Return a chain model as lists and dicts, without default values."""
+    markers: list[dict[str, Any]] = []
+    for m in model.markers:
+        markers.append({"name": m.name, "segment": m.segment, "position": list(m.position)})
+        if m.weight != 1.0:
+            markers[-1]["weight"] = m.weight
+        if any(m.locked):
+            markers[-1]["locked"] = "".join(compress(_AXES, m.locked))
     return {
         "name": model.name,
         "segment": [_segment_data(s) for s in model.segments],
-        "marker": [_marker_data(m) for m in model.markers],
+        "marker": markers,
     }
 
 
@@ -99,15 +107,6 @@ def _segment_data(s: Segment) -> dict[str, Any]:
             data[key] = list(value)
     if s.joint.path:
         data["path"] = [list(sample) for sample in s.joint.path]
-    return data
-
-
-def _marker_data(m: Marker) -> dict[str, Any]:
-    data: dict[str, Any] = {"name": m.name, "segment": m.segment, "position": list(m.position)}
-    if m.weight != 1.0:
-        data["weight"] = m.weight
-    if any(m.locked):
-        data["locked"] = "".join(a for a, yes in zip(_AXES, m.locked, strict=True) if yes)
     return data
 
 

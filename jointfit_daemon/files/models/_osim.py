@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.models._osim_document import GROUND, markers_of, read_document, read_xml
+from jointfit_daemon.files.models._osim_document import GROUND, read_document
 from jointfit_daemon.files.models._osim_joints import nearest_joint
 from jointfit_daemon.files.models._units import require_metres
 from jointfit_daemon.files.text import MalformedFileError
@@ -57,45 +57,39 @@ def to_y_up(vectors: Array) -> Array:
     return np.asarray(np.asarray(vectors)[..., np.argsort(_TO_Z_UP)])
 
 
-def read_osim(
-    path: Path,
-    *,
-    bodies: Collection[str] | None = None,
-    markers: Collection[str] | None = None,
-    marker_set: Path | None = None,
-) -> ImportedModel:
+def read_osim(path: Path, *, markers: Collection[str] | None = None) -> ImportedModel:
     """Return the chain model of an OpenSim 4 model.
 
     Parameters
     ----------
     path
         ``.osim`` file.
-    bodies
-        Use only markers of these bodies; bodies that no marker needs are omitted. Default: all.
     markers
-        Use only these markers. Default: all.
-    marker_set
-        XML file with markers that replace those of the model.
+        Use only these markers; bodies that no marker needs are omitted. Default: all.
 
     Raises
     ------
     MalformedFileError
-            Not an OpenSim 4 model, unsupported joints or functions, unknown names, or lengths that
+        Not an OpenSim 4 model, unsupported joints or functions, unknown names, or lengths that
         are not metres.
     """
     document = read_document(path)
-    found = document.markers if marker_set is None else read_marker_set(marker_set)
-    _check(path, document, found, bodies, markers)
+    names = {m.name for m in document.markers}
+    unknown = [f"no marker {m!r}" for m in markers or () if m not in names]
+    unknown += [
+        f"marker {m.name!r} on unknown body {m.body!r}"
+        for m in document.markers
+        if m.body not in document.bodies and m.body != GROUND
+    ]
+    if unknown:
+        raise MalformedFileError(f"{path}: {'; '.join(unknown)}")
+
     try:
         tree = _Tree(document)
     except ValueError as error:
         raise MalformedFileError(f"{path}: {error}") from error
 
-    chosen = [
-        m
-        for m in found
-        if (bodies is None or m.body in bodies) and (markers is None or m.name in markers)
-    ]
+    chosen = [m for m in document.markers if markers is None or m.name in markers]
     riders = [rider for m in chosen if (rider := tree.placed(m)) is not None]
     keep = tree.needed({m.segment for m in riders}) if riders else set(tree.segments)
     if not riders:
@@ -107,38 +101,6 @@ def read_osim(
     except InvalidChainModelError as error:
         raise MalformedFileError(f"{path}: {error}") from error
     return ImportedModel(require_metres(path, model), tuple(tree.remarks))
-
-
-def read_marker_set(path: Path) -> tuple[OsimMarker, ...]:
-    """Return the markers of an OpenSim marker-set XML, in OpenSim's axes."""
-    try:
-        found = markers_of(read_xml(path))
-    except ValueError as error:
-        raise MalformedFileError(f"{path}: {error}") from error
-    if not found:
-        raise MalformedFileError(
-            f"{path}: no markers in it (expected OpenSimDocument with a MarkerSet)"
-        )
-    return found
-
-
-def _check(
-    path: Path,
-    document: OsimDocument,
-    found: tuple[OsimMarker, ...],
-    bodies: Collection[str] | None,
-    markers: Collection[str] | None,
-) -> None:
-    names = {m.name for m in found}
-    unknown = [f"no body {b!r}" for b in bodies or () if b not in document.bodies]
-    unknown += [f"no marker {m!r}" for m in markers or () if m not in names]
-    unknown += [
-        f"marker {m.name!r} on unknown body {m.body!r}"
-        for m in found
-        if m.body not in document.bodies and m.body != GROUND
-    ]
-    if unknown:
-        raise MalformedFileError(f"{path}: {'; '.join(unknown)}")
 
 
 class _Tree:
@@ -165,9 +127,9 @@ class _Tree:
                 self._add(joint.parent.body, joint.child.body, nearest)
             waiting = [j for j in waiting if j not in ready]
 
-        loose = [b for b in document.bodies if b not in self._at]
-        for body in loose:
-            self._add(GROUND, body, None)
+        for body in document.bodies:
+            if body not in self._at:
+                self._add(GROUND, body, None)
 
     def _add(self, parent_body: str, body: str, joint: NearestJoint | None) -> None:
         """Attach a body to its parent; without a `joint` it moves freely."""

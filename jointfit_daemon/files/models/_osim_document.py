@@ -89,10 +89,10 @@ def read_document(path: Path) -> OsimDocument:
     Raises
     ------
     MalformedFileError
-            Not an OpenSim 4 model, invalid XML, a document type declaration, an oversized file, or
+        Not an OpenSim 4 model, invalid XML, a document type declaration, an oversized file, or
         a unit of length other than metres.
     """
-    root = read_xml(path)
+    root = _read_xml(path)
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
         raise MalformedFileError(
@@ -106,12 +106,18 @@ def read_document(path: Path) -> OsimDocument:
     unit = text_of(model, "length_units", _METRES)
     if unit != _METRES:
         raise MalformedFileError(f"{path}: length_units is {unit!r}, expected {_METRES!r}")
+    markers = []
     try:
+        for marker in model.iterfind("MarkerSet/objects/Marker"):
+            socket = text_of(marker, "socket_parent_frame") or text_of(marker, "body")
+            location = numbers_of(marker, "location", 3)
+            fixed = text_of(marker, "fixed") == "true"
+            markers.append(OsimMarker(marker.get("name", ""), body_of(socket), location, fixed))
         return OsimDocument(
             model.get("name", path.stem),
             tuple(body.get("name", "") for body in model.iterfind("BodySet/objects/Body")),
             tuple(_joint(joint) for joint in model.iterfind("JointSet/objects/*")),
-            markers_of(model),
+            tuple(markers),
             tuple(
                 constraint.get("name", constraint.tag)
                 for constraint in model.iterfind("ConstraintSet/objects/*")
@@ -122,7 +128,7 @@ def read_document(path: Path) -> OsimDocument:
         raise MalformedFileError(f"{path}: {error}") from error
 
 
-def read_xml(path: Path) -> ET.Element:
+def _read_xml(path: Path) -> ET.Element:
     """Return the root of an XML file without a document type; `MalformedFileError` otherwise."""
     reject_device(path)
     if path.stat().st_size > LARGEST:
@@ -193,17 +199,6 @@ def fixed_xyz(angles: Array) -> Array:
         turn[j, k] = -turn[k, j]
         turns.append(turn)
     return np.asarray(turns[0] @ turns[1] @ turns[2])
-
-
-def markers_of(element: ET.Element) -> tuple[OsimMarker, ...]:
-    """Return the markers of a Model or a document with a MarkerSet."""
-    found = []
-    for marker in element.iterfind("MarkerSet/objects/Marker"):
-        socket = text_of(marker, "socket_parent_frame") or text_of(marker, "body")
-        location = numbers_of(marker, "location", 3)
-        fixed = text_of(marker, "fixed") == "true"
-        found.append(OsimMarker(marker.get("name", ""), body_of(socket), location, fixed))
-    return tuple(found)
 
 
 def _joint(joint: ET.Element) -> OsimJoint:

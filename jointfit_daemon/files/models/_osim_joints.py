@@ -71,10 +71,10 @@ def nearest_joint(joint: OsimJoint) -> NearestJoint:
     turning = [c for c in moving if c.name in motion.turning]
     shifting = [c for c in moving if c.name in motion.shifting and c not in turning]
 
-    rest = _sampled(joint, motion, {})
-    welded = NearestJoint(
-        None, _transform(rest), rest[1][0], np.zeros(3), np.array([1.0, 0.0, 0.0]), None, ()
-    )
+    turns, shifts = _sampled(joint, motion, {})
+    rest = np.eye(4)
+    rest[:3, :3], rest[:3, 3] = turns[0], shifts[0]
+    welded = NearestJoint(None, rest, shifts[0], np.zeros(3), np.eye(3)[0], None, ())
     remarks = [f"{joint.name}: {c.name} is locked and fixed" for c in joint.coordinates if c.locked]
     if shifting and (joint.parent.body == GROUND or len(shifting) == _ALL):
         if len(moving) < 2 * _ALL:
@@ -114,12 +114,6 @@ def _sampled(
     turned = above[:3, :3] @ own
     shifted = shifts @ above[:3, :3].T + above[:3, 3]
     return turned @ below[:3, :3], shifted + turned @ below[:3, 3]
-
-
-def _transform(pose: tuple[Array, Array]) -> Array:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = pose[0][0], pose[1][0]
-    return out
 
 
 def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Array, float]:

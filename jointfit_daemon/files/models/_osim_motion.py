@@ -70,7 +70,11 @@ class JointMotion:
                     f"joint {joint.name}: {len(self.names)} coordinates, expected {needed} for a "
                     f"{joint.kind}"
                 )
-            axes = _in_order(vectors, self.names)
+            waiting = iter(self.names)
+            axes = [
+                ("", _X, np.zeros_like) if axis is None else (next(waiting), axis, np.asarray)
+                for axis in vectors
+            ]
         else:
             raise ValueError(f"joint {joint.name}: {joint.kind} is not supported")
         if len(axes) != 2 * _TURNING:
@@ -113,14 +117,6 @@ class JointMotion:
 
 def _padded(vectors: list[Array]) -> list[Array | None]:
     return [*vectors, *[None] * (3 - len(vectors))]
-
-
-def _in_order(vectors: list[Array | None], names: list[str]) -> list[tuple[str, Array, Function]]:
-    waiting = iter(names)
-    return [
-        ("", _X, np.zeros_like) if axis is None else (next(waiting), axis, np.asarray)
-        for axis in vectors
-    ]
 
 
 def _custom(axis: Element) -> tuple[str, Array, Function]:

@@ -137,7 +137,7 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
         )
     z_up = "up" in arrays and str(arrays["up"]) == "z"
     turn = _unit if z_up else quaternions_z_up
-    move = _plain if z_up else vectors_z_up
+    move = np.asarray if z_up else vectors_z_up
 
     t_s = _numbers(path, arrays, "t", None)
     require_times(path, t_s)
@@ -175,10 +175,6 @@ def _unit(quaternions: ArrayLike) -> NDArray[np.float64]:
     norms = np.linalg.norm(found, axis=-1, keepdims=True)
     unit: NDArray[np.float64] = found / np.where(norms > 0.0, norms, np.nan)  # 0 0 0 0: missing
     return unit
-
-
-def _plain(vectors: ArrayLike) -> NDArray[np.float64]:
-    return np.asarray(vectors, dtype=np.float64)
 
 
 def write_orientations_npz(path: Path, trial: OrientationTrial) -> None:

@@ -7,7 +7,7 @@ table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +26,7 @@ from jointfit_daemon.files.text import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -51,8 +51,6 @@ class TimeTable:
     in_degrees: bool
     name: str = ""
     """First header line."""
-    header: Mapping[str, str] = field(default_factory=dict)
-    """Keys in lower case, values as written."""
     warnings: tuple[str, ...] = ()
 
     def column(self, name: str) -> NDArray[np.float64]:
@@ -93,7 +91,7 @@ def read_sto(path: Path) -> TimeTable:
     )
 
     in_degrees = header.get("indegrees", "no").lower() in {"yes", "true", "1"}
-    return TimeTable(columns[1:], rows[:, 0], rows[:, 1:], in_degrees, name, header, doubts)
+    return TimeTable(columns[1:], rows[:, 0], rows[:, 1:], in_degrees, name, doubts)
 
 
 def read_orientations_sto(path: Path) -> OrientationTable:

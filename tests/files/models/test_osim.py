@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.files.models import read_osim, to_y_up, to_z_up
-from jointfit_daemon.files.models._osim import read_marker_set
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics.chains import apply_step, marker_positions, rest_state
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
@@ -264,14 +263,18 @@ def test_welded_and_locked_bodies_become_part_of_their_parents(
     assert tracking_error(solve_frames(imported.model, to_z_up(placed)).residuals) < 1e-9
 
 
+def markers_on(*bodies: str) -> list[str]:
+    return [name for name, body, *_ in MARKERS if body in bodies]
+
+
 def test_bodies_that_no_marker_needs_are_left_out(tmp_path: Path) -> None:
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
-    upper = read_osim(path, bodies=["pelvis", "femur"])
+    upper = read_osim(path, markers=markers_on("pelvis", "femur"))
     assert upper.model.segment_names == ("pelvis", "femur")
     assert any("tibia" in remark for remark in upper.remarks)
-    lower = read_osim(path, bodies=["femur", "tibia"]).model
+    lower = read_osim(path, markers=markers_on("femur", "tibia")).model
     assert [s.joint.kind for s in lower.segments] == ["free", "hinge"]
-    ends = read_osim(path, bodies=["pelvis", "tibia"]).model
+    ends = read_osim(path, markers=markers_on("pelvis", "tibia")).model
     assert ends.segment_names == ("pelvis", "femur", "tibia")
     assert len(read_osim(path, markers=["tibia1", "tibia2"]).model.markers) == 2
 
@@ -330,8 +333,8 @@ def test_unsupported_elements_are_rejected_by_name(tmp_path: Path, text: str, sa
 
 def test_unknown_names_are_reported_together(tmp_path: Path) -> None:
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
-    with pytest.raises(MalformedFileError, match="no body 'shin'; no marker 'tibia9'"):
-        read_osim(path, bodies=["shin"], markers=["tibia9"])
+    with pytest.raises(MalformedFileError, match="no marker 'shin'; no marker 'tibia9'"):
+        read_osim(path, markers=["shin", "tibia9"])
 
 
 def test_millimetres_are_rejected_with_or_without_a_declared_unit(tmp_path: Path) -> None:
@@ -372,16 +375,6 @@ def test_the_published_models_are_read(shared_data: Path) -> None:
     rest = marker_positions(cap, apply_step(cap, rest_state(cap), np.zeros((1, cap.nq))))
     height = rest[0, :, 2].max() - rest[0, :, 2].min()
     assert 1.3 < height < 1.9  # z is up, as in the world
-
-
-def test_a_marker_set_replaces_the_markers_of_a_model(shared_data: Path) -> None:
-    folder = shared_data / "opensim_gait2354"
-    assert len(read_marker_set(folder / "gait2354_Scale_MarkerSet.xml")) == 39
-    bare = read_osim(
-        folder / "gait2354_simbody.osim", marker_set=folder / "gait2354_Scale_MarkerSet.xml"
-    )
-    assert len(bare.model.markers) == 39
-    assert bare.model.nq == 21
 
 
 def test_the_published_model_moves_its_markers_as_opensim_does(
