@@ -1,8 +1,13 @@
 """Joint positions and angles from body-worn IMUs in real time."""
 
-from importlib.metadata import PackageNotFoundError, version
 
-try:
-    __version__ = version("jointfitd")
-except PackageNotFoundError:  # a checkout that is not installed
-    __version__ = "0+unknown"
+def __getattr__(name: str) -> str:
+    """Return ``__version__``, read on demand: the metadata of packages is slow to import."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - on demand
+
+    try:
+        return version("jointfitd")
+    except PackageNotFoundError:  # a checkout that is not installed
+        return "0+unknown"

@@ -17,8 +17,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jointfit_daemon import __version__
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -33,7 +31,16 @@ THREADS_TIMEOUT_S = 2.0
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jointfitd`` and return its exit code."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.version:
+        from jointfit_daemon import __version__
+
+        print(f"jointfitd {__version__}")
+        return 0
+    if options.config is None:
+        parser.error("the following arguments are required: --config")
+
     from jointfit_daemon.config import ConfigError, load_rig
 
     try:
@@ -73,11 +80,12 @@ def _lock_state_directory() -> bool:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jointfitd",
+        usage="%(prog)s [-h] --config rig.toml [--check] [--log-level LEVEL] [--version]",
         description="Read IMUs and motion capture, publish joint angles over MQTT.",
         epilog="Exit codes: 0 stopped, 1 bug, 2 options or rig.toml, 3 state directory in use.",
     )
     parser.add_argument(
-        "--config", type=Path, required=True, metavar="rig.toml", help="configuration of the rig"
+        "--config", type=Path, metavar="rig.toml", help="configuration of the rig (required)"
     )
     parser.add_argument("--check", action="store_true", help="check rig.toml and exit")
     parser.add_argument(
@@ -86,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         default="info",
         help="lowest level of log lines (default: info)",
     )
-    parser.add_argument("--version", action="version", version=f"jointfitd {__version__}")
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
     return parser
 
 

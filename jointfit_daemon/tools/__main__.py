@@ -10,7 +10,6 @@ import os
 
 import typer
 
-from jointfit_daemon import __version__
 from jointfit_daemon.tools import fuse
 from jointfit_daemon.tools.calibrate import calibrate
 from jointfit_daemon.tools.center import center
@@ -39,6 +38,8 @@ app.add_typer(fuse.app)
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from jointfit_daemon import __version__
+
         typer.echo(__version__)
         raise typer.Exit
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+import sys
 from pathlib import Path
 
 import orjson
@@ -91,3 +93,12 @@ def test_a_result_that_is_not_taken_ends_with_3_and_the_reason(
     assert result.exit_code == code
     assert "told" in result.stdout
     assert (kept or "") in result.stderr
+
+
+def test_help_does_not_load_the_metadata_of_packages() -> None:
+    code = (
+        "import sys, jointfit_daemon.__main__, jointfit_daemon.tools.__main__;"
+        "print('importlib.metadata' in sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "False"
