@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.files.mocap import read_trc
-from jointfit_daemon.files.mocap._c3d import read_c3d_with_up
+from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_model, read_osim
 from jointfit_daemon.files.orientations import read_orientations_npz, read_orientations_sto
 from jointfit_daemon.tools.__main__ import app
@@ -56,7 +56,7 @@ def test_a_folder_with_something_in_it_is_refused_unless_forced(tmp_path: Path) 
 
 def test_the_c3d_file_holds_the_markers_of_the_trc_file(sample: Path) -> None:
     pytest.importorskip("c3d")
-    c3d, up = read_c3d_with_up(sample / "squats.c3d")
+    c3d, up = read_c3d(sample / "squats.c3d")
     trc = read_trc(sample / "squats.trc")
     assert up == "y"
     assert c3d.names == trc.names
