@@ -276,3 +276,46 @@ class LimbState(NamedTuple):
     """`FrameFlag`, those of one sensor, segment or joint with its name."""
     segments: tuple[SegmentState, ...]
     joints: tuple[JointState, ...]
+
+
+class OpticalSegment(NamedTuple):
+    """One segment as the cameras see it."""
+
+    name: str
+    q_world_segment: Quaternion | None
+    """None while fewer than three of its markers are visible."""
+    residual: float | None
+    """Angle between the orientations from the IMUs and from the cameras, rad."""
+    residual_rms: float | None
+    """RMS of `residual` over the last seconds, rad."""
+
+
+class OpticalJoint(NamedTuple):
+    """One joint as the cameras see it; residuals are IMU minus cameras."""
+
+    name: str
+    position: Vector | None
+    """Mean of the joint center as carried by the two adjacent body parts, m."""
+    gap: float | None
+    """Distance between these two, m; None unless both are visible."""
+    distance: float | None
+    """Distance between the positions from the IMUs and from the cameras, m."""
+    distance_rms: float | None
+    """RMS of `distance` over the last seconds, m."""
+    angles: JointAngles | None = None
+    inner: float | None = None
+    """Included angle between the two segments, rad."""
+    residual: JointAngles | None = None
+    """Differences of the angles, rad, within half a turn."""
+    residual_rms: JointAngles | None = None
+    """RMS of `residual` over the last seconds, rad."""
+
+
+class OpticalState(NamedTuple):
+    """The limb as the cameras see it in one frame, and the errors of the IMUs against it."""
+
+    number: int
+    """Frame number of the camera server."""
+    t_ns: int
+    segments: tuple[OpticalSegment, ...]
+    joints: tuple[OpticalJoint, ...]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.fusion._cluster_point import ClusterPoint
+from jointfit_daemon.fusion._cluster_pose import ClusterPose
 from jointfit_daemon.limb_model import restore_cluster
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class OpticalOrigin:
         self._center: Vector | None = None
         self._clusters: list[MarkerCluster] = []
         self._layout: MocapLayout | None = None
-        self._points: list[ClusterPoint] = []
+        self._poses: list[ClusterPose] = []
         if calibration is None:
             return
         found = calibration.joint.get(chain.joints[0])
@@ -46,11 +46,11 @@ class OpticalOrigin:
             return None
         if frame.layout is not self._layout:
             self._layout = frame.layout
-            center = np.array(self._center)
-            self._points = [ClusterPoint(c, center, frame.layout) for c in self._clusters]
+            center = np.array([self._center])
+            self._poses = [ClusterPose(c, center, frame.layout) for c in self._clusters]
 
-        for point in self._points:
-            position = point.locate(frame)
-            if position is not None:
-                return position
+        for pose in self._poses:
+            fitted = pose.fit(frame)
+            if fitted is not None:
+                return fitted.points[0]
         return None

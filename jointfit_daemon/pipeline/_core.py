@@ -14,6 +14,7 @@ from jointfit_daemon.model import Corrupt, DeviceEvent, FusionMode, ImuSample, S
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
 from jointfit_daemon.pipeline._mocap_router import MocapRouter
 from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_notices
+from jointfit_daemon.pipeline._optical_comparison import OpticalComparison
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
     CalibrationStored,
@@ -83,6 +84,7 @@ class Core:
         self._lag_ns: dict[str, int] = {}
         self._lags: LagMonitor | None = None
         self._collector: OnlineFrameCollector
+        self._comparison: OpticalComparison
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
             SourceOpened: self._open_source,
@@ -202,6 +204,7 @@ class Core:
         self._mocap.set_calibration(rig.chain, usable)
         self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
         self._lag_ns |= self._lags.known_ns()
+        self._comparison = OpticalComparison(rig.chain, usable, rig.mqtt.optical_hz)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
 
@@ -276,6 +279,8 @@ class Core:
                 outputs += self._add_sample(source, measurement, stamp)
             else:
                 self._mocap.add(self._now_ns, item, self._session, self._lags, self._collector)
+                if measurement.live:
+                    self._comparison.add_frame(stamp.t_ns, measurement, synced=stamp.synced)
         return outputs
 
     def _report(self, source: str, state: SourceState, item: Corrupt | DeviceEvent) -> list[Output]:
@@ -315,7 +320,10 @@ class Core:
             return []
         now_ns = self._now_ns
         frames = self._aligner.advance(now_ns, complete_only=complete_only)
-        outputs: list[Output] = [self._fuse(frame) for frame in frames]
+        outputs: list[Output] = []
+        for frame in frames:
+            state = self._fuse(frame)
+            outputs += (state, *self._comparison.add_state(state))
         if outputs and self._lags is not None:
             outputs += self._lags.step(now_ns)
 

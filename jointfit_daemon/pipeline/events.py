@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.model import LimbState
+from jointfit_daemon.model import LimbState, OpticalState
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -287,6 +287,7 @@ class Reply:
 
 Output = (
     LimbState
+    | OpticalState
     | Notice
     | DeviceStatus
     | DeviceInfo

@@ -158,3 +158,10 @@ def test_zero_quaternion_normalizes_to_nan() -> None:
     assert np.isnan(rot.normalize(np.array([[0.0, 0, 0, 0], [np.nan, 1, 0, 0]]))).all()
     with pytest.raises(ZeroDivisionError):
         one.normalize_one((0.0, 0.0, 0.0, 0.0))
+
+
+@given(quaternions)
+def test_scalar_matrix_conversion_equals_that_of_arrays(q: Quaternion) -> None:
+    R = rot.to_matrix(q)
+    found = one.from_matrix_one(R.tolist())
+    assert found == pytest.approx(tuple(rot.from_matrix(R)), abs=1e-12)

@@ -29,7 +29,9 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 SETTLE_S = 1.7
 """A motion blends into the next for 1.5 s; s."""
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "mqtt.md"
-TOPICS = ("pose/ui", "joint/+", "calibration/progress", "bridge/log", "device/+/info")
+TOPICS = (
+    "pose/ui", "optical/pose", "joint/+", "calibration/progress", "bridge/log", "device/+/info",
+)  # fmt: skip
 """Topics beside those of the listener."""
 NAMES = {
     *SENSORS, *(f"{a}{mark}{b}" for a in SENSORS for b in SENSORS for mark in "~+"),
@@ -48,15 +50,20 @@ class CalibratedRun:
     recording: Path
     keys: dict[str, set[str]]
     """Keys of all payloads, by topic."""
+    optical: list[dict[str, Any]]
+    """Payloads of `optical/pose`."""
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
     station = Station(folder, port, more_toml="[recording]\n")
     found: dict[str, set[str]] = {}
+    optical: list[dict[str, Any]] = []
     take = Listener._take
 
     def note(self: Listener, topic: str, payload: Any) -> None:
         found.setdefault(topic, set()).update(keys(payload))
+        if topic == "optical/pose":
+            optical.append(payload)
         take(self, topic, payload)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -79,7 +86,7 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             assert code == 0, station.log
 
     (recording,) = (folder / "state" / "recordings").iterdir()
-    return CalibratedRun(station.log, recording, found)
+    return CalibratedRun(station.log, recording, found, optical)
 
 
 async def calibrate(simulator: Simulator, listener: Listener) -> None:
@@ -146,6 +153,8 @@ async def test_payloads_log_and_replay_of_a_calibrated_run(
         compare_keys_with_the_page(run)
     with subtests.test("the log has one line for each phase and no output of the worker"):
         count_phases_in_the_log(run)
+    with subtests.test("cameras and IMUs are compared at one instant"):
+        judge_the_optical_reference(run)
     with subtests.test("the event log replays to byte-identical limb states"):
         replay_the_recording(run)
 
@@ -171,6 +180,17 @@ def count_phases_in_the_log(run: CalibratedRun) -> None:
     ):  # fmt: skip
         assert run.log.count(line) == 1, (line, run.log)
     assert "output of the worker" not in run.log  # fits print nothing
+
+
+def judge_the_optical_reference(run: CalibratedRun) -> None:
+    rate_hz = (len(run.optical) - 1) / (run.optical[-1]["t_us"] - run.optical[0]["t_us"]) * 1e6
+    assert 10 < rate_hz <= 25.5  # a pause while the daemon reloads
+    knees = [payload["joints"]["knee"] for payload in run.optical]
+    compared = [knee for knee in knees if knee["residual"] is not None]
+    assert len(compared) > 0.5 * len(knees)
+    assert 0.0 < compared[-1]["residual_rms"]["flexion_deg"] < 8.0
+    assert 0.0 < compared[-1]["residual_rms_m"] < 0.05
+    assert 0.0 < compared[-1]["gap_m"] < 0.03
 
 
 def replay_the_recording(run: CalibratedRun) -> None:

@@ -17,7 +17,13 @@ from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from jointfit_daemon.model import LimbState, SegmentState
+    from jointfit_daemon.model import (
+        JointAngles,
+        LimbState,
+        OpticalJoint,
+        OpticalState,
+        SegmentState,
+    )
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_NON_STR_KEYS
 _NS_PER_US, _NS_PER_MS = 1_000, 1_000_000
@@ -93,6 +99,55 @@ def encode_joint(state: LimbState, number: int, t_us: int) -> bytes:
     return encode({"v": PAYLOAD_VERSION, "t_us": t_us} | scalars)
 
 
+def encode_optical(state: OpticalState, offset_ns: int) -> bytes:
+    """Return the payload of ``optical/pose``; `offset_ns` as for `encode_pose`."""
+    return encode(
+        {
+            "v": PAYLOAD_VERSION,
+            "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
+            "frame": state.number,
+            "segments": {
+                segment.name: {
+                    "q": _rounded(segment.q_world_segment, 5),
+                    "residual_deg": _degrees(segment.residual),
+                    "residual_rms_deg": _degrees(segment.residual_rms),
+                }
+                for segment in state.segments
+            },
+            "joints": {
+                joint.name: _optical_joint(joint, inner=0 < i < len(state.joints) - 1)
+                for i, joint in enumerate(state.joints)
+            },
+        }
+    )
+
+
+def _optical_joint(joint: OpticalJoint, *, inner: bool) -> dict[str, Any]:
+    shown: dict[str, Any] = {
+        "p_m": _rounded(joint.position, 4),
+        "gap_m": _metres(joint.gap),
+        "residual_m": _metres(joint.distance),
+        "residual_rms_m": _metres(joint.distance_rms),
+    }
+    if not inner:
+        return shown
+    return shown | {
+        **_angles(joint.angles),
+        "inner_deg": _degrees(joint.inner),
+        "residual": None if joint.residual is None else _angles(joint.residual),
+        "residual_rms": None if joint.residual_rms is None else _angles(joint.residual_rms),
+    }
+
+
+def _angles(angles: JointAngles | None) -> dict[str, float | None]:
+    names = ("flexion_deg", "adduction_deg", "rotation_deg")
+    return dict(zip(names, map(_degrees, angles or _NO_ANGLES), strict=True))
+
+
+def _metres(length: float | None) -> float | None:
+    return None if length is None else round(length, 4)
+
+
 def _segment(segment: SegmentState) -> dict[str, Any]:
     return {
         "q": _rounded(segment.q_world_segment, 5),
@@ -105,7 +160,7 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
     joint = state.joints[number]
     shown: dict[str, Any] = {
         "p_m": _rounded(joint.position, 4),
-        "sd_m": None if joint.position_sd is None else round(joint.position_sd, 4),
+        "sd_m": _metres(joint.position_sd),
     }
     inner = 0 < number < len(state.joints) - 1
     if not inner and joint.angles is None:

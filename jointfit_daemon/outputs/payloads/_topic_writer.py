@@ -12,10 +12,15 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon import __version__
-from jointfit_daemon.model import LimbState
+from jointfit_daemon.model import LimbState, OpticalState
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
-from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint, encode_pose
+from jointfit_daemon.outputs.payloads._encoding import (
+    encode,
+    encode_joint,
+    encode_optical,
+    encode_pose,
+)
 from jointfit_daemon.outputs.payloads._health_encoding import health_payload
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from jointfit_daemon.outputs.topics import OFFLINE, ONLINE, PAYLOAD_VERSION
@@ -100,6 +105,9 @@ class TopicWriter:
         match output:
             case LimbState():
                 self._publish_limb_state(output)
+            case OpticalState():
+                offset_ns = self._clock.offset_ns()
+                self._publish(topics.OPTICAL_POSE, encode_optical(output, offset_ns))
             case Notice():
                 self.publish_notice(output)
             case DeviceStatus(name, online):

@@ -20,6 +20,9 @@ from jointfit_daemon.model import (
     JointAngles,
     JointState,
     LimbState,
+    OpticalJoint,
+    OpticalSegment,
+    OpticalState,
     SegmentState,
     SyncState,
 )
@@ -31,7 +34,7 @@ from jointfit_daemon.outputs.payloads import (
     TopicWriter,
     encode_pose,
 )
-from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint
+from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint, encode_optical
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
@@ -316,3 +319,40 @@ async def test_reply_is_published_on_the_requested_topic(
         "error": None,
     }  # fmt: skip
     assert (own.topic, own.correlation, own.expiry_s) == ("my/answers", b"9", 30)
+
+
+def test_optical_pose_has_residuals_beside_what_the_cameras_see() -> None:
+    angles = JointAngles(math.radians(26.91), math.radians(-0.52), math.radians(2.71))
+    errors = JointAngles(math.radians(0.774), math.radians(-0.19), 0.0)
+    state = OpticalState(
+        88213,
+        5_000_123_000,
+        (
+            OpticalSegment("thigh", (1.0, 0.0, 0.0, 0.0), math.radians(1.1), math.radians(1.3)),
+            OpticalSegment("shank", None, None, None),
+        ),
+        (
+            OpticalJoint("hip", (0.07741, 0.0301, 0.9287), 0.00414, None, None),
+            OpticalJoint("knee", None, None, 0.0087, 0.0092, angles, 2.5, errors, errors),
+            OpticalJoint("ankle", None, None, None, None),
+        ),
+    )
+    nothing = {"p_m": None, "gap_m": None, "residual_m": None, "residual_rms_m": None}
+    residual = {"flexion_deg": 0.77, "adduction_deg": -0.19, "rotation_deg": 0.0}
+    assert json.loads(encode_optical(state, 1_000_000)) == {
+        "v": 1,
+        "t_us": 5_001_123,
+        "frame": 88213,
+        "segments": {
+            "thigh": {"q": [1.0, 0.0, 0.0, 0.0], "residual_deg": 1.1, "residual_rms_deg": 1.3},
+            "shank": {"q": None, "residual_deg": None, "residual_rms_deg": None},
+        },
+        "joints": {
+            "hip": nothing | {"p_m": [0.0774, 0.0301, 0.9287], "gap_m": 0.0041},
+            "knee": nothing
+            | {"residual_m": 0.0087, "residual_rms_m": 0.0092}
+            | {"flexion_deg": 26.91, "adduction_deg": -0.52, "rotation_deg": 2.71}
+            | {"inner_deg": 143.24, "residual": residual, "residual_rms": residual},
+            "ankle": nothing,
+        },
+    }

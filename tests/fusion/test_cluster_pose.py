@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.fusion._cluster_point import ClusterPoint
+from jointfit_daemon.fusion._cluster_pose import ClusterPose
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MarkerCluster, rigid_fit
 from jointfit_daemon.model import MocapFrame, MocapLayout
@@ -36,7 +36,7 @@ def seen(positions: np.ndarray) -> MocapFrame:
     st.sampled_from([1.0, 0.001, 0.0]),
     st.sampled_from([0.0, 0.002, 0.02, 0.2]),
 )
-def test_point_agrees_with_the_fit_of_a_trial(
+def test_pose_agrees_with_the_fit_of_a_trial(
     seed: int, hidden: list[bool], thickness: float, scatter: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -45,31 +45,38 @@ def test_point_agrees_with_the_fit_of_a_trial(
     positions = turn.apply(template) + rng.normal(size=3) + rng.normal(0, scatter, (5, 3))
     positions[hidden] = np.nan
     part = cluster(template)
-    found = ClusterPoint(part, POINT, LAYOUT).locate(seen(positions))
+    found = ClusterPose(part, POINT[None], LAYOUT).fit(seen(positions))
     q, t, rms = (each[0] for each in rigid_fit(template, positions[None]))
     if not rms <= MAX_FIT_RMS_M:
         assert found is None
     else:
         assert found is not None
-        np.testing.assert_allclose(found, rotation.rotate(q, POINT - part.origin) + t, atol=1e-6)
+        expected = rotation.rotate(q, POINT - part.origin) + t
+        np.testing.assert_allclose(found.points[0], expected, atol=1e-6)
+        np.testing.assert_allclose(rotation.to_matrix(found.q), rotation.to_matrix(q), atol=1e-6)
 
 
-def test_rigid_body_moves_the_point() -> None:
+def test_rigid_body_moves_the_points() -> None:
     part = cluster(np.eye(3), body="Pelvis")
     frame = seen(np.zeros((5, 3)))
-    point = ClusterPoint(part, POINT, LAYOUT)
-    assert point.locate(frame) is None
+    pose = ClusterPose(part, POINT[None], LAYOUT)
+    assert pose.fit(frame) is None
     frame.body_positions[1], frame.body_orientations[1] = part.origin, part.q_body
-    assert point.locate(frame) == pytest.approx(tuple(POINT))
+    fitted = pose.fit(frame)
+    assert fitted is not None
+    assert fitted.points[0] == pytest.approx(tuple(POINT))
     turned = Rotation.from_euler("z", 90, degrees=True)
     body = turned * Rotation.from_quat(part.q_body, scalar_first=True)
     frame.body_orientations[1] = body.as_quat(scalar_first=True)
     expected = turned.apply(POINT - part.origin) + part.origin
-    assert point.locate(frame) == pytest.approx(tuple(expected))
+    fitted = pose.fit(frame)
+    assert fitted is not None
+    assert fitted.points[0] == pytest.approx(tuple(expected))
+    np.testing.assert_allclose(rotation.to_matrix(fitted.q), turned.as_matrix(), atol=1e-12)
 
 
 def test_stream_without_markers_or_body_gives_none() -> None:
     frame = seen(np.zeros((5, 3)))
     bare = MocapLayout(NAMES[:-1], ("other",))
     for part in (cluster(np.eye(5, 3)), cluster(np.eye(3), body="Pelvis")):
-        assert ClusterPoint(part, POINT, bare).locate(frame) is None
+        assert ClusterPose(part, POINT[None], bare).fit(frame) is None

@@ -1,4 +1,4 @@
-"""Position of a point fixed to a marker cluster, in single mocap frames.
+"""Pose of a marker cluster, and of points fixed to it, in single mocap frames.
 
 The fit is that of ``calibration.markers.rigid_fit``, to rounding. Quantities that do not change
 from frame to frame are computed once for each set of visible markers, which takes a tenth of the
@@ -15,6 +15,7 @@ import numpy as np
 from jointfit_daemon.kinematics.rotation_scalar import (
     as_quaternion,
     conjugate_one,
+    from_matrix_one,
     multiply_one,
     rotate_one,
 )
@@ -23,7 +24,7 @@ from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.limb_model import MarkerCluster
-    from jointfit_daemon.model import MocapFrame, MocapLayout, Vector
+    from jointfit_daemon.model import MocapFrame, MocapLayout, Quaternion, Vector
 
 
 class _MarkerSubset(NamedTuple):
@@ -33,49 +34,58 @@ class _MarkerSubset(NamedTuple):
     """Rows of the cluster template."""
     centered: Array
     """Transposed template about the mean of these markers, m, shape (3, k)."""
-    offset: Array
-    """Vector from that mean to the point, static world, m, shape (3,)."""
+    offsets: Array
+    """Vectors from that mean to the points, static world, m, shape (n, 3)."""
     moment: float
     """Sum of the squares of `centered`, m²."""
 
 
-class ClusterPoint:
-    """A point fixed to a cluster, for frames of one layout.
+class FittedPose(NamedTuple):
+    """Rigid motion of a cluster from the static pose to one frame."""
+
+    q: Quaternion
+    """q_optical_static: from the static world to the optical world."""
+    points: list[Vector]
+    """Positions of the fixed points, optical world, m."""
+
+
+class ClusterPose:
+    """Pose of a cluster in frames of one layout.
 
     Parameters
     ----------
     cluster : MarkerCluster
         Markers of the body part, or its rigid body.
-    point : ndarray, shape (3,)
-        The point in the static world, m.
+    points : ndarray, shape (n, 3)
+        Points fixed to the cluster, such as joint centers, in the static world, m.
     layout : MocapLayout
         Layout of the frames.
     """
 
-    def __init__(self, cluster: MarkerCluster, point: Array, layout: MocapLayout) -> None:
+    def __init__(self, cluster: MarkerCluster, points: Array, layout: MocapLayout) -> None:
         self._cluster = cluster
-        self._offset: Array = point - cluster.origin
+        self._offsets: Array = points - cluster.origin
         self._subsets: dict[bytes, _MarkerSubset | None] = {}
         self._columns = _columns(cluster, layout)
 
-    def locate(self, frame: MocapFrame) -> Vector | None:
-        """Return the point in the optical world, m, or None if too few markers are visible."""
+    def fit(self, frame: MocapFrame) -> FittedPose | None:
+        """Return the pose in `frame`, or None if too few markers are visible."""
         if self._columns is None:
             return None
         if self._cluster.body is None:
-            return self._locate_by_markers(frame.markers[self._columns])
+            return self._fit_markers(frame.markers[self._columns])
 
         column = self._columns[0]
-        x, y, z = frame.body_positions[column].tolist()
-        q_body = as_quaternion(frame.body_orientations[column].tolist())
-        q = multiply_one(q_body, conjugate_one(as_quaternion(self._cluster.q_body)))
-        ax, ay, az = self._offset.tolist()
-        dx, dy, dz = rotate_one(q, (ax, ay, az))
-        position = (x + dx, y + dy, z + dz)
-        return position if all(map(isfinite, position)) else None
+        x, y, z = position = frame.body_positions[column].tolist()
+        now = as_quaternion(frame.body_orientations[column].tolist())
+        if not all(map(isfinite, (*position, *now))):
+            return None
+        q = multiply_one(now, conjugate_one(as_quaternion(self._cluster.q_body)))
+        turned = [rotate_one(q, offset) for offset in _vectors(self._offsets)]
+        return FittedPose(q, [(x + dx, y + dy, z + dz) for dx, dy, dz in turned])
 
-    def _locate_by_markers(self, seen: Array) -> Vector | None:
-        r"""Return the point from the visible markers, by the rotation of Kabsch (1976).
+    def _fit_markers(self, seen: Array) -> FittedPose | None:
+        r"""Return the pose from the visible markers, by the rotation of Kabsch (1976).
 
         With the singular values s of the cross moment and the sign d of the third axis, the sum of
         squared residuals is :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 + d s_3)`.
@@ -98,8 +108,8 @@ class ClusterPoint:
         residual = subset.moment + float((y * y).sum()) - 2.0 * float(s[0] + s[1] + sign * s[2])
         if not residual <= MAX_FIT_RMS_M**2 * count:
             return None
-        px, py, pz = ((subset.offset @ u) @ vt + mean).tolist()
-        return px, py, pz
+        points = np.array([(offset @ u) @ vt + mean for offset in subset.offsets])
+        return FittedPose(from_matrix_one((u @ vt).T.tolist()), _vectors(points))
 
     def _subset(self, visible: bytes) -> _MarkerSubset | None:
         rows = [row for row, seen in enumerate(visible) if seen]
@@ -108,7 +118,7 @@ class ClusterPoint:
             return None
         mean = template.mean(axis=0)
         centered = (template - mean).T.copy()
-        return _MarkerSubset(rows, centered, self._offset - mean, float((centered**2).sum()))
+        return _MarkerSubset(rows, centered, self._offsets - mean, float((centered**2).sum()))
 
 
 def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
@@ -118,6 +128,10 @@ def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
     if any(marker not in layout.markers for marker in cluster.markers):
         return None
     return [layout.markers.index(marker) for marker in cluster.markers]
+
+
+def _vectors(points: Array) -> list[Vector]:
+    return [(x, y, z) for x, y, z in points.tolist()]
 
 
 def _determinant(m: list[list[float]]) -> float:

@@ -1,0 +1,128 @@
+"""Segments and joints of a calibrated limb in one mocap frame: the optical reference.
+
+Invariant: nothing here depends on an IMU, so the result is an independent reference for fusion.
+"""
+
+from __future__ import annotations
+
+from math import dist
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.fusion._cluster_pose import ClusterPose
+from jointfit_daemon.kinematics.joint_angles import read_joint
+from jointfit_daemon.kinematics.rotation_scalar import multiply_one
+from jointfit_daemon.limb_model import flexion_sign, restore_cluster
+
+if TYPE_CHECKING:
+    from jointfit_daemon.kinematics.joint_angles import JointReading
+    from jointfit_daemon.limb_model import Calibration, MarkerCluster
+    from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Quaternion, Vector
+
+
+class OpticalReading(NamedTuple):
+    """A limb in one mocap frame, in the order of the chain. Unknown values are None."""
+
+    segments: list[Quaternion | None]
+    """q_optical_segment."""
+    positions: list[Vector | None]
+    """Joint centers, m: mean of those carried by the two adjacent body parts."""
+    gaps: list[float | None]
+    """Distances between the two carried centers, m."""
+    joints: list[JointReading | None]
+    """Angles of the joints between two segments; None at the ends of the chain."""
+
+
+class OpticalLimb:
+    r"""Computes the optical reference from the marker clusters of a calibration.
+
+    With the rigid motion (R, t) of a body part since the static pose, its segment has the
+    orientation :math:`R\,R_{static}` and carries the joint center c to :math:`R c + t`. The centers
+    carried by the two parts of a joint differ by the gap, which soft-tissue artefact and errors of
+    the center cause.
+
+    Parameters
+    ----------
+    chain : Chain
+        The limb.
+    calibration : Calibration
+        Marker clusters, joint centers and segment axes. It must fit the chain.
+    """
+
+    def __init__(self, chain: Chain, calibration: Calibration) -> None:
+        self._chain = chain
+        self._parts: list[tuple[MarkerCluster, list[int]] | None] = []
+        """Per body part, from proximal to distal: its cluster, and the joints that it carries."""
+        self._static = [calibration.segment[name].q_static for name in chain.segments]
+        self._signs = [flexion_sign(joint) for joint in chain.joints]
+        self._layout: MocapLayout | None = None
+        self._poses: list[ClusterPose | None] = []
+
+        centers = [calibration.joint.get(joint) for joint in chain.joints]
+        self._centers = [None if item is None else item.center for item in centers]
+        known = {i for i, center in enumerate(self._centers) if center is not None}
+        for k, part in enumerate((chain.proximal, *chain.segments, chain.distal)):
+            stored = None if part is None else calibration.clusters.get(part)
+            if part is None or stored is None:
+                self._parts.append(None)
+            else:
+                self._parts.append((restore_cluster(part, stored), sorted({k - 1, k} & known)))
+
+    def read(self, frame: MocapFrame) -> OpticalReading:
+        """Return the limb in one frame."""
+        if frame.layout is not self._layout:
+            self._layout = frame.layout
+            self._poses = [self._pose(part, frame.layout) for part in self._parts]
+
+        chain = self._chain
+        orientations: list[Quaternion | None] = [None] * len(self._parts)
+        carried: list[list[Vector]] = [[] for _ in chain.joints]
+        for k, pose in enumerate(self._poses):
+            fitted = None if pose is None else pose.fit(frame)
+            if fitted is None:
+                continue
+            orientations[k] = fitted.q
+            for joint, position in zip(self._carried(k), fitted.points, strict=True):
+                carried[joint].append(position)
+
+        segments = [
+            None if q is None else multiply_one(q, q_static)
+            for q, q_static in zip(orientations[1:-1], self._static, strict=True)
+        ]
+        return OpticalReading(
+            segments,
+            [_mean(points) for points in carried],
+            [dist(points[0], points[1]) if points[1:] else None for points in carried],
+            [self._angles(i, segments) for i in range(len(chain.joints))],
+        )
+
+    def _pose(
+        self, part: tuple[MarkerCluster, list[int]] | None, layout: MocapLayout
+    ) -> ClusterPose | None:
+        if part is None:
+            return None
+        cluster, joints = part
+        centers = np.array([self._centers[i] for i in joints], dtype=np.float64).reshape(-1, 3)
+        return ClusterPose(cluster, centers, layout)
+
+    def _carried(self, part: int) -> list[int]:
+        found = self._parts[part]
+        return [] if found is None else found[1]
+
+    def _angles(self, joint: int, segments: list[Quaternion | None]) -> JointReading | None:
+        if not 0 < joint < len(segments):  # the ends of the chain have no angles
+            return None
+        proximal, distal = segments[joint - 1], segments[joint]
+        if proximal is None or distal is None:
+            return None
+        sign, left = self._signs[joint], self._chain.left_side
+        return read_joint(proximal, distal, flexion_sign=sign, left=left)
+
+
+def _mean(points: list[Vector]) -> Vector | None:
+    if not points:
+        return None
+    count = len(points)
+    x, y, z = (sum(values) / count for values in zip(*points, strict=True))
+    return (x, y, z)

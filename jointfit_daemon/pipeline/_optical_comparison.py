@@ -1,0 +1,206 @@
+"""Comparison of the limb from the IMUs with the limb that the cameras see, frame by frame.
+
+Invariant: every compared pair refers to one instant; limb states are interpolated to the exposure
+of the mocap frame.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import dist, exp, pi, sqrt
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.fusion import OpticalLimb
+from jointfit_daemon.kinematics.joint_angles import read_joint
+from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, interpolate_one
+from jointfit_daemon.limb_model import flexion_sign
+from jointfit_daemon.model import JointAngles, OpticalJoint, OpticalSegment, OpticalState
+
+if TYPE_CHECKING:
+    from jointfit_daemon.fusion import OpticalReading
+    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.model import Chain, LimbState, MocapFrame, Quaternion, Vector
+
+RMS_TIME_S = 10.0
+"""Time constant of the running RMS, s: a few gait cycles."""
+MAX_GAP_NS = 50_000_000
+"""Greatest distance of two limb states to interpolate between, ns: five frames at 100 Hz."""
+_WAITING = 64
+"""Mocap frames that wait for the limb state after them: 0.25 s at 240 Hz."""
+_STATES = 64
+"""Limb states kept for mocap frames that arrive late: 0.6 s at 100 Hz."""
+
+
+class RunningRms:
+    r"""Root mean square with exponentially decreasing weights.
+
+    .. math:: \mathrm{rms}^2 = \frac{\sum_k w_k x_k^2}{\sum_k w_k}, \qquad w_k = e^{-(t - t_k) / T}
+    """
+
+    def __init__(self, time_s: float = RMS_TIME_S) -> None:
+        self._time_ns = time_s * 1e9
+        self._squares = self._weights = 0.0
+        self._last_ns = 0
+
+    def add(self, t_ns: int, value: float) -> float:
+        """Add a value and return the RMS."""
+        decay = exp(min(self._last_ns - t_ns, 0) / self._time_ns)
+        self._squares = decay * self._squares + value * value
+        self._weights = decay * self._weights + 1.0
+        self._last_ns = t_ns
+        return sqrt(self._squares / self._weights)
+
+
+class OpticalComparison:
+    """Pairs mocap frames with limb states.
+
+    Parameters
+    ----------
+    chain : Chain
+        The limb.
+    calibration : Calibration or None
+        The calibration in force; nothing is compared without one.
+    rate_hz : float
+        Greatest number of compared mocap frames per second.
+    """
+
+    def __init__(self, chain: Chain, calibration: Calibration | None, rate_hz: float) -> None:
+        usable = calibration is not None and calibration.fits(chain) and rate_hz > 0.0
+        self._chain = chain
+        self._limb = OpticalLimb(chain, calibration) if usable and calibration else None
+        self._signs = [flexion_sign(joint) for joint in chain.joints]
+        self._period_ns = round(1e9 / rate_hz) if usable else 0
+        self._next_ns = 0
+        self._waiting: deque[tuple[int, int, bool, OpticalReading]] = deque(maxlen=_WAITING)
+        """Instant, frame number, whether the stamp is synchronized, and the limb in the frame."""
+        self._states: deque[LimbState] = deque(maxlen=_STATES)
+        self._rms: dict[tuple[str, ...], RunningRms] = {}
+
+    def add_frame(self, t_ns: int, frame: MocapFrame, *, synced: bool) -> None:
+        """Add one live mocap frame with its stamp."""
+        if self._limb is None or t_ns < self._next_ns:
+            return
+        # A fixed grid keeps the mean rate; after a pause it begins again.
+        late = t_ns - self._next_ns > self._period_ns
+        self._next_ns = (t_ns if late else self._next_ns) + self._period_ns
+        self._waiting.append((t_ns, frame.number, synced, self._limb.read(frame)))
+
+    def add_state(self, state: LimbState) -> list[OpticalState]:
+        """Add one limb state; return the comparisons that it completes."""
+        if self._limb is None:
+            return []
+        self._states.append(state)
+        if not self._waiting or self._waiting[0][0] > state.t_ns:
+            return []
+        done = []
+        while self._waiting and self._waiting[0][0] <= state.t_ns:
+            done.append(self._compare(*self._waiting.popleft()))
+        return done
+
+    def _compare(
+        self, t_ns: int, number: int, synced: bool, reading: OpticalReading
+    ) -> OpticalState:
+        pair = self._states_around(t_ns) if synced else None
+        imu: list[Quaternion | None] = (
+            [None] * len(self._chain.segments) if pair is None else _segments_at(t_ns, *pair)
+        )
+        segments = tuple(
+            self._segment(t_ns, name, q, q_imu)
+            for name, q, q_imu in zip(self._chain.segments, reading.segments, imu, strict=True)
+        )
+        joints = tuple(
+            self._joint(t_ns, i, reading, imu, _position_at(t_ns, i, pair))
+            for i in range(len(self._chain.joints))
+        )
+        return OpticalState(number, t_ns, segments, joints)
+
+    def _states_around(self, t_ns: int) -> tuple[LimbState, LimbState] | None:
+        """Return the last state before and the first after an instant, or None over a gap."""
+        after = None
+        for state in reversed(self._states):
+            if state.t_ns <= t_ns:
+                after = after or state
+                near = after.t_ns - state.t_ns <= MAX_GAP_NS
+                locked = state.sync == after.sync == "locked"
+                return (state, after) if near and locked else None
+            after = state
+        return None
+
+    def _segment(
+        self, t_ns: int, name: str, q: Quaternion | None, q_imu: Quaternion | None
+    ) -> OpticalSegment:
+        if q is None or q_imu is None:
+            return OpticalSegment(name, q, None, None)
+        residual = angle_between_one(q, q_imu)
+        return OpticalSegment(name, q, residual, self._add(t_ns, residual, "segment", name))
+
+    def _joint(
+        self,
+        t_ns: int,
+        number: int,
+        reading: OpticalReading,
+        imu: list[Quaternion | None],
+        p_imu: Vector | None,
+    ) -> OpticalJoint:
+        name, position = self._chain.joints[number], reading.positions[number]
+        distance = distance_rms = None
+        if position is not None and p_imu is not None:
+            distance = dist(position, p_imu)
+            distance_rms = self._add(t_ns, distance, "position", name)
+
+        joint = OpticalJoint(name, position, reading.gaps[number], distance, distance_rms)
+        optical = reading.joints[number]
+        if optical is None:
+            return joint
+        joint = joint._replace(angles=optical.angles, inner=optical.inner)
+        proximal, distal = imu[number - 1], imu[number]
+        if proximal is None or distal is None:
+            return joint
+
+        sign, left = self._signs[number], self._chain.left_side
+        measured = read_joint(proximal, distal, flexion_sign=sign, left=left)
+        if optical.gimbal or measured.gimbal:  # the angles are not comparable one by one
+            return joint
+        pairs = zip(measured.angles, optical.angles, strict=True)
+        residual = JointAngles(*((a - b + pi) % (2.0 * pi) - pi for a, b in pairs))
+        named = zip(JointAngles._fields, residual, strict=True)
+        rms = JointAngles(*(self._add(t_ns, x, "angle", name, axis) for axis, x in named))
+        return joint._replace(residual=residual, residual_rms=rms)
+
+    def _add(self, t_ns: int, value: float, *key: str) -> float:
+        return self._rms.setdefault(key, RunningRms()).add(t_ns, value)
+
+
+def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quaternion | None]:
+    """Return the segments between two states; None where no sensor measured both."""
+    share = _share(t_ns, before, after)
+    return [
+        interpolate_one(a.q_world_segment, b.q_world_segment, share)
+        if a.used and b.used and a.q_world_segment is not None and b.q_world_segment is not None
+        else None
+        for a, b in zip(before.segments, after.segments, strict=True)
+    ]
+
+
+def _position_at(t_ns: int, joint: int, pair: tuple[LimbState, LimbState] | None) -> Vector | None:
+    """Return a joint position between two states; None unless it begins at the cameras' origin.
+
+    The first joint is the origin itself: there is nothing to compare.
+    """
+    if pair is None or joint == 0:
+        return None
+    for state in pair:
+        if state.mode != "imu+mocap" or "origin_fixed" in state.flags:
+            return None
+    before, after = pair
+    a, b = before.joints[joint].position, after.joints[joint].position
+    if a is None or b is None:
+        return None
+    share = _share(t_ns, before, after)
+    x, y, z = (p + share * (q - p) for p, q in zip(a, b, strict=True))
+    return (x, y, z)
+
+
+def _share(t_ns: int, before: LimbState, after: LimbState) -> float:
+    width = after.t_ns - before.t_ns
+    return (t_ns - before.t_ns) / width if width else 0.0
