@@ -1,18 +1,31 @@
 """Orientation of one segment from the sensors that have data.
 
 In order of preference: the model trained for exactly these sensors, their mean, the last
-orientation for 0.2 s, none. If the set of sensors changes, the difference between the old and the
-new orientation fades out over 0.25 s.
+orientation for 0.2 s, none. If the set of sensors changes, the orientation moves from the old to
+the new one within 0.25 s:
 
-Invariant: the orientation does not jump, and every degradation sets a flag.
+- A sensor came back: both sets have data, and their predictions are blended. One wrong sample of
+  the returning sensor, which is common, enters with the small weight of the first frames.
+- A sensor was lost: the difference between both sets in the frames before fades out. A last sample
+  that contradicts those before does not count.
+
+Invariant: the orientation does not jump, unless back from a wrong sample, and every degradation
+sets a flag.
 """
 
 from __future__ import annotations
 
-from math import radians, sqrt
+from collections import deque
+from math import dist, radians, sqrt
+from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.kinematics.rotation_scalar import difference_one, normalize_one, perturb_one
+from jointfit_daemon.kinematics.rotation_scalar import (
+    difference_one,
+    interpolate_one,
+    normalize_one,
+    perturb_one,
+)
 from jointfit_daemon.limb_model import UNREFERENCED_SD, Prediction, model_key
 from jointfit_daemon.model import FrameFlag
 
@@ -35,6 +48,11 @@ FADE_NS = 250_000_000
 """Fade time after a change of the set of sensors, ns."""
 MODEL_FADE_NS = 1_000_000_000
 """Fade time after a change of the models by online learning, ns."""
+OUTLIER = radians(3.0)
+"""Change of the difference between two sets of sensors within three frames from which on the last
+frame counts as wrong, rad: skin reaches a third of it."""
+_HISTORY = 5
+"""Frames kept for that: with two wrong ones the median still stands."""
 HOLD_NS = 200_000_000
 """Time for which the last orientation is held if no sensor has data, ns."""
 MINUTE_NS = 60_000_000_000
@@ -62,6 +80,14 @@ class FusedSegment(NamedTuple):
     """Standard deviation per axis caused by inconsistent sensors, rad; included in `sd`."""
 
 
+class _Blend(NamedTuple):
+    """A set of sensors that is being left since one came back."""
+
+    start_ns: int
+    alive: Names
+    near: Names
+
+
 class SegmentFuser:
     """Computes the orientation of one segment, frame by frame.
 
@@ -87,6 +113,10 @@ class SegmentFuser:
         self._before: tuple[Names, Names, Inputs] | None = None
         self._fading: tuple[int, int, Vector] | None = None
         """Start and length of the current fade, ns, and its initial rotation vector, rad."""
+        self._blends: list[_Blend] = []
+        """Sets of sensors that are being left, the oldest first; `_fading` belongs to that one."""
+        self._history: deque[tuple[Inputs, Quaternion]] = deque(maxlen=_HISTORY)
+        """Inputs and output of the last frames."""
 
     def replace_models(self, models: Mapping[str, SegmentModel]) -> None:
         """Use other models of the same sensors; the output fades to them."""
@@ -126,8 +156,8 @@ class SegmentFuser:
         if self._replaced_models is not None:
             self._start_model_fade(t_ns, alive, near, inputs)
         prediction = self._predict(alive, near, inputs)
-        self._start_fade(t_ns, alive, near, inputs, prediction.q)
-        q = self._faded(t_ns, prediction.q)
+        self._change_sensors(t_ns, alive, near, inputs, prediction.q)
+        q = self._blended(t_ns, inputs, prediction.q)
 
         # Variance of the model, and of the heading for one axis of three: it grows with time.
         if self._calibrated_ns is None:
@@ -138,6 +168,7 @@ class SegmentFuser:
         sd = sqrt(sd * sd + heading / 3.0)
         flexion_sd = None if prediction.axis_sd is None else max(prediction.axis_sd[0], MIN_SD)
         self._last, self._before = (t_ns, q, sd), (alive, near, inputs)
+        self._history.append((inputs, q))
 
         flags: tuple[str, ...] = ()
         if len(alive) == 1 and len(self._sensors) > 1:
@@ -148,7 +179,8 @@ class SegmentFuser:
 
     def _hold(self, t_ns: int) -> FusedSegment:
         if self._last is None or t_ns - self._last[0] > HOLD_NS:
-            self._before = self._fading = None
+            self._before = None
+            self._stop_fading()
             return FusedSegment(None, None, (), (FrameFlag.LOST.of(self._name),))
         last_ns, q, sd = self._last
         age_s = (t_ns - last_ns) * 1e-9
@@ -184,13 +216,14 @@ class SegmentFuser:
 
         self._use(old)
         prediction = self._predict(alive, near, inputs).q
-        self._start_fade(t_ns, alive, near, inputs, prediction)
-        output = self._faded(t_ns, prediction)
+        self._change_sensors(t_ns, alive, near, inputs, prediction)
+        output = self._blended(t_ns, inputs, prediction)
         self._use(new)
         offset = difference_one(self._predict(alive, near, inputs).q, output)
+        self._stop_fading()
         self._fading, self._before = (t_ns, MODEL_FADE_NS, offset), (alive, near, inputs)
 
-    def _start_fade(
+    def _change_sensors(
         self,
         t_ns: int,
         alive: Names,
@@ -198,25 +231,54 @@ class SegmentFuser:
         inputs: Inputs,
         target: Quaternion,
     ) -> None:
-        """Start a fade if the set of sensors differs from that of the frame before."""
+        """Start a blend or a fade if the set of sensors differs from that of the frame before."""
         if self._last is None or t_ns - self._last[0] > HOLD_NS or self._before is None:
-            self._fading = None
+            self._stop_fading()
             return
         old_alive, old_near, old_inputs = self._before
         if (alive, near) == (old_alive, old_near):
             return
 
         if all(s in inputs for s in (*old_alive, *old_near)):
-            # The old sensors still have data: compare both sets in this frame.
-            old = self._faded(t_ns, self._predict(old_alive, old_near, inputs).q)
-            offset = difference_one(target, old)
-        elif all(s in old_inputs for s in (*alive, *near)):
-            # The new sensors had data before: compare both sets in the frame before.
-            new = self._predict(alive, near, old_inputs).q
-            offset = difference_one(new, self._last[1])
-        else:
-            offset = difference_one(target, self._last[1])
-        self._fading = (t_ns, FADE_NS, offset)
+            self._blends.append(_Blend(t_ns, old_alive, old_near))
+            return
+        known = all(s in old_inputs for s in (*alive, *near))
+        offset = self._offset_before(alive, near) if known else None
+        self._stop_fading()
+        self._fading = (t_ns, FADE_NS, offset or difference_one(target, self._last[1]))
+
+    def _offset_before(self, alive: Names, near: Names) -> Vector:
+        """Return the rotation from a set of sensors to the output, in the frames before its use.
+
+        Of the last frame, unless that contradicts the median of the last frames.
+        """
+        offsets = [
+            difference_one(self._predict(alive, near, inputs).q, q)
+            for inputs, q in self._history
+            if all(s in inputs for s in (*alive, *near))
+        ]
+        x, y, z = (median(values) for values in zip(*offsets, strict=True))
+        return (x, y, z) if dist(offsets[-1], (x, y, z)) > OUTLIER else offsets[-1]
+
+    def _stop_fading(self) -> None:
+        self._fading = None
+        self._blends.clear()
+        self._history.clear()
+
+    def _blended(self, t_ns: int, inputs: Inputs, target: Quaternion) -> Quaternion:
+        """Return the output: from the sets of sensors that are being left to `target`."""
+        done = [k for k, one in enumerate(self._blends, 1) if t_ns - one.start_ns >= FADE_NS]
+        if done:
+            del self._blends[: done[-1]]
+            self._fading = None
+        if not self._blends:
+            return self._faded(t_ns, target)
+
+        sets = [self._predict(one.alive, one.near, inputs).q for one in self._blends]
+        q = self._faded(t_ns, sets[0])
+        for one, following in zip(self._blends, [*sets[1:], target], strict=True):
+            q = interpolate_one(q, following, (t_ns - one.start_ns) / FADE_NS)
+        return q
 
     def _faded(self, t_ns: int, target: Quaternion) -> Quaternion:
         if self._fading is None:

@@ -13,13 +13,16 @@ from tests.calibration.synthetic_limb import (
 )
 
 if TYPE_CHECKING:
+    from jointfit_daemon.calibration import CalibrationSettings
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain
     from tests.calibration.synthetic_limb import Subject
 
 
-def calibrated(subject: Subject, chain: Chain = CHAIN) -> Calibration:
+def calibrated(
+    subject: Subject, chain: Chain = CHAIN, settings: CalibrationSettings = SETTINGS
+) -> Calibration:
     """Return the calibration from align phase, static pose and 30 s of movement."""
     static, functional, _ = static_and_functional(subject, 30.0)
-    alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
-    return fit_calibration(static, functional, alignment, SETTINGS, chain)
+    alignment = fit_plate_alignment(plate_trial(subject), settings)
+    return fit_calibration(static, functional, alignment, settings, chain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from jointfit_daemon.calibration.phases import fit_static
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.model import Chain, FusionMode, Quaternion, SyncState
 from tests.calibration.synthetic_limb import (
     CHAIN,
@@ -32,7 +34,7 @@ from tests.fusion.calibrated_limb import calibrated
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.limb_model import Calibration, Method
     from jointfit_daemon.model import LimbState
 
 STEP = 10_000_000
@@ -43,6 +45,11 @@ SUBJECT = Subject(21, flaws=Imperfections(sensor_deg=0.2, tissue_deg=4.0, skin_m
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     return calibrated(SUBJECT)
+
+
+@cache
+def calibrated_with(method: Method) -> Calibration:
+    return calibrated(SUBJECT, settings=replace(SETTINGS, method=method))
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +179,27 @@ def test_loss_and_return_of_sensors_cause_no_jump(
         if set(CHAIN.sensors[segment]) <= lost:
             continue  # held and lost: no continuity expected
         assert np.max(steps_deg(parts, segment)) < np.max(steps_deg(whole, segment)) + 1.2
+
+
+@pytest.mark.parametrize("method", ["anchored", "patent12", "patent6", "mean"])
+@pytest.mark.parametrize("wrong", [39, 44], ids=["last before the loss", "first after it"])
+def test_one_wrong_sample_at_loss_or_return_of_a_sensor_is_not_spread(
+    walk: tuple[Motion, Frames], method: Method, wrong: int
+) -> None:
+    """A loose contact corrupts what it lets through: S2 is 24 degrees off once."""
+    known, frames = calibrated_with(method), walk[1][300:400]
+    lost = range(40, 44)
+    alive = [ALL_SENSORS - {"S2"} if k in lost else ALL_SENSORS for k in range(len(frames))]
+    faulty = [(t, dict(orientations)) for t, orientations in frames]
+    turned = Rotation.from_quat(faulty[wrong][1]["S2"], scalar_first=True)
+    turned *= Rotation.from_rotvec([24.0, 0.0, 0.0], degrees=True)
+    faulty[wrong][1]["S2"] = as_quaternion(turned.as_quat(scalar_first=True))
+
+    runs = [play(LimbFuser(CHAIN, known), some, alive.__getitem__) for some in (frames, faulty)]
+    thighs = [np.array([state.segments[0].q_world_segment for state in run]) for run in runs]
+    clean, states = (Rotation.from_quat(q, scalar_first=True) for q in thighs)
+    apart = np.degrees((clean.inv() * states).magnitude())
+    assert np.max(np.delete(apart, wrong)) < 1.0
 
 
 def test_exchange_of_the_only_sensor_fades(

@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 
 UPDATE_NS = 39_000_000
 """Interval of the comparisons, ns: 25 a second with frames at 100 Hz."""
+SUDDEN_SD = radians(2.0)
+"""Change of a segment's standard deviation from one comparison to the next, rad, from which on the
+next frame is compared, too: one wrong sample must not count for a whole interval."""
 MIN_DRIFT = radians(0.2)
 """Smallest heading drift that is corrected, rad."""
 REPORTED_DRIFT = radians(5.0)
@@ -189,7 +192,12 @@ class ConsistencyMonitor:
                 turn = drift + disturbances.get(name, 0.0)
                 if turn:
                     self._half_turns[name] = (cos(0.5 * turn), -sin(0.5 * turn))
-        self._result = self._evaluate(inputs)
+
+        before, self._result = self._result, self._evaluate(inputs)
+        if self._result is not before:
+            changes = zip(self._result.spread, before.spread, strict=True)
+            if any(abs(new - old) > SUDDEN_SD for new, old in changes):
+                self._next_ns = t_ns
         return self._result
 
     def _compare_pairs(
