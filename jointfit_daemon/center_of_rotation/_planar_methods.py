@@ -88,7 +88,8 @@ def three_frames(p: Array, _: Movement) -> CenterEstimate:
     turn = np.unwrap(np.arctan2(*(seen - whole.center).T[::-1]))
     order = np.argsort(turn)
     middle = int(np.argmin(np.abs(turn - turn[order[[0, -1]]].mean())))
-    return three_frame_estimate(seen[[order[0], middle, order[-1]]], whole.noise)
+    found = three_frame_estimate(seen[[order[0], middle, order[-1]]], whole.noise)
+    return replace(found, bound=whole.bound)  # of the movement, not of its three frames
 
 
 def geometric(points: Array, movement: Movement) -> CenterEstimate:

@@ -35,7 +35,8 @@ class CenterEstimate:
     arc: float
     """Angle covered by the markers about the center, rad."""
     bound: float
-    """Cramér-Rao bound of the RMS error at `noise`, m; inf where a direction is unseen."""
+    """Cramér-Rao bound of the RMS error for `noise` that is independent from frame to frame, m; inf
+    where a direction is unseen. It depends on the movement, not on the method."""
     conditioning: float
     """T, the curvature over its standard error; below 6 a circle is not usable."""
     frames: int

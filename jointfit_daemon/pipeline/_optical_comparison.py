@@ -14,7 +14,15 @@ from jointfit_daemon.fusion import OpticalLimb
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, interpolate_one
 from jointfit_daemon.limb_model import flexion_sign
-from jointfit_daemon.model import JointAngles, OpticalJoint, OpticalSegment, OpticalState
+from jointfit_daemon.model import (
+    FrameFlag,
+    FusionMode,
+    JointAngles,
+    OpticalJoint,
+    OpticalSegment,
+    OpticalState,
+    SyncState,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.fusion import OpticalReading
@@ -121,7 +129,7 @@ class OpticalComparison:
             if state.t_ns <= t_ns:
                 after = after or state
                 near = after.t_ns - state.t_ns <= MAX_GAP_NS
-                locked = state.sync == after.sync == "locked"
+                locked = state.sync is after.sync is SyncState.LOCKED
                 return (state, after) if near and locked else None
             after = state
         return None
@@ -190,7 +198,7 @@ def _position_at(t_ns: int, joint: int, pair: tuple[LimbState, LimbState] | None
     if pair is None or joint == 0:
         return None
     for state in pair:
-        if state.mode != "imu+mocap" or "origin_fixed" in state.flags:
+        if state.mode is not FusionMode.IMU_AND_MOCAP or FrameFlag.ORIGIN_FIXED in state.flags:
             return None
     before, after = pair
     a, b = before.joints[joint].position, after.joints[joint].position

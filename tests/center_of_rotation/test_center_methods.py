@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from bench.subjects.simulated_joints import ball_turns, carried, covers, fan, hinge_turns, watched
-from jointfit_daemon.center_of_rotation import METHODS, BodyPoses, Movement, estimate_center
+from jointfit_daemon.center_of_rotation import (
+    METHODS,
+    BodyPoses,
+    Movement,
+    circle_rms_bound,
+    estimate_center,
+)
 
 IN_A_PLANE = sorted(name for name, method in METHODS.items() if method.planar)
 IN_SPACE = ["sphere", "running_sphere", "halvorsen", "gamage_lasenby", "score"]
@@ -41,6 +48,19 @@ def test_every_planar_method_finds_the_center(name: str) -> None:
     assert np.linalg.norm(found.center - CENTER[:2]) < tolerance
     assert 0.0 < found.bound < inf
     assert found.arc == pytest.approx(np.radians(60.0), rel=0.15)
+
+
+@pytest.mark.parametrize("name", [name for name in IN_A_PLANE if name != "oriented"])
+def test_bound_belongs_to_the_movement_not_to_the_method(name: str) -> None:
+    rng = np.random.default_rng(5)
+    noise = lfilter([np.sqrt(1.0 - 0.9**2)], [1.0, -0.9], rng.normal(0, 1e-3, (500, 2)), axis=0)
+    turns = np.linspace(0.0, np.radians(70.0), 500)
+    points = 0.15 * np.stack((np.cos(turns), np.sin(turns)), axis=1) + noise
+    found = estimate_center(Movement(points[:, None]), name)
+    assert found.refused is None
+    # The errors of the methods differ by a factor of ten here; the stated noise hardly does.
+    least = circle_rms_bound(turns, found.noise)
+    assert found.bound == pytest.approx(least, rel=0.15)
 
 
 @pytest.mark.parametrize("name", IN_A_PLANE)

@@ -13,12 +13,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jointfit_daemon.calibration.phases import fit_calibration
 from jointfit_daemon.model import (
+    FrameFlag,
+    FusionMode,
     JointState,
     LimbState,
     MocapFrame,
     MocapLayout,
     OpticalState,
     SegmentState,
+    SyncState,
 )
 from jointfit_daemon.pipeline._optical_comparison import OpticalComparison, RunningRms
 from tests.calibration.synthetic_limb import (
@@ -93,7 +96,9 @@ def limb_states(shank_error: Rotation | None = None) -> list[LimbState]:
             JointState("ankle", None, None),
         )
         t_ns = round(t_s * 1e9)
-        state = LimbState(k + 1, t_ns, t_ns, "imu+mocap", "locked", (), segments, joints)
+        state = LimbState(
+            k + 1, t_ns, t_ns, FusionMode.IMU_AND_MOCAP, SyncState.LOCKED, (), segments, joints
+        )
         states.append(state)
     return states
 
@@ -107,7 +112,7 @@ def axes(segment: str) -> Rotation:
     comparison = OpticalComparison(CHAIN, calibration(), 1000.0)
     t_ns, frame = camera_frames()[0]
     comparison.add_frame(t_ns, frame, synced=True)
-    state = LimbState(1, t_ns, t_ns, "imu", "locked", (), (), ())
+    state = LimbState(1, t_ns, t_ns, FusionMode.IMU, SyncState.LOCKED, (), (), ())
     empty = tuple(SegmentState(name, None, None, ()) for name in CHAIN.segments)
     nowhere = tuple(JointState(name, None, None) for name in CHAIN.joints)
     (seen,) = comparison.add_state(state._replace(segments=empty, joints=nowhere))
@@ -192,7 +197,7 @@ def test_position_residual_needs_the_origin_from_the_cameras() -> None:
     seen = compare(states)[-1]
     assert seen.joints[0].distance is None  # the origin itself
     assert seen.joints[1].distance == pytest.approx(0.0, abs=0.005)
-    for other in ({"mode": "imu"}, {"flags": ("origin_fixed",)}):
+    for other in ({"mode": FusionMode.IMU}, {"flags": (FrameFlag.ORIGIN_FIXED,)}):
         seen = compare([state._replace(**other) for state in states])[-1]
         assert seen.joints[1].distance is None
         assert seen.segments[0].residual is not None
@@ -227,7 +232,7 @@ def test_hidden_segment_is_null_and_its_joints_come_from_the_neighbors() -> None
 def test_unsynchronized_or_held_frames_have_no_residual(case: str) -> None:
     states = limb_states()[:200]
     if case == "clock":
-        states = [state._replace(sync="settling") for state in states]
+        states = [state._replace(sync=SyncState.SETTLING) for state in states]
     if case == "held":
         held = [tuple(segment._replace(used=()) for segment in state.segments) for state in states]
         states = [s._replace(segments=one) for s, one in zip(states, held, strict=True)]

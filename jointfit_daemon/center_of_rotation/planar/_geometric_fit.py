@@ -130,6 +130,8 @@ def _accept_estimate(
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     H = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
+    least, most = np.linalg.eigvalsh(H)
+    bound = sqrt(variance * (1.0 / least + 1.0 / most)) if least > ROUNDING * most else inf
 
     # noise also changes directions; its contribution to H is not information
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
@@ -161,7 +163,7 @@ def _accept_estimate(
         residual=float(np.sqrt((e[seen] ** 2).mean())),
         radii=R,
         arc=max(shown),
-        bound=sd,
+        bound=bound,
         conditioning=T,
         frames=frames,
         effective_frames=frames / wider,
