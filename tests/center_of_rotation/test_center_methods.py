@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from bench.baselines.circle_theory import circle_rms_bound
 from bench.subjects.simulated_joints import ball_turns, carried, covers, fan, hinge_turns, watched
 from jointfit_daemon.center_of_rotation import (
     METHODS,
     BodyPoses,
     Movement,
-    circle_rms_bound,
     estimate_center,
 )
 

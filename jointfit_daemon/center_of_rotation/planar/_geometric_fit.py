@@ -129,16 +129,14 @@ def _accept_estimate(
     # Huber's variance: mean of squared pull over squared share of points that pull freely
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
-    H = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
-    least, most = np.linalg.eigvalsh(H)
-    bound = sqrt(variance * (1.0 / least + 1.0 / most)) if least > ROUNDING * most else inf
+    information = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
 
     # noise also changes directions; its contribution to H is not information
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
     across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
         "tk,tka,tkb->ab", seen / u2**2, x - c, x - c
     )
-    H -= variance * across
+    H = information - variance * across
     frames = int(seen.any(axis=1).sum())
     least, most = np.linalg.eigvalsh(H)
     if not least > ROUNDING * most:
@@ -163,7 +161,7 @@ def _accept_estimate(
         residual=float(np.sqrt((e[seen] ** 2).mean())),
         radii=R,
         arc=max(shown),
-        bound=bound,
+        bound=sqrt(variance * float(np.trace(np.linalg.inv(information)))),
         conditioning=T,
         frames=frames,
         effective_frames=frames / wider,

@@ -190,7 +190,7 @@ class Stream:
     def due(self, t_ns: int) -> int:
         """Return the arrival of the first sample at or after `t_ns`, or its deadline, ns."""
         if not self.waited_for:
-            return 0
+            return t_ns  # a frame is not published before its instant
         newest = self.newest_ns
         if newest < t_ns:
             period = self.period_ns

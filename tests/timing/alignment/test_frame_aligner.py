@@ -254,6 +254,15 @@ def test_a_closed_stream_leaves_frames_unsynced() -> None:
     assert frames[-1].t_ns >= T0 + 480 * MS
 
 
+def test_no_frame_comes_before_its_instant_when_all_streams_end() -> None:
+    a = aligner(A=10 * MS, B=10 * MS)
+    play(a, stream("A", 10 * MS, 20, delay=MS) + stream("B", 10 * MS, 20, delay=MS))
+    for name in ("A", "B"):
+        a.lose(name)
+    for now_ns in range(T0 + 191 * MS, T0 + 260 * MS, MS):
+        assert all(f.t_ns <= f.completed_ns <= now_ns for f in a.advance(now_ns))
+
+
 def test_frames_owed_for_long_are_passed_over() -> None:
     a = aligner(A=10 * MS)
     month = 30 * 86_400_000 * MS
