@@ -200,7 +200,7 @@ def refused_circle(method: str, at: ArrayLike, frames: int, reason: str) -> Cent
 
 
 def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
-    spread = m.xx + m.yy
+    spread = max(m.xx + m.yy, 0.0)  # rounding of equal points
     if frames == 0:
         return "the marker is missing in every frame: check its name, the cameras and occlusion"
     if frames < 4 or m.effective <= 3.0:

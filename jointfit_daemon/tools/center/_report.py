@@ -76,8 +76,8 @@ def details(answer: WindowEstimate) -> str:
 
     if not len(e.unseen):
         error = (
-            f"{_mm(e.sd)} mm RMS predicted; lower bound for any method on this movement:"
-            f" {_mm(e.bound)} mm"
+            f"{_mm(e.sd)} mm RMS predicted; lower bound for any method, with independent"
+            f" noise: {_mm(e.bound)} mm"
         )
     else:
         error = "unknown along the unobservable directions"
