@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import orjson
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_MISUSE
@@ -16,7 +17,6 @@ def check(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Check a rig.toml: print all faults, or a summary. Opens no device or connection."""
-    import orjson
     from rich.console import Console
     from rich.table import Table
 

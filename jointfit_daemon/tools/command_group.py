@@ -76,17 +76,13 @@ class CommandGroup(TyperGroup):
             typer.echo(text, err=True)
             raise typer.Exit(code) from None
         finally:
-            _drop_lost_output()
-
-
-def _drop_lost_output() -> None:
-    """Discard buffered output of a closed stream; otherwise Python exits with 120."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except OSError:
-            with Path(os.devnull).open("wb") as nowhere:
-                os.dup2(nowhere.fileno(), stream.fileno())
+            # Discard buffered output of a closed stream; otherwise Python exits with 120.
+            for stream in (sys.stdout, sys.stderr):
+                try:
+                    stream.flush()
+                except OSError:
+                    with Path(os.devnull).open("wb") as nowhere:
+                        os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _known_error(error: Exception) -> tuple[int, str] | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
+import orjson
 import typer
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
@@ -82,8 +83,6 @@ def decode(
     ] = None,
 ) -> None:
     """Decode a capture of an installed driver: table of counts, JSON lines, or JSON summary."""
-    import orjson
-
     from jointfit_daemon.driver import find_driver
     from jointfit_daemon.files.captures import read_capture
 

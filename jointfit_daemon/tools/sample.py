@@ -7,6 +7,7 @@ import sys
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import Annotated
 
+import orjson
 import typer
 
 
@@ -17,8 +18,6 @@ def sample(
     force: Annotated[bool, typer.Option("--force", help="Write into a non-empty folder.")] = False,
 ) -> None:
     """Write sample data: short trials of a simulated leg, a chain model, captures and a rig."""
-    import orjson
-
     # The simulator is a separate program: it shares no code with the estimators.
     words = [sys.executable, "-m", "jointfit_simulators", "sample", str(folder)]
     words += ["--seed", str(seed), *(["--force"] if force else [])]

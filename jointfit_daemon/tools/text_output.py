@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import orjson
 import typer
 
 if TYPE_CHECKING:
@@ -12,8 +13,6 @@ if TYPE_CHECKING:
 
 def echo_json(data: Any) -> None:
     """Print one JSON object in a line; NaN and infinity become null."""
-    import orjson
-
     typer.echo(orjson.dumps(data, option=orjson.OPT_SERIALIZE_NUMPY))
 
 

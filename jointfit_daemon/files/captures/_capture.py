@@ -60,23 +60,14 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
     reject_device(path)
     data = path.read_bytes()
     if data.startswith(PCAPNG_MAGIC) or data[:4] in PCAP_MAGICS:
-        if wire != "datagram":
-            raise UnreadableCaptureError(
-                f"{path}: a network capture, where a {wire} is expected: name the driver of the"
-                " device that was recorded"
-            )
+        _require_wire(path, "a network capture", "datagram", wire)
         return (
             Chunk(packet.t_ns, packet.payload)
             for packet in read_udp(data)
             if port is None or port in (packet.source_port, packet.target_port)
         )
-
     if is_candump(data):
-        if wire != "can":
-            raise UnreadableCaptureError(
-                f"{path}: candump text, where a {wire} is expected: name the driver of the device"
-                " that was recorded"
-            )
+        _require_wire(path, "candump text", "can", wire)
         return read_candump(data)
 
     if wire == "datagram":
@@ -88,6 +79,14 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
         )
     size = PIECE // RECORD_BYTES * RECORD_BYTES if wire == "can" else PIECE
     return (Chunk(at * NS_PER_BYTE, data[at : at + size]) for at in range(0, len(data), size))
+
+
+def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> None:
+    if recorded != expected:
+        raise UnreadableCaptureError(
+            f"{path}: {found}, where a {expected} is expected: name the driver of the device that"
+            " was recorded"
+        )
 
 
 def _walk(data: bytes) -> Iterator[Chunk]:

@@ -85,8 +85,8 @@ def read_trc(path: Path) -> MarkerTrajectories:
         )
 
     header_separator = separator_of(lines[1])
-    keys, values = (cells_of(line, header_separator) for line in lines[1:3])
-    header = dict(zip(keys, values, strict=False))
+    keys, cells = (cells_of(line, header_separator) for line in lines[1:3])
+    header = dict(zip(keys, cells, strict=False))
     rate_hz = number(path, 3, header.get("DataRate", ""))
     if not 0.0 < rate_hz < math.inf:
         found = header.get("DataRate", "missing")
@@ -114,7 +114,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
     return MarkerTrajectories(
         names,
         rows[:, 1],
-        np.clip(np.nan_to_num(rows[:, 0]), -_MOST_FRAMES, _MOST_FRAMES).astype(np.int64),
+        rows[:, 0].astype(np.int64),
         rows[:, 2:].reshape(-1, len(names), 3) * METRES[unit],
         rate_hz,
         warnings,

@@ -133,17 +133,14 @@ def _quaternion(path: Path, at: int, cell: str) -> list[float]:
     if not cell:
         return [np.nan] * _QUATERNION
     parts = cell.split(",")
-    if len(parts) > _QUATERNION:
-        raise MalformedFileError(
-            f"{path}, line {at}: {cell[:_SHOWN]!r} is more than w,x,y,z: if it has decimal"
-            " commas, export the table with decimal points"
-        )
     if len(parts) != _QUATERNION:
-        raise MalformedFileError(
-            f"{path}, line {at}: {cell[:_SHOWN]!r} is not w,x,y,z: correct the cell, or leave it"
-            " empty"
-        )
-
+        fault = "is not w,x,y,z: correct the cell, or leave it empty"
+        if len(parts) > _QUATERNION:
+            fault = (
+                "is more than w,x,y,z: if it has decimal commas, export the table with decimal"
+                " points"
+            )
+        raise MalformedFileError(f"{path}, line {at}: {cell[:_SHOWN]!r} {fault}")
     return [number(path, at, part) for part in parts]
 
 

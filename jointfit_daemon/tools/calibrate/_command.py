@@ -14,9 +14,13 @@ from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import orjson
 import typer
 
+from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker, RequestRefusedError
+from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines, report
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping, Sequence
@@ -25,8 +29,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import MqttClient
-    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker
-    from jointfit_daemon.tools.stop_signals import StopRequest
 
 EXIT_REJECTED = 3
 """Exit code if the new calibration is worse than the stored one."""
@@ -56,14 +58,6 @@ class StandardInputClosedError(ValueError):
 
 class OutputLostError(Exception):
     """Standard error is closed, for example because the terminal was closed."""
-
-
-class StoppedError(Exception):
-    """The command received a stop signal."""
-
-    def __init__(self, request: StopRequest) -> None:
-        super().__init__(f"stopped by {request.name}")
-        self.exit_code = request.exit_code
 
 
 def calibrate(
@@ -111,8 +105,6 @@ def calibrate(
     phases = ("abort",) if abort else phase or default
     try:
         status = asyncio.run(_guide_phases(rig, phases, seconds, config, force=force, ask=not yes))
-    except StoppedError as stopped:
-        raise typer.Exit(stopped.exit_code) from None
     except OutputLostError:
         raise typer.Exit(EXIT_FAILED) from None
     _print_status(status, json=json)
@@ -120,10 +112,6 @@ def calibrate(
 
 def _print_status(status: Mapping[str, Any], *, json: bool) -> None:
     """Print the final status; exit with `EXIT_REJECTED` if the calibration was rejected."""
-    import orjson
-
-    from jointfit_daemon.tools.calibrate._report import report
-
     if json:
         typer.echo(orjson.dumps(status))
     else:
@@ -140,7 +128,6 @@ async def _guide_phases(
     from rich.console import Console
 
     from jointfit_daemon.outputs.mqtt import MqttClient
-    from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
     console = Console(stderr=True)
     status: dict[str, Any] = {}
@@ -163,14 +150,13 @@ async def _guide_phases(
             if stop.number is None:
                 raise
             _print_note(f"jointfit calibrate: stopped by {stop.name}")
-            raise StoppedError(stop) from None
+            raise typer.Exit(stop.exit_code) from None
     return status
 
 
 async def _run_phase(
     client: MqttClient, tracker: PhaseTracker, arguments: dict[str, object], config: Path
 ) -> dict[str, Any]:
-    from jointfit_daemon.tools.calibrate._phase_tracker import RequestRefusedError
 
     name = str(arguments["phase"])
     tracker.begin()
@@ -231,8 +217,6 @@ async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator
     from rich.text import Text
 
     from jointfit_daemon.outputs.mqtt import BrokerLostError
-    from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker
-    from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines
 
     bar, joints, lines = Progress(console=console), Text(), ProgressLines()
     task = bar.add_task("", total=1.0)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.output_files import check_plot
+from jointfit_daemon.tools.text_output import check_choice, echo_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,8 +55,6 @@ def center(
     """
     from jointfit_daemon.files.mocap import read_marker_trial
     from jointfit_daemon.tools.center.trial import answers, reduce
-    from jointfit_daemon.tools.output_files import check_plot
-    from jointfit_daemon.tools.text_output import check_choice
 
     check_choice("--plane", plane, "xyz")
     check_choice("--up", up, "xyz")
@@ -91,7 +91,6 @@ def _print(
     as_json: bool,
 ) -> None:
     from jointfit_daemon.tools.center import _report
-    from jointfit_daemon.tools.text_output import echo_json
 
     if as_json:
         echo_json(_report.as_json(trial, *asked, reduced, found))

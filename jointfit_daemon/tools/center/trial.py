@@ -218,6 +218,9 @@ def answers(
     if points is None:
         raise UnsuitableTrialError("no child markers")
 
+    def within(poses: BodyPoses | None, part: slice) -> BodyPoses | None:
+        return None if poses is None else BodyPoses(poses.q[part], poses.t[part])
+
     size = len(points)
     if window_s is not None:
         size = max(_FEWEST_FRAMES, round(window_s / movement.interval))
@@ -227,7 +230,13 @@ def answers(
         part = slice(first, min(first + size, len(points)))
         if part.stop - first < min(size, len(points)) // 2:
             return  # less than half a window is not estimated
-        found = _refuse_small_motion(estimate_center(_cut(movement, part), method), points[part])
+        window = replace(
+            movement,
+            points=points[part],
+            parent=within(movement.parent, part),
+            child=within(movement.child, part),
+        )
+        found = _refuse_small_motion(estimate_center(window, method), points[part])
         world = trial.to_file(reduced.to_world(found.center))
         yield WindowEstimate(float(t_s[first]), float(t_s[part.stop - 1]), found, world)
 
@@ -272,16 +281,3 @@ def _check_method(method: str, movement: Movement) -> None:
             f"--method {method} needs at least three child markers that are not collinear: add some"
             " with --markers, or use sphere"
         )
-
-
-def _cut(movement: Movement, part: slice) -> Movement:
-    def bodies(poses: BodyPoses | None) -> BodyPoses | None:
-        return None if poses is None else BodyPoses(poses.q[part], poses.t[part])
-
-    return Movement(
-        None if movement.points is None else movement.points[part],
-        bodies(movement.parent),
-        bodies(movement.child),
-        movement.parent_markers,
-        interval=movement.interval,
-    )

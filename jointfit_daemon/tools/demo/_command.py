@@ -8,30 +8,21 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import orjson
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.output_files import check_output
+from jointfit_daemon.tools.stop_signals import StopRequest, cancel_on_signal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.tools.stop_signals import StopRequest
 
 TARGETS = {"knee_flexion_rmse_deg": 3.0, "unaccounted": 0, "latency_p99_ms": 60.0}
 """Largest accepted values; docs/simulator.md lists the simulated imperfections."""
 BASE = "jointfit/demo"
 """Topic prefix of the demo."""
-NO_RESULT: dict[str, Any] = {
-    "knee_flexion_rmse_deg": None,
-    "frames": 0,
-    "joint_center_error_mm": None,
-    "latency_ms": {"p50": None, "p99": None},
-    "samples": {"received": 0},
-    "sent": None,
-    "unaccounted": None,
-    "corrupt": 0,
-}
-"""Result of a run that was interrupted before the daemon started."""
 
 
 def demo(
@@ -56,10 +47,6 @@ def demo(
     target is missed: knee flexion error 3 degrees RMS, all samples accounted for, 99 % of frames
     received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the results so far.
     """
-    import orjson
-
-    from jointfit_daemon.tools.output_files import check_output
-
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected a finite number above 0")
     check_output("--picture", picture, (".svg",))
@@ -89,18 +76,18 @@ def demo(
 
 def result_line(outcome: str, figures: Mapping[str, Any]) -> str:
     """Return outcome, errors, latency and sample counts in one line."""
-    latency, samples = figures["latency_ms"], figures["samples"]
+    latency, samples = figures.get("latency_ms", {}), figures.get("samples", {})
 
-    def known(value: object, unit: str) -> str:
-        return "unknown" if value is None else f"{value}{unit}"
+    def known(key: str, unit: str = "", values: Mapping[str, Any] = figures) -> str:
+        return "unknown" if values.get(key) is None else f"{values[key]}{unit}"
 
     return (
-        f"result: {outcome}; knee flexion error"
-        f" {known(figures['knee_flexion_rmse_deg'], '°')} RMS over {figures['frames']} frames;"
-        f" joint center error {known(figures['joint_center_error_mm'], ' mm')}; latency"
-        f" {known(latency['p50'], ' ms')} median, {known(latency['p99'], ' ms')} p99; samples:"
-        f" {known(figures['sent'], '')} sent, {samples['received']} received,"
-        f" {known(figures['unaccounted'], '')} unaccounted for, {figures['corrupt']} corrupt"
+        f"result: {outcome}; knee flexion error {known('knee_flexion_rmse_deg', '°')} RMS over"
+        f" {figures.get('frames', 0)} frames; joint center error"
+        f" {known('joint_center_error_mm', ' mm')}; latency {known('p50', ' ms', latency)} median,"
+        f" {known('p99', ' ms', latency)} p99; samples: {known('sent')} sent,"
+        f" {samples.get('received', 0)} received, {known('unaccounted')} unaccounted for,"
+        f" {figures.get('corrupt', 0)} corrupt"
     )
 
 
@@ -109,11 +96,11 @@ HINTS = {"latency_p99_ms": ": check the load of this machine"}
 
 def missed_targets(figures: dict[str, Any]) -> list[str]:
     """Return one line for each target that the result misses."""
-    values = {**figures, "latency_p99_ms": figures["latency_ms"]["p99"]}
+    values = {**figures, "latency_p99_ms": figures.get("latency_ms", {}).get("p99")}
     return [
-        f"{name} is {values[name]}, expected at most {target:g}{HINTS.get(name, '')}"
+        f"{name} is {found}, expected at most {target:g}{HINTS.get(name, '')}"
         for name, target in TARGETS.items()
-        if values.get(name) is None or not values[name] <= target
+        if (found := values.get(name)) is None or not found <= target
     ]
 
 
@@ -127,7 +114,6 @@ async def _run(
     from jointfit_daemon.tools.demo._run import DemoRun
     from jointfit_daemon.tools.demo._truth import TruthReader
     from jointfit_daemon.tools.embedded_broker import embedded_broker
-    from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
     truth = TruthReader(folder / "truth.jsonl")
     run: DemoRun | None = None
@@ -149,4 +135,4 @@ async def _run(
         finally:
             truth.close()
     stopped = stop if stop.number is not None else None
-    return NO_RESULT if run is None else run.figures(), stopped
+    return {} if run is None else run.figures(), stopped

@@ -41,14 +41,6 @@ class TruthTrack:
         self._rows.append(row)
         self._times.append(row.t_ns)
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @property
-    def last(self) -> TrueLimbState | None:
-        """Return the newest sample."""
-        return self._rows[-1] if self._rows else None
-
     def at(self, t_ns: int) -> TrueLimbState | None:
         """Return the ground truth at `t_ns`, or None outside the recorded interval."""
         k = bisect.bisect_right(self._times, t_ns)
@@ -103,8 +95,6 @@ class DemoScore:
     flexion: RmsAccumulator = field(default_factory=RmsAccumulator)
     segments: dict[str, RmsAccumulator] = field(default_factory=dict)
     frames: int = 0
-    unknown: int = 0
-    """Frames without a knee flexion."""
     covered: int = 0
     """Frames with a knee flexion error within two published standard deviations."""
 
@@ -121,7 +111,6 @@ class DemoScore:
         knee = _table(pose, "joints").get(joint, {})
         flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
         if not isinstance(flexion, int | float):
-            self.unknown += 1
             return
 
         error_deg = flexion - math.degrees(truth.flexion)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import orjson
 
@@ -20,7 +20,6 @@ class TruthReader:
         self._path = path
         self._file: BinaryIO | None = None
         self._rest = b""
-        self.facts: dict[str, Any] = {}
         self.track = TruthTrack()
 
     def read(self) -> None:
@@ -34,8 +33,7 @@ class TruthReader:
         for line in lines:
             row = orjson.loads(line)
             if "truth" in row:
-                self.facts = row
-                continue
+                continue  # the header
 
             centers = {
                 name: tuple(math.nan if x is None else x for x in center)

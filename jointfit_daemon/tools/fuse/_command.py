@@ -8,9 +8,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
+import orjson
 import typer
 
 from jointfit_daemon.nearest_name import unknown_name
+from jointfit_daemon.tools.fuse import _report
+from jointfit_daemon.tools.output_files import check_output, check_plot
+from jointfit_daemon.tools.text_output import check_choice, echo_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -86,9 +90,6 @@ def evaluate(
 ) -> None:
     """Evaluate all methods by leave-one-trial-out cross-validation."""
     from jointfit_daemon.calibration.phases import evaluate
-    from jointfit_daemon.tools.fuse import _report
-    from jointfit_daemon.tools.output_files import check_plot
-    from jointfit_daemon.tools.text_output import echo_json
 
     check_plot(plot)
     limb, read, mounts, trial_warnings = _inputs(
@@ -127,14 +128,9 @@ def fit(
     """Fit a model to all trials and write it as a calibration of the daemon."""
     from datetime import UTC, datetime
 
-    import orjson
-
     from jointfit_daemon import __version__
     from jointfit_daemon.calibration.phases import fit_offline, mounts_of
     from jointfit_daemon.calibration.soft_tissue import METHODS
-    from jointfit_daemon.tools.fuse import _report
-    from jointfit_daemon.tools.output_files import check_output
-    from jointfit_daemon.tools.text_output import echo_json
 
     check_output("--out", out, (".json",))
     if method not in METHODS:
@@ -185,10 +181,8 @@ def apply(
     from jointfit_daemon.calibration.record import MOST_BYTES
     from jointfit_daemon.files.text import read_json
     from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
-    from jointfit_daemon.tools.fuse import _output, _report
+    from jointfit_daemon.tools.fuse import _output
     from jointfit_daemon.tools.fuse._trial import read_available_sensors
-    from jointfit_daemon.tools.output_files import check_output
-    from jointfit_daemon.tools.text_output import check_choice, echo_json
 
     check_output("--out", out, _output.ENDINGS)
     check_choice("--up", up, "yz")
@@ -225,7 +219,6 @@ def _inputs(
     """Return limb, trials, sensor alignments (None: estimated later) and warnings."""
     from jointfit_daemon.calibration.phases import trial_warnings
     from jointfit_daemon.tools.fuse import _trial
-    from jointfit_daemon.tools.text_output import check_choice
 
     check_choice("--up", up, "yz")
     limb = _trial.read_limb(segments, joints, markers or (), cast("Axis", up))

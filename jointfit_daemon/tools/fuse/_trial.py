@@ -166,13 +166,6 @@ def sensors_of(chain: Chain) -> list[str]:
     return [name for group in chain.sensors for name in group]
 
 
-def read_sensors(path: Path, chain: Chain, up: Axis) -> OrientationRecording:
-    """Read the orientations of all sensors of a chain; raises as `read_trial`."""
-    table = read_recording(path, up)
-    q = select_sensors(table, sensors_of(chain), path)
-    return OrientationRecording(table.t_s, q, table.bones)
-
-
 def name_trials(trials: Sequence[OfflineTrial], paths: Sequence[Path]) -> list[OfflineTrial]:
     """Return the trials; files with equal stems are named by their full path.
 
@@ -239,7 +232,8 @@ def read_static(
     if sensors.suffix.lower() == ".json":
         return read_mounts(sensors, limb.chain), markers
 
-    table = read_sensors(sensors, limb.chain, limb.up)
+    table = read_recording(sensors, limb.up)
+    q = select_sensors(table, sensors_of(limb.chain), sensors)
     if reference is not None and not by_markers:
         trial = read_trial(sensors, reference, limb, None)
     elif not by_markers and set(limb.bones.values()) <= set(table.bones):
@@ -247,7 +241,7 @@ def read_static(
     else:
         upright = np.tile(rotation.IDENTITY, (len(table.t_s), 1))
         axes = dict.fromkeys(limb.chain.segments, upright)
-        trial = OfflineTrial(sensors.stem, table.t_s, table.q, axes)
+        trial = OfflineTrial(sensors.stem, table.t_s, q, axes)
 
     found = mounts_of(limb.chain, [trial])
     _check_stillness(sensors, found)

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.markers import _report
+from jointfit_daemon.tools.output_files import check_output, check_plot
+from jointfit_daemon.tools.text_output import check_choice, echo_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,8 +98,6 @@ def markers(
     )
     from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.markers._trials import ModelRequest
-    from jointfit_daemon.tools.output_files import check_output, check_plot
-    from jointfit_daemon.tools.text_output import check_choice
 
     check_choice("--method", method, get_args(RefinementMethod))
     check_choice("--up", up, "xyz")
@@ -151,9 +152,7 @@ def _write_result(
     *,
     as_json: bool,
 ) -> None:
-    from jointfit_daemon.tools.markers import _report
     from jointfit_daemon.tools.markers._output import write_markers
-    from jointfit_daemon.tools.text_output import echo_json
 
     if as_json:
         echo_json(_report.as_json(chain, remarks, found))

@@ -18,7 +18,7 @@ from jointfit_daemon.calibration.phases._cluster_refinement import RefinedCluste
 from jointfit_daemon.calibration.phases._functional import refined_tracks
 from jointfit_daemon.limb_model import Calibration, cluster_record
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
-from jointfit_daemon.tools.calibrate import report
+from jointfit_daemon.tools.calibrate._report import report
 from tests.calibration.synthetic_limb import (
     CHAIN,
     MARKERS,

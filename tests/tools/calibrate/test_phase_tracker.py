@@ -15,8 +15,8 @@ from jointfit_daemon.tools.calibrate import (
     _command,
     _phase_tracker,
     movement_lines,
-    report,
 )
+from jointfit_daemon.tools.calibrate._report import report
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

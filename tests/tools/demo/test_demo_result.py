@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.demo._command import NO_RESULT, result_line
+from jointfit_daemon.tools.demo._command import result_line
 from tests.system.station import restore_signals
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def test_the_result_line_has_errors_latency_and_samples() -> None:
 
 
 def test_result_line_marks_missing_values_as_unknown() -> None:
-    line = result_line("interrupted by SIGINT", NO_RESULT)
+    line = result_line("interrupted by SIGINT", {})
     assert "knee flexion error unknown RMS" in line
     assert "None" not in line
 
