@@ -222,10 +222,16 @@ class _RigReader:
         if not isinstance(tables, dict):
             self.faults.append(Fault("can", "expected tables [can.NAME]", tables))
             return {}
-        read = {
-            name: self._validate(f"can.{name}", tables[name], CanBusSettings) for name in tables
-        }
-        return {name: bus for name, bus in read.items() if bus is not None}
+        buses = {}
+        for at, name in enumerate(tables):
+            bus = self._validate(f"can.{name}", tables[name], CanBusSettings)
+            partial = self.partial.get(f"can.{name}")
+            if bus is None and partial is not None:
+                # A stand-in for a wrong channel: identifiers and load are checked all the same.
+                bus = partial.model_copy(update={"channel": f"unknown{at}"})
+            if bus is not None and None not in dict(bus).values():
+                buses[name] = bus
+        return buses
 
     def _imus(self, chain: ChainTable | None, buses: Mapping[str, CanBusSettings]) -> list[Source]:
         tables = self.table.get("imu", [])

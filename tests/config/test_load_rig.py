@@ -428,6 +428,24 @@ def test_insufficient_bit_rates_and_invalid_interface_names_are_refused(
     )
 
 
+@pytest.mark.parametrize("channel", ["", "can 0", 3, None])
+def test_the_load_of_a_bus_is_checked_although_its_channel_is_wrong(channel: object) -> None:
+    rig = real_rig(can={"channel": channel, "bitrate": 125_000}, xcdi={"rate_hz": 400})
+    found = complaints(rig)
+    assert [line.split()[0].rstrip(":") for line in found] == [
+        "can.can0.channel",
+        "can.can0.bitrate",
+    ]
+
+
+def test_identifiers_on_two_buses_with_wrong_channels_are_not_compared() -> None:
+    rig = real_rig()
+    rig["can"] = {"can0": {"channel": ""}, "can1": {"channel": ""}}
+    rig["imu"][2] = rig["imu"][1] | {"id": "S4", "can": "can1"}
+    found = complaints(rig)
+    assert [line.split()[0] for line in found] == ["can.can0.channel", "can.can1.channel"]
+
+
 def test_sufficient_bit_rates_are_accepted() -> None:
     parse_rig(real_rig())
     parse_rig(real_rig(xbus={"baud": 9600, "rate_hz": 26}))
