@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,74 +10,24 @@ from pydantic import ValidationError
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.model import Chunk, Corrupt, ImuSample
+from jointfit_daemon.model import Chunk, Corrupt
 from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import CanFrame
 from jointfit_protocols.can.slcan import encode_frame
 from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.wires import PtyLine, SlcanAdapter
+from tests.drivers.driver_run import IDENTITY, DriverRun, serving, xcdi_driver
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
+    from collections.abc import Iterable
     from pathlib import Path
 
     from jointfit_protocols.can.slcan import SlcanLine
 
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
 
 def bus_at(folder: Path, **more: Any) -> CanBusSettings:
     return CanBusSettings(interface="slcan", channel=str(folder / "adapter"), **more)
-
-
-def driver_of(name: str, bus: CanBusSettings, base: int = 0, silence_s: float = 2.0) -> XcdiImu:
-    ids = XcdiIdSettings(sample_time=base + 5, group_counter=base + 6, quaternion=base + 0x21)
-    return XcdiImu(
-        XcdiSettings(id=name, segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=silence_s)
-    )
-
-
-class Running:
-    """A driver at work, its chunks decoded."""
-
-    def __init__(self, driver: XcdiImu) -> None:
-        self.decoder = driver.decoder()
-        self.chunks: list[Chunk] = []
-        self.events: list[Any] = []
-        self.task = asyncio.create_task(driver.run(self._emit))
-
-    def _emit(self, chunk: Chunk) -> None:
-        self.chunks.append(chunk)
-        self.events += self.decoder.feed(chunk)
-
-    @property
-    def samples(self) -> list[ImuSample]:
-        return [event for event in self.events if isinstance(event, ImuSample)]
-
-    async def wait_for(self, count: int) -> None:
-        async with asyncio.timeout(5):
-            while len(self.samples) < count:
-                if self.task.done():
-                    self.task.result()
-                await asyncio.sleep(0.005)
-
-    async def cancel(self) -> None:
-        self.task.cancel()
-        await asyncio.wait({self.task})
-
-
-@asynccontextmanager
-async def serving(*devices: Any) -> AsyncIterator[None]:
-    tasks = [asyncio.create_task(device.run()) for device in devices]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        for device in devices:
-            device.unplug()
 
 
 async def opened(adapter: SlcanAdapter) -> None:
@@ -88,7 +37,7 @@ async def opened(adapter: SlcanAdapter) -> None:
         await asyncio.sleep(0.05)
 
 
-async def lost(running: Running, within_s: float = 1.0) -> str:
+async def lost(running: DriverRun, within_s: float = 1.0) -> str:
     async with asyncio.timeout(within_s):
         with pytest.raises(DeviceLostError) as told:
             await running.task
@@ -106,7 +55,7 @@ async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> 
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     devices = two_sensors(adapter)
     async with serving(*devices):
-        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        runs = [DriverRun(xcdi_driver("S3", bus, 0x100)), DriverRun(xcdi_driver("S4", bus, 0x200))]
         await opened(adapter)
         for number in range(50):
             for device in devices:
@@ -153,7 +102,7 @@ async def test_slcan_bus_delivers_frames_that_come_with_the_answer_to_open(tmp_p
     device, _ = two_sensors(adapter)
     adapter.sensor = device
     async with serving(device):
-        run = Running(driver_of("S3", bus, 0x100))
+        run = DriverRun(xcdi_driver("S3", bus, 0x100))
         await opened(adapter)
         device.push(10_000_000, IDENTITY)
         await run.wait_for(2)
@@ -164,15 +113,15 @@ async def test_slcan_bus_delivers_frames_that_come_with_the_answer_to_open(tmp_p
 async def test_an_unplugged_adapter_loses_all_and_gives_all_back(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     devices = two_sensors(adapter)
-    drivers = [driver_of("S3", bus, 0x100), driver_of("S4", bus, 0x200)]
+    drivers = [xcdi_driver("S3", bus, 0x100), xcdi_driver("S4", bus, 0x200)]
     async with serving(*devices):
-        runs = list(map(Running, drivers))
+        runs = list(map(DriverRun, drivers))
         await opened(adapter)
         adapter.unplug()
         for run in runs:
             assert "adapter" in await lost(run)
         adapter.plug()
-        runs = list(map(Running, drivers))
+        runs = list(map(DriverRun, drivers))
         await opened(adapter)
         for number in range(10):
             for device in devices:
@@ -188,8 +137,8 @@ async def test_only_the_silent_sensor_is_lost_and_its_report_lists_received_iden
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     talks, _ = two_sensors(adapter)
     async with serving(talks):
-        heard = Running(driver_of("S3", bus, 0x100))
-        silent = Running(driver_of("S4", bus, 0x200, silence_s=0.4))
+        heard = DriverRun(xcdi_driver("S3", bus, 0x100))
+        silent = DriverRun(xcdi_driver("S4", bus, 0x200, silence_s=0.4))
         await opened(adapter)
         for number in range(60):
             talks.push(number * 10_000_000, IDENTITY)
@@ -207,7 +156,7 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter)
     async with serving(device):
-        run = Running(driver_of("S3", bus, 0x300, silence_s=0.5))
+        run = DriverRun(xcdi_driver("S3", bus, 0x300, silence_s=0.5))
         await opened(adapter)
         for number in range(10):
             device.push(number * 10_000_000, IDENTITY)
@@ -227,12 +176,12 @@ async def test_missing_quaternion_is_reported_while_time_and_counter_arrive(
         driver = XcdiImu(
             XcdiSettings(id="S3", segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=0.5)
         )
-        run = Running(driver)
+        run = DriverRun(driver)
         await opened(adapter)
         sending = asyncio.create_task(send_on(device))
         told = await lost(run, 2.0)
         assert run.chunks == [], "a sensor without orientation is not there"
-        again = Running(driver)
+        again = DriverRun(driver)
         assert await lost(again, 3.0) == told, "the same text, which is reported once"
         sending.cancel()
     assert (
@@ -254,7 +203,7 @@ async def test_a_quaternion_that_stops_is_missed_though_time_and_counter_go_on(
 ) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     async with serving(adapter):
-        run = Running(driver_of("S3", bus, silence_s=0.5))
+        run = DriverRun(xcdi_driver("S3", bus, silence_s=0.5))
         await opened(adapter)
         for number in range(200):
             if run.task.done():
@@ -279,10 +228,10 @@ async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter)
     async with serving(device):
-        first = Running(driver_of("S3", bus))
+        first = DriverRun(xcdi_driver("S3", bus))
         await opened(adapter)
         with pytest.raises(DeviceMisconfiguredError, match=r"S4.*0x\d+.*S3.*block of its own"):
-            await Running(driver_of("S4", bus)).task
+            await DriverRun(xcdi_driver("S4", bus)).task
         device.push(0, IDENTITY)
         await first.wait_for(1)
         await first.cancel()
@@ -291,7 +240,7 @@ async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None
 async def test_lost_bytes_of_a_line_are_counted_by_one_device_only(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     async with serving(adapter):
-        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        runs = [DriverRun(xcdi_driver("S3", bus, 0x100)), DriverRun(xcdi_driver("S4", bus, 0x200))]
         await opened(adapter)
         adapter.send_bytes(b"what is this\r")
         await asyncio.sleep(0.1)
@@ -309,8 +258,8 @@ async def test_a_bug_behind_one_device_hurts_no_other(tmp_path: Path) -> None:
         raise ZeroDivisionError
 
     async with serving(*devices):
-        good = Running(driver_of("S3", bus, 0x100))
-        bad = asyncio.create_task(driver_of("S4", bus, 0x200).run(emit))
+        good = DriverRun(xcdi_driver("S3", bus, 0x100))
+        bad = asyncio.create_task(xcdi_driver("S4", bus, 0x200).run(emit))
         await opened(adapter)
         for device in devices:
             device.push(0, IDENTITY)
@@ -323,7 +272,7 @@ async def test_a_bug_behind_one_device_hurts_no_other(tmp_path: Path) -> None:
 async def test_bit_rate_is_sent_to_the_adapter(tmp_path: Path) -> None:
     adapter = SlcanAdapter(tmp_path / "adapter")
     async with serving(adapter):
-        run = Running(driver_of("S3", bus_at(tmp_path, bitrate=250_000)))
+        run = DriverRun(xcdi_driver("S3", bus_at(tmp_path, bitrate=250_000)))
         await opened(adapter)
         assert adapter.bitrate == 250_000
         await run.cancel()
@@ -334,20 +283,20 @@ async def test_a_bit_rate_slcan_does_not_have_is_refused(tmp_path: Path) -> None
         bus_at(tmp_path, bitrate=83_333)
     unchecked = bus_at(tmp_path).model_copy(update={"bitrate": 83_333})
     with pytest.raises(DeviceMisconfiguredError, match=r"bit rate 83333.*1000000"):
-        await driver_of("S3", unchecked).run(lambda _: None)
+        await xcdi_driver("S3", unchecked).run(lambda _: None)
 
 
 async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter)
     async with serving(device):
-        run = Running(driver_of("S3", bus))
+        run = DriverRun(xcdi_driver("S3", bus))
         await opened(adapter)
         await run.cancel()
         adapter._open = True  # the host died without a word
         for number in range(50):
             device.push(number * 10_000_000, IDENTITY)
-        run = Running(driver_of("S3", bus))
+        run = DriverRun(xcdi_driver("S3", bus))
         await asyncio.sleep(0.2)
         await opened(adapter)
         device.push(50 * 10_000_000, IDENTITY)
@@ -372,4 +321,4 @@ class Chatter:
 async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> None:
     async with serving(Chatter(tmp_path / "adapter")):
         with pytest.raises(DeviceMisconfiguredError, match="no SLCAN adapter found at 115200 baud"):
-            await driver_of("S3", bus_at(tmp_path)).run(lambda _: None)
+            await xcdi_driver("S3", bus_at(tmp_path)).run(lambda _: None)

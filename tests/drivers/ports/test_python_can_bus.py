@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import can
 import pytest
@@ -13,44 +13,15 @@ from pydantic import ValidationError
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_drivers.ports.can_bus import shared_bus
-from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.can import CanFrame, unpack_frames
 from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.wires import PythonCanWire
+from tests.drivers.driver_run import IDENTITY, DriverRun, xcdi_driver
 
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
-
-def driver_of(name: str, bus: CanBusSettings, base: int = 0) -> XcdiImu:
-    ids = XcdiIdSettings(sample_time=base + 5, group_counter=base + 6, quaternion=base + 0x21)
-    return XcdiImu(
-        XcdiSettings(id=name, segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=2.0)
-    )
-
-
-class Running:
-    """A driver at work, its samples decoded."""
-
-    def __init__(self, driver: XcdiImu) -> None:
-        self.decoder = driver.decoder()
-        self.samples: list[ImuSample] = []
-        self.task = asyncio.create_task(driver.run(self._emit))
-
-    def _emit(self, chunk: Chunk) -> None:
-        found = self.decoder.feed(chunk)
-        self.samples += [event for event in found if isinstance(event, ImuSample)]
-
-    async def wait_for(self, count: int) -> None:
-        async with asyncio.timeout(5):
-            while len(self.samples) < count:
-                await asyncio.sleep(0.005)
-
-    async def cancel(self) -> None:
-        self.task.cancel()
-        await asyncio.wait({self.task})
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk
 
 
 async def test_a_bus_of_python_can_is_shared_too() -> None:
@@ -58,7 +29,7 @@ async def test_a_bus_of_python_can_is_shared_too() -> None:
     wire = PythonCanWire("virtual", "shared")
     devices = [XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(base))) for base in (0x100, 0x200)]
     try:
-        runs = [Running(driver_of("S3", bus, 0x100)), Running(driver_of("S4", bus, 0x200))]
+        runs = [DriverRun(xcdi_driver("S3", bus, 0x100)), DriverRun(xcdi_driver("S4", bus, 0x200))]
         async with shared_bus(bus) as opened_bus:
             await asyncio.sleep(0.05)
             began = time.monotonic_ns()
@@ -107,13 +78,13 @@ async def test_error_of_the_receive_thread_is_raised_in_the_driver(
     monkeypatch.setattr(can, "Bus", lambda **_: Broken(error))
     bus = CanBusSettings(interface="virtual", channel="broken")
     with pytest.raises(kind):
-        await driver_of("S3", bus).run(lambda _: None)
+        await xcdi_driver("S3", bus).run(lambda _: None)
 
 
 async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
     bus = CanBusSettings(interface="socketcna", channel="can0")
     with pytest.raises(ValidationError, match="did you mean 'socketcan'"):
-        driver_of("S3", bus)
+        xcdi_driver("S3", bus)
     with pytest.raises(DeviceMisconfiguredError, match="did you mean 'socketcan'"):
         async with shared_bus(bus):
             pass
@@ -122,7 +93,7 @@ async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
 async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
     bus = CanBusSettings(interface="kvaser", channel="0")
     with pytest.raises(DeviceMisconfiguredError, match="opened as kvaser"):
-        await driver_of("S3", bus).run(lambda _: None)
+        await xcdi_driver("S3", bus).run(lambda _: None)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +111,7 @@ async def test_kernels_without_can_and_absent_links(
 
     monkeypatch.setattr("jointfit_drivers.ports._python_can_bus._require_interface", refuse)
     with pytest.raises(kind, match=words):
-        await driver_of("S3", CanBusSettings(channel="can0")).run(lambda _: None)
+        await xcdi_driver("S3", CanBusSettings(channel="can0")).run(lambda _: None)
 
 
 class Filtered(can.BusABC):
@@ -194,7 +165,7 @@ async def test_link_down_is_reported_once_after_the_frames_before_it(
     monkeypatch.setattr(can, "Bus", make)
     monkeypatch.setattr("jointfit_drivers.ports._python_can_bus._require_interface", lambda _: None)
     chunks: list[Chunk] = []
-    driver = driver_of("S3", CanBusSettings(channel="can0"))
+    driver = xcdi_driver("S3", CanBusSettings(channel="can0"))
     task = asyncio.create_task(driver.run(chunks.append))
     await asyncio.sleep(0.02)
     for number in range(100):

@@ -15,7 +15,7 @@ from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.driver_contract import DriverContract
-from jointfit_simulators.wires import PtyLine
+from tests.drivers.driver_run import TextDevice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,20 +31,6 @@ def settings(folder: Path, **more: Any) -> XbusSettings:
     )  # fmt: skip
 
 
-class Modem:
-    """Answers everything in words, like what ModemManager expects."""
-
-    def __init__(self, link: Path) -> None:
-        self._line = PtyLine(link)
-        self.unplug, self.plug = self._line.unplug, self._line.plug
-
-    async def run(self) -> None:
-        await self._line.serve(self._answer)
-
-    def _answer(self, _: bytes) -> None:
-        self._line.write(b"\r\nERROR\r\n")
-
-
 class TestXbus(DriverContract):
     registered_as = "xbus"
 
@@ -57,8 +43,8 @@ class TestXbus(DriverContract):
         return XbusImu(settings(folder))
 
     @override
-    def make_wrong_device(self, folder: Path) -> Modem:
-        return Modem(folder / "imu")
+    def make_wrong_device(self, folder: Path) -> TextDevice:
+        return TextDevice(folder / "imu")
 
 
 class TestXbusThatStreamsFromTheStart(TestXbus):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,12 +17,11 @@ from jointfit_drivers.xbus._required_outputs import required_outputs
 from jointfit_protocols.xbus import XbusCodec, XbusMessage, XbusMessageId
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Precision, real_id
-from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.wires import PtyLine
+from tests.drivers.driver_run import serving
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
 
@@ -32,29 +30,6 @@ def make(folder: Path, **more: Any) -> XbusImu:
     return XbusImu(
         XbusSettings(id="S1", segment="thigh", driver="xbus", port=str(folder / "imu"), **table)
     )
-
-
-@contextlib.asynccontextmanager
-async def powered(device: Any, *, feeding: bool = False) -> AsyncIterator[None]:
-    async def feed() -> None:
-        number = 0
-        while True:
-            device.push(number * 10_000_000, orientation(number))
-            number += 1
-            await asyncio.sleep(0.01)
-
-    tasks = [asyncio.create_task(device.run())]
-    if feeding:
-        tasks.append(asyncio.create_task(feed()))
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        device.unplug()
-        for task in tasks:
-            assert task.cancelled()
 
 
 async def chunks_of(driver: XbusImu, samples: int = 5) -> list[Chunk]:
@@ -95,7 +70,7 @@ async def test_emitted_bytes_begin_with_the_acknowledgement_and_contain_all_repl
 ) -> None:
     options = XbusDeviceOptions(measures_at_once=True, config_delay_s=0.1)
     device = XbusDevice(tmp_path / "imu", options=options)
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         await asyncio.sleep(0.05)
         chunks = await chunks_of(make(tmp_path), 20)
     found = mids(chunks)
@@ -112,7 +87,7 @@ async def test_emitted_bytes_begin_with_the_acknowledgement_and_contain_all_repl
 
 async def test_a_device_that_is_right_is_not_written_to(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu")
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         await chunks_of(make(tmp_path, persist=True))
     assert device.flash_writes == 0
 
@@ -120,7 +95,7 @@ async def test_a_device_that_is_right_is_not_written_to(tmp_path: Path) -> None:
 async def test_a_difference_is_named_and_not_written_without_permission(tmp_path: Path) -> None:
     options = XbusDeviceOptions(outputs=((Item.QUATERNION, 50),))
     device = XbusDevice(tmp_path / "imu", options=options)
-    async with powered(device):
+    async with serving(device):
         said = await refusal(make(tmp_path), DeviceMisconfiguredError)
     assert device.flash_writes == 0
     for part in ("S1", "packet counter", "time", "50 Hz, not 100 Hz", "persist = true"):
@@ -129,7 +104,7 @@ async def test_a_difference_is_named_and_not_written_without_permission(tmp_path
 
 async def test_a_rate_alone_is_offered_as_the_setting_it_takes(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu")
-    async with powered(device):
+    async with serving(device):
         said = await refusal(make(tmp_path, rate_hz=200), DeviceMisconfiguredError)
     assert "set rate_hz = 100" in said
 
@@ -138,7 +113,7 @@ async def test_a_difference_is_written_once_with_permission(tmp_path: Path) -> N
     options = XbusDeviceOptions(outputs=((0x2034, 50),))
     device = XbusDevice(tmp_path / "imu", options=options)
     driver = make(tmp_path, persist=True, world="NED")
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         await chunks_of(driver)
         await chunks_of(driver)
     assert device.flash_writes == 1
@@ -153,7 +128,7 @@ async def test_raw_outputs_are_written_once_where_the_gateway_computes_the_orien
     pytest.importorskip("vqf")
     device = XbusDevice(tmp_path / "imu")
     asked = {"orientation": "gateway", "magnetometer": True}
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         said = await refusal(make(tmp_path, **asked), DeviceMisconfiguredError)
         await chunks_of(make(tmp_path, persist=True, **asked))
         await chunks_of(make(tmp_path, **asked))
@@ -181,7 +156,7 @@ def test_increments_will_do_where_the_device_sends_them_already() -> None:
 
 async def test_a_rate_the_device_rounds_is_named(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu")
-    async with powered(device):
+    async with serving(device):
         said = await refusal(make(tmp_path, rate_hz=120, persist=True), DeviceMisconfiguredError)
     assert "quaternions at 100 Hz, not 120 Hz" in said
     assert "set rate_hz = 100" in said
@@ -196,7 +171,7 @@ async def test_device_error_code_is_reported_as_text(tmp_path: Path) -> None:
             return XbusMessageId.OUTPUT_CONFIGURATION_ACK, b""
 
     device = Refusing(tmp_path / "imu")
-    async with powered(device):
+    async with serving(device):
         said = await refusal(make(tmp_path, persist=True), DeviceMisconfiguredError)
     assert "0x21" in said
     assert "parameter" in said
@@ -205,7 +180,7 @@ async def test_device_error_code_is_reported_as_text(tmp_path: Path) -> None:
 async def test_a_wrong_speed_is_named_with_the_right_one(tmp_path: Path) -> None:
     options = XbusDeviceOptions(baud=921_600, measures_at_once=True)
     device = XbusDevice(tmp_path / "imu", options=options)
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         said = await refusal(make(tmp_path), DeviceMisconfiguredError)
         assert device.streaming  # left as it was
     assert "set baud = 921600" in said
@@ -216,7 +191,7 @@ async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(
     tmp_path: Path,
 ) -> None:
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(baud=9_600))
-    async with powered(device):
+    async with serving(device):
         said = await refusal(make(tmp_path), DeviceMisconfiguredError)
     assert "set baud = 9600" in said
 
@@ -242,14 +217,14 @@ async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
     tmp_path: Path, streams: bool
 ) -> None:
     device = Queueing(tmp_path / "imu", options=XbusDeviceOptions(measures_at_once=streams))
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         assert len(await chunks_of(make(tmp_path))) >= 5
         assert device.asked == 1 or not streams, "one request at a time"
 
 
 async def test_device_that_restarts_at_every_request_is_configured(tmp_path: Path) -> None:
     options = XbusDeviceOptions(measures_at_once=True, config_delay_s=1.5)
-    async with powered(XbusDevice(tmp_path / "imu", options=options), feeding=True):
+    async with serving(XbusDevice(tmp_path / "imu", options=options), feeding=True):
         assert len(await chunks_of(make(tmp_path))) >= 5
 
 
@@ -265,7 +240,7 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
             loop.call_at(self.awake_s, super()._answer, message)
 
     device = Late(tmp_path / "imu")
-    async with powered(device):
+    async with serving(device):
         assert "too late" in await refusal(make(tmp_path), DeviceLostError)
 
 
@@ -282,7 +257,7 @@ async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
 
 async def test_a_stuck_device_is_reset_only_with_permission(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(stuck=True))
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         said = await refusal(make(tmp_path), DeviceLostError)
         assert "reset_if_stuck" in said
         chunks = await chunks_of(make(tmp_path, reset_if_stuck=True))
@@ -291,7 +266,7 @@ async def test_a_stuck_device_is_reset_only_with_permission(tmp_path: Path) -> N
 
 async def test_a_device_that_just_woke_up_is_configured_at_once(tmp_path: Path) -> None:
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(wakes_up=True))
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         chunks = await chunks_of(make(tmp_path))
     assert mids(chunks)[0] == XbusMessageId.GOTO_CONFIG_ACK
 
@@ -299,7 +274,7 @@ async def test_a_device_that_just_woke_up_is_configured_at_once(tmp_path: Path) 
 async def test_a_power_failure_while_streaming_is_one_restart(tmp_path: Path) -> None:
     device, driver = XbusDevice(tmp_path / "imu"), make(tmp_path, silence_s=1.0)
     decoder, events = driver.decoder(), []
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         task = asyncio.create_task(driver.run(lambda chunk: events.extend(decoder.feed(chunk))))
         while device.sent < 10:
             await asyncio.sleep(0.01)
@@ -322,7 +297,7 @@ async def test_the_acknowledgement_is_found_behind_a_broken_message(tmp_path: Pa
         )
 
     device = XbusDevice(tmp_path / "imu", wire_noise=cut_off)
-    async with powered(device, feeding=True):
+    async with serving(device, feeding=True):
         chunks = await chunks_of(make(tmp_path))
     assert mids(chunks)[0] == XbusMessageId.GOTO_CONFIG_ACK
 
@@ -331,7 +306,7 @@ async def test_more_than_the_line_carries_is_refused_before_anything_is_sent(
     tmp_path: Path,
 ) -> None:
     device = XbusDevice(tmp_path / "imu")
-    async with powered(device):
+    async with serving(device):
         said = await refusal(make(tmp_path, rate_hz=400), DeviceMisconfiguredError)
     assert "144000 bit/s" in said
 

@@ -11,7 +11,8 @@ from jointfit_drivers.xcdi import XcdiIdSettings, XcdiImu, XcdiSettings
 from jointfit_protocols.xcdi import id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.driver_contract import DriverContract
-from jointfit_simulators.wires import PtyLine, PythonCanWire, SlcanAdapter
+from jointfit_simulators.wires import PythonCanWire, SlcanAdapter
+from tests.drivers.driver_run import TextDevice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,20 +28,6 @@ def settings(interface: str, channel: str, **more: Any) -> XcdiSettings:
     )  # fmt: skip
 
 
-class Modem:
-    """Answers everything in words, like what ModemManager expects."""
-
-    def __init__(self, link: Path) -> None:
-        self._line = PtyLine(link)
-        self.unplug, self.plug = self._line.unplug, self._line.plug
-
-    async def run(self) -> None:
-        await self._line.serve(self._answer)
-
-    def _answer(self, _: bytes) -> None:
-        self._line.write(b"\r\nERROR\r\n")
-
-
 class TestXcdiOverSlcan(DriverContract):
     registered_as = "xcdi"
 
@@ -53,8 +40,8 @@ class TestXcdiOverSlcan(DriverContract):
         return XcdiImu(settings("slcan", str(folder / "adapter")))
 
     @override
-    def make_wrong_device(self, folder: Path) -> Modem:
-        return Modem(folder / "adapter")
+    def make_wrong_device(self, folder: Path) -> TextDevice:
+        return TextDevice(folder / "adapter")
 
 
 class TestXcdiWith29BitIdsInMicrosecondsOverAMuteAdapter(TestXcdiOverSlcan):
