@@ -170,38 +170,31 @@ class GatewayOrientation:
             self._passed_ns += passed_ns
             self._steps += steps
 
-        first: tuple[FilterOutput, ...] = ()
+        oriented: list[FilterOutput] = []
         if self._filter is None:
             self._start(self.period_ns, last.t_ns)
-            first = (self._update(last),)
+            oriented.append(self._update(last))
 
-        if not followed:
+        if followed:
+            for k in range(1, steps):
+                self._update(_interpolate(last, reading, k / steps))
+        else:
             # A new inclination, and the same gyroscope bias.
             bias, sd = self._filter.getBiasEstimate()
             self._start(self._period_ns, reading.t_ns)
             self._filter.setBiasEstimate(bias, sd)
-            return self._step((self._update(reading, follows=False),), reading, steps - 1, True)
+            oriented.clear()
+        oriented.append(self._update(reading, follows=followed))
 
-        for k in range(1, steps):
-            self._update(_interpolate(last, reading, k / steps))
-        return self._step((*first, self._update(reading)), reading, steps - 1)
-
-    def _step(
-        self,
-        oriented: tuple[FilterOutput, ...],
-        reading: RawReading,
-        missing: int,
-        restarted: bool = False,
-    ) -> FilterStep:
-        """Return the output: none before the filter has settled."""
-        if self._started_ns is None:
-            return FilterStep(oriented, missing, restarted)
-
-        waited_ns = reading.t_ns - self._started_ns
-        if waited_ns < self._settle_ns and not self._filter.getRestDetected():
-            return FilterStep((), missing, restarted)
-        self._started_ns = None
-        return FilterStep(oriented[-1:], missing, restarted)
+        # No output before the filter has settled.
+        if self._started_ns is not None:
+            waited_ns = reading.t_ns - self._started_ns
+            if waited_ns < self._settle_ns and not self._filter.getRestDetected():
+                oriented.clear()
+            else:
+                self._started_ns = None
+                oriented = oriented[-1:]
+        return FilterStep(tuple(oriented), steps - 1, restarted=not followed)
 
     def _start(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns

@@ -23,23 +23,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import MocapLayout
 from jointfit_daemon.nearest_name import did_you_mean
-from jointfit_protocols.natnet import (
-    AssetDescription,
-    BodyDescription,
-    MarkerSetDescription,
-    SkeletonDescription,
-)
+from jointfit_protocols import natnet
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from types import UnionType
 
-    from jointfit_protocols.natnet import ModelDefinition
 
 Key = int | tuple[str, int]
 """Id of a labeled marker or body, or set name and place in the set."""
 
-_MODELS = BodyDescription | SkeletonDescription | AssetDescription
+_MODELS = natnet.BodyDescription | natnet.SkeletonDescription | natnet.AssetDescription
 _EVERY = "all"
 _MOST_COLUMNS = 2000
 """Columns besides those named in rig.toml. Further ones are dropped, because each costs time in
@@ -94,7 +88,7 @@ class Binding:
 
 
 def bind_model(
-    model: ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str, str]
+    model: natnet.ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str, str]
 ) -> Binding:
     """Return the columns for a model.
 
@@ -105,7 +99,7 @@ def bind_model(
     markers, bodies : mapping of str to str
         Names in rig.toml, and the key of each.
     """
-    shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, BodyDescription)
+    shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, natnet.BodyDescription)
     all_bodies, all_markers = _body_entries(model), _marker_entries(model)
     bodies_found = [e for e in all_bodies if e.owner or e.key not in shared_bodies]
     markers_found = [
@@ -140,13 +134,13 @@ def body_key(owner: int, member: int) -> int:
 # --- entries of the model ---------------------------------------------------------------------
 
 
-def _body_entries(model: ModelDefinition) -> list[ModelEntry]:
+def _body_entries(model: natnet.ModelDefinition) -> list[ModelEntry]:
     found: list[ModelEntry] = []
     for item in model.descriptions:
-        if isinstance(item, BodyDescription):
+        if isinstance(item, natnet.BodyDescription):
             found.append(ModelEntry(item.id, "", item.name, 1))
-        elif isinstance(item, SkeletonDescription | AssetDescription):
-            inner = item.bones if isinstance(item, SkeletonDescription) else item.bodies
+        elif isinstance(item, natnet.SkeletonDescription | natnet.AssetDescription):
+            inner = item.bones if isinstance(item, natnet.SkeletonDescription) else item.bodies
             found += [
                 ModelEntry(body_key(item.id, body.id), item.name, body.name, number)
                 for number, body in enumerate(inner, 1)
@@ -154,21 +148,23 @@ def _body_entries(model: ModelDefinition) -> list[ModelEntry]:
     return found
 
 
-def _marker_entries(model: ModelDefinition) -> list[ModelEntry]:
-    sets = {m.name: m.markers for m in model.descriptions if isinstance(m, MarkerSetDescription)}
+def _marker_entries(model: natnet.ModelDefinition) -> list[ModelEntry]:
+    sets = {
+        m.name: m.markers for m in model.descriptions if isinstance(m, natnet.MarkerSetDescription)
+    }
     found: list[ModelEntry] = []
 
     for item in model.descriptions:
-        if isinstance(item, BodyDescription):
+        if isinstance(item, natnet.BodyDescription):
             named = (item.markers, sets.get(item.name, ()))
             names = [
                 next((n[i] for n in named if i < len(n) and n[i]), f"Marker{i + 1}")
                 for i in range(max(len(item.positions), len(named[1])))
             ]
             found += _members(item.id, item.name, names)
-        elif isinstance(item, SkeletonDescription):
+        elif isinstance(item, natnet.SkeletonDescription):
             found += _members(item.id, item.name, sets.get(item.name, ()))
-        elif isinstance(item, AssetDescription):
+        elif isinstance(item, natnet.AssetDescription):
             found += [
                 ModelEntry(body_key(item.id, m.id), item.name, m.name, number)
                 for number, m in enumerate(item.markers, 1)
@@ -185,7 +181,7 @@ def _members(model: int, owner: str, names: Iterable[str]) -> list[ModelEntry]:
     return [ModelEntry(body_key(model, i), owner, name, i) for i, name in enumerate(names, 1)]
 
 
-def _shared_ids(model: ModelDefinition, kinds: type | UnionType) -> dict[Key, list[str]]:
+def _shared_ids(model: natnet.ModelDefinition, kinds: type | UnionType) -> dict[Key, list[str]]:
     """Return the ids that several models of these kinds have, and the names of the models."""
     names: defaultdict[Key, list[str]] = defaultdict(list)
     for item in model.descriptions:

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from jointfit_drivers.natnet._binding import Binding, Key
     from jointfit_protocols.natnet import FrameOfData
 
+    Place = Callable[[float, float, float], Vector]
+    Turn = Callable[[float, float, float, float], Quaternion]
+
 _HALF = math.sqrt(0.5)
 _NO_POSITION: Vector = (math.nan, math.nan, math.nan)
 _NO_ORIENTATION: Quaternion = (math.nan, math.nan, math.nan, math.nan)
@@ -152,12 +155,7 @@ def _array(rows: list[Vector] | list[Quaternion], width: int) -> NDArray[np.floa
     return np.array(rows, dtype=np.float64).reshape(len(rows), width)
 
 
-_WORLDS: dict[
-    str,
-    tuple[
-        Callable[[float, float, float], Vector], Callable[[float, float, float, float], Quaternion]
-    ],
-] = {
+_WORLDS: dict[str, tuple[Place, Turn]] = {
     "x": (
         lambda x, y, z: (-z, y, x),
         lambda w, x, y, z: (_HALF * (w + y), _HALF * (x - z), _HALF * (y - w), _HALF * (z + x)),

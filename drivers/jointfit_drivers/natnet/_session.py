@@ -101,7 +101,13 @@ class NatNetSession:
             unicast = is_unicast(self._settings, info)
             try:
                 if not unicast:
-                    self._join(info)
+                    port = self._settings.data_port or info.data_port
+                    check_group(self._name, info, port)
+                    try:
+                        link.join(info.group, port)
+                    except OSError as error:
+                        text = f"cannot join {info.group}:{port}: {error.strerror or error}"
+                        raise DeviceLostError(f"{self._name}: {text}") from error
 
                 # The server's own bitstream is used if it refuses another one.
                 if self._settings.wanted_version is not None:
@@ -207,15 +213,6 @@ class NatNetSession:
                 "command_port (Motive: Streaming pane, command port, 1510 unless changed)"
             )
         raise DeviceLostError(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
-
-    def _join(self, info: natnet.ServerInfo) -> None:
-        port = self._settings.data_port or info.data_port
-        check_group(self._name, info, port)
-        try:
-            self._link.join(info.group, port)
-        except OSError as error:
-            text = f"cannot join {info.group}:{port}: {error.strerror or error}"
-            raise DeviceLostError(f"{self._name}: {text}") from error
 
     async def _stream(self, info: natnet.ServerInfo, unicast: bool) -> None:
         began_ns = time.monotonic_ns()

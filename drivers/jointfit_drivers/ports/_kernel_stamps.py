@@ -5,7 +5,6 @@ The kernel stamps the end of a frame, in UNIX seconds. The conversion returns it
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 from jointfit_drivers.ports._wall_clock import WallClock
@@ -24,17 +23,12 @@ class KernelStamps(WallClock):
     ----------
     bitrate : int
         Bit rate of the bus, bit/s. It gives the duration of a frame.
-    monotonic_ns, unix_ns : callable
-        The two clocks, ns; replaced in tests.
+    *clocks : callable
+        The two clocks of `WallClock`; replaced in tests.
     """
 
-    def __init__(
-        self,
-        bitrate: int,
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
-        unix_ns: Callable[[], int] = time.time_ns,
-    ) -> None:
-        super().__init__(monotonic_ns, unix_ns)
+    def __init__(self, bitrate: int, *clocks: Callable[[], int]) -> None:
+        super().__init__(*clocks)
         self._bit_ns = _NS / bitrate
 
     def start_ns(self, unix_s: float, size: int, extended: bool) -> int:

@@ -144,6 +144,11 @@ class PythonCanBus:
 
     async def _open_bus(self) -> can.BusABC:
         """Open the bus, outside the event loop where that may take long, and convert its errors."""
+
+        def close_late(made: asyncio.Future[can.BusABC]) -> None:
+            if not made.cancelled() and made.exception() is None:
+                made.result().shutdown()
+
         try:
             if self._kernel:
                 _require_interface(self._settings.channel)  # otherwise python-can leaks a socket
@@ -154,7 +159,7 @@ class PythonCanBus:
                 return await asyncio.shield(making)
             except asyncio.CancelledError:
                 # The thread cannot be cancelled: close its bus when it is open.
-                making.add_done_callback(_close_late)
+                making.add_done_callback(close_late)
                 raise
         except Exception as error:  # a missing vendor library gives even NameError
             raise self._opening_error(error) from error
@@ -198,14 +203,8 @@ class PythonCanBus:
         t_ns = time.monotonic_ns()
         if self._kernel:
             t_ns = self._stamps.start_ns(message.timestamp, len(data), extended)
-        return CanFrame(
-            t_ns,
-            message.arbitration_id,
-            data,
-            extended,
-            message.is_error_frame,
-            message.is_remote_frame,
-        )
+        kind = (extended, message.is_error_frame, message.is_remote_frame)
+        return CanFrame(t_ns, message.arbitration_id, data, *kind)
 
     def _opening_error(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
         """Return the error for a bus that cannot be opened, with its remedy."""
@@ -268,12 +267,6 @@ def unknown_kind(kind: str) -> str | None:
     if kind == "slcan" or kind in can.VALID_INTERFACES:
         return None
     return unknown_name("CAN interface", kind, sorted({*can.VALID_INTERFACES, "slcan"}))
-
-
-def _close_late(making: asyncio.Future[can.BusABC]) -> None:
-    """Close a bus that was opened after its request was cancelled."""
-    if not making.cancelled() and making.exception() is None:
-        making.result().shutdown()
 
 
 class _Pump:

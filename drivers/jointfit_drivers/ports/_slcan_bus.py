@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_protocols.can import CanFrame, host_corrupt
-from jointfit_protocols.can.slcan import BITRATES, SlcanCodec, SlcanLine, bitrate_code
+from jointfit_protocols.can.slcan import BITRATES, SlcanCodec, SlcanLine
 from jointfit_protocols.corrupt import CorruptBytes
 
 if TYPE_CHECKING:
@@ -52,7 +52,6 @@ class SlcanBus:
         self._decoder = SlcanCodec(baud, bitrate=settings.bitrate)
         self._understood = 0  # frames and answers of the handshake
         self._early: list[tuple[int, list[CanFrame]]] = []  # read together with the answer to `O`
-        self._is_open = False
         self._reading: asyncio.Task[None] | None = None
 
     async def open(
@@ -65,22 +64,14 @@ class SlcanBus:
         DeviceLostError
             The port is absent or in use, or the adapter refuses to open the bus.
         DeviceMisconfiguredError
-            The file is no serial port, the device does not answer in SLCAN, or the bit rate is
-            none of the nine SLCAN bit rates.
+            The file is no serial port, the device does not answer in SLCAN, or it refuses the bit
+            rate.
         """
-        code = bitrate_code(self._settings.bitrate)
-        if code is None:
-            known = ", ".join(str(rate) for rate in BITRATES)
-            raise DeviceMisconfiguredError(
-                f"{self._settings.channel}: SLCAN has no bit rate {self._settings.bitrate}: "
-                f"set `bitrate` of the [can] table to one of {known}"
-            )
         self._port.__enter__()
-        self._is_open = True
         try:
-            await self._handshake(code)
+            await self._handshake()
         except BaseException:
-            self._exit_port()
+            self._port.__exit__()
             raise
 
         self._reading = asyncio.create_task(
@@ -93,25 +84,19 @@ class SlcanBus:
     async def close(self) -> None:
         """Stop reading, then close the bus and the port."""
         reading, self._reading = self._reading, None
-        if reading is not None:
+        if reading is None:
+            return
+
+        try:
             reading.cancel()
             await asyncio.wait({reading})
-
-        if not self._is_open:
-            return
-        try:
             with suppress(DeviceLostError, TimeoutError):
                 async with asyncio.timeout(0.1):
                     await self._port.write(b"C\r")
                     # Closing the port discards unsent bytes.
                     await asyncio.sleep(4 * 10 / self._settings.baud)
         finally:
-            self._exit_port()
-
-    def _exit_port(self) -> None:
-        if self._is_open:
-            self._is_open = False
-            self._port.__exit__(None, None, None)
+            self._port.__exit__()
 
     async def _read(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
@@ -138,7 +123,7 @@ class SlcanBus:
         except Exception as error:  # noqa: BLE001 - handed to every subscriber, who raises it
             failed(error)
 
-    async def _handshake(self, code: int) -> None:
+    async def _handshake(self) -> None:
         """Open the adapter's bus from any state that an earlier session left."""
         settings = self._settings
         await self._port.write(b"\r\r\rC\r")  # end an incomplete command, then close the bus
@@ -151,7 +136,7 @@ class SlcanBus:
         self._early.clear()
 
         await self._ask(b"V\r", "V")
-        if await self._ask(b"S%d\r" % code) == "\a":
+        if await self._ask(b"S%d\r" % BITRATES.index(settings.bitrate)) == "\a":
             raise DeviceMisconfiguredError(
                 f"{settings.channel}: the adapter refuses {settings.bitrate} bit/s: "
                 "set `bitrate` of the [can] table to what adapter and sensors share"

@@ -17,7 +17,7 @@ import time
 from collections import deque
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
@@ -27,11 +27,11 @@ from jointfit_drivers.ports._slcan_bus import SlcanBus
 from jointfit_protocols.can import HOST_CORRUPT, CanFrame, pack_frames
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Collection, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping
 
     from jointfit_daemon.driver import CanBusSettings, Emit
 
-__all__ = ["Backend", "CanKey", "SharedBus", "shared_bus", "unknown_kind"]
+__all__ = ["CanKey", "SharedBus", "shared_bus", "unknown_kind"]
 
 CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""
@@ -50,21 +50,6 @@ _SAMPLES = 4
 """Stored frames of each unclaimed identifier."""
 _EARLY = 16
 """Chunks that wait for the first frame with the required identifier."""
-
-
-class Backend(Protocol):
-    """Reader of one bus."""
-
-    async def open(
-        self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
-    ) -> None:
-        """Start reading; raise if that fails. Later errors go to `failed`."""
-
-    def listen(self, ids: Collection[CanKey] | None) -> None:
-        """Accept these identifiers (others may pass as well); None accepts all."""
-
-    async def close(self) -> None:
-        """Release all resources; also after a failure, also twice."""
 
 
 @dataclass(eq=False, slots=True)
@@ -123,7 +108,7 @@ class SharedBus:
         self.foreign = 0
         """Frames that no device of the rig subscribed to."""
         self._settings = settings
-        self._backend: Backend | None = None
+        self._backend: SlcanBus | PythonCanBus | None = None
         self._failed: Exception | None = None
         self._unclaimed: deque[tuple[int, CanFrame]] = deque(maxlen=_UNCLAIMED)
         self._others = 0  # frames delivered to devices of the rig

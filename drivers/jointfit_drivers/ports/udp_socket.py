@@ -77,28 +77,26 @@ class UdpSocket:
             self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
             if shared:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._filter(sender)
+
+            # The kernel drops datagrams of other senders; the reader checks them again.
+            (source,) = struct.unpack("!I", socket.inet_aton(sender))
+            program = array.array(
+                "B",
+                _INSTRUCTION.pack(_LOAD_WORD, 0, 0, _SOURCE_ADDRESS)
+                + _INSTRUCTION.pack(_JUMP_IF_EQUAL, 0, 1, source)
+                + _INSTRUCTION.pack(_RETURN, 0, 0, _WHOLE_PACKET)
+                + _INSTRUCTION.pack(_RETURN, 0, 0, 0),
+            )
+            start, size = program.buffer_info()
+            described = _PROGRAM.pack(size // _INSTRUCTION.size, start)
+            with contextlib.suppress(OSError):  # a kernel without socket filters
+                self._socket.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, described)
+
             self._socket.bind((address, port))
         except OSError:
             self._socket.close()
             raise
         self._wall = WallClock()
-
-    def _filter(self, sender: str) -> None:
-        """Let the kernel drop datagrams of other senders; the reader checks them again."""
-        (address,) = struct.unpack("!I", socket.inet_aton(sender))
-        program = array.array(
-            "B",
-            _INSTRUCTION.pack(_LOAD_WORD, 0, 0, _SOURCE_ADDRESS)
-            + _INSTRUCTION.pack(_JUMP_IF_EQUAL, 0, 1, address)
-            + _INSTRUCTION.pack(_RETURN, 0, 0, _WHOLE_PACKET)
-            + _INSTRUCTION.pack(_RETURN, 0, 0, 0),
-        )
-
-        start, size = program.buffer_info()
-        described = _PROGRAM.pack(size // _INSTRUCTION.size, start)
-        with contextlib.suppress(OSError):  # a kernel without socket filters
-            self._socket.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, described)
 
     @classmethod
     def in_group(cls, group: str, port: int, local: str, *, sender: str) -> UdpSocket:

@@ -158,18 +158,18 @@ class XbusConversation:
             messages = [event for event in found if isinstance(event, XbusMessage)]
             self.understood += sum(map(_is_certain, messages))
             for message in messages:
-                if message.mid in mids and _is_certain(message):
-                    if message.mid == XbusMessageId.GOTO_CONFIG_ACK and not self._emitting:
-                        self._start_emitting(message)
-                    return message
-        return None
+                if message.mid not in mids or not _is_certain(message):
+                    continue
 
-    def _start_emitting(self, message: XbusMessage) -> None:
-        """Start emitting with the acknowledgement of configuration mode."""
-        after = self._decoder.fed - message.end
-        rest = self._recent[len(self._recent) - after :]
-        self._emitting, self._recent = True, b""
-        self._emit(Chunk(self._t_ns, encode(message.mid, message.data, message.bid) + rest))
+                # From the acknowledgement of configuration mode on, all bytes are emitted.
+                if message.mid == XbusMessageId.GOTO_CONFIG_ACK and not self._emitting:
+                    after = self._decoder.fed - message.end
+                    rest = self._recent[len(self._recent) - after :]
+                    self._emitting, self._recent = True, b""
+                    wire = encode(message.mid, message.data, message.bid)
+                    self._emit(Chunk(self._t_ns, wire + rest))
+                return message
+        return None
 
 
 def _is_certain(message: XbusMessage) -> bool:

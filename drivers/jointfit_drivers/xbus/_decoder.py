@@ -273,7 +273,15 @@ class XbusDecoder:
         """Return the events of a message other than a measurement."""
         mid, data = message.mid, message.data
         if mid == XbusMessageId.WAKE_UP:
-            return [] if data else self._wake_up_events()  # a corrupt measurement has data
+            if data:  # a corrupt measurement
+                return []
+            out = self._drop_held()
+            self._continuity.forget()
+            self._forget_orientation()
+            if self._measuring:  # it lost power, or was reset
+                self._measuring = False
+                out.append(DeviceEvent("restart", "device restarted (WakeUp received)"))
+            return out
 
         if mid in {XbusMessageId.ERROR, XbusMessageId.WARNING}:
             code = data[0] if data else 0
@@ -286,16 +294,6 @@ class XbusDecoder:
         known = _device_property(mid, data)
         text = ", ".join(f"{key} {value}" for key, value in known.items())
         return [DeviceEvent("info", text, known)] if known else []
-
-    def _wake_up_events(self) -> list[Decoded]:
-        """Return a restart if the device had been measuring: it lost power, or was reset."""
-        out = self._drop_held()
-        self._continuity.forget()
-        self._forget_orientation()
-        if self._measuring:
-            self._measuring = False
-            out.append(DeviceEvent("restart", "device restarted (WakeUp received)"))
-        return out
 
     def _drop_held(self) -> list[Decoded]:
         """Reject an orientation that no later message confirmed."""

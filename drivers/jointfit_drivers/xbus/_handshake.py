@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NoReturn
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.xbus import _sync_lines
 from jointfit_drivers.xbus._conversation import OUTSTANDING_S, XbusConversation
-from jointfit_drivers.xbus._required_outputs import ORIENTATION, message_bytes, required_outputs
+from jointfit_drivers.xbus._required_outputs import ORIENTATION, required_outputs
 from jointfit_protocols.xbus import XbusMessage, XbusMessageId
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, real_id
@@ -34,8 +34,6 @@ _LISTEN_S = 0.15
 """Time at each speed of the search, s. An acknowledgement takes 10 ms at 9600 baud."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
 """Requests after a reset, 0.1 s apart. A stuck MTi-G-700 answered 1.8 s after its reset."""
-_BITS = 10
-"""Bits of one byte on the line, 8N1."""
 _FRAMES = (0, 1)
 """Frames of the alignment rotations: sensor, local."""
 _NO_SYNC = bytes(12)
@@ -80,31 +78,29 @@ class XbusHandshake:
             differs and may not be written.
         """
         settings = self._settings
-        needs = settings.rate_hz * message_bytes(self._needs) * _BITS
-        if needs > settings.baud:
+        needs = settings.serial_bits_per_s
+        if needs is not None and needs > settings.baud:
             raise DeviceMisconfiguredError(
                 f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
                 f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
             )
 
         self._conversation.reset()
-        if not await self._ensure_config():
+        entered = await self._conversation.enter_config(
+            late_s=OUTSTANDING_S, late_if_silent=self._hunt
+        )
+        if not entered and settings.reset_if_stuck and self._conversation.understood:
+            log.warning("%s: streams but does not answer; resetting it", self._who)
+            await self._conversation.send(XbusMessageId.RESET)
+            entered = await self._conversation.enter_config(tries=_RESETS, wait_s=_RESET_WAIT_S)
+        if not entered:
             await self._explain_silence()
+
         await self._read_identity()
         await self._ensure_outputs()
         await self._ensure_sync()
         reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
         self._refuse_error(reply, "refuses to start measuring")
-
-    async def _ensure_config(self) -> bool:
-        """Return whether the device is in configuration mode."""
-        if await self._conversation.enter_config(late_s=OUTSTANDING_S, late_if_silent=self._hunt):
-            return True
-        if not self._settings.reset_if_stuck or not self._conversation.understood:
-            return False
-        log.warning("%s: streams but does not answer; resetting it", self._who)
-        await self._conversation.send(XbusMessageId.RESET)
-        return await self._conversation.enter_config(tries=_RESETS, wait_s=_RESET_WAIT_S)
 
     async def _read_identity(self) -> None:
         """Request the properties that the decoder reports; only the device id is required."""

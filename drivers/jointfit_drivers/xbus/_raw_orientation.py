@@ -93,7 +93,19 @@ class RawOrientation:
         self, message: RawMessage, values: Mapping[int, object], modulus: int
     ) -> list[Decoded] | None:
         """Return warnings and samples of a complete message; None if it is not plausible."""
-        reading = self._convert(message.ticks, values, modulus)
+        passed = 0 if self._ticks is None else (message.ticks - self._ticks) % modulus
+        period_s = self._filter.period_ns * 1e-9
+
+        # Increments are divided by the interval; both forms are in sensor axes.
+        rate, force = values.get(RATES[0]), values.get(FORCES[0])
+        if rate is None:
+            turn = cast("tuple[float, float, float, float]", values[RATES[1]])
+            rate = _scaled(_rotation_vector(turn), 1.0 / period_s)
+        if force is None:
+            force = _scaled(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
+        field = values.get(FIELD) if self._made[1] else None
+        vectors = (cast("Vector", rate), cast("Vector", force), cast("Vector | None", field))
+        reading = RawReading(self._t_ns + passed * TICK_NS, *vectors)
         if message.ticks == self._ticks or not is_plausible(reading):
             return None
 
@@ -108,22 +120,6 @@ class RawOrientation:
             out += self._state_events()
             out.append(_sample(message, reading, step.oriented[-1]))
         return out
-
-    def _convert(self, ticks: int, values: Mapping[int, object], modulus: int) -> RawReading:
-        passed = 0 if self._ticks is None else (ticks - self._ticks) % modulus
-        period_s = self._filter.period_ns * 1e-9
-
-        rate, force = values.get(RATES[0]), values.get(FORCES[0])
-        if rate is None:
-            turn = cast("tuple[float, float, float, float]", values[RATES[1]])
-            rate = _scaled(_rotation_vector(turn), 1.0 / period_s)
-        if force is None:
-            force = _scaled(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
-
-        field = values.get(FIELD) if self._made[1] else None
-        t_ns = self._t_ns + passed * TICK_NS
-        vectors = (cast("Vector", rate), cast("Vector", force), cast("Vector | None", field))
-        return RawReading(t_ns, *vectors)
 
     def _warnings(
         self, message: RawMessage, values: Mapping[int, object], *, restarted: bool, missing: int
@@ -180,19 +176,16 @@ class RawOrientation:
         return out
 
 
-def _sample(message: RawMessage, reading: RawReading, oriented: FilterOutput) -> ImuSample:
+def _sample(
+    message: RawMessage,
+    reading: RawReading,
+    oriented: FilterOutput,
+) -> ImuSample:
     q = oriented.q_world_sensor
-    return ImuSample(
-        message.arrival_ns,
-        q,
-        q,
-        message.ticks,
-        message.counter,
-        message.status,
-        None,  # the device sends the mean rate since the previous sample
-        reading.force,
-        reading.magnetic,
-    )
+    arrival_ns, ticks, counter, status = message
+    # The device sends the mean rate since the previous sample, not the present one.
+    rate, force, field = None, reading.force, reading.magnetic
+    return ImuSample(arrival_ns, q, q, ticks, counter, status, rate, force, field)
 
 
 def _rotation_vector(q: tuple[float, float, float, float]) -> Vector:

@@ -6,9 +6,12 @@ accepted in place of rates if the device is already configured for them.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_protocols.xbus.mtdata2 import Item, reals_in
+
+if TYPE_CHECKING:
+    from jointfit_drivers.xbus._settings import XbusSettings
 
 _FRAME_BYTES = 5 + 5 + 7
 """Framing, packet counter and time, bytes."""
@@ -31,19 +34,7 @@ _INERTIAL = (
 _FIELD = RequiredOutput((Item.MAGNETIC_FIELD,), "magnetic field", "magnetic fields")
 
 
-class OrientationSettings(Protocol):
-    """The keys of a device's table that determine its required outputs."""
-
-    @property
-    def orientation(self) -> str:
-        """``device`` or ``gateway``."""
-
-    @property
-    def magnetometer(self) -> bool:
-        """Whether the gateway uses the magnetometer."""
-
-
-def required_outputs(settings: OrientationSettings) -> tuple[RequiredOutput, ...]:
+def required_outputs(settings: XbusSettings) -> tuple[RequiredOutput, ...]:
     """Return the outputs that a device with these settings must send."""
     if settings.orientation == "device":
         return ORIENTATION

@@ -111,7 +111,12 @@ def sync_differences(found: Sequence[SyncSetting], asked: Sequence[SyncSetting])
 
 def describe_entry(one: SyncSetting) -> str:
     """Return a description of an entry."""
-    words = [function_name(one.function), "on", line_name(one.line), polarity_name(one.polarity)]
+    words = [
+        function_name(one.function),
+        "on",
+        line_name(one.line),
+        polarity_name(one.polarity),
+    ]
     more = {
         "once": one.once,
         "skip_first": one.skip_first,

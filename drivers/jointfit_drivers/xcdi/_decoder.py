@@ -13,15 +13,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.xcdi._continuity import XcdiContinuity
-from jointfit_protocols.can import (
-    HOST_CORRUPT,
-    HOST_DROPPED,
-    RECORD_BYTES,
-    CanFrame,
-    describe_error,
-    host_count,
-    unpack_frames,
-)
+from jointfit_protocols import can
 from jointfit_protocols.orientation import OrientationGate
 from jointfit_protocols.xcdi import (
     OVERFLOW,
@@ -87,8 +79,8 @@ class XcdiDecoder:
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
         out: list[Decoded] = []
-        for item in unpack_frames(chunk.data):
-            if not isinstance(item, CanFrame):
+        for item in can.unpack_frames(chunk.data):
+            if not isinstance(item, can.CanFrame):
                 out.append(self._lose(item.discarded, item.reason))
             elif item.error:
                 out += self._error_frame_events(item)
@@ -101,7 +93,7 @@ class XcdiDecoder:
                     text = _OVERFLOWED if known else f"device reports error {message.code}"
                     out += self._limited("error", text, message.t_ns)
                 elif message is not None:
-                    out.append(self._lose(RECORD_BYTES, message.reason))
+                    out.append(self._lose(can.RECORD_BYTES, message.reason))
         return out
 
     def flush(self) -> list[Decoded]:
@@ -204,16 +196,16 @@ class XcdiDecoder:
             text = f"median quaternion norm is {norm:.4g}, expected 1: change `byte_order`"
             out += self._once("warning", "norm", text, {"median_norm": norm})
 
-    def _error_frame_events(self, frame: CanFrame) -> list[Decoded]:
+    def _error_frame_events(self, frame: can.CanFrame) -> list[Decoded]:
         """Return the events of an error frame of the controller, its driver or the host."""
-        if frame.can_id == HOST_CORRUPT:
-            return [self._lose(host_count(frame), "no SLCAN line")]
-        if frame.can_id == HOST_DROPPED:
-            lost = host_count(frame)
+        if frame.can_id == can.HOST_CORRUPT:
+            return [self._lose(can.host_count(frame), "no SLCAN line")]
+        if frame.can_id == can.HOST_DROPPED:
+            lost = can.host_count(frame)
             text = f"this host was too slow: the kernel dropped {lost} CAN frames"
             return [DeviceEvent("warning", text, {"dropped_frames": lost})]
 
-        text, serious = describe_error(frame)
+        text, serious = can.describe_error(frame)
         return self._limited("error" if serious else "warning", text, frame.t_ns)
 
     def _limited(self, kind: str, text: str, t_ns: int) -> list[Decoded]:
@@ -234,7 +226,7 @@ class XcdiDecoder:
     def _refuse(self, reason: str, out: list[Decoded]) -> None:
         """Discard the quaternion frame that was just decoded."""
         self._refused += 1
-        out.append(self._lose(RECORD_BYTES, reason))
+        out.append(self._lose(can.RECORD_BYTES, reason))
 
     def _lose(self, count: int, reason: str) -> Corrupt:
         self.discarded_bytes += count

@@ -159,7 +159,14 @@ class XcdiImu:
         ids = {key: data_id.name.lower() for key, data_id in by_id.items()}
         (needed,) = (key for key, data_id in by_id.items() if data_id is DataId.QUATERNION)
 
+        left = _RAW_FRAMES if log.isEnabledFor(logging.DEBUG) else 0
+
         def emit_sample(chunk: Chunk) -> None:
+            nonlocal left
+            if left:
+                for frame in unpack_frames(chunk.data)[:left]:
+                    left -= 1
+                    log.debug("%s: %s", settings.id, frame)
             self._silent_s = settings.silence_s
             emit(chunk)
 
@@ -173,23 +180,7 @@ class XcdiImu:
 
         silence_s = self._silent_s
         self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
-        emit_logged = self._logged(emit_sample)
         async with shared_bus(settings.can) as bus:
             await bus.pump(
-                settings.id, ids, emit_logged, silence_s, needed=needed, resembles=resembles
+                settings.id, ids, emit_sample, silence_s, needed=needed, resembles=resembles
             )
-
-    def _logged(self, emit: Emit) -> Emit:
-        """Return `emit`, which also logs the first frames at debug level."""
-        if not log.isEnabledFor(logging.DEBUG):
-            return emit
-        left = _RAW_FRAMES
-
-        def emit_and_log(chunk: Chunk) -> None:
-            nonlocal left
-            for frame in unpack_frames(chunk.data)[:left]:
-                left -= 1
-                log.debug("%s: %s", self._settings.id, frame)
-            emit(chunk)
-
-        return emit_and_log

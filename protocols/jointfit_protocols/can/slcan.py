@@ -67,11 +67,6 @@ class SlcanLine(NamedTuple):
     argument: str = ""
 
 
-def bitrate_code(bitrate: int) -> int | None:
-    """Return n of the command ``Sn`` for `bitrate`, bit/s; None if there is none."""
-    return BITRATES.index(bitrate) if bitrate in BITRATES else None
-
-
 def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
     """Return `frame` as a line, with `time_ms` modulo 60 000 as its adapter time if given."""
     letter = ("rR" if frame.remote else "tT")[frame.extended]
