@@ -64,7 +64,7 @@ class XbusHandshake:
         self._who = f"{settings.id} ({settings.port})"
         self._product_code = ""
         self._triggers = tuple(map(Item, _sync_lines.trigger_wires(settings.sync or ())))
-        self._needs = required_outputs(settings)
+        self._needs = required_outputs(settings.orientation, magnetometer=settings.magnetometer)
 
     async def ensure_measuring(self) -> None:
         """Return when the device measures according to the settings.

@@ -6,12 +6,9 @@ accepted in place of rates if the device is already configured for them.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from jointfit_protocols.xbus.mtdata2 import Item, reals_in
-
-if TYPE_CHECKING:
-    from jointfit_drivers.xbus._settings import XbusSettings
 
 _FRAME_BYTES = 5 + 5 + 7
 """Framing, packet counter and time, bytes."""
@@ -34,11 +31,19 @@ _INERTIAL = (
 _FIELD = RequiredOutput((Item.MAGNETIC_FIELD,), "magnetic field", "magnetic fields")
 
 
-def required_outputs(settings: XbusSettings) -> tuple[RequiredOutput, ...]:
-    """Return the outputs that a device with these settings must send."""
-    if settings.orientation == "device":
+def required_outputs(orientation: str, *, magnetometer: bool) -> tuple[RequiredOutput, ...]:
+    """Return the outputs that a device with these settings must send.
+
+    Parameters
+    ----------
+    orientation : {"device", "gateway"}
+        Where the orientation is computed.
+    magnetometer : bool
+        Whether the gateway uses the magnetometer.
+    """
+    if orientation == "device":
         return ORIENTATION
-    return (*_INERTIAL, _FIELD) if settings.magnetometer else _INERTIAL
+    return (*_INERTIAL, _FIELD) if magnetometer else _INERTIAL
 
 
 def message_bytes(needs: tuple[RequiredOutput, ...]) -> int:

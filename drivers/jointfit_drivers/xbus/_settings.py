@@ -69,7 +69,8 @@ class XbusSettings(ImuSettings):
     def serial_bits_per_s(self) -> float | None:
         if self.transport == "usb":
             return None
-        return self.rate_hz * 10 * message_bytes(required_outputs(self))
+        outputs = required_outputs(self.orientation, magnetometer=self.magnetometer)
+        return self.rate_hz * 10 * message_bytes(outputs)
 
     @field_validator("port")
     @classmethod
