@@ -142,20 +142,18 @@ class CalibrationWriter:
             try:
                 version = await asyncio.to_thread(save, rig, calibration)
             except OSError as error:
-                self._schedule_retry(str(error))
+                if (fault := str(error)) != self.fault:
+                    self.fault = fault
+                    self._report(f"in force but not stored: {fault}; retrying every {RETRY_S:g} s")
+                if self._next_try is None:
+                    loop = asyncio.get_running_loop()
+                    self._next_try = loop.call_later(RETRY_S, self.retry)
                 return
             if self._unwritten is None or self._unwritten[1] is calibration:
                 self._unwritten = self.fault = None
 
         if rig.calibration_store == self._store:  # otherwise a reload selected another store
             self._deliver(CalibrationStored(time.monotonic_ns(), version))
-
-    def _schedule_retry(self, fault: str) -> None:
-        if fault != self.fault:
-            self.fault = fault
-            self._report(f"in force but not stored: {fault}; retrying every {RETRY_S:g} s")
-        if self._next_try is None:
-            self._next_try = asyncio.get_running_loop().call_later(RETRY_S, self.retry)
 
     async def settle(self) -> None:
         """Wait until no write is in progress."""

@@ -5,6 +5,7 @@ Only ``/proc/self`` is read: systemd's ProcSubset=pid hides the other files of `
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections import deque
@@ -37,12 +38,9 @@ class ProcessStatistics:
 
         delays = sorted(self._delays_s)
         p99 = delays[int(0.99 * len(delays))] if delays else None
+
+        rss_bytes = None
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            rss_bytes = int(_STATM.read_text(encoding="ascii").split()[1]) * _PAGE
         delay_ms = None if p99 is None else round(1e3 * p99, 2)
-        return ProcessHealth(round(100 * share, 1), _resident_bytes(), delay_ms)
-
-
-def _resident_bytes() -> int | None:
-    try:
-        return int(_STATM.read_text(encoding="ascii").split()[1]) * _PAGE
-    except (OSError, ValueError, IndexError):
-        return None
+        return ProcessHealth(round(100 * share, 1), rss_bytes, delay_ms)

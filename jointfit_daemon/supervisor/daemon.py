@@ -236,7 +236,9 @@ class Daemon:
             self._topics.output(replace(self._calibration, t_ns=now_ns, text=text))
 
     def _publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
-        self._topics.publish_log_line(level, name, text, suppressed)
+        self._topics.publish_log_line(
+            level, name, text, suppressed
+        )  # topics change with the broker
 
     def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
         """Report a state of the shell on the log and on ``bridge/event``."""
@@ -263,20 +265,16 @@ class Daemon:
                 fields = journal_fields(output.kind, output.id)
                 log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=fields)
             case CalibrationStatus():
-                self._calibration = output
-                self._log_calibration(output)
+                # A change of the calibration, with the file in which it is stored.
+                self._calibration, phase, text = output, output.phase, output.text
+                if output.version is not None and output.version != self._version:
+                    path = store_of(self._rig).path(output.version)
+                    text = f"{text} (version {output.version} in {path})"
+                self._version, fields = output.version, journal_fields("calibration", phase)
+                log.log(_LEVELS[output.level], "calibration %s: %s", phase, text, extra=fields)
             case DeviceStatus(name, online):
                 (self._online.add if online else self._online.discard)(name)
                 self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
-
-    def _log_calibration(self, status: CalibrationStatus) -> None:
-        """Log a change of the calibration, with the file in which it is stored."""
-        text, fields = status.text, journal_fields("calibration", status.phase)
-        if status.version is not None and status.version != self._version:
-            path = store_of(self._rig).path(status.version)
-            text = f"{text} (version {status.version} in {path})"
-        self._version = status.version
-        log.log(_LEVELS[status.level], "calibration %s: %s", status.phase, text, extra=fields)
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -316,27 +314,17 @@ class Daemon:
 
     def _publish_health(self) -> None:
         health = self._core.core.health(time.monotonic_ns())
-        self._topics.publish_health(
-            BridgeHealth(
-                health,
-                self._process.health(),
-                self._link.health(self._loop_errors.dropped),
-                StateHealth(self._state_fault, self._calibrations.fault),
-                None if self._recorder is None else self._recorder.health(),
-            )
-        )
+        link = self._link.health(self._loop_errors.dropped)
+        state = StateHealth(self._state_fault, self._calibrations.fault)
+        recording = None if self._recorder is None else self._recorder.health()
+        process = self._process.health()
+        self._topics.publish_health(BridgeHealth(health, process, link, state, recording))
 
         states = health.frames.sent - health.frames.empty
         rate_hz = self._frame_rate.rate_hz(states, time.monotonic())
-        self._systemd.status(
-            status_line(
-                self._rig.sources,
-                self._online,
-                health.phase,
-                rate_hz,
-                connected=self._link.connected,
-            )
-        )
+        rig, online, connected = self._rig.sources, self._online, link.connected
+        line = status_line(rig, online, health.phase, rate_hz, connected=connected)
+        self._systemd.status(line)
 
     # --- configuration -----------------------------------------------------------------------
 
@@ -354,6 +342,7 @@ class Daemon:
             await self._reload_requested.wait()
             self._reload_requested.clear()
             self._systemd.reloading()
+
             try:
                 rig = await asyncio.to_thread(load_rig, self._config)
             except ConfigError as fault:

@@ -116,13 +116,15 @@ class MqttClient:
         self._waiting[transaction] = answer
         topic = topics.REQUEST.name(self.base, command)
         try:
-            payload = self._payload(topic, {**arguments, "transaction": transaction})
+            request: dict[str, object] = {**arguments, "transaction": transaction}
+            if (key := request_key_of(self._settings)) is not None:
+                request = signed(key, topic, request)
             if self._lost is not None:
                 raise self._lost
             await self._connection.publish(
                 Outgoing(
                     topic,
-                    payload,
+                    orjson.dumps(request),
                     1,
                     expiry_s=_EXPIRY_S,
                     response_topic=f"{topics.RESPONSE.name(self.base, command)}/{self._own}",
@@ -130,6 +132,8 @@ class MqttClient:
             )
             async with asyncio.timeout(timeout_s):
                 return await answer
+        except RequestKeyError as missing:
+            raise NoAnswerError(f"cannot sign the request: {missing}") from missing
         except TimeoutError as error:
             text = (
                 f"no daemon answers on {topic}: check that jointfitd is running with this base, and"
@@ -139,13 +143,6 @@ class MqttClient:
         finally:
             del self._waiting[transaction]
             answer.cancel()
-
-    def _payload(self, topic: str, request: dict[str, object]) -> bytes:
-        try:
-            key = request_key_of(self._settings)
-        except RequestKeyError as missing:
-            raise NoAnswerError(f"cannot sign the request: {missing}") from missing
-        return orjson.dumps(request if key is None else signed(key, topic, request))
 
     async def _read(self) -> None:
         try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
 import socket
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_re
 from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterator, Sequence
     from types import TracebackType
 
     from jointfit_daemon.config import MqttSettings
@@ -174,19 +175,18 @@ class MqttConnection:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        client = self._client
         try:
-            if kind is None or issubclass(kind, asyncio.CancelledError):
-                await self._leave()
+            if kind is not None and not issubclass(kind, asyncio.CancelledError):
+                return
+            # Publish the farewell and disconnect, each with a time limit; this cancels the will.
+            client.timeout = GOODBYE_S
+            with contextlib.suppress(aiomqtt.MqttError, OSError):
+                if self._farewell is not None:
+                    await self._publish(self._farewell)
+                await client.__aexit__(None, None, None)
         finally:
-            self._client.abandon()
-
-    async def _leave(self) -> None:
-        """Publish the farewell and disconnect, each with a time limit; this cancels the will."""
-        self._client.timeout = GOODBYE_S
-        with contextlib.suppress(aiomqtt.MqttError, OSError):
-            if self._farewell is not None:
-                await self._publish(self._farewell)
-            await self._client.__aexit__(None, None, None)
+            client.abandon()
 
     @property
     def oversized(self) -> int:
@@ -202,12 +202,8 @@ class MqttConnection:
             The broker's reason for refusing the message; only with MQTT 5 and at QoS 1.
         """
         self._client.refusal = None
-        try:
+        with self._session_errors(f"{message.topic}: "):
             await self._publish(message)
-        except (aiomqtt.MqttError, ValueError) as error:
-            why = session_fault(error)
-            raise BrokerLostError(f"{self._address()}: {message.topic}: {why}") from error
-        stop_if_cancelled()
         return self._client.refusal
 
     async def _publish(self, message: Outgoing) -> None:
@@ -235,22 +231,24 @@ class MqttConnection:
         handling = _NOT_STORED if live else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
         options = SubscribeOptions(qos=qos, retainAsPublished=True, retainHandling=handling)
         asked: list[Any] = [(topic, options if self._modern else qos) for topic in topics]
-        try:
+        with self._session_errors("cannot subscribe: "):
             codes = await self._client.subscribe(asked, timeout=SUBSCRIBED_S)
-        except aiomqtt.MqttError as error:
-            why = session_fault(error)
-            raise BrokerLostError(f"{self._address()}: cannot subscribe: {why}") from error
-        stop_if_cancelled()
         values = [code if isinstance(code, int) else int(code.value) for code in codes]
         return [topic for topic, value in zip(topics, values, strict=False) if value >= _REFUSED]
 
     async def unsubscribe(self, topic: str) -> None:
         """Unsubscribe from one topic."""
-        try:
+        with self._session_errors("cannot unsubscribe: "):
             await self._client.unsubscribe(topic)
-        except aiomqtt.MqttError as error:
+
+    @contextlib.contextmanager
+    def _session_errors(self, operation: str) -> Iterator[None]:
+        """Raise the errors of one exchange with the broker as `BrokerLostError`."""
+        try:
+            yield
+        except (aiomqtt.MqttError, ValueError) as error:
             why = session_fault(error)
-            raise BrokerLostError(f"{self._address()}: cannot unsubscribe: {why}") from error
+            raise BrokerLostError(f"{self._address()}: {operation}{why}") from error
         stop_if_cancelled()
 
     async def messages(self) -> AsyncIterator[Incoming]:
@@ -259,11 +257,10 @@ class MqttConnection:
         while True:
             try:
                 message = await anext(arriving)
-            except aiomqtt.MqttError as error:
-                why = broker_fault(error.__cause__ or error)
+            except (aiomqtt.MqttError, OSError) as error:
+                cause = error.__cause__ if isinstance(error, aiomqtt.MqttError) else None
+                why = broker_fault(cause or error)
                 raise BrokerLostError(f"{self._address()}: {why}") from error
-            except OSError as error:  # what the reader met
-                raise BrokerLostError(f"{self._address()}: {broker_fault(error)}") from error
             stop_if_cancelled()
             yield Incoming(
                 message.topic.value,
@@ -472,15 +469,13 @@ class DisconnectErrorFilter:
         """Count or report one error of the event loop."""
         error, message = context.get("exception"), str(context.get("message", ""))
         late = isinstance(error, aiomqtt.MqttError) and "never retrieved" in message
-        closed = isinstance(error, OSError) and error.errno == 9 and _is_mqtt(context)  # noqa: PLR2004 - EBADF
+
+        # The callback, or one of its arguments, belongs to aiomqtt.
+        handle = context.get("handle")
+        functions = (getattr(handle, "_callback", None), *(getattr(handle, "_args", None) or ()))
+        ours = any(str(getattr(f, "__module__", "")).startswith("aiomqtt") for f in functions)
+        closed = isinstance(error, OSError) and error.errno == errno.EBADF and ours
         if late or closed:
             self.dropped += 1
         else:
             loop.default_exception_handler(context)
-
-
-def _is_mqtt(context: dict[str, Any]) -> bool:
-    """Return whether the callback of `context`, or one of its arguments, belongs to aiomqtt."""
-    handle = context.get("handle")
-    functions = (getattr(handle, "_callback", None), *(getattr(handle, "_args", None) or ()))
-    return any(str(getattr(f, "__module__", "")).startswith("aiomqtt") for f in functions)

@@ -102,7 +102,7 @@ class Outbox:
                 return self._next_state()
             for queue in (self._events, self._streams):
                 if queue:
-                    return queue.popleft(), _ignore
+                    return queue.popleft(), lambda: None
             self._wake.clear()
             await self._wake.wait()
 
@@ -117,7 +117,3 @@ class Outbox:
                     del self._state[topic]
 
         return Outgoing(topic, payload, 1, True), sent
-
-
-def _ignore() -> None:
-    pass

@@ -99,9 +99,11 @@ class PacketLimitSocket:
                 return False
             header, start = self._header, self._start
             self._header = self._start = b""
-            if asks and not self._is_admitted(header, start):
-                self._excess_bytes = length - len(start)
-                continue
+            if asks and self._admit is not None:
+                topic = start[_TOPIC_LENGTH_BYTES : _topic_end(start)].decode(errors="replace")
+                if not self._admit(topic, bool(header[0] & _RETAIN)):
+                    self._excess_bytes = length - len(start)
+                    continue
 
             self._ready, self._body_bytes = header + start, length - len(start)
             return True
@@ -132,10 +134,6 @@ class PacketLimitSocket:
                 return False
             self._start += data
         return True
-
-    def _is_admitted(self, header: bytes, start: bytes) -> bool:
-        topic = start[_TOPIC_LENGTH_BYTES : _topic_end(start)].decode(errors="replace")
-        return self._admit is None or self._admit(topic, bool(header[0] & _RETAIN))
 
     def _discard(self) -> bool:
         """Read the rest of a dropped packet; return False if the peer closed.

@@ -239,8 +239,12 @@ class MqttPublisher:
     async def _write(self, connection: MqttConnection) -> None:
         while True:
             message, sent = await self._outbox.next()
-            if message.qos == 0 and self._modern and self._is_check_due(message.topic):
-                message = replace(message, qos=1)
+            if message.qos == 0 and self._modern:
+                # Every CHECK_S one message of a stream is acknowledged.
+                topic, now_s = message.topic, self._loop.time()
+                if now_s >= self._checked_s.get(topic, now_s):
+                    self._checked_s[topic] = now_s + CHECK_S
+                    message = replace(message, qos=1)
 
             refusal = await connection.publish(message)
             sent()
@@ -249,13 +253,6 @@ class MqttPublisher:
                 self._note_acknowledgement(message.topic, refusal)
             if (echo := self._echoes.get(message.topic)) is not None:
                 echo.sent.set()
-
-    def _is_check_due(self, topic: str) -> bool:
-        now_s = self._loop.time()
-        if now_s < self._checked_s.get(topic, now_s):
-            return False
-        self._checked_s[topic] = now_s + CHECK_S
-        return True
 
     def _note_acknowledgement(self, topic: str, refusal: str | None) -> None:
         """Note whether the broker accepted a message on `topic`; log a change."""
@@ -279,10 +276,25 @@ class MqttPublisher:
 
     async def _listen(self, connection: MqttConnection) -> None:
         async for message in connection.messages():
-            if message.topic in self._echoes:
-                await self._receive_echo(connection, message)
-            else:
+            echo = self._echoes.get(message.topic)
+            if echo is None:
                 self._on_request(message)
+                continue
+
+            # With MQTT 3.1.1 a retained message is an earlier process's. MQTT 5 marks new messages
+            # as retained, too, and sends no stored ones.
+            if message.retained and not self._modern:
+                continue
+            if message.topic == self._outbox.state_topic:
+                if message.payload == ONLINE:
+                    echo.arrived.set()
+                elif echo.arrived.is_set() and not self._correcting:  # late will of another process
+                    self._correcting = True
+                    self._loop.call_later(_CORRECTION_S, self._correct_state)
+            elif not echo.arrived.is_set():
+                echo.arrived.set()
+                await connection.unsubscribe(message.topic)
+            self.denied.discard(message.topic)
 
     def _admit(self, topic: str, retained: bool) -> bool:
         """Return whether a message is passed on; count and log an ignored request."""
@@ -305,24 +317,6 @@ class MqttPublisher:
                 self.ignored_requests,
             )
         return False
-
-    async def _receive_echo(self, connection: MqttConnection, message: Incoming) -> None:
-        # With MQTT 3.1.1 a retained message is an earlier process's. MQTT 5 marks new messages as
-        # retained, too, and sends no stored ones.
-        if message.retained and not self._modern:
-            return
-
-        echo = self._echoes[message.topic]
-        if message.topic == self._outbox.state_topic:
-            if message.payload == ONLINE:
-                echo.arrived.set()
-            elif echo.arrived.is_set() and not self._correcting:  # late will of an earlier process
-                self._correcting = True
-                self._loop.call_later(_CORRECTION_S, self._correct_state)
-        elif not echo.arrived.is_set():
-            echo.arrived.set()
-            await connection.unsubscribe(message.topic)
-        self.denied.discard(message.topic)
 
     def _correct_state(self) -> None:
         self._correcting = False

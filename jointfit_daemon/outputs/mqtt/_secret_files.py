@@ -6,6 +6,7 @@ other service can read a systemd credential.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import stat
@@ -86,20 +87,15 @@ def security_warnings(settings: MqttSettings) -> list[str]:
         ("request_key_file", settings.request_key_file),
         ("tls.key", tls_key),
     ):
-        if path is not None and _is_open_to_others(Path(path)):
-            found.append(
-                f"{name} = {path}: every user of this machine can read it: run chmod o-rw {path}"
-            )
+        with contextlib.suppress(OSError):
+            if path is not None and Path(path).stat().st_mode & _OTHERS:
+                found.append(
+                    f"{name} = {path}: every user of this machine can read it: run chmod o-rw "
+                    f"{path}"
+                )
     return found
 
 
 def _credential(name: str) -> Path | None:
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return None if folder is None else Path(folder) / name
-
-
-def _is_open_to_others(path: Path) -> bool:
-    try:
-        return bool(path.stat().st_mode & _OTHERS)
-    except OSError:
-        return False

@@ -46,7 +46,11 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
         A file is missing, unreadable or not PEM, or key and certificate do not match.
     """
     for name, path in (("ca", tls.ca), ("cert", tls.cert), ("key", tls.key)):
-        _check_readable(name, path)
+        if path is not None:
+            try:
+                Path(path).read_bytes()
+            except OSError as error:
+                raise TlsFilesError(f"{name} = {path}: {error.strerror}") from error
 
     try:
         context = ssl.create_default_context(cafile=tls.ca)
@@ -57,7 +61,8 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
 
     if tls.cert is not None:
         try:
-            context.load_cert_chain(tls.cert, tls.key, password=_no_passphrase)
+            # Without a function for the passphrase, OpenSSL prompts on the terminal.
+            context.load_cert_chain(tls.cert, tls.key, password=lambda: "")
         except (ssl.SSLError, ValueError) as error:
             files = f"cert = {tls.cert}, key = {tls.key or tls.cert}"
             raise TlsFilesError(
@@ -65,20 +70,6 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
                 "passphrase"
             ) from error
     return context
-
-
-def _check_readable(name: str, path: str | None) -> None:
-    if path is None:
-        return
-    try:
-        Path(path).read_bytes()
-    except OSError as error:
-        raise TlsFilesError(f"{name} = {path}: {error.strerror}") from error
-
-
-def _no_passphrase() -> str:
-    """Return an empty passphrase; otherwise OpenSSL prompts on the terminal."""
-    return ""
 
 
 def tls_remedy(

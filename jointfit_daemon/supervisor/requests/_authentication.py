@@ -72,15 +72,14 @@ class RequestAuthenticator:
                 raise SignatureRejectedError(
                     "t_us: from before the daemon started: sign the request again"
                 )
-            self._use_up(nonce, time.monotonic_ns())
+
+            # Each nonce is accepted once.
+            now_ns = time.monotonic_ns()
+            while self._used and now_ns - next(iter(self._used.values())) > _NONCE_LIFETIME_NS:
+                self._used.popitem(last=False)
+            if nonce in self._used:
+                raise SignatureRejectedError("nonce: used already: every request needs a new one")
+            if len(self._used) >= NONCE_CAPACITY:
+                raise SignatureRejectedError(f"more than {NONCE_CAPACITY} requests within a minute")
+            self._used[nonce] = now_ns
         return {name: value for name, value in request.items() if name not in SIGNING_KEYS}
-
-    def _use_up(self, nonce: str, now_ns: int) -> None:
-        while self._used and now_ns - next(iter(self._used.values())) > _NONCE_LIFETIME_NS:
-            self._used.popitem(last=False)
-
-        if nonce in self._used:
-            raise SignatureRejectedError("nonce: used already: every request needs a new one")
-        if len(self._used) >= NONCE_CAPACITY:
-            raise SignatureRejectedError(f"more than {NONCE_CAPACITY} requests within a minute")
-        self._used[nonce] = now_ns
