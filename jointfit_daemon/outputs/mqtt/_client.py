@@ -147,28 +147,25 @@ class MqttClient:
     async def _read(self) -> None:
         try:
             async for message in self._connection.messages():
-                self._receive(message)
+                if message.topic.startswith(topics.RESPONSE.name(self.base)):
+                    reply = _decoded(message.payload)
+                    key = reply.get("transaction") if isinstance(reply, dict) else None
+                    answer = self._waiting.get(key) if isinstance(key, str) else None
+                    if answer is not None and not answer.done():
+                        answer.set_result(reply)
+                    continue
+
+                if len(self._unread) >= _UNREAD_CAPACITY:
+                    self._unread.popleft()
+                    self.dropped += 1
+                self._unread.append(message)
+                self._arrived.set()
         except BrokerLostError as error:
             self._lost = error
             for answer in self._waiting.values():
                 if not answer.done():
                     answer.set_exception(error)
             self._arrived.set()
-
-    def _receive(self, message: Incoming) -> None:
-        if message.topic.startswith(topics.RESPONSE.name(self.base)):
-            reply = _decoded(message.payload)
-            key = reply.get("transaction") if isinstance(reply, dict) else None
-            answer = self._waiting.get(key) if isinstance(key, str) else None
-            if answer is not None and not answer.done():
-                answer.set_result(reply)
-            return
-
-        if len(self._unread) >= _UNREAD_CAPACITY:
-            self._unread.popleft()
-            self.dropped += 1
-        self._unread.append(message)
-        self._arrived.set()
 
 
 def _decoded(payload: bytes) -> Any:

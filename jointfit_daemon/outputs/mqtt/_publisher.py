@@ -156,7 +156,10 @@ class MqttPublisher:
             try:
                 await attempt  # no TaskGroup: it loses a cancellation that meets a failure
             except* BrokerLostError as lost:
-                reason = _first_error(lost)
+                error: BaseException = lost
+                while isinstance(error, BaseExceptionGroup):
+                    error = error.exceptions[0]
+                reason = str(error)
             stop_if_cancelled()
 
             try:
@@ -361,10 +364,3 @@ def client_identifier(base: str) -> str:
     return "jointfitd-" + "".join(
         letter if letter.isascii() and letter.isalnum() else "-" for letter in base
     )
-
-
-def _first_error(group: BaseExceptionGroup[BrokerLostError]) -> str:
-    error: BaseException = group
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    return str(error)

@@ -78,15 +78,12 @@ def core_payload(core: CoreHealth) -> dict[str, Any]:
 
 
 def _device(device: DeviceHealth) -> dict[str, Any]:
-    wire, silent_ns = device.wire, device.silent_ns
+    wire, silent_ns = asdict(device.wire), device.silent_ns
+    opened = wire.pop("opened")
     payload = {
         "online": device.online,
-        "received": wire.received,
-        "corrupt": wire.corrupt,
-        "discarded_bytes": wire.discarded_bytes,
-        "lost": wire.lost,
-        "restarts": wire.restarts,
-        "reconnects": max(0, wire.opened - 1),
+        **wire,
+        "reconnects": max(0, opened - 1),
         "last_age_ms": None if silent_ns is None else round(silent_ns / _NS_PER_MS, 1),
         **device.samples,
         **_clock(device.clock),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -68,37 +68,14 @@ def encode_event(event: Event) -> bytes:
         return orjson.dumps(
             {"e": "chunk", "source": event.source, "t_ns": chunk.t_ns, "hex": chunk.data.hex()}
         )
-    return orjson.dumps(_line(event), _to_json, orjson.OPT_SERIALIZE_NUMPY)
 
-
-def _line(event: Event) -> dict[str, Any]:  # noqa: PLR0911 - one return per event class
-    match event:
-        case Tick(t_ns):
-            return {"e": "tick", "t_ns": t_ns}
-        case Configured(t_ns, rig, calibration, version, age_s):
-            stored = None if calibration is None else calibration.to_dict()
-            return {"e": "configured", "t_ns": t_ns, "table": rig.table} | {
-                "calibration": stored,
-                "calibration_version": version,
-                "calibration_age_s": age_s,
-            }
-        case SourceOpened(t_ns, source):
-            return {"e": "opened", "t_ns": t_ns, "source": source}
-        case SourceClosed(t_ns, source, reason, text):
-            return {"e": "closed", "t_ns": t_ns, "source": source, "reason": reason, "text": text}
-        case Request(t_ns, command, transaction, arguments):
-            return {"e": "request", "t_ns": t_ns, "command": command} | {
-                "transaction": transaction,
-                "arguments": arguments,
-            }
-        case JobFinished(t_ns, job, result, error):
-            found = None if result is None else result.to_dict()
-            return {"e": "job", "t_ns": t_ns, "job": job, "result": found, "error": error}
-        case CalibrationStored(t_ns, version):
-            return {"e": "stored", "t_ns": t_ns, "version": version}
-        case UnixOffset(t_ns, offset_ns):
-            return {"e": "unix", "t_ns": t_ns, "offset_ns": offset_ns}
-    raise TypeError(f"not an input event: {event!r}")
+    line: dict[str, Any] = {"e": _NAMES[type(event)]}
+    for field in fields(event):
+        if field.name == "rig":
+            line["table"] = getattr(event, field.name).table
+        elif field.name not in _NOT_RECORDED:
+            line[field.name] = getattr(event, field.name)
+    return orjson.dumps(line, _to_json, _OPTIONS)
 
 
 def decode_event(line: dict[str, Any]) -> Event:
@@ -154,9 +131,15 @@ _EVENTS: dict[str, Any] = {
     "stored": CalibrationStored,
     "unix": UnixOffset,
 }
+_NAMES = {event: name for name, event in _EVENTS.items()}
+_NOT_RECORDED = ("reply_to",)
+"""Fields of events that a replay does not need."""
+_OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_PASSTHROUGH_DATACLASS
 
 
 def _to_json(value: object) -> object:
+    if isinstance(value, Calibration | FitResult):
+        return value.to_dict()
     if isinstance(value, _NAMED):
         return value._asdict()
     if isinstance(value, tuple):  # orjson does not write named tuples
