@@ -141,6 +141,12 @@ class Corrupt:
     reason: str
 
 
+DeviceEventKind = Literal[
+    "info", "restart", "clock", "gap", "counter", "setting", "warning", "error"
+]  # fmt: skip
+"""Kinds of device events, explained at `DeviceEvent`."""
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
     """A message or state change of a device that is not a measurement.
@@ -150,7 +156,7 @@ class DeviceEvent:
     loss), ``setting`` (changed in operation), ``warning``, ``error``.
     """
 
-    kind: str
+    kind: DeviceEventKind
     text: str
     data: Mapping[str, object] = field(default_factory=dict)
 

@@ -7,7 +7,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.model import Corrupt, DeviceEvent
+from jointfit_daemon.model import Corrupt, DeviceEvent, DeviceEventKind
 from jointfit_daemon.pipeline._notice_limiter import QUIET_NS, NoticeLimiter
 
 S = 1_000_000_000
@@ -63,7 +63,12 @@ def test_repeated_clock_jumps_give_one_notice_a_minute_with_a_count() -> None:
 
 def test_restarts_and_clock_jumps_are_limited_per_kind_and_device() -> None:
     limiter = NoticeLimiter()
-    kinds = [("S1", "clock"), ("S1", "restart"), ("S2", "clock"), ("S2", "restart")]
+    kinds: list[tuple[str, DeviceEventKind]] = [
+        ("S1", "clock"),
+        ("S1", "restart"),
+        ("S2", "clock"),
+        ("S2", "restart"),
+    ]
     notices = [limiter.add(1, source, DeviceEvent(kind, "restarted")) for source, kind in kinds]
     assert [len(each) for each in notices] == [1, 1, 1, 1]
 

@@ -29,7 +29,7 @@ from jointfit_protocols.xbus.mtdata2 import Item, Trigger, decode_item, split, w
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_daemon.model import Chunk, Decoded, DeviceEventKind
     from jointfit_drivers.xbus._raw_orientation import RawOrientation
     from jointfit_protocols.corrupt import CorruptBytes
     from jointfit_protocols.xbus.mtdata2 import Value
@@ -285,7 +285,7 @@ class XbusDecoder:
 
         if mid in {XbusMessageId.ERROR, XbusMessageId.WARNING}:
             code = data[0] if data else 0
-            kind = "error" if mid == XbusMessageId.ERROR else "warning"
+            kind: DeviceEventKind = "error" if mid == XbusMessageId.ERROR else "warning"
             return [DeviceEvent(kind, setup.error_text(code), {"code": code})]
 
         if mid == XbusMessageId.PRODUCT_CODE:

@@ -27,7 +27,7 @@ from jointfit_protocols.xcdi import (
 )
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_daemon.model import Chunk, Decoded, DeviceEventKind
     from jointfit_protocols.orientation import Quaternion
     from jointfit_protocols.xcdi import ByteOrder, XcdiIds
 
@@ -208,7 +208,7 @@ class XcdiDecoder:
         text, serious = can.describe_error(frame)
         return self._limited("error" if serious else "warning", text, frame.t_ns)
 
-    def _limited(self, kind: str, text: str, t_ns: int) -> list[Decoded]:
+    def _limited(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
         """Return the event unless the same one was reported within a second."""
         if text == self._error_text and 0 <= t_ns - self._reported_at_ns < _REPEAT_NS:
             return []
@@ -216,7 +216,7 @@ class XcdiDecoder:
         return [DeviceEvent(kind, text)]
 
     def _once(
-        self, kind: str, topic: str, text: str, data: dict[str, object] | None = None
+        self, kind: DeviceEventKind, topic: str, text: str, data: dict[str, object] | None = None
     ) -> list[Decoded]:
         if topic in self._reported_topics:
             return []
