@@ -46,17 +46,19 @@ from jointfit_simulators.scene import (
     SceneOptions,
     play_directory,
 )
-from jointfit_simulators.settings import Knobs, knobs_from_toml, perfect, turn
+from jointfit_simulators.settings import Knobs, apply_settings, knobs_from_toml, perfect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_simulators.body import InstrumentedSubject
-    from jointfit_simulators.scene import PlayDirectory
 
 USAGE = 2
+"""Exit code for invalid options, files or ports."""
 ORIGIN_NS = 100_000_000
+"""Interval of possible start times, ns: samples of perfect clocks coincide with ground truth."""
 _COMMAND_BYTES = 4096
+"""Longest command line, bytes."""
 COMMANDS = """commands, one per line on standard input:
   play NAME                   change to another motion
   unplug ID, plug ID          disconnect or connect a sensor, or the bus adapter (can0)
@@ -78,15 +80,18 @@ def _parser() -> argparse.ArgumentParser:
         description="Simulate the sensors and cameras of a moving leg on real ports.",
         epilog="Exit codes: 0 stopped normally, 1 bug, 2 wrong options, files or ports.",
     )
+
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("knobs", help="list every knob with its default")
     commands.add_parser("motions", help="list every motion")
+
     sample = commands.add_parser("sample", help="write sample trials, a model, captures and a rig")
     sample.add_argument("folder", type=Path, help="output folder; created if absent")
     sample.add_argument("--seed", type=int, default=1, help="random seed of the subject")
     sample.add_argument(
         "--force", action="store_true", help="write into a folder that is not empty"
     )
+
     play = commands.add_parser(
         "play", help="simulate in real time until stopped", epilog=COMMANDS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -125,6 +130,7 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
                       help="write samples.jsonl with the true time of each sample")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
                       help="replay a trial: .npz or .sto, with .trc and .json")  # fmt: skip
+
     for field in dataclasses.fields(RigOptions):
         play.add_argument(
             f"--{field.name.replace('_', '-')}",
@@ -142,7 +148,7 @@ def _knobs(options: argparse.Namespace) -> Knobs:
         raise ValueError(f"--rate {options.rate:g}: expected samples a second above 0")
     named = {"rate_hz": options.rate, "seed": options.seed}
     settings = [f"{name}={value}" for name, value in named.items() if value is not None]
-    return turn(knobs, settings + options.settings)
+    return apply_settings(knobs, settings + options.settings)
 
 
 def _subject(options: argparse.Namespace, knobs: Knobs) -> InstrumentedSubject:
@@ -150,39 +156,45 @@ def _subject(options: argparse.Namespace, knobs: Knobs) -> InstrumentedSubject:
     if options.trial:
         recording = read_recorded_trial(options.trial)
         return RecordedSubject(recording, SENSORS, steps, transition_s=knobs.transition_s)
-    files = dict(_pairs("--motion", options.motion))
-    return SimulatedSubject(
-        knobs, steps, motion_files={name: Path(path) for name, path in files.items()}
-    )
+    files = {name: Path(path) for name, path in _pairs("--motion", options.motion)}
+    return SimulatedSubject(knobs, steps, motion_files=files)
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
     """Split ``A=B`` words; raise ValueError for a word without ``=``."""
-    found = [word.partition("=") for word in words]
-    if wrong := [a for a, equals, _ in found if not equals]:
+    parts = [word.partition("=") for word in words]
+    if wrong := [a for a, equals, _ in parts if not equals]:
         raise ValueError(f"{option} {wrong[0]}: expected two parts, A=B: see --help")
-    return [(a, b) for a, _, b in found]
+    return [(a, b) for a, _, b in parts]
 
 
-def _clock(name: str, text: str) -> ClockFault:
-    try:
-        return ClockFault.parse(text)
-    except ValueError as error:
-        raise ValueError(
-            f"--clock {name}={text}: expected numbers, PPM or PPM,UP_S, as in {name}=50"
-        ) from error
+def _clocks(words: Sequence[str]) -> dict[str, ClockFault]:
+    """Return the clock faults of ``ID=PPM[,UP_S]`` words."""
+    clocks = {}
+    for name, text in _pairs("--clock", words):
+        try:
+            clocks[name] = ClockFault.parse(text)
+        except ValueError as error:
+            raise ValueError(
+                f"--clock {name}={text}: expected numbers, PPM or PPM,UP_S, as in {name}=50"
+            ) from error
+    return clocks
 
 
-def _due(at_s: str, command: str) -> tuple[float, str]:
-    try:
-        return float(at_s), command
-    except ValueError as error:
-        raise ValueError(
-            f"--at {at_s}={command}: expected seconds before the command, as in 12.5=quit"
-        ) from error
+def _schedule(words: Sequence[str]) -> tuple[tuple[float, str], ...]:
+    """Return the commands of ``SECONDS=COMMAND`` words."""
+    script = []
+    for at_s, command in _pairs("--at", words):
+        try:
+            script.append((float(at_s), command))
+        except ValueError as error:
+            raise ValueError(
+                f"--at {at_s}={command}: expected seconds before the command, as in 12.5=quit"
+            ) from error
+    return tuple(script)
 
 
-def _say(line: dict[str, object]) -> None:
+def _print_json(line: dict[str, object]) -> None:
     text = orjson.dumps(line, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
     try:
         sys.stdout.buffer.write(text)
@@ -193,7 +205,7 @@ def _say(line: dict[str, object]) -> None:
         os.close(nowhere)
 
 
-async def _obey(scene: Scene) -> None:
+async def _run_commands(scene: Scene) -> None:
     """Run the commands from stdin until end of file."""
     reader = asyncio.StreamReader(limit=_COMMAND_BYTES)
     try:
@@ -202,20 +214,18 @@ async def _obey(scene: Scene) -> None:
         )
     except (ValueError, OSError):  # stdin is a plain file or /dev/null: no commands
         return
+
     try:
-        while line := await reader.readline():
-            _answer(scene, line.decode(errors="replace").strip())
+        while data := await reader.readline():
+            line = data.decode(errors="replace").strip()
+            try:
+                answer = scene.command(line) if line else None
+            except InvalidCommandError as error:
+                answer = {"error": str(error)}
+            if answer is not None:
+                _print_json(answer)
     finally:
         transport.close()
-
-
-def _answer(scene: Scene, line: str) -> None:
-    try:
-        answer = scene.command(line) if line else None
-    except InvalidCommandError as error:
-        answer = {"error": str(error)}
-    if answer is not None:
-        _say(answer)
 
 
 async def _play(options: argparse.Namespace) -> None:
@@ -228,8 +238,8 @@ async def _play(options: argparse.Namespace) -> None:
         mocap=not options.no_mocap,
         can=options.can,
         rig=rig,
-        clocks={name: _clock(name, text) for name, text in _pairs("--clock", options.clock)},
-        script=tuple(_due(*pair) for pair in _pairs("--at", options.at)),
+        clocks=_clocks(options.clock),
+        script=_schedule(options.at),
         sync_line=options.sync_line,
         ptp=options.ptp,
         sample_log=options.sample_log,
@@ -237,48 +247,40 @@ async def _play(options: argparse.Namespace) -> None:
     if options.follow and options.trial:
         raise ValueError("--follow needs the motions of the simulator: leave out --trial")
     subject = _subject(options, knobs)
+
     with play_directory(hardware.directory) as directory:
         if hardware.mocap:
             port = directory.command_port(options.command_port)
             hardware = dataclasses.replace(hardware, command_port=port)
-        await _run_scene(knobs, subject, hardware, directory, follow=options.follow)
+        now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS
+        scene = Scene(knobs, subject, hardware, now_ns=now_ns)
+        directory.remember(scene.command_port)
+        await _run_scene(scene, rig if options.follow else None)
 
 
-async def _run_scene(
-    knobs: Knobs,
-    subject: InstrumentedSubject,
-    hardware: SceneOptions,
-    directory: PlayDirectory,
-    *,
-    follow: bool,
-) -> None:
-    # start at a multiple of 0.1 s: samples of perfect clocks then coincide with ground-truth lines
-    now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS
-    scene = Scene(knobs, subject, hardware, now_ns=now_ns)
-    directory.remember(scene.command_port)
+async def _run_scene(scene: Scene, followed: RigOptions | None) -> None:
+    """Run a scene with commands from stdin and, if given, the phases of the rig's daemon."""
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
+
+    def play(name: str) -> None:
+        scene.command(f"play {name}")
+        _print_json({"motion": name})
+
+    def report(text: str) -> None:
+        print(f"jointfit-sim: {text}", file=sys.stderr, flush=True)
+
     async with asyncio.TaskGroup() as tasks:
-        others = [tasks.create_task(_obey(scene), name="commands")]
-        if follow:
-            follower = PhaseFollower(hardware.rig, lambda name: _play_motion(scene, name), _report)
+        others = [tasks.create_task(_run_commands(scene), name="commands")]
+        if followed is not None:
+            follower = PhaseFollower(followed, play, report)
             others.append(tasks.create_task(follower.run(), name="phase follower"))
-        await scene.run(_say)
+        await scene.run(_print_json)
         for other in others:
             other.cancel()
 
 
-def _play_motion(scene: Scene, name: str) -> None:
-    """Start a motion and report it as a JSON line."""
-    scene.command(f"play {name}")
-    _say({"motion": name})
-
-
-def _report(text: str) -> None:
-    print(f"jointfit-sim: {text}", file=sys.stderr, flush=True)
-
-
-def _punctual_loop() -> asyncio.AbstractEventLoop:
+def _select_loop() -> asyncio.AbstractEventLoop:
     """Return an event loop based on select: epoll rounds timeouts up to the next millisecond."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
@@ -287,22 +289,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jointfit-sim``; return its exit code."""
     options = _parser().parse_args(arguments)
     if options.command == "knobs":
-        _say(dataclasses.asdict(Knobs()))
+        _print_json(dataclasses.asdict(Knobs()))
     elif options.command == "motions":
-        _say({"motions": list(MOTIONS)})
+        _print_json({"motions": list(MOTIONS)})
     else:
         try:
             if options.command == "sample":
-                _say(
-                    {"files": write_sample(options.folder, seed=options.seed, force=options.force)}
-                )
+                files = write_sample(options.folder, seed=options.seed, force=options.force)
+                _print_json({"files": files})
                 return 0
-            with asyncio.Runner(loop_factory=_punctual_loop) as runner:
+            with asyncio.Runner(loop_factory=_select_loop) as runner:
                 runner.run(_play(options))
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            why = error.strerror or error
-            print(f"jointfit-sim: {where}{why}: check the path", file=sys.stderr)
+            place = f"{error.filename}: " if error.filename else ""
+            reason = error.strerror or error
+            print(f"jointfit-sim: {place}{reason}: check the path", file=sys.stderr)
             return USAGE
         except (ValueError, UnknownMotionError) as error:
             print(f"jointfit-sim: {error}", file=sys.stderr)

@@ -131,7 +131,7 @@ def perfect(knobs: Knobs) -> Knobs:
     return dataclasses.replace(knobs, **nothing)
 
 
-def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
+def apply_settings(knobs: Knobs, settings: Iterable[str]) -> Knobs:
     """Return `knobs` with ``NAME=VALUE`` settings applied.
 
     Raises
@@ -141,6 +141,7 @@ def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
         nearest name.
     """
     kinds = {field.name: type(getattr(knobs, field.name)) for field in dataclasses.fields(Knobs)}
+
     changed: dict[str, Any] = {}
     for setting in settings:
         name, _, value = setting.partition("=")
@@ -156,4 +157,4 @@ def turn(knobs: Knobs, settings: Iterable[str]) -> Knobs:
 def knobs_from_toml(path: Path) -> Knobs:
     """Return the settings of a TOML file of ``name = value`` lines; others have defaults."""
     table = read_toml(path)
-    return turn(Knobs(), [f"{name}={value}" for name, value in table.items()])
+    return apply_settings(Knobs(), [f"{name}={value}" for name, value in table.items()])

@@ -36,6 +36,7 @@ from jointfit_daemon.files.orientations import (
     write_sto,
 )
 from jointfit_daemon.files.text import MalformedFileError
+from jointfit_simulators.body import SimulatedSubject, Step
 from jointfit_simulators.sample._c3d_file import c3d_bytes
 from jointfit_simulators.sample._sample_data import _write_models
 from jointfit_simulators.settings import Knobs
@@ -75,7 +76,8 @@ def c3d(path: Path) -> None:
 @functools.cache
 def model() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        _write_models(Path(folder), Knobs())
+        subject = SimulatedSubject(Knobs(), [Step("stand", 1.0)])
+        _write_models(Path(folder), Knobs(), subject)
         return (Path(folder) / "leg.osim").read_bytes()
 
 

@@ -14,7 +14,7 @@ from jointfit_simulators.body import CLUSTERS, SENSORS, SimulatedSubject, parse_
 from jointfit_simulators.body._random_signal import RandomSignal
 from jointfit_simulators.body._soft_tissue import SoftTissue
 from jointfit_simulators.devices import NS, CameraFrames, Cameras, OrientationSensor, SampleTiming
-from jointfit_simulators.settings import Knobs, perfect, turn
+from jointfit_simulators.settings import Knobs, apply_settings, perfect
 from jointfit_simulators.wires import line_noise
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def test_own_soft_tissue_is_each_sensors_own(seed: int) -> None:
 @pytest.mark.parametrize("share", [0.0, 0.15, 0.5])
 def test_random_share_of_the_artefact_does_not_repeat_with_posture(share: float) -> None:
     wearer = SimulatedSubject(NOTHING, WALK_AND_SQUATS)
-    coordinates = wearer._programme.coordinates(T)
+    coordinates = wearer._script.coordinates(T)
     skins = [
         SoftTissue(
             np.random.default_rng([7, i]),
@@ -150,7 +150,7 @@ def test_headings_spread_up_to_a_right_angle_about_the_vertical() -> None:
 
 
 def test_a_tilted_world_is_a_fault_of_the_chosen_sensor_only() -> None:
-    knobs = turn(NOTHING, ["world_tilt_deg=90", "world_tilt_sensor=S2"])
+    knobs = apply_settings(NOTHING, ["world_tilt_deg=90", "world_tilt_sensor=S2"])
     tilts = {n: OrientationSensor(knobs, n).world.apply([0.0, 0.0, 1.0])[2] for n in SENSORS}
     assert tilts["S2"] == pytest.approx(0, abs=1e-9)
     assert [tilts[n] for n in ("S1", "S3", "S4")] == [1, 1, 1]
@@ -218,7 +218,7 @@ def frames(
 
 
 def test_markers_are_hidden_for_their_share_of_the_time_in_bursts() -> None:
-    _, found, _ = frames(turn(NOTHING, ["occlusion=0.05"]), 200.0)
+    _, found, _ = frames(apply_settings(NOTHING, ["occlusion=0.05"]), 200.0)
     hidden = np.isnan(found.markers[:, :, 0])
     assert hidden.mean() == pytest.approx(0.05, rel=0.15)
     begins = np.sum(~hidden[:-1] & hidden[1:])
@@ -226,7 +226,7 @@ def test_markers_are_hidden_for_their_share_of_the_time_in_bursts() -> None:
 
 
 def test_bodies_come_from_skin_markers_and_vanish_with_them() -> None:
-    knobs = turn(NOTHING, ["marker_soft_tissue_mm=5", "occlusion=0.3"])
+    knobs = apply_settings(NOTHING, ["marker_soft_tissue_mm=5", "occlusion=0.3"])
     cameras, found, observation = frames(knobs, 30.0)
     at = cameras.bodies.index("Thigh")
     columns = [cameras.markers.index(name) for name in CLUSTERS["thigh"]]
@@ -254,7 +254,9 @@ def test_perfect_bodies_ride_on_their_bones() -> None:
 
 
 def test_the_optical_world_is_turned_about_the_vertical() -> None:
-    cameras, found, observation = frames(turn(NOTHING, ["optical_heading_deg=180"]), 1.0, "stand")
+    cameras, found, observation = frames(
+        apply_settings(NOTHING, ["optical_heading_deg=180"]), 1.0, "stand"
+    )
     assert abs(cameras.heading_rad) > 0.05
     np.testing.assert_allclose(found.markers[:, :, 2], observation.markers[:, :, 2], atol=1e-12)
     flat = np.linalg.norm(found.markers[:, :, :2], axis=-1)
@@ -263,11 +265,13 @@ def test_the_optical_world_is_turned_about_the_vertical() -> None:
 
 def test_line_noise_flips_the_asked_share_of_bytes_and_adds_bursts() -> None:
     data = bytes(1000)
-    flips = line_noise(turn(NOTHING, ["line_flip_per_byte=0.01"]), "S1")
+    flips = line_noise(apply_settings(NOTHING, ["line_flip_per_byte=0.01"]), "S1")
     noisy = b"".join(flips(data) for _ in range(100))
     assert len(noisy) == 100_000
     assert np.count_nonzero(np.frombuffer(noisy, np.uint8)) == pytest.approx(1000, rel=0.15)
-    bursts = line_noise(turn(NOTHING, ["line_burst_per_byte=0.01", "line_burst_bytes=16"]), "S1")
+    bursts = line_noise(
+        apply_settings(NOTHING, ["line_burst_per_byte=0.01", "line_burst_bytes=16"]), "S1"
+    )
     longer = sum(len(bursts(data)) - 1000 for _ in range(100))
     assert longer == pytest.approx(1000 * 8.5, rel=0.2)
     assert line_noise(NOTHING, "S1")(data) is data
@@ -290,7 +294,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
 
 
 def test_turning_one_knob_leaves_the_other_dice_as_they_fell() -> None:
-    one, other = (seen(turn(NOTHING, [f"mount_deg={d}"]), t=T[:5]) for d in (10, 20))
+    one, other = (seen(apply_settings(NOTHING, [f"mount_deg={d}"]), t=T[:5]) for d in (10, 20))
     for small, large in zip(one, other, strict=True):
         np.testing.assert_allclose(2 * small.as_rotvec(), large.as_rotvec(), atol=1e-9)
 
@@ -309,6 +313,6 @@ def test_wanders_can_be_read_in_any_order_and_stay_in_their_band() -> None:
 
 def test_an_unknown_knob_is_answered_with_the_nearest_one() -> None:
     with pytest.raises(ValueError, match="did you mean 'dropout'"):
-        turn(Knobs(), ["dropot=1"])
+        apply_settings(Knobs(), ["dropot=1"])
     with pytest.raises(ValueError, match="expected float"):
-        turn(Knobs(), ["dropout=much"])
+        apply_settings(Knobs(), ["dropout=much"])

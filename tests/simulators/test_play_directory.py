@@ -71,7 +71,7 @@ def test_a_number_that_is_no_port_is_refused(tmp_path: Path, port: int) -> None:
 def test_a_taken_port_that_was_asked_for_is_refused_with_a_remedy(
     tmp_path: Path, taken_port: int
 ) -> None:
-    with play_directory(tmp_path) as directory, pytest.raises(PortInUseError, match="choose"):
+    with play_directory(tmp_path) as directory, pytest.raises(PortInUseError, match="select another"):
         directory.command_port(taken_port)
 
 
@@ -114,7 +114,7 @@ async def test_a_running_daemon_finds_its_cameras_after_the_simulator_restarted(
         links = links_in(tmp_path)
         code, output = await refused("--directory", str(tmp_path))
         assert code == 2, output
-        assert "already plays here" in output
+        assert "uses this directory" in output
         assert links_in(tmp_path) == links
 
         await stack.enter_async_context(station.daemon())
@@ -167,12 +167,12 @@ async def test_a_phase_with_several_motions_plays_them_in_turn_until_the_next_ph
     follower = PhaseFollower(RigOptions(mqtt_port=free_port()), played.append, lambda _: None)
     following = asyncio.create_task(follower.run())
     for status in (b'{"phase":"functional"}', b'{"phase":"functional"}', b"[]", b"{", b"\xff"):
-        follower._take(status)
+        follower._receive(status)
     async with asyncio.timeout(10):
         while len(played) < 5:
             await asyncio.sleep(0.01)
     assert played[:5] == ["functional", "walk", "functional", "walk", "functional"]
-    follower._take(b'{"phase":"aligned"}')
+    follower._receive(b'{"phase":"aligned"}')
     await asyncio.sleep(0.2)
     assert played[-1] == "stand"
     following.cancel()

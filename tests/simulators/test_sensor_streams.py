@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from jointfit_simulators.body._recorded_trial import InterpolatedTrack
 from jointfit_simulators.devices import NS
 from jointfit_simulators.scene._streams import ImuStream
-from jointfit_simulators.settings import Knobs, perfect, turn
+from jointfit_simulators.settings import Knobs, apply_settings, perfect
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 NOW = 5 * 10**12
@@ -58,21 +58,23 @@ def stream(knobs: Knobs, device: Listed, *, shared: bool = False) -> ImuStream:
     return ImuStream(knobs, "S1", device, latency_ms=2.0, shared_wire=shared, now_ns=NOW)
 
 
-def play(source: ImuStream, seconds: int, begin_s: int = 0, *, heard: bool = True) -> int:
+def play(source: ImuStream, seconds: int, begin_s: int = 0, *, sending: bool = True) -> int:
     """Send so many seconds of standing upright; return how many samples were taken."""
     begin = NOW + begin_s * NS
     instants = source.plan(begin, begin + seconds * NS)
     assert np.all((instants >= begin) & (instants < begin + seconds * NS))
     due = source.fill(instants / NS, np.tile(UPRIGHT, (len(instants), 1)))
     for _ in due:
-        source.emit(heard=heard)
+        source.emit(sending=sending)
     return len(due)
 
 
 @pytest.mark.parametrize("skew", [0, 50])
 def test_every_sample_is_sent_dropped_or_refused(skew: int) -> None:
     device = Listed()
-    source = stream(turn(perfect(Knobs()), ["dropout=0.1", f"clock_skew_ppm={skew}"]), device)
+    source = stream(
+        apply_settings(perfect(Knobs()), ["dropout=0.1", f"clock_skew_ppm={skew}"]), device
+    )
     taken = play(source, 20)
     device.full = True
     taken += play(source, 5, 20)
@@ -90,7 +92,7 @@ def test_unreceived_samples_are_counted_separately() -> None:
     unheard = play(source, 1)
     assert device.plugged  # others are on that wire
     source.plug()
-    unheard += play(source, 1, 1, heard=False)
+    unheard += play(source, 1, 1, sending=False)
     device.streaming = False
     unheard += play(source, 1, 2)
     assert (device.sent, source.unheard) == (0, unheard)
@@ -107,11 +109,13 @@ def test_a_wire_of_its_own_is_taken_away() -> None:
 
 def test_stamps_are_the_devices_own_time_of_the_true_instant() -> None:
     device = Listed()
-    source = stream(turn(perfect(Knobs()), ["clock_skew_ppm=50", "latency_jitter_ms=5"]), device)
+    source = stream(
+        apply_settings(perfect(Knobs()), ["clock_skew_ppm=50", "latency_jitter_ms=5"]), device
+    )
     instants = source.plan(NOW, NOW + 10 * NS)
     for _ in source.fill(instants / NS, np.tile(UPRIGHT, (len(instants), 1))):
         source.emit()
-    clock = source.ticker.clock
+    clock = source.timing.clock
     shown = [clock.device_ns(int(t)) for t in instants]
     assert np.abs(np.subtract([stamp for stamp, _ in device.kept], shown)).max() <= 2
     assert clock.skew != 0

@@ -15,7 +15,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.tools.demo._truth import TruthReader
 from jointfit_simulators.body import SimulatedSubject, parse_motion_script
 from jointfit_simulators.scene import RigOptions, Scene, SceneOptions
-from jointfit_simulators.settings import Knobs, perfect, turn
+from jointfit_simulators.settings import Knobs, apply_settings, perfect
 from tests.system.station import BASE, Station, in_this_process, listening, sensors_in
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ CHAIN = (
 
 @contextlib.asynccontextmanager
 async def played(folder: Path, port: int) -> AsyncIterator[Scene]:
-    knobs = turn(perfect(Knobs()), SETTINGS)
+    knobs = apply_settings(perfect(Knobs()), SETTINGS)
     rig = RigOptions(mqtt_port=port, mqtt_base=BASE, axes="static")  # the truth's axes
     options = SceneOptions(folder, wires=WIRES, rig=rig)
     subject = SimulatedSubject(knobs, parse_motion_script("stand"), sensors=SENSORS)

@@ -16,7 +16,7 @@ from jointfit_daemon.tools.demo._score import DemoScore
 from jointfit_daemon.tools.demo._truth import TruthReader
 from jointfit_simulators.body import SimulatedSubject, parse_motion_script
 from jointfit_simulators.scene import RigOptions, Scene, SceneOptions
-from jointfit_simulators.settings import Knobs, perfect, turn
+from jointfit_simulators.settings import Knobs, apply_settings, perfect
 from tests.system.station import BASE, SENSORS, Station, in_this_process, listening
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class SpoiledScene(Scene):
 
 @contextlib.asynccontextmanager
 async def played(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
-    knobs = turn(perfect(Knobs()), SETTINGS)
+    knobs = apply_settings(perfect(Knobs()), SETTINGS)
     options = SceneOptions(folder, rig=RigOptions(mqtt_port=port, mqtt_base=BASE))
     subject = SimulatedSubject(knobs, parse_motion_script("stand"))
     scene = SpoiledScene(knobs, subject, options, now_ns=time.monotonic_ns())

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_simulators.body._orientation import Rotation, to_wxyz
+from jointfit_simulators.body._orientation import Rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PARTS = ("pelvis", "thigh", "shank", "foot")
-JOINTS = ("hip", "knee", "ankle")
 
 COORDINATES = 22
 """Columns of a coordinate array: the posture of leg and plate at one instant."""
@@ -33,33 +32,33 @@ KNEE = slice(9, 12)
 ANKLE = slice(12, 15)
 LEG_ANGLES = slice(6, 15)
 PLATE_POSITION = slice(15, 18)
-"""Position of the plate's center, m."""
+"""Position of the plate's centre, m."""
 PLATE_TURN = slice(18, 21)
 """Rotation vector of the plate, rad."""
 ON_PLATE = 21
-"""1: the sensors sit on the plate; 0: they are worn; between: they are carried over."""
+"""Place of the sensors: 1 on the plate, 0 on the leg; intermediate values during the transfer."""
 
 
 @dataclass(frozen=True, slots=True)
 class LegGeometry:
-    """Bones of one leg, m."""
+    """Bone lengths and joint centres of one leg, m."""
 
     thigh_m: float = 0.42
     shank_m: float = 0.40
     hip_in_pelvis: tuple[float, float, float] = (0.09, 0.02, -0.07)
-    """Hip center in pelvis coordinates: right, anterior, up."""
+    """Hip joint centre in pelvis coordinates: right, anterior, up."""
     ankle_height_m: float = 0.08
-    """Ankle center above the sole."""
+    """Ankle joint centre above the sole."""
 
     @property
     def standing_pelvis(self) -> tuple[float, float, float]:
-        """Pelvis origin when the wearer stands upright over the world's origin, m."""
+        """Pelvis origin in upright stance over the origin of the world, m."""
         leg = self.ankle_height_m + self.shank_m + self.thigh_m
         return (0.0, 0.0, leg - self.hip_in_pelvis[2])
 
     @property
     def standing_ankle(self) -> tuple[float, float, float]:
-        """Ankle center in that stance, m."""
+        """Ankle joint centre in upright stance, m."""
         return (self.hip_in_pelvis[0], self.hip_in_pelvis[1], self.ankle_height_m)
 
 
@@ -67,7 +66,7 @@ class LegPose(NamedTuple):
     """Bones at n instants, base world."""
 
     orientations: dict[str, Rotation]
-    """Rotation of each part (n of them): part coordinates to base world."""
+    """Rotations of each part (n): part coordinates to base world."""
     origins: dict[str, NDArray[np.float64]]
     """Origin of each part, shape (n, 3), m: pelvis origin, hip, knee, ankle."""
 
@@ -78,12 +77,12 @@ def joint_rotation(flexion_sign: int, angles: NDArray[np.float64]) -> Rotation:
     .. math:: R = R_x(s f) R_y(a) R_z(i)
 
     with flexion *f*, adduction *a*, internal rotation *i* (Grood and Suntay's order), and s = +1
-    for hip flexion and ankle dorsiflexion, -1 for the knee, whose flexion brings the heel back.
+    for hip flexion and ankle dorsiflexion, s = -1 for knee flexion (heel back).
 
     Parameters
     ----------
     flexion_sign
-        *s* above.
+        Sign *s*.
     angles
         Flexion, adduction, rotation, rad, shape (n, 3).
     """
@@ -96,6 +95,7 @@ def leg_pose(geometry: LegGeometry, coordinates: NDArray[np.float64]) -> LegPose
     thigh = pelvis * joint_rotation(1, coordinates[:, HIP])
     shank = thigh * joint_rotation(-1, coordinates[:, KNEE])
     foot = shank * joint_rotation(1, coordinates[:, ANKLE])
+
     origin = coordinates[:, PELVIS_POSITION]
     hip = origin + pelvis.apply(np.array(geometry.hip_in_pelvis))
     knee = hip + thigh.apply(np.array([0.0, 0.0, -geometry.thigh_m]))
@@ -107,13 +107,8 @@ def leg_pose(geometry: LegGeometry, coordinates: NDArray[np.float64]) -> LegPose
 
 
 def included_angle(thigh: Rotation, shank: Rotation) -> NDArray[np.float64]:
-    """Return the inner angle between two bones' long axes, rad, shape (n,): pi when straight."""
+    """Return the inner angle of two long axes, rad, shape (n,); pi if straight."""
     down = np.array([0.0, 0.0, -1.0])
     a, b = thigh.apply(down), shank.apply(down)
     bend = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
     return np.pi - np.asarray(bend, dtype=np.float64)
-
-
-def orientations(pose: LegPose, part: str) -> NDArray[np.float64]:
-    """Return q_world_part, shape (n, 4), scalar first."""
-    return to_wxyz(pose.orientations[part])

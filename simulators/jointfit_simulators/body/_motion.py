@@ -48,55 +48,65 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Motion = Callable[["NDArray[np.float64]"], "NDArray[np.float64]"]
-"""Seconds since the motion began, shape (n,), to coordinates, shape (n, COORDINATES)."""
+"""Function from time since the start, s, shape (n,), to coordinates, shape (n, COORDINATES)."""
 StyledMotion = Callable[[MovementStyle, "NDArray[np.float64]"], "NDArray[np.float64]"]
-"""The same, as done by a person."""
+"""Motion that depends on the movement style of a subject."""
 
 
 def _cycle(*keys: tuple[float, float]) -> CubicSpline:
-    """Return a periodic curve through (share of the cycle, degrees), as radians."""
+    """Return a periodic spline through (share of the cycle, degrees), in radians."""
     share, degrees = np.array([*keys, (1.0, keys[0][1])]).T
     return CubicSpline(share, np.radians(degrees), bc_type="periodic")
 
 
-# Sagittal angles of level walking: textbook shapes, read off by eye, one stride from heel strike.
+# Sagittal angles of level walking over one stride from heel strike, read from textbook curves.
 _GAIT_HIP = _cycle((0, 30), (0.15, 24), (0.35, 0), (0.52, -10), (0.65, 5), (0.85, 33))
 _GAIT_KNEE = _cycle((0, 4), (0.14, 17), (0.4, 4), (0.58, 30), (0.72, 62), (0.86, 28), (0.96, 4))
 _GAIT_ANKLE = _cycle((0, 0), (0.07, -5), (0.3, 6), (0.46, 11), (0.62, -17), (0.78, 1), (0.9, 2))
 _STRIDE_S = 1.1
-# Sitting down and standing up: seated, leaning, upright, leaning, seated; one cycle of 5 s.
+"""Duration of a stride, s."""
+
+# Sitting down and standing up: seated, leaning, upright, leaning, seated.
 _CHAIR_KNEE = _cycle((0, 92), (0.15, 92), (0.28, 75), (0.45, 4), (0.55, 4), (0.75, 70), (0.9, 92))
 _CHAIR_THIGH = _cycle((0, 86), (0.15, 86), (0.28, 66), (0.45, 2), (0.55, 2), (0.75, 60), (0.9, 86))
 _CHAIR_LEAN = _cycle((0, 6), (0.12, 12), (0.24, 38), (0.45, 2), (0.55, 2), (0.72, 35), (0.9, 10))
 _CHAIR_S = 5.0
+"""Duration of one cycle, s."""
 
 
 def stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stand upright, swaying by tenths of a degree."""
+    """Stand upright with a sway of tenths of a degree."""
     coordinates = upright(style, t)
     coordinates[:, LEG_ANGLES] += style.sway.at(t)
     hip, knee = coordinates[:, HIP], coordinates[:, KNEE]
-    coordinates[:, ANKLE] = np.array([1, -1, -1]) * knee - hip  # the sole stays flat
+    coordinates[:, ANKLE] = np.array([1, -1, -1]) * knee - hip  # flat sole
     ground(style, coordinates)
     return coordinates
 
 
 def walk(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Walk on a treadmill, facing ahead."""
+    """Walk on a treadmill with a constant mean heading."""
     coordinates = upright(style, t)
     share = t / _STRIDE_S
     phase = 2 * np.pi * share
+
+    # sagittal angles
     coordinates[:, column(HIP, FLEXION)] = _GAIT_HIP(share % 1.0)
     coordinates[:, column(KNEE, FLEXION)] = _GAIT_KNEE(share % 1.0)
     coordinates[:, column(ANKLE, FLEXION)] = _GAIT_ANKLE(share % 1.0)
+
+    # frontal and transverse angles
     coordinates[:, column(HIP, ADDUCTION)] = np.radians(5) * np.sin(phase - 0.4)
     coordinates[:, column(HIP, ROTATION)] = np.radians(4) * np.cos(phase)
     coordinates[:, column(ANKLE, ADDUCTION)] = np.radians(3) * np.sin(phase + 1.0)
+
+    # pelvis
     coordinates[:, column(PELVIS_TURN, HEADING)] = np.radians(5) * np.sin(phase)
     coordinates[:, column(PELVIS_TURN, TILT)] = np.radians(1.5) * np.sin(2 * phase)
     coordinates[:, column(PELVIS_TURN, LIST)] = np.radians(3) * np.sin(phase + 0.5)
     coordinates[:, 0] += 0.02 * np.sin(phase)
     coordinates[:, 2] += 0.02 * np.cos(2 * phase) - 0.03
+
     couple_knee(coordinates)
     vary(style, t, coordinates)
     return coordinates
@@ -110,14 +120,17 @@ def _sagittal(
     thigh: NDArray[np.float64],
     lean: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Bend hip, knee and ankle over a flat foot; `thigh` and `lean` are pitches in space."""
+    """Flex hip, knee and ankle over a flat foot; `thigh` and `lean` are pitch angles in space."""
     coordinates = upright(style, t)
     coordinates[:, column(PELVIS_TURN, TILT)] = -lean
     coordinates[:, column(HIP, FLEXION)] = thigh + lean
     coordinates[:, column(KNEE, FLEXION)] = knee
     coordinates[:, column(ANKLE, FLEXION)] = knee - thigh
-    coordinates[:, column(HIP, ADDUCTION)] = -0.08 * thigh  # knees over the toes
+
+    # knees over the toes
+    coordinates[:, column(HIP, ADDUCTION)] = -0.08 * thigh
     coordinates[:, column(ANKLE, ADDUCTION)] = 0.06 * thigh
+
     couple_knee(coordinates)
     vary(style, t, coordinates)
     ground(style, coordinates)
@@ -125,7 +138,7 @@ def _sagittal(
 
 
 def squat(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squat every 3 s, not always equally deep."""
+    """Squat every 3 s with varying depth."""
     depth = (1 - np.cos(2 * np.pi * t / 3.0)) / 2 * (0.9 + 0.1 * np.cos(0.37 * t))
     return _sagittal(
         style,
@@ -138,17 +151,18 @@ def squat(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def sit_to_stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sit on a chair and stand up again, every 5 s."""
-    share = (t / _CHAIR_S + 0.5) % 1.0  # begins standing
+    share = (t / _CHAIR_S + 0.5) % 1.0  # start in upright stance
     return _sagittal(
         style, t, knee=_CHAIR_KNEE(share), thigh=_CHAIR_THIGH(share), lean=_CHAIR_LEAN(share)
     )
 
 
 def hip_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Swing the almost straight leg through a star of arcs in turning directions (star-arc)."""
+    """Swing the almost straight leg in arcs of rotating direction (star-arc movement)."""
     coordinates = upright(style, t)
     swing = np.sin(2 * np.pi * 0.5 * t)
     direction = 2 * np.pi * t / 13.0
+
     coordinates[:, column(HIP, FLEXION)] = np.radians(14 + 30 * swing * np.cos(direction))
     coordinates[:, column(HIP, ADDUCTION)] = np.radians(-12 + 22 * swing * np.sin(direction))
     coordinates[:, column(HIP, ROTATION)] = np.radians(15) * np.sin(2 * np.pi * 0.23 * t)
@@ -156,13 +170,14 @@ def hip_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.floa
     coordinates[:, column(ANKLE, FLEXION)] = np.radians(5) * np.sin(2 * np.pi * 0.4 * t)
     coordinates[:, column(PELVIS_TURN, LIST)] = np.radians(4) * swing * np.sin(direction)
     coordinates[:, 2] += 0.04
+
     couple_knee(coordinates)
     vary(style, t, coordinates)
     return coordinates
 
 
 def knee_swings(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Swing the shank under a raised thigh, turning the foot in and out as the knee bends."""
+    """Swing the shank with a raised thigh; internal rotation varies with knee flexion."""
     coordinates = upright(style, t)
     bend = np.radians(55 + 43 * np.sin(2 * np.pi * 0.55 * t))
     coordinates[:, column(HIP, FLEXION)] = np.radians(42 + 8 * np.sin(2 * np.pi * 0.21 * t))
@@ -170,6 +185,8 @@ def knee_swings(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.floa
     coordinates[:, column(KNEE, FLEXION)] = bend
     coordinates[:, column(ANKLE, FLEXION)] = np.radians(8) * np.sin(2 * np.pi * 0.33 * t)
     coordinates[:, 2] += 0.04
+
+    # only a flexed knee allows voluntary rotation
     twist = np.radians(15) * np.sin(2 * np.pi * 0.29 * t)
     couple_knee(coordinates)
     coordinates[:, column(KNEE, ROTATION)] += twist * np.sin(bend / 2)
@@ -178,29 +195,31 @@ def knee_swings(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def ankle_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Circle the lifted foot."""
+    """Move the raised foot in circles."""
     coordinates = upright(style, t)
     phase = 2 * np.pi * 0.7 * t
+
     coordinates[:, column(HIP, FLEXION)] = np.radians(25)
     coordinates[:, column(KNEE, FLEXION)] = np.radians(30 + 6 * np.sin(0.9 * t))
     coordinates[:, column(ANKLE, FLEXION)] = np.radians(-6 + 20 * np.sin(phase))
     coordinates[:, column(ANKLE, ADDUCTION)] = np.radians(13) * np.cos(phase)
     coordinates[:, column(ANKLE, ROTATION)] = np.radians(10) * np.sin(0.43 * phase)
     coordinates[:, 2] += 0.04
+
     couple_knee(coordinates)
     vary(style, t, coordinates)
     return coordinates
 
 
 def turn(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Walk while turning the whole body by a right angle to either side, once in 16 s."""
+    """Walk with a heading that oscillates by 90 degrees to either side, with a period of 16 s."""
     coordinates = walk(style, t)
     coordinates[:, column(PELVIS_TURN, HEADING)] += np.radians(90) * np.sin(2 * np.pi * t / 16.0)
     return coordinates
 
 
 def plate(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stand and turn the plate that carries all sensors by hand, about every axis."""
+    """Stand and rotate the plate with all sensors by hand, about every axis."""
     coordinates = stand(style, t)
     coordinates[:, ON_PLATE] = 1.0
     rates_hz, phases = np.array([0.31, 0.23, 0.17]), np.array([0.0, 1.1, 2.3])
@@ -210,21 +229,19 @@ def plate(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-_MIX: tuple[StyledMotion, ...] = (
-    walk,
-    hip_circles,
-    squat,
-    knee_swings,
-    ankle_circles,
-)
+_MIX: tuple[StyledMotion, ...] = (walk, hip_circles, squat, knee_swings, ankle_circles)
 _MIX_S = 4.0
+"""Duration of each motion of the functional calibration, s."""
 _MIX_BLEND_S = 1.0
+"""Duration of the blend between two of them, s."""
 
 
 def functional(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Go through walking, hip star, squats, knee swings and ankle circles, 4 s each, for ever."""
+    """Repeat walking, hip circles, squats, knee swings and ankle circles, 4 s each."""
     coordinates = np.zeros((len(t), COORDINATES))
     place = (t / _MIX_S) % len(_MIX)
+
+    # the weights of all motions add up to 1 at every instant
     for index, part in enumerate(_MIX):
         since = ((place - index) % len(_MIX)) * _MIX_S
         weight = smootherstep(since / _MIX_BLEND_S) * smootherstep(
@@ -239,21 +256,13 @@ def functional(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float
 MOTIONS: Mapping[str, StyledMotion] = {
     motion.__name__: motion
     for motion in (
-        stand,
-        walk,
-        squat,
-        sit_to_stand,
-        hip_circles,
-        knee_swings,
-        ankle_circles,
-        functional,
-        plate,
-        turn,
+        stand, walk, squat, sit_to_stand, hip_circles, knee_swings, ankle_circles, functional,
+        plate, turn,
     )
-}
-"""Every built-in motion by name."""
+}  # fmt: skip
+"""All built-in motions by name."""
 
 
 def motions_of(style: MovementStyle) -> dict[str, Motion]:
-    """Return all built-in motions as `style` does them."""
+    """Return all built-in motions in the movement style of a subject."""
     return {name: partial(motion, style) for name, motion in MOTIONS.items()}

@@ -1,11 +1,11 @@
 """Motions from files: joint angles over time, as TOML keys, NPZ arrays or OpenSim kinematics.
 
-TOML, degrees, clinical signs, one table a key; a smooth curve is laid through them::
+TOML: degrees, clinical signs, one table for each key; a cubic spline interpolates the keys::
 
-    loop = true                     # else the last posture is held
+    loop = true                     # otherwise the last posture is held
     [[key]]
     t_s = 0.0
-    hip = [20, 0, 0]                # flexion, adduction, internal rotation; left out: 0
+    hip = [20, 0, 0]                # flexion, adduction, internal rotation; default 0
     knee = [5, 0, 0]
     ankle = [0, 0, 0]
     pelvis = [0, 0, 0]              # heading, tilt, list
@@ -13,7 +13,8 @@ TOML, degrees, clinical signs, one table a key; a smooth curve is laid through t
 NPZ, radians: ``t`` (n,) seconds and any of ``hip knee ankle pelvis`` (n, 3).
 
 MOT or STO: the coordinates of OpenSim's lower-limb models, right leg. Their axes (x forward, y up,
-z right) are ours renamed; their pelvis turns by tilt, list, rotation in this order.
+z right) are ours in the order (y, z, x). Their pelvis rotates by tilt, list and rotation, in this
+order.
 """
 
 from __future__ import annotations
@@ -84,19 +85,19 @@ _READERS = {".toml": _read_toml, ".npz": _read_npz, ".mot": _read_opensim, ".sto
 
 
 def motion_from_file(path: Path, style: MovementStyle) -> Motion:
-    """Return the motion a file describes; curves between its keys have two continuous derivatives.
+    """Return the motion of a file; splines between its keys have two continuous derivatives.
 
     Raises
     ------
     ValueError
-        A file of another kind, fewer than two keys, times that do not increase, or a loop whose
-        ends differ.
+        Unknown suffix, fewer than two keys, times that do not increase, or a loop with different
+        first and last postures.
     """
     if path.suffix.lower() not in _READERS:
-        raise ValueError(f"{path}: a motion is read from {', '.join(_READERS)}")
+        raise ValueError(f"{path}: unknown motion file; expected one of {', '.join(_READERS)}")
     t_s, angles, loop = _READERS[path.suffix.lower()](path)
     if not len(t_s) > 1 or np.any(np.diff(t_s) <= 0):
-        raise ValueError(f"{path}: needs at least two keys with increasing t_s")
+        raise ValueError(f"{path}: expected at least two keys with increasing t_s")
     ends: Literal["periodic", "clamped"] = "periodic" if loop else "clamped"
     curves = {part: CubicSpline(t_s, values, bc_type=ends) for part, values in angles.items()}
     length = float(t_s[-1] - t_s[0])

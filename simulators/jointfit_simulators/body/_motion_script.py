@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 
 class Step(NamedTuple):
-    """One motion of a programme."""
+    """One motion of a sequence."""
 
     name: str
     seconds: float
 
 
 class UnknownMotionError(LookupError):
-    """Nobody taught the person that motion."""
+    """The motion does not exist; the message lists the existing ones."""
 
 
 def parse_motion_script(text: str) -> tuple[Step, ...]:
-    """Return the steps of ``"plate:20,stand:8,walk:60"``; the last one goes on for ever.
+    """Return the steps of ``"plate:20,stand:8,walk:60"``; the last motion continues.
 
     Raises
     ------
@@ -52,18 +52,18 @@ def parse_motion_script(text: str) -> tuple[Step, ...]:
 
 
 class MotionScript:
-    """The motions of one run, layered: each newer one fades in over the older ones.
+    """Sequence of motions of one run; each newer motion fades in over the older ones.
 
     Parameters
     ----------
     motions
-        What can be played, by name.
+        Available motions by name.
     steps
-        What is played from `start_s` on; the last step goes on for ever.
+        Motions from `start_s` on; the last one continues.
     start_s
-        Instant of the first step, s.
+        Start of the first step, s.
     transition_s
-        Length of every blend, s.
+        Duration of every blend, s.
     """
 
     def __init__(
@@ -78,29 +78,29 @@ class MotionScript:
         self._transition_s = transition_s
         self._layers: list[tuple[float, str]] = []
         for step in steps:
-            self._layers.append((start_s, self._known(step.name)))
+            self._check(step.name)
+            self._layers.append((start_s, step.name))
             start_s += step.seconds
         if not self._layers:
             raise ValueError("a programme needs at least one step")
 
-    def _known(self, name: str) -> str:
+    def _check(self, name: str) -> None:
         if name not in self._motions:
             raise UnknownMotionError(f"no motion {name!r}; there are: {', '.join(self._motions)}")
-        return name
 
     def play(self, name: str, t_s: float) -> None:
-        """Begin motion `name` at instant `t_s` and forget what was planned after it."""
-        self._known(name)
-        kept = [layer for layer in self._layers if layer[0] < t_s]
-        self._layers = [*(kept or self._layers[:1]), (t_s, name)]
+        """Start motion `name` at instant `t_s` and discard later steps."""
+        self._check(name)
+        earlier = [layer for layer in self._layers if layer[0] < t_s]
+        self._layers = [*(earlier or self._layers[:1]), (t_s, name)]
 
     def name_at(self, t_s: float) -> str:
-        """Return the motion that is on (or fading in) at `t_s`."""
+        """Return the motion that plays or fades in at `t_s`."""
         begun = [name for start, name in self._layers if start <= t_s]
         return begun[-1] if begun else self._layers[0][1]
 
     def discard_before(self, t_s: float) -> None:
-        """Drop what can no longer be seen from `t_s` on."""
+        """Discard the motions that have no effect from `t_s` on."""
         covered = [
             i for i, (start, _) in enumerate(self._layers) if start + self._transition_s <= t_s
         ]
@@ -108,13 +108,13 @@ class MotionScript:
             del self._layers[: covered[-1]]
 
     def coordinates(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the coordinates at instants `t_s` of shape (n,), shape (n, width)."""
+        """Return the coordinates at instants `t_s` of shape (n,), shape (n, COORDINATES)."""
         start, name = self._layers[0]
-        found = self._motions[name](t_s - start)
+        blended = self._motions[name](t_s - start)
         for start, name in self._layers[1:]:
             begun = t_s > start
             if not np.any(begun):
                 break
             share = smootherstep((t_s[begun] - start) / self._transition_s)[:, None]
-            found[begun] += share * (self._motions[name](t_s[begun] - start) - found[begun])
-        return found
+            blended[begun] += share * (self._motions[name](t_s[begun] - start) - blended[begun])
+        return blended

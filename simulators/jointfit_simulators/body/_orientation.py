@@ -18,21 +18,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Rotation", "from_wxyz", "heading", "to_wxyz"]
 
-_SCALAR_LAST = [1, 2, 3, 0]
-_SCALAR_FIRST = [3, 0, 1, 2]
-
 
 def from_wxyz(quaternions: NDArray[np.float64]) -> Rotation:
     """Return rotations of Hamilton quaternions (w, x, y, z), shape (..., 4)."""
-    return Rotation.from_quat(quaternions[..., _SCALAR_LAST])
+    return Rotation.from_quat(quaternions[..., [1, 2, 3, 0]])
 
 
 def to_wxyz(rotations: Rotation) -> NDArray[np.float64]:
     """Return Hamilton quaternions (w, x, y, z), shape (4,) or (n, 4)."""
-    found: NDArray[np.float64] = np.asarray(rotations.as_quat())[..., _SCALAR_FIRST]
-    return found
+    quaternions: NDArray[np.float64] = np.asarray(rotations.as_quat())[..., [3, 0, 1, 2]]
+    return quaternions
 
 
 def heading(angle: float) -> Rotation:
-    """Return the rotation by `angle` rad about the vertical."""
+    """Return the rotation by `angle`, rad, about the vertical."""
     return Rotation.from_rotvec([0.0, 0.0, angle])

@@ -22,12 +22,22 @@ CLUSTERS: dict[str, tuple[str, ...]] = {
 }
 """Markers by body part; C is for calf (S is a sensor), R for the rigid plate."""
 
+PLATE_TEMPLATE = np.array(
+    [
+        (0.16, 0.10, 0.03),
+        (-0.15, 0.11, 0.05),
+        (0.15, -0.12, 0.04),
+        (-0.16, -0.10, 0.02),
+        (0.03, 0.02, 0.09),
+    ]
+)
+"""Marker positions in the frame of the plate, asymmetric, m, shape (5, 3)."""
 _PLACEMENT_M = 0.008
-"""Nobody sticks a marker exactly where the drawing shows it."""
+"""Standard deviation of each coordinate of a marker on the skin, m."""
 
 
 def random_misalignment(random: np.random.Generator, most_rad: float) -> Rotation:
-    """Return how a sensor sits: turned by up to `most_rad` about a random axis."""
+    """Return a rotation by up to `most_rad` about a random axis, as sensor alignment."""
     axis = random.standard_normal(3)
     return Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0, most_rad))
 
@@ -37,11 +47,11 @@ def marker_templates(
 ) -> dict[str, NDArray[np.float64]]:
     """Return marker positions in the frame of each part, upright stance, shape (4, 3).
 
-    Pelvis: spines of the ilium, front and back. Thigh and shank: plates of four on the outside
-    and front, spread along the bone as far as the soft parts allow. Foot: heel, instep, toes.
+    Pelvis: anterior and posterior iliac spines. Thigh and shank: clusters of four on the lateral
+    and anterior side, distributed along the bone. Foot: heel, instep and toes.
     """
     thigh, shank = geometry.thigh_m, geometry.shank_m
-    drawn = {
+    nominal = {
         "pelvis": [
             (0.12, 0.08, 0.0),
             (-0.12, 0.08, 0.0),
@@ -68,19 +78,6 @@ def marker_templates(
         ],
     }
     return {
-        part: np.array(found) + random.normal(0.0, _PLACEMENT_M, (len(found), 3))
-        for part, found in drawn.items()
+        part: np.array(points) + random.normal(0.0, _PLACEMENT_M, (len(points), 3))
+        for part, points in nominal.items()
     }
-
-
-def plate_template() -> NDArray[np.float64]:
-    """Return the plate's markers in its own frame: an asymmetric five on stalks, shape (5, 3)."""
-    return np.array(
-        [
-            (0.16, 0.10, 0.03),
-            (-0.15, 0.11, 0.05),
-            (0.15, -0.12, 0.04),
-            (-0.16, -0.10, 0.02),
-            (0.03, 0.02, 0.09),
-        ]
-    )

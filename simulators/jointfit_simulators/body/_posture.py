@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PLATE_ON_TABLE = (0.55, 0.35, 0.90)
-"""Where the plate lies when nobody holds it, m."""
+"""Position of the plate on its table, m."""
 FLEXION, ADDUCTION, ROTATION = 0, 1, 2
 """Columns of a joint."""
 HEADING, TILT, LIST = 0, 1, 2
-"""Columns of the pelvis' orientation."""
+"""Columns of the orientation of the pelvis."""
 
 
 def column(part: slice, axis: int) -> int:
@@ -39,17 +39,17 @@ def column(part: slice, axis: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class MovementStyle:
-    """How this person moves."""
+    """Geometry and movement variability of a subject."""
 
     geometry: LegGeometry
     sway: RandomSignal
     """Slow sway of each joint angle in quiet stance, rad, 9 channels."""
     variability: RandomSignal
-    """By how much each joint angle of a movement departs from its pattern, rad, 9 channels."""
+    """Deviation of each joint angle from the pattern of a motion, rad, 9 channels."""
 
 
 def draw_style(geometry: LegGeometry, random: np.random.Generator) -> MovementStyle:
-    """Return a person with habits drawn from `random`."""
+    """Return a movement style drawn from `random`."""
     return MovementStyle(
         geometry,
         sway=RandomSignal(random, 9, low_hz=0.05, high_hz=0.3, rms=np.radians(0.08)),
@@ -58,39 +58,38 @@ def draw_style(geometry: LegGeometry, random: np.random.Generator) -> MovementSt
 
 
 def upright(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return upright stance over the origin, plate on its table."""
+    """Return upright stance over the origin, with the plate on its table."""
     coordinates = np.zeros((len(t), COORDINATES))
     coordinates[:, PELVIS_POSITION] = style.geometry.standing_pelvis
     coordinates[:, PLATE_POSITION] = PLATE_ON_TABLE
     return coordinates
 
 
-def couple_knee(coordinates: NDArray[np.float64], rotation_rad: float = 0.0) -> None:
-    """Give the knee what its flexion brings along: a little adduction and internal rotation.
+def couple_knee(coordinates: NDArray[np.float64]) -> None:
+    """Add the adduction and internal rotation that accompany knee flexion.
 
-    The tibia turns inward by some 8 degrees and tips by 2 as the knee bends to a right angle
-    (the screw-home movement, reversed); `rotation_rad` adds what the person turns at will, which
-    only a bent knee allows.
+    Over 90 degrees of flexion the tibia rotates internally by about 8 degrees and adducts by about
+    2 degrees (the screw-home movement, reversed).
     """
     bend = np.sin(coordinates[:, column(KNEE, FLEXION)] / 2)
     coordinates[:, column(KNEE, ADDUCTION)] += np.radians(2.5) * bend
-    coordinates[:, column(KNEE, ROTATION)] += np.radians(11.0) * bend + rotation_rad * bend
+    coordinates[:, column(KNEE, ROTATION)] += np.radians(11.0) * bend
 
 
 def vary(style: MovementStyle, t: NDArray[np.float64], coordinates: NDArray[np.float64]) -> None:
-    """Let the movement depart from its pattern, as a person's does."""
-    departure = style.variability.at(t)
-    departure[:, 4:6] *= 0.3  # the knee hardly tips or twists at will
-    coordinates[:, LEG_ANGLES] += departure
+    """Add the movement variability of the subject."""
+    deviation = style.variability.at(t)
+    deviation[:, 4:6] *= 0.3  # the knee has little voluntary adduction and rotation
+    coordinates[:, LEG_ANGLES] += deviation
 
 
 def ground(style: MovementStyle, coordinates: NDArray[np.float64]) -> None:
-    """Move the pelvis so that the ankle stays where it stands."""
+    """Translate the pelvis so that the ankle has its position in upright stance."""
     ankle = leg_pose(style.geometry, coordinates).origins["foot"]
     coordinates[:, PELVIS_POSITION] += np.array(style.geometry.standing_ankle) - ankle
 
 
 def smootherstep(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    r"""Return :math:`6x^5 - 15x^4 + 10x^3` clipped to [0, 1]: two continuous derivatives."""
+    r"""Return :math:`6x^5 - 15x^4 + 10x^3` of `x` clipped to [0, 1]: two continuous derivatives."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (x * (6 * x - 15) + 10)

@@ -14,26 +14,26 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LINES = 48
-"""Sinusoids in one signal; with fewer it would visibly repeat and its RMS would swing."""
+"""Number of sinusoids; with fewer, the signal repeats visibly and its RMS fluctuates."""
 
 
 class RandomSignal:
-    r"""A stationary, nearly Gaussian signal of several channels within a frequency band.
+    r"""Stationary, nearly Gaussian signal of several channels within a frequency band.
 
     .. math:: x_c(t) = \sum_k a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t
 
-    (Rice's sum of sinusoids, Bell Syst. Tech. J. 23, 1944), with the :math:`f_k` stratified over
-    the band and the amplitudes scaled so that every channel has its RMS exactly, over a time
-    that is long against ``1/low_hz``.
+    (Rice's sum of sinusoids, Bell Syst. Tech. J. 23, 1944). The :math:`f_k` are stratified over
+    the band. The amplitudes are scaled so that every channel has exactly its RMS over a time much
+    longer than ``1/low_hz``.
 
     Parameters
     ----------
     random
-        Source of frequencies and amplitudes; used here and never again.
+        Source of frequencies and amplitudes, used by the constructor only.
     channels
         Number of signals.
     low_hz, high_hz
-        The band.
+        Limits of the band, Hz.
     rms
         RMS of each channel, any unit.
     """
@@ -57,12 +57,12 @@ class RandomSignal:
         """Return the signals at instants `t_s` of shape (n,), shape (n, channels)."""
         phase = t_s[:, None] * self._omega
         waves = np.concatenate((np.cos(phase), np.sin(phase)), axis=1)
-        found: NDArray[np.float64] = waves @ self._amplitudes
-        return found
+        signals: NDArray[np.float64] = waves @ self._amplitudes
+        return signals
 
 
 def random_vector_signal(
     random: np.random.Generator, vectors: int, *, low_hz: float, high_hz: float, rms: float
 ) -> RandomSignal:
-    """Return a wander of 3-vectors whose *length* has the given RMS (isotropic)."""
+    """Return a signal of isotropic 3-vectors whose *length* has the given RMS."""
     return RandomSignal(random, 3 * vectors, low_hz=low_hz, high_hz=high_hz, rms=rms / np.sqrt(3))

@@ -1,4 +1,4 @@
-"""A `Subject` that replays a `Recording`.
+"""Subject that replays a `RecordedTrial`.
 
 Invariant: the recording is not altered. During synthetic intervals (the blend between standing and
 trial, the final pose) the cameras see no bones and the ground truth has no positions, so these
@@ -33,39 +33,43 @@ if TYPE_CHECKING:
 
 _STAND = "stand"
 _MOTION = re.compile(r"stand|trial(@(?P<begin>[\d.]*)-(?P<end>[\d.]*))?")
-_ROUNDING_S = 1e-6  # of instants that came through nanoseconds
+_ROUNDING_S = 1e-6
+"""Rounding of instants that were converted from nanoseconds, s."""
+_FIRST = np.zeros(1)
+"""Instant of the first recorded frame, s."""
 
 
 class _Switch(NamedTuple):
+    """Start of a motion; `begin_s` to `end_s` is its part of the recording."""
+
     start_s: float
     name: str
     begin_s: float
     end_s: float
-    """Part of the recording."""
 
 
 class RecordedSubject:
-    """The wearer of a recorded trial.
+    """Subject of a recorded trial.
 
     Parameters
     ----------
     recording
-        What is played.
+        Trial to replay.
     sensors
-        Sensor ids and the segment each is worn on.
+        Sensor ids and their segments.
     steps
-        ``stand``, ``trial`` and ``trial@A-B`` (its seconds A to B; either may be left out) in any
-        order; the last one goes on for ever.
+        ``stand``, ``trial`` and ``trial@A-B`` (its seconds A to B; either may be omitted) in any
+        order; the last one continues.
     start_s
-        Instant of the first step.
+        Start of the first step, s.
     transition_s
-        Length of the blend between them.
+        Duration of the blend between steps, s.
     clusters
         Markers of each body part; default: OpenCap's right leg, as far as recorded.
     """
 
     templates: Mapping[str, NDArray[np.float64]] = {}
-    """None: the recording has bones for reference."""
+    """Empty: the reference of a recording is its bones."""
 
     def __init__(
         self,
@@ -83,6 +87,7 @@ class RecordedSubject:
         if missing:
             raise ValueError(f"the trial has no sensor {', '.join(missing)}")
         self.sensors = sensors
+
         trial = recording.orientations
         self._tracks = {
             name: InterpolatedTrack(trial.t_s, trial.sensors[name], rotation=True)
@@ -97,49 +102,52 @@ class RecordedSubject:
             if name.split("_")[0] in BONES and name in trial.origins
         }
         self.visible_bones = tuple(self._bones)
-        self._foothold = self._standing_origins()
+        self._standing_origins = self._place_standing_bones()
         self._markers = interpolated_markers(recording.markers) if recording.markers else None
-        self.clusters = self._known_clusters(clusters or OPENCAP_CLUSTERS)
+        self.clusters = self._recorded_clusters(clusters or OPENCAP_CLUSTERS)
+
         self._switches: list[_Switch] = []
         for step in steps:
             self.play(step.name, start_s)
             start_s += step.seconds
 
-    def _standing_origins(self) -> Mapping[str, NDArray[np.float64]]:
-        """Return where each bone's origin is while standing: as in the first frame, straightened.
+    def _place_standing_bones(self) -> Mapping[str, NDArray[np.float64]]:
+        """Return the origins of the bones while standing.
 
-        Each bone hangs where it hung on the one before, so that the joints stay whole.
+        Each bone is attached to the more proximal one as in the first frame, so that the joints
+        remain connected when the bones are upright.
         """
-        first = np.zeros(1)
-        found: dict[str, NDArray[np.float64]] = {}
+        placed: dict[str, NDArray[np.float64]] = {}
         above: tuple[Rotation, NDArray[np.float64], NDArray[np.float64]] | None = None
         for name, (turns, origins) in self._bones.items():
-            turn, origin = from_wxyz(turns.at(first)[0]), origins.at(first)[0]
-            found[name] = origin
+            turn, origin = from_wxyz(turns.at(_FIRST)[0]), origins.at(_FIRST)[0]
+            placed[name] = origin
             if above is not None and self._recording.biases:
-                found[name] = above[2] + above[0].inv().apply(origin - above[1])
-            above = (turn, origin, found[name])
-        return found
+                placed[name] = above[2] + above[0].inv().apply(origin - above[1])
+            above = (turn, origin, placed[name])
+        return placed
 
-    def _known_clusters(
+    def _recorded_clusters(
         self, clusters: Mapping[str, tuple[str, ...]]
     ) -> Mapping[str, tuple[str, ...]]:
+        """Return the recorded clusters and the other markers; set the columns of all markers."""
         markers = self._recording.markers
         recorded = markers.names if markers else ()
         known = {part: names for part, names in clusters.items() if set(names) <= set(recorded)}
         clustered = {name for names in known.values() for name in names}
-        self._columns = [recorded.index(name) for names in known.values() for name in names]
         others = tuple(name for name in recorded if name not in clustered)
-        self._columns += [recorded.index(name) for name in others]
-        return {**known, "other": others} if others else known
+        if others:
+            known["other"] = others
+        self._columns = [recorded.index(name) for names in known.values() for name in names]
+        return known
 
     @property
     def facts(self) -> Mapping[str, object]:
-        """Length of the trial and what it holds, for the truth log."""
+        """Duration and bones of the trial, for the ground-truth log."""
         return {"trial_s": self._recording.seconds, "bones": list(self._bones)}
 
     def play(self, name: str, t_s: float) -> None:
-        """Stand, or begin the trial or a part of it anew; UnknownMotion for anything else."""
+        """Start ``stand``, ``trial`` or a part of it; raise UnknownMotionError for other names."""
         part = _MOTION.fullmatch(name)
         if part is None:
             raise UnknownMotionError(
@@ -154,19 +162,16 @@ class RecordedSubject:
 
     def motion_at(self, t_s: float) -> str:
         """Return the name of the motion at an instant."""
-        return self._switch(t_s).name
+        begun = [switch for switch in self._switches if switch.start_s <= t_s]
+        return (begun[-1] if begun else self._switches[0]).name
 
     def discard_before(self, t_s: float) -> None:
-        """Nothing to forget: switches are few."""
-
-    def _switch(self, t_s: float) -> _Switch:
-        begun = [switch for switch in self._switches if switch.start_s <= t_s]
-        return begun[-1] if begun else self._switches[0]
+        """Discard nothing; the number of switches is small."""
 
     def _place(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return time within the trial and share of it (1) against standing (0).
+        """Return the time within the trial, s, and the share of trial (1) against standing (0).
 
-        The recording itself begins when it has faded in.
+        The recording starts after the blend; during the blend its first posture is held.
         """
         place, share = np.zeros_like(t_s), np.zeros_like(t_s)
         before = _STAND
@@ -182,20 +187,20 @@ class RecordedSubject:
             before = name
         return place, share
 
-    def _made_up(self, t_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return when neither the static pose nor the recording is played."""
-        made_up = np.zeros(len(t_s), dtype=np.bool_)
+    def _synthetic(self, t_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether neither the static pose nor the recording plays, at each instant."""
+        synthetic = np.zeros(len(t_s), dtype=np.bool_)
         before = _STAND
         for start_s, name, begin_s, end_s in self._switches:
             begun = t_s >= start_s
             since = t_s[begun] - start_s - self._transition_s
             blending = since < -_ROUNDING_S
             if name == _STAND:
-                made_up[begun] = blending & (before != _STAND)
+                synthetic[begun] = blending & (before != _STAND)
             else:
-                made_up[begun] = blending | (since > end_s - begin_s + _ROUNDING_S)
+                synthetic[begun] = blending | (since > end_s - begin_s + _ROUNDING_S)
             before = name
-        return made_up
+        return synthetic
 
     def observe(
         self,
@@ -203,54 +208,58 @@ class RecordedSubject:
         cameras: NDArray[np.float64],
         truth: NDArray[np.float64],
     ) -> Observation:
-        """Return what is to be seen."""
-        seen = [self._sensor(name, t) for name, t in zip(self.sensors, sensors, strict=True)]
-        place, _ = self._place(cameras)
+        """Return the observation at the instants (s) of each sensor, the cameras, the log."""
+        orientations = [
+            self._sensor(name, t) for name, t in zip(self.sensors, sensors, strict=True)
+        ]
         markers = np.empty((len(cameras), 0, 3))
         if self._markers is not None:
+            place, _ = self._place(cameras)
             recorded = self._markers.at(place).reshape(len(cameras), len(self._columns), 3)
             markers = recorded[:, self._columns]
         bones = {name: self._bone(name, cameras) for name in self._bones}
-        return Observation(seen, markers, bones, self._truth(truth))
+        return Observation(orientations, markers, bones, self._truth(truth))
 
     def _sensor(self, name: str, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
         bias = self._recording.biases.get(name)
-        still = self._tracks[name].at(np.zeros(1))[0] if bias is None else bias * [1, -1, -1, -1]
-        return self._faded(self._tracks[name], still, t_s)
+        still = self._tracks[name].at(_FIRST)[0] if bias is None else bias * [1, -1, -1, -1]
+        return self._blended(self._tracks[name], still, t_s)
 
     def _bone(self, name: str, t_s: NDArray[np.float64]) -> tuple[Rotation, NDArray[np.float64]]:
         turns, origins = self._bones[name]
         upright = np.array([1.0, 0.0, 0.0, 0.0])
-        still = upright if self._recording.biases else turns.at(np.zeros(1))[0]
+        still = upright if self._recording.biases else turns.at(_FIRST)[0]
         place, share = self._place(t_s)
-        where = share[:, None] * origins.at(place) + (1 - share[:, None]) * self._foothold[name]
-        where[self._made_up(t_s)] = np.nan
-        return from_wxyz(self._faded(turns, still, t_s)), where
+        standing = self._standing_origins[name]
+        origin = share[:, None] * origins.at(place) + (1 - share[:, None]) * standing
+        origin[self._synthetic(t_s)] = np.nan
+        return from_wxyz(self._blended(turns, still, t_s)), origin
 
-    def _faded(
+    def _blended(
         self, track: InterpolatedTrack, still: NDArray[np.float64], t_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return a track blended with its still value along the shortest arc."""
+        """Return a track blended with its value while standing, along the shortest arc."""
         place, share = self._place(t_s)
         moving = track.at(place)
-        fading = (share < 1) & np.isfinite(moving[:, 0])
-        if np.any(fading):
+        blending = (share < 1) & np.isfinite(moving[:, 0])
+        if np.any(blending):
             rest = from_wxyz(still)
-            arc = (rest.inv() * from_wxyz(moving[fading])).as_rotvec() * share[fading, None]
-            moving[fading] = to_wxyz(rest * Rotation.from_rotvec(arc))
+            arc = (rest.inv() * from_wxyz(moving[blending])).as_rotvec() * share[blending, None]
+            moving[blending] = to_wxyz(rest * Rotation.from_rotvec(arc))
         return moving
 
     def _truth(self, t_s: NDArray[np.float64]) -> GroundTruth:
         bones = {name: self._bone(name, t_s) for name in self._bones}
-        nothing = np.full((len(t_s), 3), np.nan)
-        joints = {"hip": nothing, "knee": nothing, "ankle": nothing}
+        unknown = np.full((len(t_s), 3), np.nan)
+        joints = {"hip": unknown, "knee": unknown, "ankle": unknown}
         joints |= {
             joint: bones[part][1]
             for joint, part in (("hip", "thigh"), ("knee", "shank"))
             if part in bones
         }
+
         turns = {name: turn for name, (turn, _) in bones.items()}
         if not {"thigh", "shank"} <= set(turns) or not len(t_s):
-            return GroundTruth(turns, joints, nothing, nothing[:, 0])
+            return GroundTruth(turns, joints, unknown, unknown[:, 0])
         knee = (turns["thigh"].inv() * turns["shank"]).as_euler("XYZ") * [-1, 1, 1]
         return GroundTruth(turns, joints, knee, included_angle(turns["thigh"], turns["shank"]))

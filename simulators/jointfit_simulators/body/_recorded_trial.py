@@ -11,6 +11,7 @@ except NPZ files that specify another axis.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -46,7 +47,7 @@ OPENCAP_CLUSTERS = {
 
 @dataclass(frozen=True)
 class RecordedTrial:
-    """All that was recorded of one trial, z up, on one time line that begins at 0."""
+    """Recorded data of one trial, z up, on one time axis from 0."""
 
     orientations: OrientationTrial
     markers: MarkerTrajectories | None = None
@@ -55,17 +56,17 @@ class RecordedTrial:
 
     @property
     def seconds(self) -> float:
-        """Length of the trial."""
+        """Duration of the trial, s."""
         return float(self.orientations.t_s[-1])
 
 
 def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
-    """Return the trial that several files describe together.
+    """Return the trial of several files.
 
     Raises
     ------
     ValueError
-        No file has sensors, two have, or a file is of no known kind.
+        The number of files with sensors is not one, or the type of a file is unknown.
     """
     orientations: list[OrientationTrial] = []
     markers: MarkerTrajectories | None = None
@@ -75,43 +76,41 @@ def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
             case ".npz":
                 orientations.append(read_orientations_npz(path))
             case ".sto":
-                orientations.append(_sensors_of_sto(path))
+                table = read_orientations_sto(path)
+                sensors = {
+                    name: quaternions_z_up(table.quaternions[:, i])
+                    for i, name in enumerate(table.names)
+                }
+                orientations.append(OrientationTrial(table.t_s, sensors, {}, {}))
             case ".trc":
                 markers = read_trc(path)
             case ".json":
-                table = read_json(path)["q_bias"]
-                biases = {name: quaternions_z_up(q) for name, q in table.items()}
+                q_bias = read_json(path)["q_bias"]
+                biases = {name: quaternions_z_up(q) for name, q in q_bias.items()}
             case other:
-                raise ValueError(f"{path}: no trial is read from {other!r} files")
+                raise ValueError(
+                    f"{path}: no trial is read from {other!r} files; expected .npz, .sto, .trc or"
+                    " .json"
+                )
     if len(orientations) != 1:
         raise ValueError(f"a trial needs one .npz or .sto with sensors, got {len(orientations)}")
-    return RecordedTrial(_from_zero(orientations[0]), markers, biases)
 
-
-def _sensors_of_sto(path: Path) -> OrientationTrial:
-    table = read_orientations_sto(path)
-    sensors = {
-        name: quaternions_z_up(table.quaternions[:, i]) for i, name in enumerate(table.names)
-    }
-    return OrientationTrial(table.t_s, sensors, {}, {})
-
-
-def _from_zero(trial: OrientationTrial) -> OrientationTrial:
-    return OrientationTrial(trial.t_s - trial.t_s[0], trial.sensors, trial.bones, trial.origins)
+    (trial,) = orientations
+    return RecordedTrial(dataclasses.replace(trial, t_s=trial.t_s - trial.t_s[0]), markers, biases)
 
 
 class InterpolatedTrack:
-    """Vectors or quaternions over time, read between their samples.
+    """Vectors or quaternions over time, interpolated between their samples.
 
-    Straight lines between neighbours; of unit quaternions, made continuous first, that is within
-    1e-5 rad of the shortest arc while neighbours are less than 5 degrees apart.
+    The interpolation is linear. For unit quaternions, after sign alignment, the result is within
+    1e-5 rad of the shortest arc if successive samples differ by less than 5 degrees.
 
     Parameters
     ----------
     t_s
         Shape (n,), s, increasing.
     values
-        Shape (n, 3) or (n, 4); NaN makes the two intervals beside it unknown.
+        Shape (n, 3) or (n, 4); NaN makes the two adjacent intervals unknown.
     rotation
         Whether the values are unit quaternions.
     """
@@ -125,22 +124,22 @@ class InterpolatedTrack:
             self._values = values * np.append(1.0, np.cumprod(np.where(turned, -1.0, 1.0)))[:, None]
 
     def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values at instants of shape (n,); the ends are held."""
+        """Return the values at instants of shape (n,), clipped to the recorded time."""
         right = np.clip(np.searchsorted(self._t_s, t_s, side="right"), 1, len(self._t_s) - 1)
         begin, end = self._t_s[right - 1], self._t_s[right]
         share = np.clip((t_s - begin) / (end - begin), 0.0, 1.0)[:, None]
+
+        # at a sample use it alone, so that a NaN of the adjacent sample has no effect
         before, after = self._values[right - 1], self._values[right]
-        found = np.where(
-            share == 0, before, np.where(share == 1, after, 0.0)
-        )  # NaN only where needed
+        values = np.where(share == 0, before, np.where(share == 1, after, 0.0))
         between = ((share > 0) & (share < 1))[:, 0]
-        found[between] = ((1 - share) * before + share * after)[between]
+        values[between] = ((1 - share) * before + share * after)[between]
         if self._rotation:
-            found /= np.linalg.norm(found, axis=1, keepdims=True)
-        return found
+            values /= np.linalg.norm(values, axis=1, keepdims=True)
+        return values
 
 
 def interpolated_markers(markers: MarkerTrajectories) -> InterpolatedTrack:
-    """Return all markers as one track, z up, flat: shape (n, 3 * markers)."""
+    """Return all markers as one track, z up, flattened to shape (n, 3 * markers)."""
     flat = vectors_z_up(markers.positions).reshape(len(markers.t_s), -1)
     return InterpolatedTrack(markers.t_s - markers.t_s[0], flat, rotation=False)

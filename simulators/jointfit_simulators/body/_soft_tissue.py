@@ -8,12 +8,13 @@ adjacent joint angles; the random part is band-limited and scales with the same 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_simulators.body._limb import ANKLE, HIP, KNEE
-from jointfit_simulators.body._random_signal import RandomSignal, random_vector_signal
+from jointfit_simulators.body._random_signal import random_vector_signal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,10 +25,12 @@ ADJACENT: dict[str, tuple[slice, ...]] = {
     "shank": (KNEE, ANKLE),
     "foot": (ANKLE,),
 }
-"""Joints next to each part, as columns of a coordinate array."""
+"""Joints adjacent to each part, as columns of a coordinate array."""
 
-_WOBBLE_HZ = (0.3, 3.0)
+_NOISE_HZ = (0.3, 3.0)
+"""Frequency band of the random part, Hz."""
 _ROUNDING = 0.05
+"""Rounding of the posture magnitude near upright stance, where its derivative is undefined."""
 
 
 def _features(coordinates: NDArray[np.float64], joint: slice) -> NDArray[np.float64]:
@@ -54,49 +57,48 @@ def _mixing(
     vectors: int,
     common_share: float,
 ) -> NDArray[np.float64]:
-    """Return random directions for one joint's features; RMS length 1 over all vectors."""
+    """Return random directions for the features of one joint; RMS length 1 over all vectors."""
     kinds = features.shape[1]
-    together = random.standard_normal((kinds, 1, 3))
-    together /= _rms_length(np.tensordot(features, together, 1))
+    common = random.standard_normal((kinds, 1, 3))
+    common /= _rms_length(np.tensordot(features, common, 1))
     if vectors == 1:
-        return together
-    alone = random.standard_normal((kinds, vectors, 3))
-    alone -= alone.mean(axis=1, keepdims=True)
-    alone /= _rms_length(np.tensordot(features, alone, 1))
-    mixed: NDArray[np.float64] = (
-        np.sqrt(common_share) * together + np.sqrt(1 - common_share) * alone
-    )
+        return common
+
+    single = random.standard_normal((kinds, vectors, 3))
+    single -= single.mean(axis=1, keepdims=True)
+    single /= _rms_length(np.tensordot(features, single, 1))
+    mixed: NDArray[np.float64] = np.sqrt(common_share) * common + np.sqrt(1 - common_share) * single
     return mixed
 
 
 class SoftTissue:
-    r"""Displacements of several points of one body part against its bone.
+    r"""Displacements of several points of one body part relative to its bone.
 
     .. math:: d(t) = \sum_j \Phi(\theta_j) C_j + g(\theta)\,n(t)
 
     with :math:`\Phi = (\sin f, 1-\cos f, \tfrac12\sin 2f, \sin a, \sin i)` of each adjacent joint
-    *j*, random :math:`C_j`, band-limited noise *n* (0.3 to 3 Hz) and *g* the size of
+    *j*, random :math:`C_j`, band-limited noise *n* (0.3 to 3 Hz) and *g* the magnitude of
     :math:`\Phi`. Scaled so that the RMS length over all vectors and the `reference` is `rms`.
 
     Parameters
     ----------
     random
-        Dice for the directions and the noise.
+        Source of the directions and the noise.
     part
-        Body part: a key of ADJACENT.
+        Body part, a key of ADJACENT.
     vectors
-        How many points (or sensors) move.
+        Number of points (or sensors).
     rms
         RMS length over the reference, m or rad.
     random_share
         Share of the variance in the noise.
     knee_share
-        Share of the repeatable variance driven by the knee, where the part has two joints.
+        Share of the repeatable variance driven by the knee, for parts with two joints.
     reference
         Coordinates of walking and squats, shape (n, COORDINATES).
     common_share
-        Share of the variance in the movement of the middle of several vectors; the rest moves
-        them about their middle.
+        Share of the variance in the displacement of the mean of all points; the remainder moves
+        the points relative to their mean.
     """
 
     def __init__(
@@ -112,53 +114,49 @@ class SoftTissue:
         common_share: float = 0.0,
     ) -> None:
         self._joints = ADJACENT[part]
-        alone = len(self._joints) == 1
+        one_joint = len(self._joints) == 1
         shares = [
-            1.0 if alone else knee_share if j is KNEE else 1 - knee_share for j in self._joints
+            1.0 if one_joint else knee_share if j is KNEE else 1 - knee_share for j in self._joints
         ]
         features = [_features(reference, joint) for joint in self._joints]
+
+        # repeatable part, scaled to the RMS over the reference
         self._gains = [
-            share / np.mean(np.sum(found**2, axis=1))
-            for share, found in zip(shares, features, strict=True)
+            share / np.mean(np.sum(values**2, axis=1))
+            for share, values in zip(shares, features, strict=True)
         ]
         self._mixing = np.concatenate(
             [
-                _mixing(random, found, vectors, common_share) * np.sqrt(share)
-                for share, found in zip(shares, features, strict=True)
+                _mixing(random, values, vectors, common_share) * np.sqrt(share)
+                for share, values in zip(shares, features, strict=True)
             ]
         )
         self._mixing *= rms * np.sqrt(1 - random_share) / _rms_length(self._repeatable(reference))
-        size = np.sqrt(np.mean(self._size(reference) ** 2))
-        wobble = rms * np.sqrt(random_share) / size
-        single = vectors == 1
-        self._together = _wobble(random, 1, wobble * np.sqrt(1.0 if single else common_share))
+
+        # random part; subtracting the mean of k vectors reduces their variance by (k - 1) / k
+        magnitude = np.sqrt(np.mean(self._magnitude(reference) ** 2))
+        noise_rms = rms * np.sqrt(random_share) / magnitude
+        noise = partial(random_vector_signal, random, low_hz=_NOISE_HZ[0], high_hz=_NOISE_HZ[1])
+        self._common = noise(1, rms=noise_rms * np.sqrt(1.0 if vectors == 1 else common_share))
         spread = np.sqrt((1 - common_share) * vectors / max(vectors - 1, 1))
-        self._alone = None if single else _wobble(random, vectors, wobble * spread)
+        self._single = None if vectors == 1 else noise(vectors, rms=noise_rms * spread)
 
     def _repeatable(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
         features = np.concatenate([_features(coordinates, j) for j in self._joints], axis=1)
-        found: NDArray[np.float64] = np.tensordot(features, self._mixing, 1)
-        return found
+        displacements: NDArray[np.float64] = np.tensordot(features, self._mixing, 1)
+        return displacements
 
-    def _size(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _magnitude(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
         square = np.full(len(coordinates), _ROUNDING**2)
         for gain, joint in zip(self._gains, self._joints, strict=True):
             square += gain * np.sum(_features(coordinates, joint) ** 2, axis=1)
-        size: NDArray[np.float64] = np.sqrt(square) - _ROUNDING
-        return size
+        magnitude: NDArray[np.float64] = np.sqrt(square) - _ROUNDING
+        return magnitude
 
     def at(self, t_s: NDArray[np.float64], coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements, shape (n, vectors, 3), in the part's own axes."""
-        found = self._repeatable(coordinates)
-        wobble = self._together.at(t_s)[:, None, :]
-        if self._alone is not None:
-            alone = self._alone.at(t_s).reshape(len(t_s), -1, 3)
-            wobble = wobble + alone - alone.mean(axis=1, keepdims=True)
-        found += self._size(coordinates)[:, None, None] * wobble
-        return found
-
-
-def _wobble(random: np.random.Generator, vectors: int, rms: float) -> RandomSignal:
-    return random_vector_signal(
-        random, vectors, low_hz=_WOBBLE_HZ[0], high_hz=_WOBBLE_HZ[1], rms=rms
-    )
+        """Return the displacements, shape (n, vectors, 3), in the frame of the part."""
+        noise = self._common.at(t_s)[:, None, :]
+        if self._single is not None:
+            single = self._single.at(t_s).reshape(len(t_s), -1, 3)
+            noise = noise + single - single.mean(axis=1, keepdims=True)
+        return self._repeatable(coordinates) + self._magnitude(coordinates)[:, None, None] * noise

@@ -14,36 +14,36 @@ if TYPE_CHECKING:
 
 
 class GroundTruth(NamedTuple):
-    """The bones at n instants."""
+    """Bones at n instants."""
 
     orientations: Mapping[str, Rotation]
-    """Each segment: segment coordinates to base world."""
+    """Orientation of each segment: segment coordinates to base world."""
     joints: Mapping[str, NDArray[np.float64]]
-    """Center of each joint, m, shape (n, 3); NaN where unknown."""
+    """Centre of each joint, m, shape (n, 3); NaN if unknown."""
     knee: NDArray[np.float64]
-    """Flexion, adduction, internal rotation, rad, shape (n, 3); flexion brings the heel back."""
+    """Flexion (heel back), adduction, internal rotation, rad, shape (n, 3)."""
     included: NDArray[np.float64]
     """Inner angle of the knee, rad, shape (n,): pi when straight."""
 
 
 class Observation(NamedTuple):
-    """What there is to see in one block of time, each stream at its own instants."""
+    """Error-free measurements of one block of time, each stream at its own instants."""
 
     sensors: Sequence[NDArray[np.float64]]
-    """q_base_sensor of each sensor, mount and soft tissue included, shape (n, 4)."""
+    """q_base_sensor of each sensor, with alignment and soft-tissue artefact, shape (n, 4)."""
     markers: NDArray[np.float64]
-    """Marker positions on the skin, m, shape (m, markers, 3); NaN where never recorded."""
+    """Marker positions on the skin, m, shape (m, markers, 3); NaN if not recorded."""
     bones: Mapping[str, tuple[Rotation, NDArray[np.float64]]]
-    """Orientation and origin (m) of bones that the cameras can see as bodies; else empty."""
+    """Orientation and origin (m) of bones that the cameras stream as bodies."""
     truth: GroundTruth
 
 
 class InstrumentedSubject(Protocol):
-    """Whoever wears the sensors."""
+    """Subject with sensors and markers."""
 
     @property
     def sensors(self) -> Mapping[str, str]:
-        """Sensor ids and the segment each is worn on."""
+        """Sensor ids and their segments."""
 
     @property
     def clusters(self) -> Mapping[str, tuple[str, ...]]:
@@ -51,7 +51,7 @@ class InstrumentedSubject(Protocol):
 
     @property
     def templates(self) -> Mapping[str, NDArray[np.float64]]:
-        """Markers of each rigid body in the body's own frame, m, shape (markers, 3)."""
+        """Markers of each rigid body in the frame of the body, m, shape (markers, 3)."""
 
     @property
     def visible_bones(self) -> tuple[str, ...]:
@@ -59,16 +59,16 @@ class InstrumentedSubject(Protocol):
 
     @property
     def facts(self) -> Mapping[str, object]:
-        """What does not change during the run, for the truth log; JSON values."""
+        """Constant properties for the ground-truth log; JSON values."""
 
     def play(self, name: str, t_s: float) -> None:
-        """Begin another motion."""
+        """Start another motion; raise UnknownMotionError for an unknown name."""
 
     def motion_at(self, t_s: float) -> str:
         """Return the name of the motion at an instant."""
 
     def discard_before(self, t_s: float) -> None:
-        """Promise never to ask about earlier instants again."""
+        """Discard the state for instants before `t_s`, which are not requested again."""
 
     def observe(
         self,
@@ -76,4 +76,4 @@ class InstrumentedSubject(Protocol):
         cameras: NDArray[np.float64],
         truth: NDArray[np.float64],
     ) -> Observation:
-        """Return what is to be seen at the instants (s) of each sensor, the cameras, the log."""
+        """Return the observation at the instants (s) of each sensor, the cameras, the log."""

@@ -1,4 +1,4 @@
-"""C3D files with marker points and nothing else. Invariant: bytes in memory, little-endian, floats.
+"""C3D files with marker points only: little-endian, points as floats.
 
 Blocks of 512 bytes: the header, the parameters (groups POINT and TRIAL), then the frames, each
 point as four 32-bit floats: x, y, z, residual. A missing point has the residual -1 and zeros.
@@ -18,12 +18,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _BLOCK = 512
+"""Bytes per block."""
 _KEY = 0x50
+"""Second byte of header and parameters in every C3D file."""
 _INTEL = 84
-_FLOATS = -1.0  # POINT:SCALE below zero: the points are floats, in the unit of POINT:UNITS
+"""Processor type: little-endian."""
+_FLOATS = -1.0
+"""POINT:SCALE; a negative value means floats in the unit of POINT:UNITS."""
 _CHARACTERS, _INTEGER, _REAL = -1, 2, 4
+"""Types of a parameter."""
 _POINT, _TRIAL = 1, 2
+"""Numbers of the groups."""
 _MISSING = -1.0
+"""Residual of a missing point."""
 
 
 def c3d_bytes(
@@ -44,6 +51,7 @@ def c3d_bytes(
     """
     frames, points = positions.shape[:2]
 
+    # the number of the first data block is part of the parameters, whose length is constant
     parameters = _parameters(names, frames=frames, rate_hz=rate_hz, up=up, data_block=0)
     data_block = 2 + -(-len(parameters) // _BLOCK)
     parameters = _parameters(names, frames=frames, rate_hz=rate_hz, up=up, data_block=data_block)
@@ -56,7 +64,8 @@ def c3d_bytes(
     cells = np.concatenate(
         [np.where(missing, 0.0, positions * 1e3), np.where(missing, _MISSING, 0.0)], axis=-1
     )
-    return _padded(header) + _padded(parameters) + _padded(cells.astype("<f4").tobytes())
+    sections = (header, parameters, cells.astype("<f4").tobytes())
+    return b"".join(section + bytes(-len(section) % _BLOCK) for section in sections)
 
 
 def _parameters(
@@ -72,8 +81,8 @@ def _parameters(
         _parameter(_POINT, "DATA_START", _INTEGER, (), struct.pack("<H", data_block)),
         _parameter(_POINT, "SCALE", _REAL, (), struct.pack("<f", _FLOATS)),
         _parameter(_POINT, "RATE", _REAL, (), struct.pack("<f", rate_hz)),
-        _text(_POINT, "UNITS", "mm"),
-        _text(_POINT, "Y_SCREEN", up),
+        _parameter(_POINT, "UNITS", _CHARACTERS, (2,), b"mm"),
+        _parameter(_POINT, "Y_SCREEN", _CHARACTERS, (len(up),), up.encode("ascii")),
         _parameter(_POINT, "LABELS", _CHARACTERS, (width, len(names)), labels.encode("ascii")),
         _parameter(_TRIAL, "ACTUAL_START_FIELD", _INTEGER, (2,), struct.pack("<HH", 1, 0)),
         _parameter(_TRIAL, "ACTUAL_END_FIELD", _INTEGER, (2,), struct.pack("<HH", frames, 0)),
@@ -83,23 +92,15 @@ def _parameters(
 
 
 def _group(number: int, name: str) -> bytes:
-    rest = b"\0"  # no description
-    return struct.pack("<bb", len(name), -number) + name.encode() + _counted(rest)
-
-
-def _text(group: int, name: str, value: str) -> bytes:
-    return _parameter(group, name, _CHARACTERS, (len(value),), value.encode("ascii"))
+    return _entry(name, -number, b"\0")
 
 
 def _parameter(group: int, name: str, kind: int, shape: tuple[int, ...], data: bytes) -> bytes:
     rest = struct.pack("<bB", kind, len(shape)) + bytes(shape) + data + b"\0"
-    return struct.pack("<bb", len(name), group) + name.encode() + _counted(rest)
+    return _entry(name, group, rest)
 
 
-def _counted(rest: bytes) -> bytes:
-    """Put the offset to the next entry, counted from itself, before `rest`."""
-    return struct.pack("<H", len(rest) + 2) + rest
-
-
-def _padded(data: bytes) -> bytes:
-    return data + bytes(-len(data) % _BLOCK)
+def _entry(name: str, group: int, rest: bytes) -> bytes:
+    """Return an entry: lengths, name, offset to the next entry from itself, and `rest`."""
+    offset = struct.pack("<H", len(rest) + 2)
+    return struct.pack("<bb", len(name), group) + name.encode() + offset + rest

@@ -1,7 +1,7 @@
-"""Captures of the three wires for the sample data. Invariant: bytes in memory, no port is opened.
+"""Captures of the three wires for the sample data. Invariant: no port is opened.
 
 The same movement as raw bytes of an Xbus UART, as the text of ``candump -L`` and as a pcap file
-(raw IPv4, nanoseconds) of a NatNet server's datagrams.
+(raw IPv4, nanoseconds) with the datagrams of a NatNet server.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _LOOPBACK = bytes([127, 0, 0, 1])
 
 
 def xbus_bytes(samples: Iterable[tuple[int, Quaternion]]) -> bytes:
-    """Return MTData2 messages of (time of the device, ns; orientation, sensor to ENU world)."""
+    """Return MTData2 messages from (device time, ns; orientation, sensor to ENU world)."""
     messages = []
     for counter, (device_ns, q) in enumerate(samples):
         items: list[tuple[int, Value]] = [
@@ -57,7 +57,7 @@ def xbus_bytes(samples: Iterable[tuple[int, Quaternion]]) -> bytes:
 
 
 def candump_text(groups: Iterable[tuple[int, Sequence[CanFrame]]], channel: str) -> str:
-    """Return a ``candump -L`` log of (arrival, ns; frames)."""
+    """Return a ``candump -L`` log from (arrival, ns; frames)."""
     lines = []
     for t_ns, frames in groups:
         for place, frame in enumerate(frames):
@@ -74,14 +74,14 @@ def natnet_pcap(
     frames: Iterable[tuple[int, Markers, Bodies]],
     rate_hz: float,
 ) -> bytes:
-    """Return a capture of a NatNet 3.1 server: its description, then a datagram a frame.
+    """Return a capture of a NatNet 3.1 server: its description, then one datagram per frame.
 
     Parameters
     ----------
     clusters
         Markers by body part; each part is a marker set and a rigid body of the project.
     frames
-        Exposure (ns since the first), markers and rigid bodies, m, z up; None is hidden.
+        Exposure (ns since the first), markers and rigid bodies, m, z up; None if occluded.
     rate_hz
         Frames per second.
     """
@@ -89,7 +89,7 @@ def natnet_pcap(
         RigidBodyAsset(part.capitalize(), tuple(names), number)
         for number, (part, names) in enumerate(clusters.items(), 1)
     )
-    stage = NatNetFrameBuilder(bodies, "y", "missing")
+    builder = NatNetFrameBuilder(bodies, "y", "missing")
     info = ServerInfo(
         "Motive", (3, 0, 0, 0), (*_BITSTREAM, 0, 0), _CLOCK_HZ, _DATA_PORT, False, "239.255.42.99"
     )
@@ -99,10 +99,10 @@ def natnet_pcap(
         (0, encode_natnet(model_definition(bodies, _BITSTREAM), _BITSTREAM)),
     ]
     for number, (exposure_ns, markers, poses) in enumerate(frames):
-        ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // _NS  # not from 0, which means unknown
+        ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // _NS  # 0 means unknown
         received, transmitted = ticks + _CLOCK_HZ // 200, ticks + _CLOCK_HZ // 150
         stamps = FrameStamps(number, number / rate_hz, ticks, received, transmitted, 0)
-        frame = stage.frame(stamps, markers, poses)
+        frame = builder.frame(stamps, markers, poses)
         datagrams.append((exposure_ns + _NS // 100, encode_natnet(frame, _BITSTREAM)))
     return _pcap(datagrams)
 

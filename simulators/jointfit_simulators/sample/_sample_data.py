@@ -1,8 +1,8 @@
 """Sample data for every command that reads files: one leg, recorded in a few short trials.
 
-Invariant: the same seed gives the same files. The sensors' worlds, the cameras' world and the
-reference are one world, and the clocks of a trial are one clock, as in an edited recording; skin,
-mounts, sensor errors, scatter and hidden markers are those of the default knobs.
+Invariant: the same seed gives the same files. Sensors, cameras and reference share one world frame,
+and all streams of a trial share one clock, as in an edited recording. Soft-tissue artefacts, sensor
+alignment, sensor errors, marker noise and occlusion are those of the default settings.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from jointfit_simulators.sample._sample_model import (
     model_osim,
     model_toml,
 )
-from jointfit_simulators.scene import RigOptions, rig_toml
+from jointfit_simulators.scene import RigOptions, ids_toml, rig_toml
 from jointfit_simulators.settings import Knobs
 
 if TYPE_CHECKING:
@@ -44,11 +44,13 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
 
 RATE_HZ = 50.0
-"""Of sensors and cameras in the trials: enough for slow movements, and small files."""
+"""Rate of sensors and cameras in the trials, Hz: sufficient for slow movements, small files."""
 CAPTURE_HZ = 100.0
+"""Rate of sensors and cameras in the captures, Hz."""
 CAPTURE_S = 2.0
+"""Duration of the captures, s."""
 APART_S = 200.0
-"""Between the beginnings of two trials, so that no two of them share noise."""
+"""Time between the starts of two trials, s, so that their noise is independent."""
 TRIALS = {
     "standing": 5.0,
     "squats": 8.0,
@@ -56,17 +58,18 @@ TRIALS = {
     "knee_swings": 8.0,
     "sit_to_stand": 8.0,
 }
-"""Each trial and its length, s."""
+"""Names and durations of the trials, s."""
 _MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}
-_SENSORS = ("S1", "S2", "S3", "S4")
+"""Motions of trials that have another name."""
 _IDS = {
     "S2": XcdiIds(0x205, 0x206, 0x221, status_word=None, error=None),
     "S4": XcdiIds(0x405, 0x406, 0x421, status_word=None, error=None),
 }
+"""CAN identifiers of the sensors on the bus."""
 
 
 class SampleTrial(NamedTuple):
-    """What was recorded in one trial, z up."""
+    """Recorded data of one trial, z up."""
 
     t_s: NDArray[np.float64]
     sensors: Mapping[str, NDArray[np.float64]]
@@ -75,13 +78,13 @@ class SampleTrial(NamedTuple):
     """q_world_segment, shape (n, 4)."""
     markers: tuple[str, ...]
     positions: NDArray[np.float64]
-    """Shape (n, len(markers), 3), m; NaN where hidden."""
+    """Marker positions, m, shape (n, len(markers), 3); NaN if occluded."""
     bodies: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     """Rigid bodies of the cameras: positions, m, shape (n, 3), and q_world_body, shape (n, 4)."""
 
 
 class FolderNotEmptyError(ValueError):
-    """The folder for the sample data has something in it."""
+    """The output folder of the sample data is not empty."""
 
 
 def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[str, str]:
@@ -90,23 +93,23 @@ def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[st
     Parameters
     ----------
     folder
-        Made when absent.
+        Output folder; created if absent.
     seed
-        Another seed is another wearer.
+        Random seed of the simulated subject.
     force
-        Write into a folder that has something in it; files of the same names are replaced.
+        Write into a folder that is not empty; files of the same names are replaced.
 
     Returns
     -------
     dict
-        What each file is and which command reads it, by file name.
+        Content of each file and the commands that read it, by file name.
 
     Raises
     ------
     FolderNotEmptyError
         The folder is not empty, and `force` is not set.
     OSError
-        It cannot be written to.
+        The folder is not writable.
     """
     if folder.is_dir() and any(folder.iterdir()) and not force:
         message = f"{folder} is not empty: name a new folder, or use --force to replace files in it"
@@ -120,36 +123,35 @@ def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[st
         name: _record(knobs, _MOTIONS.get(name, name), APART_S * number, length_s, RATE_HZ)
         for number, (name, length_s) in enumerate(TRIALS.items())
     }
+    standing = SimulatedSubject(knobs, [Step("stand", 1.0)])
     return (
         _write_marker_trials(folder, trials)
         | _write_orientation_trials(folder, trials)
-        | _write_models(folder, knobs)
-        | _write_captures(folder, knobs)
-        | _write_rig(folder, knobs)
+        | _write_models(folder, knobs, standing)
+        | _write_captures(folder, knobs, standing)
+        | _write_rig(folder, standing)
     )
-
-
-def _wearer(knobs: Knobs, motion: str, start_s: float) -> SimulatedSubject:
-    return SimulatedSubject(knobs, [Step(motion, 1.0)], start_s=start_s)
 
 
 def _record(
     knobs: Knobs, motion: str, start_s: float, length_s: float, rate_hz: float
 ) -> SampleTrial:
-    wearer = _wearer(knobs, motion, start_s)
+    subject = SimulatedSubject(knobs, [Step(motion, 1.0)], start_s=start_s)
     since_s = np.arange(round(length_s * rate_hz)) / rate_hz
     t_s = start_s + since_s
-    seen = wearer.observe([t_s] * len(_SENSORS), t_s, t_s)
+    observation = subject.observe([t_s] * len(subject.sensors), t_s, t_s)
 
     sensors = {
         name: OrientationSensor(knobs, name).report(t_s, q)
-        for name, q in zip(wearer.sensors, seen.sensors, strict=True)
+        for name, q in zip(subject.sensors, observation.sensors, strict=True)
     }
-    bones = {part: to_wxyz(seen.truth.orientations[part]) for part in ("thigh", "shank")}
+    truth = observation.truth.orientations
+    bones = {part: to_wxyz(truth[part]) for part in ("thigh", "shank")}
 
-    names = tuple(name for part in PARTS for name in wearer.clusters[part])
-    cameras = Cameras(knobs, wearer, rate_hz=rate_hz)
-    frames = cameras.capture(seen)
+    # the plate, whose markers are last, is not part of the trials
+    names = tuple(name for part in PARTS for name in subject.clusters[part])
+    cameras = Cameras(knobs, subject, rate_hz=rate_hz)
+    frames = cameras.capture(observation)
     bodies = {
         body: (frames.body_positions[:, column], frames.body_orientations[:, column])
         for column, body in enumerate(cameras.bodies)
@@ -160,7 +162,7 @@ def _record(
 def _write_marker_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dict[str, str]:
     written = {}
     for name, trial in trials.items():
-        y_up = trial.positions[..., [1, 2, 0]]  # forward, up, right: OpenSim's axes
+        y_up = trial.positions[..., [1, 2, 0]]  # OpenSim's axes: forward, up, right
         numbers = np.arange(1, len(trial.t_s) + 1)
         write_trc(
             folder / f"{name}.trc",
@@ -181,6 +183,7 @@ def _write_orientation_trials(folder: Path, trials: Mapping[str, SampleTrial]) -
             folder / f"{name}.npz", OrientationTrial(trial.t_s, trial.sensors, trial.bones, {})
         )
         written[f"{name}.npz"] = "sensors S1 to S4 and the bones: jointfit fuse"
+
     for name in ("standing", "walking"):
         sensors = trials[name].sensors
         table = OrientationTable(
@@ -191,46 +194,56 @@ def _write_orientation_trials(folder: Path, trials: Mapping[str, SampleTrial]) -
     return written
 
 
-def _write_models(folder: Path, knobs: Knobs) -> dict[str, str]:
-    wearer = _wearer(knobs, "stand", 0.0)
-    parts = leg_parts(wearer.geometry)
-    markers = misplaced_markers(knobs.random("model"), wearer.clusters, wearer.templates, parts)
+def _write_models(folder: Path, knobs: Knobs, subject: SimulatedSubject) -> dict[str, str]:
+    parts = leg_parts(subject.geometry)
+    markers = misplaced_markers(knobs.random("model"), subject.clusters, subject.templates, parts)
     (folder / "leg.toml").write_text(model_toml(parts, markers), encoding="utf-8")
     (folder / "leg.osim").write_text(model_osim(parts, markers), encoding="utf-8")
-    said = "a chain model, its markers misplaced by about 1 cm: jointfit markers"
-    return {"leg.toml": said, "leg.osim": "the same model for OpenSim: jointfit markers"}
+    return {
+        "leg.toml": "a chain model with marker position errors of about 1 cm: jointfit markers",
+        "leg.osim": "the same model for OpenSim: jointfit markers",
+    }
 
 
-def _write_captures(folder: Path, knobs: Knobs) -> dict[str, str]:
-    start_s = APART_S * len(TRIALS)
-    trial = _record(knobs, "squat", start_s, CAPTURE_S, CAPTURE_HZ)
+def _write_captures(folder: Path, knobs: Knobs, subject: SimulatedSubject) -> dict[str, str]:
+    trial = _record(knobs, "squat", APART_S * len(TRIALS), CAPTURE_S, CAPTURE_HZ)
     times_ns = [round(t_s * 1e9) for t_s in trial.t_s.tolist()]
+    orientations = {
+        name: [cast("Quaternion", tuple(q)) for q in sensor.tolist()]
+        for name, sensor in trial.sensors.items()
+    }
 
-    s1 = zip(times_ns, _quaternions(trial, "S1"), strict=True)
-    (folder / "xbus.bin").write_bytes(xbus_bytes(s1))
-    (folder / "can.log").write_text(candump_text(_groups(trial, times_ns), "can0"), "utf-8")
+    samples = zip(times_ns, orientations["S1"], strict=True)
+    (folder / "xbus.bin").write_bytes(xbus_bytes(samples))
+
+    # the devices on the bus send their groups 1 ms apart
+    devices = {
+        name: XcdiDevice(_NoWire(), XcdiDeviceOptions(ids=ids)) for name, ids in _IDS.items()
+    }
+    groups = [
+        (t_ns + place * 1_000_000, device.group(t_ns, orientations[name][index]))
+        for index, t_ns in enumerate(times_ns)
+        for place, (name, device) in enumerate(devices.items())
+    ]
+    (folder / "can.log").write_text(candump_text(groups, "can0"), "utf-8")
 
     frames = [
         (t_ns, _markers(trial, index), _bodies(trial, index)) for index, t_ns in enumerate(times_ns)
     ]
-    clusters = {part: _wearer(knobs, "stand", 0.0).clusters[part] for part in PARTS}
+    clusters = {part: subject.clusters[part] for part in PARTS}
     (folder / "cameras.pcap").write_bytes(natnet_pcap(clusters, frames, CAPTURE_HZ))
     return {
         "xbus.bin": "sensor S1 on its UART: jointfit decode xbus",
-        "can.log": "sensors S2 and S4 on CAN, as candump -L writes it: jointfit decode xcdi",
-        "cameras.pcap": "the cameras' datagrams: jointfit decode natnet",
+        "can.log": "sensors S2 and S4 on CAN, in the format of candump -L: jointfit decode xcdi",
+        "cameras.pcap": "the datagrams of the cameras: jointfit decode natnet",
     }
 
 
-def _quaternions(trial: SampleTrial, name: str) -> list[Quaternion]:
-    return [cast("Quaternion", tuple(q)) for q in trial.sensors[name].tolist()]
-
-
 def _markers(trial: SampleTrial, index: int) -> dict[str, Vector | None]:
-    places = trial.positions[index].tolist()
+    positions = trial.positions[index].tolist()
     return {
         name: None if np.isnan(at[0]) else cast("Vector", tuple(at))
-        for name, at in zip(trial.markers, places, strict=True)
+        for name, at in zip(trial.markers, positions, strict=True)
     }
 
 
@@ -242,7 +255,7 @@ def _bodies(trial: SampleTrial, index: int) -> dict[str, Pose | None]:
 
 
 class _NoWire:
-    """A bus that nobody reads: the device only makes frames."""
+    """Closed bus of a device that only returns its frames."""
 
     bitrate: int | None = None
     is_open = False
@@ -257,40 +270,22 @@ class _NoWire:
     def plug(self) -> None: ...
 
 
-def _groups(trial: SampleTrial, times_ns: list[int]) -> list[tuple[int, list[CanFrame]]]:
-    devices = {
-        name: XcdiDevice(_NoWire(), XcdiDeviceOptions(ids=ids)) for name, ids in _IDS.items()
-    }
-    found = []
-    for index, t_ns in enumerate(times_ns):
-        for place, (name, device) in enumerate(devices.items()):
-            q = cast("Quaternion", tuple(trial.sensors[name][index].tolist()))
-            found.append((t_ns + place * 1_000_000, device.group(t_ns, q)))
-    return found
-
-
-def _write_rig(folder: Path, knobs: Knobs) -> dict[str, str]:
-    wearer = _wearer(knobs, "stand", 0.0)
+def _write_rig(folder: Path, subject: SimulatedSubject) -> dict[str, str]:
     devices = []
-    for name, segment in wearer.sensors.items():
+    for name, segment in subject.sensors.items():
         lines = ["[[imu]]", f'id = "{name}"', f'segment = "{segment}"']
         if name in _IDS:
-            ids = _IDS[name]
-            lines += [
-                'driver = "xcdi"',
-                'can = "can0"',
-                f"ids = {{ sample_time = {ids.sample_time:#05x}, group_counter = "
-                f"{ids.group_counter:#05x}, quaternion = {ids.quaternion:#05x} }}",
-            ]
+            lines += ['driver = "xcdi"', 'can = "can0"', ids_toml(_IDS[name])]
         else:
             lines += ['driver = "xbus"', f'port = "/dev/jointfit/imu-{name}"', "baud = 921600"]
         devices.append("\n".join([*lines, "rate_hz = 100", ""]))
     devices.append('[can.can0]\ninterface = "socketcan"\nchannel = "can0"\n')
+
     text = rig_toml(
         RigOptions(name="sample", mqtt_base="jointfit/sample", store="sample"),
         devices=devices,
         mocap='[mocap]\ndriver = "natnet"\nserver = "192.168.1.10"\nup_axis = "y"',
-        clusters=wearer.clusters,
+        clusters=subject.clusters,
         bones=(),
         plate=True,
     )

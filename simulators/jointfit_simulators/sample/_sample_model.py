@@ -1,7 +1,7 @@
-"""The chain model of the sample data, as TOML and as OpenSim 4. Invariant: both are one model.
+"""Chain model of the sample data, as TOML and as OpenSim 4.
 
-The markers of thigh, shank and foot are off by about a centimetre, as those of a scaled model are;
-two markers of the pelvis are right and locked.
+Invariant: both files describe the same model. The markers of thigh, shank and foot have errors of
+about a centimetre, like those of a scaled model. Two markers of the pelvis are exact and locked.
 """
 
 from __future__ import annotations
@@ -19,15 +19,18 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import LegGeometry
 
 LOCKED = ("P1", "P2")
+"""Markers that the refinement may not move."""
 MISPLACED_M = 0.006
 """Standard deviation of each coordinate of a misplaced marker, m."""
-_RIGHT_PARTS = ("pelvis",)
+_EXACT_PARTS = ("pelvis",)
+"""Segments with exact markers."""
 _FLEXION_RAD = (-2.4, 0.1)
+"""Range of the knee hinge about the right axis, rad."""
 Vector = tuple[float, float, float]
 
 
 class Part(NamedTuple):
-    """One segment and how it hangs on its parent."""
+    """One segment and the joint to its parent."""
 
     name: str
     parent: str | None
@@ -36,7 +39,7 @@ class Part(NamedTuple):
 
 
 class SampleMarker(NamedTuple):
-    """One marker of the model; position in the segment's axes (z up, x right), m."""
+    """One marker of the model; position in the segment frame (z up, x right), m."""
 
     name: str
     segment: str
@@ -59,19 +62,20 @@ def misplaced_markers(
     templates: Mapping[str, NDArray[np.float64]],
     parts: Sequence[Part],
 ) -> list[SampleMarker]:
-    """Return the markers of `parts`, displaced but for those of the pelvis."""
-    found = []
+    """Return the markers of `parts`, displaced at random except those of the pelvis."""
+    markers = []
     for part in parts:
         true = templates[part.name]
-        off = random.normal(0.0, MISPLACED_M, true.shape) * (part.name not in _RIGHT_PARTS)
+        off = random.normal(0.0, MISPLACED_M, true.shape) * (part.name not in _EXACT_PARTS)
         for name, (x, y, z) in zip(clusters[part.name], (true + off).tolist(), strict=True):
-            found.append(SampleMarker(name, part.name, (round(x, 4), round(y, 4), round(z, 4))))
-    return found
+            markers.append(SampleMarker(name, part.name, (round(x, 4), round(y, 4), round(z, 4))))
+    return markers
 
 
 def model_toml(parts: Sequence[Part], markers: Sequence[SampleMarker]) -> str:
     """Return the model as a chain model file."""
     lines = ['name = "sample leg"']
+
     for part in parts:
         lines += ["", "[[segment]]", f'name = "{part.name}"']
         if part.parent is not None:
@@ -79,6 +83,7 @@ def model_toml(parts: Sequence[Part], markers: Sequence[SampleMarker]) -> str:
             lines += [f"center_in_parent = {list(part.center_in_parent)}"]
         if part.kind == "hinge":
             lines += ["axis = [1.0, 0.0, 0.0]", f"limits = {list(_FLEXION_RAD)}"]
+
     for marker in markers:
         lines += ["", "[[marker]]", f'name = "{marker.name}"', f'segment = "{marker.segment}"']
         lines += [f"position = {list(marker.position)}"]
@@ -91,7 +96,7 @@ _COORDINATES = {"free": 6, "ball": 3, "hinge": 1}
 
 
 def model_osim(parts: Sequence[Part], markers: Sequence[SampleMarker]) -> str:
-    """Return the model as OpenSim 4 has it: x forward, y up, z right."""
+    """Return the model as an OpenSim 4 file: x forward, y up, z right."""
     document = ET.Element("OpenSimDocument", Version="40000")
     model = ET.SubElement(document, "Model", name="sample_leg")
     ET.SubElement(model, "Ground", name="ground")
@@ -143,6 +148,6 @@ def _add_joint(joints: ET.Element, part: Part) -> None:
 
 
 def _y_up(vector: Vector) -> str:
-    """Return a vector in OpenSim's axes: (forward, up, right) of (right, forward, up)."""
+    """Return a vector (right, forward, up) in OpenSim's axes (forward, up, right)."""
     x, y, z = vector
     return f"{y:g} {z:g} {x:g}"

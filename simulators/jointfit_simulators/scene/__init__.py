@@ -1,5 +1,6 @@
 """A whole scene in real time: a subject, its devices, their streams, and the ground truth."""
 
+from jointfit_simulators.scene._hardware import ids_toml
 from jointfit_simulators.scene._phase_follower import PhaseFollower
 from jointfit_simulators.scene._play_directory import PlayDirectory, play_directory
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
@@ -12,6 +13,7 @@ __all__ = [
     "RigOptions",
     "Scene",
     "SceneOptions",
+    "ids_toml",
     "play_directory",
     "rig_toml",
 ]

@@ -28,7 +28,7 @@ from jointfit_simulators.scene._streams import ImuStream
 from jointfit_simulators.wires import CanWire, PythonCanWire, SlcanAdapter, line_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from jointfit_simulators.devices import SampleTiming
@@ -37,14 +37,18 @@ if TYPE_CHECKING:
 WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
 """Default protocol of each sensor."""
 BUS = "can0"
-_FREE_RUNNING = 0xFFFF
+"""Name of the CAN bus in rig.toml and in commands."""
+_EVERY_MESSAGE = 0xFFFF
+"""Output rate of items in every message."""
 _TAI_MINUS_UTC_S = 37
-_EVERY = 12  # exposures per reported sync edge: ten edges a second at 120 Hz
-_SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _EVERY - 1),)
+_SKIPPED_EDGES = 11
+"""Exposures without a reported sync edge in between: ten edges per second at 120 Hz."""
+_SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _SKIPPED_EDGES),)
 _SYNC_TOML = (
-    f'sync = [{{ function = "trigger_indication", line = "in1", skip_factor = {_EVERY - 1} }}]'
+    f'sync = [{{ function = "trigger_indication", line = "in1", skip_factor = {_SKIPPED_EDGES} }}]'
 )
-_FIRST_BLOCK = 0x100
+_ID_BLOCK = 0x100
+"""Number of CAN identifiers for each sensor."""
 
 
 @dataclass
@@ -90,49 +94,61 @@ def create_hardware(
     """
     hardware = SceneHardware()
     for number, (name, segment) in enumerate(sensors.items(), start=1):
+        device: XbusDevice | XcdiDevice
         if wires[name] == "xbus":
-            sync = _SYNC if sync_line else ()
-            _on_uart(hardware, knobs, name, segment, directory=directory, now_ns=now_ns, sync=sync)
-            continue
-        if hardware.bus is None:
-            hardware.bus = _bus(hardware, knobs, directory, can)
-        _on_can(hardware, knobs, name, segment, number=number, now_ns=now_ns)
+            port = directory / f"tty{name}"
+            device = _xbus_device(knobs, name, port, _SYNC if sync_line else ())
+            hardware.ports[name] = str(port)
+            address = [f'port = "{port}"', "baud = 921600", *([_SYNC_TOML] if sync_line else [])]
+        else:
+            if hardware.bus is None:
+                hardware.bus = _add_bus(hardware, knobs, directory, can)
+            first = _ID_BLOCK * number
+            ids = XcdiIds(first + 0x05, first + 0x06, first + 0x21, status_word=None, error=None)
+            device = XcdiDevice(hardware.bus, XcdiDeviceOptions(ids=ids, rate_hz=knobs.rate_hz))
+            hardware.ports[name] = f"{BUS}:{ids.quaternion:#05x}"
+            address = [f'can = "{BUS}"', ids_toml(ids)]
+
+        on_uart = isinstance(device, XbusDevice)
+        hardware.streams[name] = ImuStream(
+            knobs,
+            name,
+            device,
+            latency_ms=knobs.latency_uart_ms if on_uart else knobs.latency_can_ms,
+            shared_wire=not on_uart,
+            now_ns=now_ns,
+        )
+        head = [f'id = "{name}"', f'segment = "{segment}"', f'driver = "{wires[name]}"']
+        rate = f"rate_hz = {knobs.rate_hz:g}"
+        hardware.tables.append("\n".join(["[[imu]]", *head, *address, rate, ""]))
     return hardware
 
 
-def _on_uart(
-    hardware: SceneHardware,
-    knobs: Knobs,
-    name: str,
-    segment: str,
-    *,
-    directory: Path,
-    now_ns: int,
-    sync: tuple[SyncSetting, ...],
-) -> None:
-    port = directory / f"tty{name}"
-    outputs = (
-        (Item.PACKET_COUNTER, _FREE_RUNNING),
-        (Item.SAMPLE_TIME_FINE, _FREE_RUNNING),
-        (Item.STATUS_WORD, _FREE_RUNNING),
-        (Item.QUATERNION, round(knobs.rate_hz)),
-        *(((Item.TRIGGER_IN1, _FREE_RUNNING),) if sync else ()),
+def ids_toml(ids: XcdiIds) -> str:
+    """Return the line of rig.toml with the CAN identifiers of a sensor."""
+    return (
+        f"ids = {{ sample_time = {ids.sample_time:#05x}, group_counter = {ids.group_counter:#05x},"
+        f" quaternion = {ids.quaternion:#05x} }}"
     )
-    identity = bytes([0x03, 0x60, 0xA1, *name.encode()[-1:]])
-    device = XbusDevice(
+
+
+def _xbus_device(knobs: Knobs, name: str, port: Path, sync: tuple[SyncSetting, ...]) -> XbusDevice:
+    outputs = (
+        (Item.PACKET_COUNTER, _EVERY_MESSAGE),
+        (Item.SAMPLE_TIME_FINE, _EVERY_MESSAGE),
+        (Item.STATUS_WORD, _EVERY_MESSAGE),
+        (Item.QUATERNION, round(knobs.rate_hz)),
+        *(((Item.TRIGGER_IN1, _EVERY_MESSAGE),) if sync else ()),
+    )
+    device_id = bytes([0x03, 0x60, 0xA1, *name.encode()[-1:]])
+    return XbusDevice(
         port,
-        options=XbusDeviceOptions(device_id=identity, outputs=outputs, sync=sync),
+        options=XbusDeviceOptions(device_id=device_id, outputs=outputs, sync=sync),
         wire_noise=line_noise(knobs, name),
     )
-    hardware.streams[name] = ImuStream(
-        knobs, name, device, latency_ms=knobs.latency_uart_ms, shared_wire=False, now_ns=now_ns
-    )
-    hardware.ports[name] = str(port)
-    where = [f'port = "{port}"', "baud = 921600", *([_SYNC_TOML] if sync else [])]
-    hardware.tables.append(_imu_table(knobs, name, segment, "xbus", where))
 
 
-def _bus(hardware: SceneHardware, knobs: Knobs, directory: Path, can: str) -> CanWire:
+def _add_bus(hardware: SceneHardware, knobs: Knobs, directory: Path, can: str) -> CanWire:
     interface, _, channel = can.partition(":")
     wire: CanWire
     if interface == "slcan":
@@ -143,45 +159,19 @@ def _bus(hardware: SceneHardware, knobs: Knobs, directory: Path, can: str) -> Ca
             wire = PythonCanWire(interface, channel)
         except OSError as error:
             raise ValueError(
-                f"--can {can}: cannot be opened ({error.strerror}): is the interface there, and up"
-                " (ip link)?"
+                f"--can {can}: cannot open the interface ({error.strerror}): check that it exists"
+                " and is up (ip link)"
             ) from error
     hardware.ports[BUS] = channel
     hardware.tables.append(f'[can.{BUS}]\ninterface = "{interface}"\nchannel = "{channel}"\n')
     return wire
 
 
-def _on_can(
-    hardware: SceneHardware, knobs: Knobs, name: str, segment: str, *, number: int, now_ns: int
-) -> None:
-    if hardware.bus is None:
-        raise ValueError("no bus to put a CAN device on")
-    block = _FIRST_BLOCK * number
-    ids = XcdiIds(block + 0x05, block + 0x06, block + 0x21, status_word=None, error=None)
-    device = XcdiDevice(hardware.bus, XcdiDeviceOptions(ids=ids, rate_hz=knobs.rate_hz))
-    hardware.streams[name] = ImuStream(
-        knobs, name, device, latency_ms=knobs.latency_can_ms, shared_wire=True, now_ns=now_ns
-    )
-    hardware.ports[name] = f"{BUS}:{ids.quaternion:#05x}"
-    numbers = (
-        f"sample_time = {ids.sample_time:#05x}, group_counter = {ids.group_counter:#05x}, "
-        f"quaternion = {ids.quaternion:#05x}"
-    )
-    hardware.tables.append(
-        _imu_table(knobs, name, segment, "xcdi", [f'can = "{BUS}"', f"ids = {{ {numbers} }}"])
-    )
-
-
-def _imu_table(knobs: Knobs, name: str, segment: str, driver: str, where: list[str]) -> str:
-    head = ["[[imu]]", f'id = "{name}"', f'segment = "{segment}"', f'driver = "{driver}"']
-    return "\n".join([*head, *where, f"rate_hz = {knobs.rate_hz:g}", ""])
-
-
 def optical_server(
     knobs: Knobs,
     clusters: Mapping[str, tuple[str, ...]],
     bodies: Sequence[str],
-    ticker: SampleTiming,
+    timing: SampleTiming,
     *,
     ptp: bool = False,
     command_port: int = 0,
@@ -196,7 +186,7 @@ def optical_server(
         Marker names of each body part.
     bodies
         Tracked rigid bodies; those without markers are last.
-    ticker
+    timing
         Clock of the server.
     ptp
         Whether frames carry PTP precision timestamps.
@@ -205,30 +195,36 @@ def optical_server(
     """
     owned = {part.capitalize(): names for part, names in clusters.items()}
     owned |= {body: () for body in bodies if body not in owned}
-    staged = tuple(
-        RigidBodyAsset(body, names, number) for number, (body, names) in enumerate(owned.items(), 1)
-    )
     options = NatNetServerOptions(
-        bodies=staged,
+        bodies=tuple(
+            RigidBodyAsset(body, names, number)
+            for number, (body, names) in enumerate(owned.items(), 1)
+        ),
         command_port=command_port,
         rate_hz=knobs.mocap_hz,
-        device_ns=ticker.device_ns,
+        device_ns=timing.device_ns,
         seed=knobs.seed,
     )
     if ptp:
-        options = replace(options, bitstream=(4, 1), precision_ns=_ptp_time())
+        # PTP counts TAI; its offset from the host clock is measured once
+        offset_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
+        options = replace(
+            options, bitstream=(4, 1), precision_ns=lambda host_ns: host_ns + offset_ns
+        )
     return NatNetServer(options)
-
-
-def _ptp_time() -> Callable[[int], int]:
-    """Return the conversion from host time to PTP time (TAI), with the offset measured now."""
-    ahead_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
-    return lambda host_ns: host_ns + ahead_ns
 
 
 def mocap_table(server: NatNetServer, *, sync_line: bool = False) -> str:
     """Return the first lines of the ``[mocap]`` table for the server."""
-    wired = "\nsync_line = 0" if sync_line else ""
-    wired += '\ntime = "ptp"' if server.options.precision_ns is not None else ""
-    where = f'server = "127.0.0.1"\ncommand_port = {server.command_port}'
-    return f'[mocap]\ndriver = "natnet"\n{where}\nup_axis = "{server.options.up_axis}"{wired}'
+    lines = [
+        "[mocap]",
+        'driver = "natnet"',
+        'server = "127.0.0.1"',
+        f"command_port = {server.command_port}",
+        f'up_axis = "{server.options.up_axis}"',
+    ]
+    if sync_line:
+        lines.append("sync_line = 0")
+    if server.options.precision_ns is not None:
+        lines.append('time = "ptp"')
+    return "\n".join(lines)

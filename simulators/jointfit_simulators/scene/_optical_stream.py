@@ -9,43 +9,19 @@ from __future__ import annotations
 
 from collections import deque
 from math import isfinite
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from jointfit_simulators.devices import NS
+from jointfit_simulators.devices import NS, Pose, Vector
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from jointfit_simulators.body import Observation
-    from jointfit_simulators.devices import CameraFrames, Cameras, SampleTiming
+    from jointfit_simulators.devices import Bodies, Cameras, Markers, NatNetServer, SampleTiming
     from jointfit_simulators.scene._streams import SampleCallback
     from jointfit_simulators.settings import Knobs
-
-Vector = tuple[float, float, float]
-Pose = tuple[Vector, tuple[float, float, float, float]]
-
-
-class OpticalServer(Protocol):
-    """Server that sends camera frames."""
-
-    number: int
-    """Of the next frame."""
-
-    @property
-    def sent(self) -> int:
-        """Frames put on the wire so far."""
-
-    def push(
-        self,
-        exposure_host_ns: int,
-        markers: Mapping[str, Vector | None],
-        bodies: Mapping[str, Pose | None],
-    ) -> None:
-        """Send one frame now; None marks an occluded marker or body."""
 
 
 class OpticalStream:
@@ -57,28 +33,26 @@ class OpticalStream:
         Camera rate.
     cameras
         Source of the frames.
-    ticker
+    timing
         Exposure times and the server's clock.
     server
         Receiver of the frames; None without an optical system.
-    told
-        Called for every frame sent, with the id ``mocap``.
     """
 
     def __init__(
         self,
         knobs: Knobs,
         cameras: Cameras,
-        ticker: SampleTiming,
-        server: OpticalServer | None,
-        told: SampleCallback | None = None,
+        timing: SampleTiming,
+        server: NatNetServer | None,
     ) -> None:
         self.cameras = cameras
-        self._told = told
+        self.on_sample: SampleCallback | None = None
+        """Called for every frame sent, with the id ``mocap``."""
         self._server = server
-        self._ticker = ticker
+        self._timing = timing
         self._period_ns = NS / knobs.mocap_hz
-        self._waiting: deque[tuple[int, dict[str, Vector | None], dict[str, Pose | None]]] = deque()
+        self._planned: deque[tuple[int, Markers, Bodies]] = deque()
         self.running = server is not None
         """Whether frames are sent; the cameras continue to expose."""
 
@@ -91,40 +65,38 @@ class OpticalStream:
         """Plan the exposures of a block and return their true host times, ns."""
         if self._server is None:
             return np.empty(0, dtype=np.int64)
-        self._taken = self._ticker.samples(begin_ns, end_ns, self._period_ns)
-        return self._taken.host_ns
+        self._block = self._timing.samples(begin_ns, end_ns, self._period_ns)
+        return self._block.host_ns
 
     def fill(self, observation: Observation) -> list[int]:
         """Add markers to the planned frames and return the transmission times, ns."""
         if self._server is None:
             return []
-        seen = self.cameras.capture(observation)
-        for i, exposure in enumerate(self._taken.host_ns.tolist()):
-            self._waiting.append((exposure, self._markers(seen, i), self._bodies(seen, i)))
-        return cast("list[int]", self._taken.due_ns.tolist())
+        frames = self.cameras.capture(observation)
+        for exposure_ns, positions, origins, turns in zip(
+            self._block.host_ns.tolist(), frames.markers.tolist(),
+            frames.body_positions.tolist(), frames.body_orientations.tolist(), strict=True,
+        ):  # fmt: skip
+            markers = {
+                name: cast("Vector", tuple(at)) if isfinite(at[0]) else None
+                for name, at in zip(self.cameras.markers, positions, strict=True)
+            }
+            bodies = {
+                name: cast("Pose", (tuple(at), tuple(q))) if isfinite(at[0]) else None
+                for name, at, q in zip(self.cameras.bodies, origins, turns, strict=True)
+            }
+            self._planned.append((exposure_ns, markers, bodies))
+        return cast("list[int]", self._block.due_ns.tolist())
 
-    def _markers(self, seen: CameraFrames, i: int) -> dict[str, Vector | None]:
-        return {
-            name: cast("Vector", tuple(at)) if isfinite(at[0]) else None
-            for name, at in zip(self.cameras.markers, seen.markers[i].tolist(), strict=True)
-        }
-
-    def _bodies(self, seen: CameraFrames, i: int) -> dict[str, Pose | None]:
-        places, turns = seen.body_positions[i].tolist(), seen.body_orientations[i].tolist()
-        return {
-            name: cast("Pose", (tuple(at), tuple(q))) if isfinite(at[0]) else None
-            for name, at, q in zip(self.cameras.bodies, places, turns, strict=True)
-        }
-
-    def emit(self, *, heard: bool = True) -> None:
+    def emit(self, *, sending: bool = True) -> None:
         """Send the next frame, or drop it if the stream is stopped."""
-        frame = self._waiting.popleft()
-        if heard and self.running and self._server is not None:
+        frame = self._planned.popleft()
+        if sending and self.running and self._server is not None:
             before, number = self._server.sent, self._server.number
             self._server.push(*frame)
-            if self._told is not None and self._server.sent > before:
-                self._told("mocap", number, frame[0])
+            if self.on_sample is not None and self._server.sent > before:
+                self.on_sample("mocap", number, frame[0])
 
-    def forget(self) -> None:
-        """Drop the frames that are planned but not sent."""
-        self._waiting.clear()
+    def discard(self) -> None:
+        """Discard the frames that are planned but not sent."""
+        self._planned.clear()

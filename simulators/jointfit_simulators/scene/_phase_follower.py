@@ -24,9 +24,10 @@ MOTIONS_OF_PHASES: dict[str, tuple[tuple[str, float], ...]] = {
     "functional": (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
     "calibrated": (("walk", 20.0),),
 }
-"""Motions of each phase, in turn, and their lengths in s; in other phases the subject stands."""
-_OTHERWISE = (("stand", 5.0),)
+"""Motions of each phase, in turn, and their durations in s; in other phases the subject stands."""
+_OTHER_PHASES = (("stand", 5.0),)
 _RETRY_S = 1.0
+"""Delay before the next connection to the broker, s."""
 
 
 class PhaseFollower:
@@ -47,43 +48,41 @@ class PhaseFollower:
     ) -> None:
         self._rig, self._play, self._report = rig, play, report
         self._phase: str | None = None
-        self._moving: asyncio.Task[None] | None = None
+        self._motions: asyncio.Task[None] | None = None
 
     async def run(self) -> None:
         """Run until cancelled; retry the broker connection every second."""
-        place = f"{self._rig.mqtt_host}:{self._rig.mqtt_port}"
+        rig = self._rig
+        broker = f"{rig.mqtt_host}:{rig.mqtt_port}"
+        topic = f"{rig.mqtt_base}/calibration"
+        version = aiomqtt.ProtocolVersion
+        protocol = version.V5 if rig.mqtt_version == "5" else version.V311
         reported = ""
         try:
             while True:
                 try:
-                    async with self._client() as client:
-                        topic = f"{self._rig.mqtt_base}/calibration"
+                    async with aiomqtt.Client(
+                        rig.mqtt_host, rig.mqtt_port, protocol=protocol
+                    ) as client:
                         await client.subscribe(topic, qos=1)
-                        reported = f"follows {topic} on broker {place}"
+                        reported = f"follows {topic} on broker {broker}"
                         self._report(reported)
                         async for message in client.messages:
-                            self._take(message.payload)
+                            self._receive(message.payload)
                 except aiomqtt.MqttError:
                     lost = (
-                        f"no broker at {place}: start one there, or set --mqtt-host and --mqtt-port"
+                        f"no broker at {broker}: start one there, or set --mqtt-host and"
+                        " --mqtt-port"
                     )
                     if lost != reported:  # once, not every second
                         reported = lost
                         self._report(lost)
                 await asyncio.sleep(_RETRY_S)
         finally:
-            if self._moving is not None:
-                self._moving.cancel()
+            if self._motions is not None:
+                self._motions.cancel()
 
-    def _client(self) -> aiomqtt.Client:
-        modern = self._rig.mqtt_version == "5"
-        return aiomqtt.Client(
-            self._rig.mqtt_host,
-            self._rig.mqtt_port,
-            protocol=aiomqtt.ProtocolVersion.V5 if modern else aiomqtt.ProtocolVersion.V311,
-        )
-
-    def _take(self, payload: object) -> None:
+    def _receive(self, payload: object) -> None:
         """Start the motions of a new phase; ignore a repeated status."""
         try:
             status = orjson.loads(payload) if isinstance(payload, bytes | bytearray) else None
@@ -92,14 +91,17 @@ class PhaseFollower:
         phase = status.get("phase") if isinstance(status, dict) else None
         if not isinstance(phase, str) or phase == self._phase:
             return
-        self._phase = phase
-        if self._moving is not None:
-            self._moving.cancel()
-        motions = MOTIONS_OF_PHASES.get(phase, _OTHERWISE)
-        self._play(motions[0][0])
-        self._moving = asyncio.create_task(self._go_on(motions), name="motions of the phase")
 
-    async def _go_on(self, motions: tuple[tuple[str, float], ...]) -> None:
+        self._phase = phase
+        if self._motions is not None:
+            self._motions.cancel()
+        motions = MOTIONS_OF_PHASES.get(phase, _OTHER_PHASES)
+        self._play(motions[0][0])
+        self._motions = asyncio.create_task(
+            self._play_in_turn(motions), name="motions of the phase"
+        )
+
+    async def _play_in_turn(self, motions: tuple[tuple[str, float], ...]) -> None:
         """Play the motions after the first, in turn."""
         if len(motions) == 1:
             return

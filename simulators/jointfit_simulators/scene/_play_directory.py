@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 STATE_FILE = ".jointfit-sim.json"
 """Lock file; contains ``{"pid": …, "command_port": …}`` for the next run."""
-_LARGEST = 1000  # bytes read of the lock file, more than this module writes
+_LARGEST = 1000
+"""Bytes read of the lock file, more than this module writes."""
 _PORTS = range(1, 65536)
 
 
@@ -57,10 +58,11 @@ class PlayDirectory:
                 raise PortInUseError(f"--command-port {asked}: expected 1 to {_PORTS[-1]}")
             if why := _taken(asked):
                 raise PortInUseError(
-                    f"--command-port {asked}: cannot open UDP {LOOPBACK}:{asked} ({why}): choose"
-                    f" another, or end the program that has it (ss -ulnp 'sport = {asked}')"
+                    f"--command-port {asked}: cannot open UDP {LOOPBACK}:{asked} ({why}): select"
+                    f" another, or stop the program that uses it (ss -ulnp 'sport = {asked}')"
                 )
             return asked
+
         before = self._before.get("command_port")
         if isinstance(before, int) and before in _PORTS and not _taken(before):
             return before
@@ -68,9 +70,9 @@ class PlayDirectory:
 
     def remember(self, command_port: int | None) -> None:
         """Store the port for the next run; None leaves the stored port unchanged."""
-        kept = self._before.get("command_port") if command_port is None else command_port
+        stored = self._before.get("command_port") if command_port is None else command_port
         os.ftruncate(self._file, 0)
-        os.pwrite(self._file, orjson.dumps({"pid": os.getpid(), "command_port": kept}), 0)
+        os.pwrite(self._file, orjson.dumps({"pid": os.getpid(), "command_port": stored}), 0)
 
 
 @contextmanager
@@ -90,12 +92,12 @@ def play_directory(path: Path) -> Iterator[PlayDirectory]:
         except BlockingIOError:
             pid = _state(file).get("pid", "unknown")
             raise DirectoryInUseError(
-                f"{path}: a simulator (process {pid}) already plays here: stop it (kill {pid}), or"
-                " choose another --directory"
+                f"{path}: another simulator (process {pid}) uses this directory: stop it"
+                f" (kill {pid}), or select another --directory"
             ) from None
-        owned = PlayDirectory(path, file)
-        owned.remember(None)
-        yield owned
+        directory = PlayDirectory(path, file)
+        directory.remember(None)
+        yield directory
     finally:
         os.close(file)
 

@@ -22,25 +22,32 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.body import InstrumentedSubject
     from jointfit_simulators.scene._optical_stream import OpticalStream
-    from jointfit_simulators.scene._streams import ImuStream
+    from jointfit_simulators.scene._streams import ImuStream, SampleCallback
     from jointfit_simulators.scene._truth_log import TruthLog
 
 BLOCK_NS = NS // 5
+"""Duration of a planned block, ns."""
 AHEAD_NS = NS // 10
-"""A block is planned when less than this is left of the one before."""
-GIVE_UP_NS = 2 * NS
+"""Remaining part of a block at which the next block is planned, ns."""
+SKIP_NS = 2 * NS
+"""Interruption from which the missed time is skipped, ns."""
 TRUTH_NS = NS // 100
+"""Interval of the ground truth, ns."""
 _FLUSH_NS = NS // 10
+"""Interval between two writes of the ground-truth log, ns."""
 
 
 class PlannedStream(Protocol):
     """Stream with planned samples."""
 
-    def emit(self, *, heard: bool) -> None:
-        """Send or drop the next planned sample."""
+    on_sample: SampleCallback | None
+    """Called for every sample sent."""
 
-    def forget(self) -> None:
-        """Drop all that are planned."""
+    def emit(self, *, sending: bool) -> None:
+        """Send the next planned sample, or drop it if not `sending`."""
+
+    def discard(self) -> None:
+        """Discard all planned samples."""
 
 
 class ScenePlayer:
@@ -78,7 +85,7 @@ class ScenePlayer:
         self._streams: list[PlannedStream] = [*self._imus, optical]
         self._origin_ns = origin_ns
         self._planned_ns = origin_ns
-        self._due: list[tuple[int, int]] = []  # when, stream; a heap
+        self._due: list[tuple[int, int]] = []  # heap of transmission time and stream number
         self.paused = False
         """Whether transmission is paused; samples due meanwhile are dropped."""
         self.left_out_ns = 0
@@ -89,7 +96,7 @@ class ScenePlayer:
         return self._subject.motion_at((time.monotonic_ns() - self._origin_ns) / NS)
 
     def play(self, name: str) -> None:
-        """Begin another motion as soon as it can still be planned; UnknownMotion if unknown."""
+        """Start a motion at the next block; raise UnknownMotionError for an unknown name."""
         self._subject.play(name, (self._planned_ns - self._origin_ns) / NS)
 
     async def run(self) -> None:
@@ -97,59 +104,63 @@ class ScenePlayer:
         flushed_ns = 0
         while True:
             now_ns = time.monotonic_ns()
-            if now_ns > self._planned_ns + GIVE_UP_NS:
+            if now_ns > self._planned_ns + SKIP_NS:
                 self.left_out_ns += now_ns - self._planned_ns
                 self._planned_ns = now_ns
             if now_ns > self._planned_ns - AHEAD_NS:
                 self._plan_block()
-            self._send_due(time.monotonic_ns())
+
+            now_ns = time.monotonic_ns()
+            while self._due and self._due[0][0] <= now_ns:
+                self._streams[heapq.heappop(self._due)[1]].emit(sending=not self.paused)
             if now_ns > flushed_ns + _FLUSH_NS:
                 self._truth.advance(now_ns)
                 flushed_ns = now_ns
-            await asyncio.sleep(self._idle_s())
+
+            wake_ns = self._planned_ns - AHEAD_NS
+            if self._due:
+                wake_ns = min(wake_ns, self._due[0][0])
+            await asyncio.sleep(max(0.0, (wake_ns - time.monotonic_ns()) / NS))
 
     def finish(self) -> None:
-        """Send nothing any more and write what truth there is up to now."""
+        """Stop sending and write the ground truth up to now."""
         self.paused = True
         self._due.clear()
         for stream in self._streams:
-            stream.forget()
+            stream.discard()
         self._truth.advance(time.monotonic_ns())
-
-    def _idle_s(self) -> float:
-        """Return the time until something has to be done."""
-        wake_ns = self._planned_ns - AHEAD_NS
-        if self._due:
-            wake_ns = min(wake_ns, self._due[0][0])
-        return max(0.0, (wake_ns - time.monotonic_ns()) / NS)
-
-    def _seconds(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return (t_ns - self._origin_ns) / NS
 
     def _plan_block(self) -> None:
         begin_ns, end_ns = self._planned_ns, self._planned_ns + BLOCK_NS
+
+        # instants of all streams
         imu_ns = [imu.plan(begin_ns, end_ns) for imu in self._imus]
         exposures_ns = self._optical.plan(begin_ns, end_ns)
         if self._sync_line:
             for imu in self._imus:
-                imu.wire(exposures_ns)
+                imu.add_edges(exposures_ns)
         first = -(-begin_ns // TRUTH_NS) * TRUTH_NS
         truth_ns = np.arange(first, end_ns, TRUTH_NS, dtype=np.int64)
+
+        # observation of the subject at these instants
         imu_s = [self._seconds(t_ns) for t_ns in imu_ns]
         truth_s = self._seconds(truth_ns)
-        seen = self._subject.observe(imu_s, self._seconds(exposures_ns), truth_s)
-        for number, (imu, t_s, q) in enumerate(zip(self._imus, imu_s, seen.sensors, strict=True)):
-            self._schedule(number, imu.fill(t_s, q))
-        self._schedule(len(self._imus), self._optical.fill(seen))
+        observation = self._subject.observe(imu_s, self._seconds(exposures_ns), truth_s)
+
+        # measurements and their transmission times
+        due_ns = [
+            imu.fill(t_s, q)
+            for imu, t_s, q in zip(self._imus, imu_s, observation.sensors, strict=True)
+        ]
+        due_ns.append(self._optical.fill(observation))
+        for number, times in enumerate(due_ns):
+            for due in times:
+                heapq.heappush(self._due, (due, number))
+
         motions = [self._subject.motion_at(t) for t in truth_s.tolist()]
-        self._truth.add(truth_ns, motions, seen.truth, self._optical.cameras.world)
+        self._truth.add(truth_ns, motions, observation.truth, self._optical.cameras.world)
         self._planned_ns = end_ns
         self._subject.discard_before((begin_ns - self._origin_ns) / NS)
 
-    def _schedule(self, stream: int, due_ns: list[int]) -> None:
-        for due in due_ns:
-            heapq.heappush(self._due, (due, stream))
-
-    def _send_due(self, now_ns: int) -> None:
-        while self._due and self._due[0][0] <= now_ns:
-            self._streams[heapq.heappop(self._due)[1]].emit(heard=not self.paused)
+    def _seconds(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return (t_ns - self._origin_ns) / NS

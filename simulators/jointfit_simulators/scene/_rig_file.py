@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-_PROXIMAL, _DISTAL = "pelvis", "foot"
-
 
 @dataclass(frozen=True, slots=True)
 class RigOptions:
@@ -55,25 +53,32 @@ def rig_toml(
     plate
         Whether the optical system tracks the plate.
     """
-    parts = [name for name in (_PROXIMAL, _DISTAL) if name in clusters and mocap]
-    ends = [f'{end} = "{name}"' for end, name in zip(_ends(parts), parts, strict=True)]
+    ends = [
+        f'{end} = "{part}"'
+        for end, part in (("proximal", "pelvis"), ("distal", "foot"))
+        if part in clusters and mocap
+    ]
+    chain = [
+        "[chain]",
+        'joints = ["hip", "knee", "ankle"]',
+        'segments = ["thigh", "shank"]',
+        'side = "right"',
+        f'axes = "{options.axes}"',
+        *ends,
+    ]
     tables = [
         f'[rig]\nname = "{options.name}"\noutput_rate_hz = {options.output_rate_hz:g}\n',
-        "\n".join(
-            [
-                "[chain]",
-                'joints = ["hip", "knee", "ankle"]',
-                'segments = ["thigh", "shank"]',
-                'side = "right"',
-                f'axes = "{options.axes}"',
-                *ends,
-                "",
-            ]
-        ),
+        "\n".join([*chain, ""]),
         *devices,
     ]
     if mocap:
-        tables.append("\n".join([mocap, *_bodies(clusters, bones, plate=plate), ""]))
+        lines = ['plate = "Plate"'] if plate else []
+        for part, names in clusters.items():
+            if part not in {"plate", "other", *bones}:
+                listed = ", ".join(f'"{name}"' for name in names)
+                lines.append(f"markers.{part} = [{listed}]")
+        lines += [f'rigid_body.{bone} = "{bone.capitalize()}"' for bone in bones]
+        tables.append("\n".join([mocap, *lines, ""]))
     tables.append(
         f'[calibration]\nstore = "{options.store}"\nmethod = "{options.method}"\n'
         f"align_s = {options.align_s:g}\nstatic_s = {options.static_s:g}\n"
@@ -84,18 +89,3 @@ def rig_toml(
         f'base = "{options.mqtt_base}"\nversion = "{options.mqtt_version}"\n'
     )
     return "\n".join(tables)
-
-
-def _ends(parts: Sequence[str]) -> list[str]:
-    return ["proximal" if part == _PROXIMAL else "distal" for part in parts]
-
-
-def _bodies(
-    clusters: Mapping[str, tuple[str, ...]], bones: Sequence[str], *, plate: bool
-) -> list[str]:
-    lines = ['plate = "Plate"'] if plate else []
-    for part, names in clusters.items():
-        if part not in {"plate", "other", *bones}:
-            listed = ", ".join(f'"{name}"' for name in names)
-            lines.append(f"markers.{part} = [{listed}]")
-    return lines + [f'rigid_body.{bone} = "{bone.capitalize()}"' for bone in bones]

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 from jointfit_simulators.body import UnknownMotionError, to_wxyz
 from jointfit_simulators.devices import NS, Cameras, SampleTiming
-from jointfit_simulators.scene._hardware import WIRES, create_hardware, mocap_table, optical_server
+from jointfit_simulators.scene._hardware import (
+    BUS,
+    WIRES,
+    create_hardware,
+    mocap_table,
+    optical_server,
+)
 from jointfit_simulators.scene._optical_stream import OpticalStream
 from jointfit_simulators.scene._player import ScenePlayer
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
@@ -19,18 +25,21 @@ from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.scene._truth_log import TruthLog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
     from jointfit_simulators.body import InstrumentedSubject
-    from jointfit_simulators.devices import ClockFault, NatNetServer
+    from jointfit_simulators.devices import ClockFault
+    from jointfit_simulators.scene._player import PlannedStream
     from jointfit_simulators.scene._streams import ImuStream
     from jointfit_simulators.settings import Knobs
+    from jointfit_simulators.wires import CanWire
 
 RIG_FILE = "rig.toml"
 TRUTH_FILE = "truth.jsonl"
 SAMPLES_FILE = "samples.jsonl"
 OPTICAL = "mocap"
+"""Name of the motion-capture server in commands and in the ground-truth log."""
 DOWN_S = 1.0
 """Downtime of the motion-capture server during a restart."""
 LINGER_S = 0.3
@@ -94,58 +103,66 @@ class Scene:
             now_ns=now_ns,
             sync_line=options.sync_line,
         )
-        cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
-        samples = options.directory / SAMPLES_FILE
-        self._samples = SampleLog(samples) if options.sample_log else None
-        told = None if self._samples is None else self._samples.add
-        ticker = SampleTiming(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
-        self._tickers = {n: s.ticker for n, s in self._hardware.streams.items()} | {OPTICAL: ticker}
+
+        timing = SampleTiming(knobs, OPTICAL, latency_ms=knobs.latency_mocap_ms, now_ns=now_ns)
+        streams = self._hardware.streams
+        self._timings = {n: s.timing for n, s in streams.items()} | {OPTICAL: timing}
         for name, fault in options.clocks.items():
-            self._tickers[name].set_fault(fault, now_ns)
-        for stream in self._hardware.streams.values():
-            stream.told = told
-        self._server: NatNetServer | None = None
-        if options.mocap:
-            self._server = optical_server(
+            self._timings[name].set_fault(fault, now_ns)
+
+        cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
+        self._server = (
+            optical_server(
                 knobs,
                 subject.clusters,
                 cameras.bodies,
-                ticker,
+                timing,
                 ptp=options.ptp,
                 command_port=options.command_port,
             )
-        self._optical = OpticalStream(knobs, cameras, ticker, self._server, told)
+            if options.mocap
+            else None
+        )
+        self._optical = OpticalStream(knobs, cameras, timing, self._server)
+
+        samples = SampleLog(options.directory / SAMPLES_FILE) if options.sample_log else None
+        self._samples = samples
+        planned: list[PlannedStream] = [*streams.values(), self._optical]
+        for stream in planned:
+            stream.on_sample = samples.add if samples else None
+
         self._origin_ns = now_ns
         self._truth = TruthLog(options.directory / TRUTH_FILE, self._facts(knobs, now_ns))
         self._player = ScenePlayer(
             subject,
-            self._hardware.streams,
+            streams,
             self._optical,
             self._truth,
             origin_ns=now_ns,
             sync_line=options.sync_line,
         )
         self._quit = asyncio.Event()
-        self._verbs = self._commands(cameras)
+        self._commands = self._command_table(cameras)
 
-    def _commands(self, cameras: Cameras) -> dict[str, Callable[[str], None]]:
+    def _command_table(self, cameras: Cameras) -> dict[str, Callable[[str], None]]:
         """Return the handlers by command name; each receives the arguments as text."""
         return {
-            "play": self._play,
-            "unplug": lambda name: self._plugs(name)[0](),
-            "plug": lambda name: self._plugs(name)[1](),
+            "play": self._player.play,
+            "unplug": lambda name: self._connection(name).unplug(),
+            "plug": lambda name: self._connection(name).plug(),
             "reboot": self._reboot,
             "stick": lambda name: self._stream(name).faults.stick(),
             "free": lambda name: self._stream(name).faults.free(),
             "slip": self._slip,
             "drift": self._drift,
-            "occlude": lambda word: setattr(cameras, "covered", _on(word)),
+            "occlude": lambda word: setattr(cameras, "covered", _switch(word)),
             "mocap": self._mocap,
-            "pause": lambda word: setattr(self._player, "paused", _on(word or "on")),
+            "pause": lambda word: setattr(self._player, "paused", _switch(word or "on")),
             "quit": lambda _: self._quit.set(),
         }
 
     def _facts(self, knobs: Knobs, now_ns: int) -> dict[str, object]:
+        """Return the contents of the first line of the ground-truth log."""
         cameras, streams = self._optical.cameras, self._hardware.streams
         return {
             "t_ns": now_ns,
@@ -157,18 +174,18 @@ class Scene:
                 n: to_wxyz(cameras.world * s.sensor.world.inv()) for n, s in streams.items()
             },
             "clocks": {
-                n: {"boot_ns": ticker.clock.boot_ns, "skew": ticker.clock.skew}
-                for n, ticker in self._tickers.items()
+                n: {"boot_ns": timing.clock.boot_ns, "skew": timing.clock.skew}
+                for n, timing in self._timings.items()
             },
             **self._subject.facts,
         }
 
-    async def run(self, say: Callable[[dict[str, object]], None]) -> None:
+    async def run(self, report: Callable[[dict[str, object]], None]) -> None:
         """Run until `stop`, then wait `LINGER_S` and close all ports.
 
         Parameters
         ----------
-        say
+        report
             Called with the ports when all devices are ready, and with the counts at the end.
         """
         try:
@@ -180,24 +197,26 @@ class Scene:
                 if self._server is not None:
                     serving.append(tasks.create_task(self._server.run(), name="natnet"))
                     await self._server.ready.wait()
+
                 rig = self._write_rig()
                 playing = tasks.create_task(self._player.run(), name="player")
-                following = tasks.create_task(self._follow_script(say), name="script")
+                following = tasks.create_task(self._follow_script(report), name="script")
                 truth = self._options.directory / TRUTH_FILE
                 ports = self._hardware.ports
-                say({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
+                report({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
+
                 await self._quit.wait()
                 playing.cancel()
                 following.cancel()
                 self._player.finish()
-                say(self.account())
+                report(self.account())
                 await asyncio.sleep(LINGER_S)
                 for task in serving:
                     task.cancel()
         finally:  # also after an error or cancellation
             self.close()
 
-    async def _follow_script(self, say: Callable[[dict[str, object]], None]) -> None:
+    async def _follow_script(self, report: Callable[[dict[str, object]], None]) -> None:
         """Run the scheduled commands."""
         for at_s, line in sorted(self._options.script):
             due_ns = self._origin_ns + round(at_s * NS)
@@ -205,7 +224,7 @@ class Scene:
             try:
                 self.command(line)
             except InvalidCommandError as error:
-                say({"error": str(error)})
+                report({"error": str(error)})
 
     def stop(self) -> None:
         """End `run`."""
@@ -222,22 +241,18 @@ class Scene:
             self._server.unplug()
 
     def _write_rig(self) -> Path:
+        server = self._server
         path = self._options.directory / RIG_FILE
         text = rig_toml(
             self._options.rig,
             devices=self._hardware.tables,
-            mocap=self._mocap_table(),
+            mocap=mocap_table(server, sync_line=self._options.sync_line) if server else "",
             clusters=self._subject.clusters,
             bones=self._subject.visible_bones,
             plate="plate" in self._subject.templates,
         )
         path.write_text(text, encoding="utf-8")
         return path
-
-    def _mocap_table(self) -> str:
-        if self._server is None:
-            return ""
-        return mocap_table(self._server, sync_line=self._options.sync_line)
 
     @property
     def command_port(self) -> int | None:
@@ -249,40 +264,37 @@ class Scene:
 
         Raises
         ------
-        BadCommand
+        InvalidCommandError
             The command, motion, sensor or argument is unknown.
         """
         verb, _, rest = line.strip().partition(" ")
         if verb == "status":
             return self.status()
-        if verb not in self._verbs:
+        if verb not in self._commands:
             raise InvalidCommandError(
-                f"no command {verb!r}; there are: {', '.join(self._verbs)}, status"
+                f"no command {verb!r}; there are: {', '.join(self._commands)}, status"
             )
         try:
-            self._verbs[verb](rest.strip())
+            self._commands[verb](rest.strip())
         except UnknownMotionError as error:
             raise InvalidCommandError(str(error)) from error
         return None
 
-    def _play(self, name: str) -> None:
-        self._player.play(name)
-
     def _reboot(self, name: str) -> None:
         if name == OPTICAL:
-            self._restart_server(clock_anew=True)
+            self._restart_server(reset_clock=True)
         else:
             self._stream(name).device.power_cycle()
 
     def _slip(self, words: str) -> None:
-        stream, degrees = self._with_number(words, "slip S1 15 (degrees)")
+        stream, degrees = self._sensor_and_number(words, "slip S1 15 (degrees)")
         stream.faults.slip(math.radians(degrees))
 
     def _drift(self, words: str) -> None:
-        stream, degrees = self._with_number(words, "drift S1 5 (degrees a minute)")
+        stream, degrees = self._sensor_and_number(words, "drift S1 5 (degrees a minute)")
         stream.faults.drift(math.radians(degrees) / 60.0)
 
-    def _with_number(self, words: str, example: str) -> tuple[ImuStream, float]:
+    def _sensor_and_number(self, words: str, example: str) -> tuple[ImuStream, float]:
         name, _, number = words.partition(" ")
         stream = self._stream(name)
         try:
@@ -295,30 +307,31 @@ class Scene:
 
     def _mocap(self, word: str) -> None:
         if word == "restart":
-            self._restart_server(clock_anew=False)
+            self._restart_server(reset_clock=False)
         else:
-            self._optical.running = _on(word)
+            self._optical.running = _switch(word)
 
-    def _restart_server(self, *, clock_anew: bool) -> None:
-        """Close the server and reopen it after `DOWN_S`; reset its clock if `clock_anew`."""
+    def _restart_server(self, *, reset_clock: bool) -> None:
+        """Close the server and reopen it after `DOWN_S`."""
         server = self._server
         if server is None:
             raise InvalidCommandError("there is no motion-capture server")
         server.unplug()
-        if clock_anew:
-            self._tickers[OPTICAL].reboot(time.monotonic_ns())
+        if reset_clock:
+            self._timings[OPTICAL].reboot(time.monotonic_ns())
         asyncio.get_running_loop().call_later(DOWN_S, server.restart)
 
     def _stream(self, name: str) -> ImuStream:
-        try:
-            return self._hardware.streams[name]
-        except KeyError:
-            known = ", ".join(self._hardware.streams)
-            raise InvalidCommandError(f"no sensor {name!r}; there are: {known}") from None
+        streams = self._hardware.streams
+        if name not in streams:
+            raise InvalidCommandError(f"no sensor {name!r}; there are: {', '.join(streams)}")
+        return streams[name]
 
-    def _plugs(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
-        found = self._hardware.bus if name == "can0" and self._hardware.bus else self._stream(name)
-        return found.unplug, found.plug
+    def _connection(self, name: str) -> ImuStream | CanWire:
+        """Return the sensor or the bus adapter of a name, for (un)plugging."""
+        if name == BUS and self._hardware.bus is not None:
+            return self._hardware.bus
+        return self._stream(name)
 
     def status(self) -> dict[str, object]:
         """Return the motion and the state of each device, as JSON values."""
@@ -341,13 +354,13 @@ class Scene:
         }
 
 
-def _check_clocks(asked: Mapping[str, ClockFault], known: tuple[str, ...]) -> None:
-    for name in asked:
+def _check_clocks(clocks: Iterable[str], known: tuple[str, ...]) -> None:
+    for name in clocks:
         if name not in known:
             raise InvalidCommandError(f"no clock {name!r}; there are: {', '.join(known)}")
 
 
-def _on(word: str) -> bool:
+def _switch(word: str) -> bool:
     words = {"on": True, "start": True, "off": False, "stop": False}
     if word not in words:
         raise InvalidCommandError(f"{word!r}: expected {' or '.join(words)}")

@@ -25,35 +25,35 @@ if TYPE_CHECKING:
 SampleCallback = Callable[[str, int, int], None]
 """Callback for every sample sent: device, number on the wire, true host time in ns."""
 
-
-_EDGES = 4096
+_MOST_EDGES = 4096
+"""Number of planned sync edges; older ones are dropped."""
 
 
 class SceneImuDevice(ImuDevice, Protocol):
     """Virtual IMU with the faults that a scene can trigger."""
 
     def edge(self, device_ns: int) -> None:
-        """Take an edge on its sync input, at a time of its own clock; nothing where it has none."""
+        """Add an edge on the sync input at a device time; no effect without a sync input."""
 
     @property
     def counter(self) -> int:
-        """Number that its next sample will carry."""
+        """Number of the next sample."""
 
     @property
     def line_ns(self) -> int:
-        """How long a sample takes on the line, first byte to last, ns; 0 where it takes none."""
+        """Transmission time of a sample, first byte to last, ns; 0 for a wire without delay."""
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` samples: they take a counter value and are not sent."""
+        """Lose the next `count` samples: the counter increments, but they are not sent."""
 
     def power_cycle(self) -> None:
-        """Lose power for a moment: clock and counter begin anew."""
+        """Interrupt the power supply: clock and counter restart."""
 
     def unplug(self) -> None:
-        """Take its wire away."""
+        """Disconnect the wire."""
 
     def plug(self) -> None:
-        """Put it back."""
+        """Connect the wire."""
 
 
 class ImuStream:
@@ -73,8 +73,6 @@ class ImuStream:
         Whether other devices use the wire; unplugging then only stops this sensor.
     now_ns
         Host time of the start of the run, ns.
-    told
-        Called for every sample sent.
     """
 
     def __init__(
@@ -86,15 +84,16 @@ class ImuStream:
         latency_ms: float,
         shared_wire: bool,
         now_ns: int,
-        told: SampleCallback | None = None,
     ) -> None:
-        self.name, self.device, self.told = name, device, told
+        self.name, self.device = name, device
+        self.on_sample: SampleCallback | None = None
+        """Called for every sample sent."""
         self.sensor, self.faults = OrientationSensor(knobs, name), SensorFaults()
-        self.ticker = SampleTiming(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
-        self._fallback_hz, self._shared = knobs.rate_hz, shared_wire
+        self.timing = SampleTiming(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
+        self._default_hz, self._shared = knobs.rate_hz, shared_wire
         self._unplugged = False
-        self._waiting: deque[tuple[int, int, Quaternion | None]] = deque()
-        self._edges: deque[int] = deque(maxlen=_EDGES)
+        self._planned: deque[tuple[int, int, Quaternion | None]] = deque()
+        self._edges: deque[int] = deque(maxlen=_MOST_EDGES)
         self.dropped_out = 0
         """Number of samples dropped by `Knobs.dropout` while measuring."""
         self.unheard = 0
@@ -102,34 +101,37 @@ class ImuStream:
         self.refused = 0
         """Number of samples rejected by a full line."""
 
-    def wire(self, edges_ns: NDArray[np.int64]) -> None:
-        """Apply edges to the sync line at these host times, ns."""
+    def add_edges(self, edges_ns: NDArray[np.int64]) -> None:
+        """Plan edges on the sync line at these host times, ns."""
         self._edges.extend(edges_ns.tolist())
 
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
         """Plan the samples of a block and return their true host times, ns."""
-        rate_hz = self.device.rate_hz or self._fallback_hz
-        self._taken = self.ticker.samples(begin_ns, end_ns, NS / rate_hz)
-        return self._taken.host_ns
+        rate_hz = self.device.rate_hz or self._default_hz
+        self._block = self.timing.samples(begin_ns, end_ns, NS / rate_hz)
+        return self._block.host_ns
 
     def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
         """Add orientations to the planned samples and return the transmission times, ns."""
-        said = self.faults.apply(t_s, self.sensor.report(t_s, q_base_sensor))
-        lost = self._taken.dropped | ~np.isfinite(said[:, 0])
-        for true_ns, stamp, q, never in zip(
-            self._taken.host_ns.tolist(), self._taken.device_ns.tolist(), said.tolist(),
+        measured = self.faults.apply(t_s, self.sensor.report(t_s, q_base_sensor))
+        lost = self._block.dropped | ~np.isfinite(measured[:, 0])
+        for true_ns, stamp, q, dropped in zip(
+            self._block.host_ns.tolist(), self._block.device_ns.tolist(), measured.tolist(),
             lost.tolist(), strict=True,
         ):  # fmt: skip
-            self._waiting.append((true_ns, stamp, None if never else cast("Quaternion", tuple(q))))
-        # the host has a sample when its last byte is there
-        return cast("list[int]", (self._taken.due_ns + self.device.line_ns).tolist())
+            orientation = None if dropped else cast("Quaternion", tuple(q))
+            self._planned.append((true_ns, stamp, orientation))
 
-    def emit(self, *, heard: bool = True) -> None:
+        # the host receives a sample with its last byte
+        return cast("list[int]", (self._block.due_ns + self.device.line_ns).tolist())
+
+    def emit(self, *, sending: bool = True) -> None:
         """Send the next sample, or drop it if the device cannot send."""
-        true_ns, stamp, q = self._waiting.popleft()
+        true_ns, stamp, q = self._planned.popleft()
         while self._edges and self._edges[0] <= true_ns:
-            self.device.edge(self.ticker.device_ns(self._edges.popleft()))
-        if self._unplugged or not heard or not self.device.streaming:
+            self.device.edge(self.timing.device_ns(self._edges.popleft()))
+
+        if self._unplugged or not sending or not self.device.streaming:
             self.unheard += 1
             return
         if q is None:
@@ -137,25 +139,26 @@ class ImuStream:
             self.device.lose(1)
             self.device.push(stamp, (1.0, 0.0, 0.0, 0.0))
             return
+
         before, number = self.device.sent, self.device.counter
         self.device.push(stamp, q)
         if self.device.sent == before:
             self.refused += 1
-        elif self.told is not None:
-            self.told(self.name, number, true_ns)
+        elif self.on_sample is not None:
+            self.on_sample(self.name, number, true_ns)
 
-    def forget(self) -> None:
-        """Drop what is planned and not sent."""
-        self._waiting.clear()
+    def discard(self) -> None:
+        """Discard the samples that are planned but not sent."""
+        self._planned.clear()
 
     def unplug(self) -> None:
-        """Take the device off its wire."""
+        """Disconnect the device from its wire."""
         self._unplugged = True
         if not self._shared:
             self.device.unplug()
 
     def plug(self) -> None:
-        """Put it back."""
+        """Connect the device to its wire."""
         self._unplugged = False
         if not self._shared:
             self.device.plug()

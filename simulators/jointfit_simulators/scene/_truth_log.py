@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import GroundTruth, Rotation
 
 VERSION = 1
+"""Version of the format, in the first line."""
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 
 
@@ -53,7 +54,7 @@ class TruthLog:
         self._file: BinaryIO = path.open("wb")
         self._file.write(orjson.dumps({"truth": VERSION, **facts}, option=_OPTIONS))
         self._file.flush()
-        self._waiting: deque[tuple[int, bytes]] = deque()
+        self._queued: deque[tuple[int, bytes]] = deque()
 
     def add(
         self, t_ns: NDArray[np.int64], motions: list[str], truth: GroundTruth, world: Rotation
@@ -73,6 +74,7 @@ class TruthLog:
         """
         turns = {part: to_wxyz(world * turn).tolist() for part, turn in truth.orientations.items()}
         joints = {joint: world.apply(center).tolist() for joint, center in truth.joints.items()}
+
         for i, (at, motion) in enumerate(zip(t_ns.tolist(), motions, strict=True)):
             flexion, adduction, rotation = truth.knee[i].tolist()
             line = {
@@ -83,13 +85,12 @@ class TruthLog:
                 "knee": {"flexion": flexion, "adduction": adduction, "rotation": rotation},
                 "included": float(truth.included[i]),
             }
-            self._waiting.append((at, orjson.dumps(line, option=_OPTIONS)))
+            self._queued.append((at, orjson.dumps(line, option=_OPTIONS)))
 
     def advance(self, now_ns: int) -> None:
         """Write the queued lines up to `now_ns`."""
-        waiting = self._waiting
-        while waiting and waiting[0][0] <= now_ns:
-            self._file.write(waiting.popleft()[1])
+        while self._queued and self._queued[0][0] <= now_ns:
+            self._file.write(self._queued.popleft()[1])
         self._file.flush()
 
     def close(self) -> None:
