@@ -18,8 +18,9 @@ PACKAGES = (
     "drivers/jointfit_drivers",
     "protocols/jointfit_protocols",
     "bench",
+    "simulators/jointfit_simulators",
+    "examples",
 )
-"""The simulators are not rewritten yet."""
 PAGES = ("docs", "README.md", "CONVENTIONS.md")
 
 RATES_PER_1000 = {

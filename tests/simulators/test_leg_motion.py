@@ -1,4 +1,4 @@
-"""The truth is right: bones keep their lengths, signs are clinical, nothing jerks."""
+"""Ground truth: constant bone lengths, clinical signs, smooth motions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 GEOMETRY = LegGeometry()
 STYLE = draw_style(GEOMETRY, np.random.default_rng(5))
-DOING = motions_of(STYLE)
+MOTIONS_OF_STYLE = motions_of(STYLE)
 angle = st.floats(-1.2, 1.2)
 
 
@@ -50,7 +50,7 @@ def turn_about(axis: int, by: float) -> np.ndarray:
 
 
 @given(st.lists(angle, min_size=12, max_size=12), st.lists(angle, min_size=3, max_size=3))
-def test_bones_close_the_chain_that_textbook_matrices_give(
+def test_forward_kinematics_equals_textbook_matrices(
     angles: list[float], position: list[float]
 ) -> None:
     coordinates = np.zeros((1, COORDINATES))
@@ -88,7 +88,9 @@ def test_flexion_has_its_clinical_sign(joint: slice, moved: str, axis: int, sign
 
 
 @pytest.mark.parametrize(("column", "axis", "sign"), [(1, 0, -1), (2, 0, -1)])
-def test_a_right_leg_goes_towards_the_midline(column: int, axis: int, sign: int) -> None:
+def test_adduction_and_internal_rotation_move_the_toes_medially(
+    column: int, axis: int, sign: int
+) -> None:
     coordinates = np.zeros((1, COORDINATES))
     coordinates[0, HIP.start + column] = 0.3
     pose = leg_pose(GEOMETRY, coordinates)
@@ -97,7 +99,7 @@ def test_a_right_leg_goes_towards_the_midline(column: int, axis: int, sign: int)
     assert sign * (toes[0, axis] - upright) > 0.04
 
 
-def test_the_included_angle_is_flat_when_straight_and_falls_by_the_flexion() -> None:
+def test_included_angle_is_180_degrees_minus_flexion() -> None:
     coordinates = np.zeros((2, COORDINATES))
     coordinates[1, KNEE.start] = np.radians(70)
     pose = leg_pose(GEOMETRY, coordinates)
@@ -105,9 +107,9 @@ def test_the_included_angle_is_flat_when_straight_and_falls_by_the_flexion() -> 
     assert inner == pytest.approx([180, 110])
 
 
-def test_standing_is_upright_and_almost_still() -> None:
+def test_standing_is_upright_with_little_sway() -> None:
     t = np.arange(0.0, 60.0, 0.05)
-    coordinates = DOING["stand"](t)
+    coordinates = MOTIONS_OF_STYLE["stand"](t)
     pose = leg_pose(GEOMETRY, coordinates)
     for part in ("thigh", "shank", "foot"):
         tilt = np.degrees(pose.orientations[part].magnitude())
@@ -123,81 +125,83 @@ def test_standing_is_upright_and_almost_still() -> None:
     ("name", "least", "most"),
     [("walk", 55, 75), ("squat", 90, 110), ("sit_to_stand", 85, 105), ("knee_swings", 85, 110)],
 )
-def test_movements_bend_the_knee_as_people_do(name: str, least: float, most: float) -> None:
-    knee = np.degrees(DOING[name](np.arange(0, 60, 0.02))[:, KNEE])
+def test_motions_have_physiological_knee_angles(name: str, least: float, most: float) -> None:
+    knee = np.degrees(MOTIONS_OF_STYLE[name](np.arange(0, 60, 0.02))[:, KNEE])
     assert least < knee[:, 0].max() < most
     assert knee[:, 0].min() > -6
     assert np.abs(knee[:, 1]).max() < 6
     assert np.abs(knee[:, 2]).max() < 25
 
 
-def test_functional_exercises_every_axis_that_calibration_needs() -> None:
-    coordinates = np.degrees(DOING["functional"](np.arange(0, 30, 0.02)))
+def test_functional_motion_exercises_all_axes() -> None:
+    coordinates = np.degrees(MOTIONS_OF_STYLE["functional"](np.arange(0, 30, 0.02)))
     reach = np.ptp(coordinates, axis=0)
     assert np.all(reach[HIP] > [80, 30, 20])
     assert np.all(reach[KNEE] > [90, 1, 10])
     assert np.all(reach[ANKLE] > [40, 20, 15])
 
 
-def test_the_plate_turns_about_several_axes_and_carries_the_sensors() -> None:
-    coordinates = DOING["plate"](np.arange(0, 30, 0.02))
+def test_plate_with_the_sensors_rotates_about_several_axes() -> None:
+    coordinates = MOTIONS_OF_STYLE["plate"](np.arange(0, 30, 0.02))
     turns = coordinates[:, 18:21]
     assert np.linalg.cond(turns.T @ turns) < 4
     assert np.all(coordinates[:, 21] == 1)
 
 
 def jerkiness(coordinates: np.ndarray, step: float) -> float:
-    """Return the largest jump of the second derivative from one step to the next, per step."""
+    """Return the largest change of the second derivative between two steps."""
     second = np.diff(coordinates, n=2, axis=0) / step**2
     return float(np.abs(np.diff(second, axis=0)).max())
 
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_every_motion_has_two_continuous_derivatives(name: str) -> None:
-    programme = MotionScript(DOING, [Step("stand", 2.0), Step(name, 4.0), Step("squat", 9.0)])
+    script = MotionScript(
+        MOTIONS_OF_STYLE, [Step("stand", 2.0), Step(name, 4.0), Step("squat", 9.0)]
+    )
     jumps = []
-    for step in (2e-3, 1e-3):  # a jump that is none shrinks with the step
+    for step in (2e-3, 1e-3):  # the change of a continuous derivative decreases with the step
         t = np.arange(1.0, 9.0, step)
-        jumps.append(jerkiness(programme.coordinates(t), step))
+        jumps.append(jerkiness(script.coordinates(t), step))
     assert jumps[1] < 0.65 * jumps[0]
 
 
-def test_a_kink_would_be_found() -> None:
+def test_jerkiness_detects_a_discontinuous_derivative() -> None:
     jumps = [jerkiness(np.abs(np.arange(-1, 1, s) + s / 3)[:, None], s) for s in (2e-3, 1e-3)]
     assert jumps[1] > 0.65 * jumps[0]
 
 
-def test_a_switch_bends_the_future_only() -> None:
+def test_switch_changes_later_coordinates_only() -> None:
     steps = parse_motion_script("stand:5,walk")
-    programme, same = MotionScript(DOING, steps), MotionScript(DOING, steps)
-    programme.play("squat", 3.0)
+    script, same = MotionScript(MOTIONS_OF_STYLE, steps), MotionScript(MOTIONS_OF_STYLE, steps)
+    script.play("squat", 3.0)
     past, future = np.arange(0, 3.0, 0.1), np.arange(4.6, 9, 0.1)
-    np.testing.assert_array_equal(programme.coordinates(past), same.coordinates(past))
-    np.testing.assert_allclose(programme.coordinates(future), DOING["squat"](future - 3.0))
-    assert [programme.name_at(t) for t in (2.9, 3.1, 6.0)] == ["stand", "squat", "squat"]
+    np.testing.assert_array_equal(script.coordinates(past), same.coordinates(past))
+    np.testing.assert_allclose(script.coordinates(future), MOTIONS_OF_STYLE["squat"](future - 3.0))
+    assert [script.name_at(t) for t in (2.9, 3.1, 6.0)] == ["stand", "squat", "squat"]
 
 
-def test_forgetting_the_past_does_not_change_later_motion() -> None:
+def test_discarding_past_motions_does_not_change_later_coordinates() -> None:
     steps = parse_motion_script("stand:3,walk:1,squat:3,turn")
-    whole, forgetful = MotionScript(DOING, steps), MotionScript(DOING, steps)
+    whole, discarding = MotionScript(MOTIONS_OF_STYLE, steps), MotionScript(MOTIONS_OF_STYLE, steps)
     for begin in np.arange(0.0, 12.0, 0.2):
         t = begin + np.arange(0, 0.2, 0.01)
-        forgetful.discard_before(begin)
-        np.testing.assert_allclose(forgetful.coordinates(t), whole.coordinates(t), atol=1e-15)
+        discarding.discard_before(begin)
+        np.testing.assert_allclose(discarding.coordinates(t), whole.coordinates(t), atol=1e-15)
 
 
 @pytest.mark.parametrize("text", ["", "walk:0", "walk:-1", ":5", "walk:x"])
-def test_a_senseless_programme_is_refused(text: str) -> None:
+def test_invalid_motion_scripts_are_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"expected|convert"):
         parse_motion_script(text)
 
 
-def test_an_unknown_motion_is_named_with_the_known_ones() -> None:
+def test_unknown_motion_is_rejected_with_the_known_ones() -> None:
     with pytest.raises(UnknownMotionError, match=r"'hop'.*stand, walk"):
-        MotionScript(DOING, [Step("hop", 1.0)])
+        MotionScript(MOTIONS_OF_STYLE, [Step("hop", 1.0)])
 
 
-def test_a_motion_from_toml_goes_through_its_keys(tmp_path: Path) -> None:
+def test_motion_from_toml_interpolates_its_keys(tmp_path: Path) -> None:
     path = tmp_path / "kick.toml"
     path.write_text(
         "loop = true\n"
@@ -212,7 +216,7 @@ def test_a_motion_from_toml_goes_through_its_keys(tmp_path: Path) -> None:
     assert found[1, HIP.start] == pytest.approx(30)
 
 
-def test_a_motion_from_npz_holds_its_end(tmp_path: Path) -> None:
+def test_motion_from_npz_holds_its_last_posture(tmp_path: Path) -> None:
     path = tmp_path / "kick.npz"
     t = np.linspace(5, 7, 50)
     np.savez(path, t=t, knee=np.column_stack([np.sin(t), 0 * t, 0 * t]))
@@ -220,13 +224,11 @@ def test_a_motion_from_npz_holds_its_end(tmp_path: Path) -> None:
     assert found[:, KNEE.start] == pytest.approx(np.sin([5.5, 7.0, 7.0]), abs=1e-4)
 
 
-def test_real_joint_angles_move_the_leg(shared_data: Path) -> None:
+def test_motion_from_opensim_has_its_joint_angles(shared_data: Path) -> None:
     path = shared_data / "opencap_subject4/ik/squats1_manual_scaling_ik.mot"
     coordinates = motion_from_file(path, STYLE)(np.arange(0, 13.4, 0.01))
     knee = np.degrees(coordinates[:, KNEE.start])
     assert (knee.min(), knee.max()) == pytest.approx((0.9, 103.6), abs=0.2)
     pose = leg_pose(GEOMETRY, coordinates)
-    assert (
-        np.ptp(pose.origins["foot"][:, 2]) < 0.08
-    )  # feet stay on the ground, bones differ a little
+    assert np.ptp(pose.origins["foot"][:, 2]) < 0.08  # flat feet; the bone lengths differ slightly
     assert np.ptp(pose.origins["thigh"][:, 2]) > 0.3

@@ -1,4 +1,4 @@
-"""The simulated NatNet server, judged by an independent client and by its own codec."""
+"""Simulated NatNet server, tested with an independent client and with the codec."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ async def serving(**options: Any) -> AsyncIterator[NatNetServer]:
         server.unplug()
 
 
-class Caller:
-    """A client that says what it is told and hears one datagram after another."""
+class BareClient:
+    """Client that sends messages and receives single datagrams."""
 
     def __init__(self, server: NatNetServer) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -65,20 +65,20 @@ class Caller:
 
     async def ask(self, message: Message) -> object:
         self.socket.send(encode(message))
-        return await self.hear()
+        return await self.receive()
 
-    async def hear(self) -> object:
+    async def receive(self) -> object:
         async with asyncio.timeout(2):
             data = await asyncio.get_running_loop().sock_recv(self.socket, 65536)
         return decode(data, self.version)
 
 
 @contextlib.asynccontextmanager
-async def calling(**options: Any) -> AsyncIterator[tuple[NatNetServer, Caller]]:
+async def calling(**options: Any) -> AsyncIterator[tuple[NatNetServer, BareClient]]:
     async with serving(**options) as server:
-        caller = Caller(server)
-        with contextlib.closing(caller.socket):
-            yield server, caller
+        client = BareClient(server)
+        with contextlib.closing(client.socket):
+            yield server, client
 
 
 def listen(server: NatNetServer, multicast: bool) -> tuple[Any, list[Any]]:
@@ -108,16 +108,16 @@ def listen(server: NatNetServer, multicast: bool) -> tuple[Any, list[Any]]:
 
 @pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
 @pytest.mark.parametrize("version", [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2)])
-async def test_an_independent_client_reads_models_and_frames(
+async def test_independent_client_reads_models_and_frames(
     version: tuple[int, int], multicast: bool
 ) -> None:
     transport = "multicast" if multicast else "unicast"
     async with serving(bitstream=version, transport=transport) as server:
-        hearing = asyncio.create_task(asyncio.to_thread(listen, server, multicast))
-        while not hearing.done():
+        listening = asyncio.create_task(asyncio.to_thread(listen, server, multicast))
+        while not listening.done():
             server.push(time.monotonic_ns(), PLACES, POSES)
             await asyncio.sleep(0.005)
-        model, frames = await hearing
+        model, frames = await listening
     assert [(body.name, body.id_num) for body in model.rigid_bodies] == [("Thigh", 7), ("Shank", 8)]
     assert [s.name for s in model.marker_sets] == ["Thigh", "Shank", "all"]
     assert len(frames) >= 5
@@ -141,35 +141,35 @@ async def test_an_independent_client_reads_models_and_frames(
     "connect",
     [Connect(0), Connect(5), Connect(264, "x"), Connect(269, "x"), Connect(271, "Ping")],
 )
-async def test_every_form_of_connect_is_answered(connect: Connect) -> None:
-    async with calling() as (server, caller):
-        info = await caller.ask(connect)
+async def test_all_forms_of_connect_are_answered(connect: Connect) -> None:
+    async with calling() as (server, client):
+        info = await client.ask(connect)
     assert isinstance(info, ServerInfo)
     assert (info.application, info.clock_hz, info.multicast) == ("Motive", 10_000_000, False)
     assert info.data_port == server.data_port
 
 
-async def test_discovery_is_answered_but_makes_no_client() -> None:
-    async with calling() as (server, caller):
-        assert isinstance(await caller.ask(Discovery(Connect(264))), ServerInfo)
+async def test_discovery_is_answered_without_adding_a_client() -> None:
+    async with calling() as (server, client):
+        assert isinstance(await client.ask(Discovery(Connect(264))), ServerInfo)
         assert server.clients == ()
 
 
-async def test_requests_are_answered_and_unknown_ones_named_so() -> None:
-    async with calling(rate_hz=200.0) as (_, caller):
-        assert await caller.ask(CommandRequest("FrameRate")) == CommandResponse(b"\0\0HC")
-        assert await caller.ask(CommandRequest("Dance")) == Bare(
+async def test_requests_are_answered_and_unknown_ones_rejected() -> None:
+    async with calling(rate_hz=200.0) as (_, client):
+        assert await client.ask(CommandRequest("FrameRate")) == CommandResponse(b"\0\0HC")
+        assert await client.ask(CommandRequest("Dance")) == Bare(
             NatNetMessageId.UNRECOGNIZED_REQUEST
         )
 
 
-async def test_echo_of_the_simulated_server_has_clock_offset_and_skew() -> None:
+async def test_echo_returns_a_clock_with_offset_and_skew() -> None:
     async with calling(clock_hz=3_312_787, device_ns=lambda ns: ns + ns // 20_000 + 10**12) as (
         _,
-        caller,
+        client,
     ):
         before = time.monotonic_ns()
-        echo = await caller.ask(EchoRequest(42))
+        echo = await client.ask(EchoRequest(42))
         after = time.monotonic_ns()
     assert isinstance(echo, EchoResponse)
     assert echo.stamp == 42
@@ -177,79 +177,79 @@ async def test_echo_of_the_simulated_server_has_clock_offset_and_skew() -> None:
     assert before * 1.00005 + 1e12 - 1e3 <= shown <= after * 1.00005 + 1e12 + 1e3
 
 
-async def test_no_frame_comes_before_the_model_was_answered() -> None:
-    async with calling() as (server, caller):
-        await caller.ask(Connect(0))
+async def test_no_frame_is_sent_before_the_model_description() -> None:
+    async with calling() as (server, client):
+        await client.ask(Connect(0))
         server.push(0, PLACES, POSES)
-        assert isinstance(await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF)), ModelDefinition)
+        assert isinstance(await client.ask(Bare(NatNetMessageId.REQUEST_MODELDEF)), ModelDefinition)
         server.push(0, PLACES, POSES)
-        assert isinstance(await caller.hear(), FrameOfData)
+        assert isinstance(await client.receive(), FrameOfData)
         assert server.sent == 1
 
 
-async def test_client_without_model_request_receives_frames_after_a_delay() -> None:
-    async with calling() as (server, caller):
-        await caller.ask(Connect(0))
+async def test_client_without_a_model_request_receives_frames_after_50_ms() -> None:
+    async with calling() as (server, client):
+        await client.ask(Connect(0))
         await asyncio.sleep(0.06)
         server.push(0, PLACES, POSES)
-        assert isinstance(await caller.hear(), FrameOfData)
+        assert isinstance(await client.receive(), FrameOfData)
 
 
-async def test_silent_client_is_dropped_and_reported() -> None:
-    async with calling(keepalive_s=0.05) as (server, caller):
-        await caller.ask(Connect(0))
+async def test_silent_client_is_disconnected_with_a_message() -> None:
+    async with calling(keepalive_s=0.05) as (server, client):
+        await client.ask(Connect(0))
         await asyncio.sleep(0.06)
         server.push(0, PLACES, POSES)
-        assert await caller.hear() == Bare(NatNetMessageId.DISCONNECTBYTIMEOUT)
+        assert await client.receive() == Bare(NatNetMessageId.DISCONNECTBYTIMEOUT)
         assert server.clients == ()
 
 
 @pytest.mark.parametrize(("hiding", "count", "params"), [("missing", 2, 10), ("filled", 3, 11)])
-async def test_occluded_markers_are_encoded_as_in_recorded_frames(
+async def test_occluded_markers_are_represented_as_in_real_frames(
     hiding: str, count: int, params: int
 ) -> None:
-    async with calling(hiding=hiding) as (server, caller):
-        await caller.ask(Connect(0))
-        await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
+    async with calling(hiding=hiding) as (server, client):
+        await client.ask(Connect(0))
+        await client.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
         places = {"T1": (1.0, 2.0, 3.0), "T2": (4.0, 5.0, 6.0), "T3": (0.0, 0.0, 1.0)}
         server.push(0, places, POSES)
-        await caller.hear()
+        await client.receive()
         server.push(0, places | {"T2": None}, {"Thigh": None})
-        frame = await caller.hear()
+        frame = await client.receive()
     assert isinstance(frame, FrameOfData)
     assert len(frame.markers) == count
     assert frame.markers[1].params == params
     body = frame.bodies[0]
-    assert (body.x, body.y, body.z, body.params) == (1.0, 3.0, -2.0, 0)  # frozen, bit 0 clear
+    assert (body.x, body.y, body.z, body.params) == (1.0, 3.0, -2.0, 0)  # last pose, bit 0 clear
 
 
-async def test_a_unicast_client_may_choose_its_bitstream_from_4_0_on() -> None:
-    async with calling(bitstream=(4, 0)) as (server, caller):
-        await caller.ask(Connect(0))
-        await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
-        answer = await caller.ask(CommandRequest("Bitstream,4.1"))
+async def test_unicast_client_selects_its_bitstream_from_4_0() -> None:
+    async with calling(bitstream=(4, 0)) as (server, client):
+        await client.ask(Connect(0))
+        await client.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
+        answer = await client.ask(CommandRequest("Bitstream,4.1"))
         assert isinstance(answer, CommandResponse)
         assert answer.text == "Bitstream,4.1"
         server.push(0, PLACES, POSES)
-        caller.version = (4, 1)
-        frame = await caller.hear()
+        client.version = (4, 1)
+        frame = await client.receive()
         assert isinstance(frame, FrameOfData)
         assert frame.params & 8
 
 
-@pytest.mark.parametrize("knob", ["loss", "duplication", "reordering", "hostile"])
-async def test_simulated_network_has_the_configured_faults(knob: str) -> None:
-    async with calling(**{knob: 0.5}) as (server, caller):
-        await caller.ask(Connect(0))
-        await caller.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
+@pytest.mark.parametrize("fault", ["loss", "duplication", "reordering", "hostile"])
+async def test_network_faults_have_their_probability(fault: str) -> None:
+    async with calling(**{fault: 0.5}) as (server, client):
+        await client.ask(Connect(0))
+        await client.ask(Bare(NatNetMessageId.REQUEST_MODELDEF))
         for _ in range(60):
             server.push(0, PLACES, POSES)
-        heard = [await caller.hear() for _ in range(server.sent)]
-    numbers = [frame.number for frame in heard if isinstance(frame, FrameOfData)]
-    seen = {
+        received = [await client.receive() for _ in range(server.sent)]
+    numbers = [frame.number for frame in received if isinstance(frame, FrameOfData)]
+    observed = {
         "loss": len(numbers) < 50,
         "duplication": len(numbers) > 70 and len(set(numbers)) == 60,
         "reordering": numbers != sorted(numbers) and len(set(numbers)) >= 59,
-        "hostile": len(heard) == 60 and len(numbers) < 50,
+        "hostile": len(received) == 60 and len(numbers) < 50,
     }
-    assert seen[knob]
+    assert observed[fault]

@@ -1,4 +1,4 @@
-"""One simulator a directory, its camera port kept for the next run, motions that follow a phase."""
+"""Directory lock, stored command port, and motions selected by the calibration phase."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def taken_port() -> Iterator[int]:
+def used_port() -> Iterator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
         holder.bind((LOOPBACK, 0))
         yield holder.getsockname()[1]
 
 
-def test_a_second_simulator_in_a_directory_is_refused_with_the_process_and_a_remedy(
+def test_second_simulator_in_a_directory_is_rejected_with_process_and_remedy(
     tmp_path: Path,
 ) -> None:
     with (
@@ -39,18 +39,16 @@ def test_a_second_simulator_in_a_directory_is_refused_with_the_process_and_a_rem
         play_directory(tmp_path),
     ):
         pass
-    with play_directory(tmp_path):  # the lock went with its owner
+    with play_directory(tmp_path):  # the first block released the lock
         pass
 
 
-def test_the_command_port_is_that_of_the_run_before_while_it_is_free(
-    tmp_path: Path, taken_port: int
-) -> None:
+def test_command_port_of_the_previous_run_is_used_if_free(tmp_path: Path, used_port: int) -> None:
     with play_directory(tmp_path) as first:
         assert first.command_port(None) == 0
-        first.remember(taken_port)
+        first.remember(used_port)
     with play_directory(tmp_path) as second:
-        assert second.command_port(None) == 0  # taken by another program
+        assert second.command_port(None) == 0  # in use by another program
         second.remember(None)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
@@ -63,27 +61,28 @@ def test_the_command_port_is_that_of_the_run_before_while_it_is_free(
 
 
 @pytest.mark.parametrize("port", [0, -1, 70_000])
-def test_a_number_that_is_no_port_is_refused(tmp_path: Path, port: int) -> None:
+def test_invalid_port_number_is_rejected(tmp_path: Path, port: int) -> None:
     with play_directory(tmp_path) as directory, pytest.raises(PortInUseError, match="1 to 65535"):
         directory.command_port(port)
 
 
-def test_a_taken_port_that_was_asked_for_is_refused_with_a_remedy(
-    tmp_path: Path, taken_port: int
-) -> None:
-    with play_directory(tmp_path) as directory, pytest.raises(PortInUseError, match="select another"):
-        directory.command_port(taken_port)
+def test_requested_port_in_use_is_rejected_with_a_remedy(tmp_path: Path, used_port: int) -> None:
+    with (
+        play_directory(tmp_path) as directory,
+        pytest.raises(PortInUseError, match="select another"),
+    ):
+        directory.command_port(used_port)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff", b"[]", b'{"command_port":"x"}', b"9" * 5000])
-def test_a_broken_state_file_is_no_obstacle(tmp_path: Path, content: bytes) -> None:
+def test_invalid_state_file_is_ignored(tmp_path: Path, content: bytes) -> None:
     (tmp_path / ".jointfit-sim.json").write_bytes(content)
     with play_directory(tmp_path) as directory:
         assert directory.command_port(None) == 0
 
 
-async def refused(*options: str) -> tuple[int | None, str]:
-    """Run ``jointfit-sim play``, which is expected to end at once."""
+async def rejected(*options: str) -> tuple[int | None, str]:
+    """Run ``jointfit-sim play``, expected to exit at once; return exit code and output."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "jointfit_simulators", "play", *options),
         stdin=asyncio.subprocess.DEVNULL,
@@ -92,18 +91,18 @@ async def refused(*options: str) -> tuple[int | None, str]:
     )
     async with asyncio.timeout(20):
         output, _ = await process.communicate()
-    process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the collector
+    process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the garbage collector
     return process.returncode, output.decode()
 
 
 def links_in(folder: Path) -> dict[str, Path]:
-    """Return where the links of the ptys point."""
+    """Return the targets of the link_targets to the ptys."""
     return {path.name: path.readlink() for path in folder.glob("tty*")}
 
 
 @pytest.mark.system
 @pytest.mark.timeout(90)
-async def test_a_running_daemon_finds_its_cameras_after_the_simulator_restarted(
+async def test_running_daemon_reconnects_to_the_cameras_of_a_restarted_simulator(
     tmp_path: Path,
 ) -> None:
     async with AsyncExitStack() as stack:
@@ -111,11 +110,11 @@ async def test_a_running_daemon_finds_its_cameras_after_the_simulator_restarted(
         station = Station(tmp_path, port)
         first = await stack.enter_async_context(station.simulator())
 
-        links = links_in(tmp_path)
-        code, output = await refused("--directory", str(tmp_path))
+        link_targets = links_in(tmp_path)
+        code, output = await rejected("--directory", str(tmp_path))
         assert code == 2, output
         assert "uses this directory" in output
-        assert links_in(tmp_path) == links
+        assert links_in(tmp_path) == link_targets
 
         await stack.enter_async_context(station.daemon())
         listener = await stack.enter_async_context(listening(port))
@@ -130,7 +129,7 @@ async def test_a_running_daemon_finds_its_cameras_after_the_simulator_restarted(
 
 @pytest.mark.system
 @pytest.mark.timeout(60)
-async def test_the_motion_follows_the_phase_that_the_daemon_publishes(tmp_path: Path) -> None:
+async def test_motion_follows_the_phase_published_by_the_daemon(tmp_path: Path) -> None:
     with embedded_broker(tmp_path) as port:
         station = Station(tmp_path, port, options=("--follow", "--programme", "walk"))
         async with running(station, 30) as (simulator, _, listener):
@@ -147,18 +146,18 @@ async def test_the_motion_follows_the_phase_that_the_daemon_publishes(tmp_path: 
             assert await motion() == "plate"
             await listener.client.request("calibrate", {"phase": "abort"})
             assert await motion() == "stand"
-            async with asyncio.timeout(10):  # a motion begins with the next samples
+            async with asyncio.timeout(10):  # a motion starts with the next block
                 await simulator.say("status")
                 while await motion() != "stand":
                     await simulator.say("status")
 
 
-def test_every_motion_of_a_phase_exists() -> None:
+def test_all_motions_of_phases_exist() -> None:
     played = {name for motions in MOTIONS_OF_PHASES.values() for name, _ in motions}
     assert played <= set(MOTIONS)
 
 
-async def test_a_phase_with_several_motions_plays_them_in_turn_until_the_next_phase(
+async def test_phase_with_several_motions_repeats_them_until_the_next_phase(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     short = {"functional": (("functional", 0.05), ("walk", 0.05)), "align": (("plate", 0.05),)}

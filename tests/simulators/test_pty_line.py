@@ -1,4 +1,4 @@
-"""A serial line made of a pty: what it accepted arrives."""
+"""Serial line based on a pty: all accepted bytes arrive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 MESSAGE = bytes(range(256)) * 4
 
 
-async def test_the_last_message_arrives_whole_once_the_host_reads_again(tmp_path: Path) -> None:
+async def test_last_message_arrives_complete_when_the_host_reads_again(tmp_path: Path) -> None:
     line = PtyLine(tmp_path / "line")
     serving = asyncio.create_task(line.serve(lambda _: None))
     await asyncio.sleep(0)

@@ -1,4 +1,4 @@
-"""A recorded trial is played as it was recorded, and its static pose stands upright."""
+"""Recorded subjects replay their trial unaltered, with an upright static pose."""
 
 from __future__ import annotations
 
@@ -36,17 +36,19 @@ def squats(shared_data: Path) -> list[Path]:
     return [semireal / "squats1.npz", semireal / "static_bias.json", opencap]
 
 
-def test_sensors_bones_and_markers_are_those_of_the_files(squats: list[Path]) -> None:
+def test_recorded_subject_reproduces_sensors_bones_and_markers_of_the_files(
+    squats: list[Path],
+) -> None:
     recorded = read_orientations_npz(squats[0])
     subject = RecordedSubject(
         read_recorded_trial(squats), SENSORS, [Step("trial", 1.0)], transition_s=1.5
     )
-    t = recorded.t_s - recorded.t_s[0] + 1.5  # the trial begins when it has faded in
+    t = recorded.t_s - recorded.t_s[0] + 1.5  # the trial starts after the blend
     found = subject.observe([t] * 4, t, t)
     for name, q in zip(SENSORS, found.sensors, strict=True):
-        said = Rotation.from_quat(q, scalar_first=True)
-        was = Rotation.from_quat(recorded.sensors[name], scalar_first=True)
-        assert np.degrees((said.inv() * was).magnitude()).max() < 1e-4
+        measured = Rotation.from_quat(q, scalar_first=True)
+        expected = Rotation.from_quat(recorded.sensors[name], scalar_first=True)
+        assert np.degrees((measured.inv() * expected).magnitude()).max() < 1e-4
     knee = np.degrees(found.truth.knee[:, 0])
     assert (knee.min(), knee.max()) == pytest.approx((7.3, 104.5), abs=0.06)
     np.testing.assert_allclose(found.truth.joints["knee"], recorded.origins["tibia_r"], atol=1e-6)
@@ -61,17 +63,19 @@ def test_sensors_bones_and_markers_are_those_of_the_files(squats: list[Path]) ->
     assert np.median(apart) < 0.002
 
 
-def test_between_samples_the_recording_is_interpolated(squats: list[Path]) -> None:
+def test_recording_is_interpolated_between_samples(squats: list[Path]) -> None:
     recorded = read_orientations_npz(squats[0])
     track = InterpolatedTrack(recorded.t_s, recorded.sensors["S3"], rotation=True)
     middle = (recorded.t_s[:-1] + recorded.t_s[1:]) / 2
-    said = Rotation.from_quat(track.at(middle), scalar_first=True)
-    was = Rotation.from_quat(recorded.sensors["S3"], scalar_first=True)
-    halfway = was[:-1] * Rotation.from_rotvec((was[:-1].inv() * was[1:]).as_rotvec() / 2)
-    assert np.degrees((said.inv() * halfway).magnitude()).max() < 1e-3
+    measured = Rotation.from_quat(track.at(middle), scalar_first=True)
+    expected = Rotation.from_quat(recorded.sensors["S3"], scalar_first=True)
+    halfway = expected[:-1] * Rotation.from_rotvec(
+        (expected[:-1].inv() * expected[1:]).as_rotvec() / 2
+    )
+    assert np.degrees((measured.inv() * halfway).magnitude()).max() < 1e-3
 
 
-def test_with_its_biases_the_static_pose_is_upright(squats: list[Path]) -> None:
+def test_static_pose_with_known_biases_is_upright(squats: list[Path]) -> None:
     subject = RecordedSubject(
         read_recorded_trial(squats), SENSORS, parse_motion_script("stand:9,trial")
     )
@@ -80,23 +84,23 @@ def test_with_its_biases_the_static_pose_is_upright(squats: list[Path]) -> None:
     assert found.truth.orientations["thigh"].magnitude().max() < 1e-9
     bias = json.loads(squats[1].read_text())["q_bias"]["S1"]
     q_bias = Rotation.from_quat(np.array(bias)[[0, 3, 1, 2]], scalar_first=True)
-    said = Rotation.from_quat(found.sensors[0], scalar_first=True)
-    assert (said * q_bias).magnitude().max() < 1e-9  # q_sensor q_bias = q_segment = identity
+    measured = Rotation.from_quat(found.sensors[0], scalar_first=True)
+    assert (measured * q_bias).magnitude().max() < 1e-9  # q_sensor q_bias = q_segment = identity
 
 
-def test_transition_from_standing_to_the_trial_is_continuous(squats: list[Path]) -> None:
+def test_orientations_are_continuous_between_standing_and_trial(squats: list[Path]) -> None:
     subject = RecordedSubject(
         read_recorded_trial(squats), SENSORS, parse_motion_script("stand:2,trial:12,stand")
     )
     t = np.arange(0.0, 18.0, 0.005)
     found = subject.observe([t] * 4, t, t)
     for q in found.sensors:
-        said = Rotation.from_quat(q, scalar_first=True)
-        assert np.degrees((said[:-1].inv() * said[1:]).magnitude()).max() < 2.5
+        measured = Rotation.from_quat(q, scalar_first=True)
+        assert np.degrees((measured[:-1].inv() * measured[1:]).magnitude()).max() < 2.5
     assert [subject.motion_at(x) for x in (1.0, 3.0, 15.0)] == ["stand", "trial", "stand"]
 
 
-def test_a_missing_marker_makes_a_missing_sample_not_a_made_up_one(shared_data: Path) -> None:
+def test_missing_recorded_samples_are_not_interpolated(shared_data: Path) -> None:
     walking = shared_data / "semireal_knee4imu/walking1.npz"
     recorded = read_orientations_npz(walking)
     subject = RecordedSubject(
@@ -106,7 +110,7 @@ def test_a_missing_marker_makes_a_missing_sample_not_a_made_up_one(shared_data: 
     found = subject.observe([t] * 4, NONE, NONE)
     missing = [int(np.isnan(q[:, 0]).sum()) for q in found.sensors]
     assert missing[0] == missing[2] == missing[3] == 0
-    assert 3 <= missing[1] <= 6  # a gap's neighbours may fall a rounding error into it
+    assert 3 <= missing[1] <= 6  # rounding may extend a gap to the adjacent samples
 
 
 def test_reference_bones_are_streamed_as_bodies(squats: list[Path]) -> None:
@@ -114,14 +118,14 @@ def test_reference_bones_are_streamed_as_bodies(squats: list[Path]) -> None:
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
     t = np.arange(2.0, 8.0, 0.1)
     observation = subject.observe([NONE] * 4, t, t)
-    seen = cameras.capture(observation)
+    frames = cameras.capture(observation)
     assert cameras.bodies == ("Thigh", "Shank")
-    body = Rotation.from_quat(seen.body_orientations[:, 1], scalar_first=True)
+    body = Rotation.from_quat(frames.body_orientations[:, 1], scalar_first=True)
     apart = body.inv() * observation.truth.orientations["shank"]
     assert apart.magnitude().max() < 1e-9
 
 
-def test_files_that_make_no_trial_are_refused(tmp_path: Path, squats: list[Path]) -> None:
+def test_incomplete_or_unknown_trial_files_are_rejected(tmp_path: Path, squats: list[Path]) -> None:
     with pytest.raises(ValueError, match="got 0"):
         read_recorded_trial(squats[1:])
     with pytest.raises(ValueError, match=r"'\.txt'"):
@@ -149,31 +153,31 @@ def test_truth_log_contains_past_instants_only_and_null_for_unknown_values(
     assert rows[0]["included"] == pytest.approx(np.pi - abs(rows[0]["knee"]["flexion"]), abs=0.05)
 
 
-def test_a_part_of_the_trial_is_played_at_its_place(squats: list[Path]) -> None:
+def test_part_of_a_trial_is_played_at_its_time(squats: list[Path]) -> None:
     recorded = read_orientations_npz(squats[0])
     steps = parse_motion_script("stand:2,trial@8.06-9:9")
     subject = RecordedSubject(read_recorded_trial(squats), SENSORS, steps, transition_s=1.0)
-    t = 3.0 + np.arange(0.0, 0.95, 0.02)  # the blend is over at 3 s
+    t = 3.0 + np.arange(0.0, 0.95, 0.02)  # the blend ends at 3 s
     found = subject.observe([t] * 4, t, t)
     first = round(8.06 * 50)
-    was = Rotation.from_quat(recorded.sensors["S2"][first : first + len(t)], scalar_first=True)
-    said = Rotation.from_quat(found.sensors[1], scalar_first=True)
-    assert np.degrees((said.inv() * was).magnitude()).max() < 1e-4
+    expected = Rotation.from_quat(recorded.sensors["S2"][first : first + len(t)], scalar_first=True)
+    measured = Rotation.from_quat(found.sensors[1], scalar_first=True)
+    assert np.degrees((measured.inv() * expected).magnitude()).max() < 1e-4
     with pytest.raises(UnknownMotionError, match=r"13\.44 s long"):
         subject.play("trial@13.5-", 20.0)
 
 
-def test_cameras_track_bones_except_in_interpolated_frames(squats: list[Path]) -> None:
+def test_cameras_see_no_bones_during_synthetic_intervals(squats: list[Path]) -> None:
     steps = parse_motion_script("stand:2,trial@0-4:8,stand")
     subject = RecordedSubject(read_recorded_trial(squats), SENSORS, steps, transition_s=1.0)
     cameras = Cameras(perfect(Knobs()), subject, rate_hz=100.0)
     t = np.array([1.0, 1.99, 2.01, 2.5, 2.99, 3.0, 5.0, 7.0, 7.01, 9.9, 10.5, 11.01])
-    seen = cameras.capture(subject.observe([NONE] * 4, t, t)).body_positions[:, :, 0]
+    frames = cameras.capture(subject.observe([NONE] * 4, t, t)).body_positions[:, :, 0]
     visible = [True, True, False, False, False, True, True, True, False, False, False, True]
-    assert np.isfinite(seen).all(axis=1).tolist() == visible
+    assert np.isfinite(frames).all(axis=1).tolist() == visible
 
 
-def test_standing_the_shank_hangs_on_the_thigh_where_it_hung_in_the_trial(
+def test_standing_shank_is_attached_to_the_thigh_as_in_the_trial(
     squats: list[Path],
 ) -> None:
     recorded = read_orientations_npz(squats[0])

@@ -1,4 +1,4 @@
-"""A scene whose clocks are asked for, whose script reboots devices, and which tells the truth."""
+"""Scenes with prescribed clocks, scheduled commands and a log of sampling times."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.settings import Knobs
 
 NOW = 10**13
-"""Host time for parts that look at no clock of their own."""
+"""Host time for parts without a clock, ns."""
 
 
-def test_a_clock_runs_as_it_is_asked_to() -> None:
-    ticker = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
-    ticker.set_fault(ClockFault.parse("50,3600"), NOW)
-    assert ticker.device_ns(NOW) == pytest.approx(3600 * NS * (1 + 50e-6), abs=1)
-    hour_later = ticker.device_ns(NOW + 3600 * NS) - ticker.device_ns(NOW)
+def test_prescribed_clock_has_its_skew_and_uptime() -> None:
+    timing = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
+    timing.set_fault(ClockFault.parse("50,3600"), NOW)
+    assert timing.device_ns(NOW) == pytest.approx(3600 * NS * (1 + 50e-6), abs=1)
+    hour_later = timing.device_ns(NOW + 3600 * NS) - timing.device_ns(NOW)
     assert hour_later == pytest.approx(3600 * NS + 3600 * 50_000, abs=2)
-    ticker.reboot(NOW + NS)
-    assert ticker.device_ns(NOW + 2 * NS) == pytest.approx(NS, abs=60_000)
+    timing.reboot(NOW + NS)
+    assert timing.device_ns(NOW + 2 * NS) == pytest.approx(NS, abs=60_000)
 
 
-def test_a_skew_alone_leaves_the_start_to_the_dice() -> None:
-    ticker = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
-    boot_ns = ticker.clock.boot_ns
-    ticker.set_fault(ClockFault.parse("-20"), NOW)
-    assert ticker.clock.boot_ns == boot_ns
-    assert ticker.clock.skew == pytest.approx(-20e-6)
+def test_prescribed_skew_keeps_the_random_uptime() -> None:
+    timing = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
+    boot_ns = timing.clock.boot_ns
+    timing.set_fault(ClockFault.parse("-20"), NOW)
+    assert timing.clock.boot_ns == boot_ns
+    assert timing.clock.skew == pytest.approx(-20e-6)
 
 
 def test_sample_log_contains_device_number_and_instant(tmp_path: Path) -> None:
@@ -48,22 +48,22 @@ def test_sample_log_contains_device_number_and_instant(tmp_path: Path) -> None:
 
 def scene(folder: Path, **options: Any) -> Scene:
     knobs = Knobs()
-    wearer = SimulatedSubject(knobs, parse_motion_script("stand"), motion_files={})
-    now_ns = time.monotonic_ns()  # the script waits for instants after it
-    return Scene(knobs, wearer, SceneOptions(folder, **options), now_ns=now_ns)
+    subject = SimulatedSubject(knobs, parse_motion_script("stand"), motion_files={})
+    now_ns = time.monotonic_ns()  # the scheduled commands refer to it
+    return Scene(knobs, subject, SceneOptions(folder, **options), now_ns=now_ns)
 
 
-def test_clocks_that_are_not_there_cannot_be_asked(tmp_path: Path) -> None:
+def test_unknown_clocks_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommandError, match=r"S9.*there are: S1"):
         scene(tmp_path, clocks={"S9": ClockFault(1.0)})
 
 
-async def test_script_commands_run_on_time_and_errors_are_reported(tmp_path: Path) -> None:
+async def test_scheduled_commands_run_in_time_and_their_errors_are_reported(tmp_path: Path) -> None:
     script = ((0.0, "reboot S9"), (0.0, "mocap restart"), (0.1, "quit"))
-    said: list[dict[str, object]] = []
+    reported: list[dict[str, object]] = []
     async with asyncio.timeout(10):
-        await scene(tmp_path, script=script, sync_line=True).run(said.append)
-    assert [line for line in said if "error" in line] == [
+        await scene(tmp_path, script=script, sync_line=True).run(reported.append)
+    assert [line for line in reported if "error" in line] == [
         {"error": "no sensor 'S9'; there are: S1, S2, S3, S4"}
     ]
     text = (tmp_path / "rig.toml").read_text(encoding="utf-8")
@@ -75,7 +75,7 @@ def descriptors() -> set[str]:
     return {path.name for path in Path("/proc/self/fd").iterdir()}
 
 
-async def test_a_cancelled_scene_closes_its_ports_and_files(tmp_path: Path) -> None:
+async def test_cancelled_scene_closes_its_ports_and_files(tmp_path: Path) -> None:
     before = descriptors()
     ready = asyncio.Event()
     playing = asyncio.create_task(scene(tmp_path, sample_log=True).run(lambda _: ready.set()))

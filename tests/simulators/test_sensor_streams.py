@@ -1,4 +1,4 @@
-"""A stream accounts for every sample, and what the device stamps is when it was taken."""
+"""IMU streams count every sample and stamp it with its sampling time."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 NOW = 5 * 10**12
 
 
-class Listed:
-    """A device that keeps what it sends, and whose line is full when asked to be."""
+class StoringDevice:
+    """Device that stores its samples; its line can be full."""
 
     rate_hz = 100.0
     counter = line_ns = 0
 
     def __init__(self) -> None:
         self.streaming, self.full = True, False
-        self.kept: list[tuple[int, tuple[float, ...]]] = []
+        self.samples: list[tuple[int, tuple[float, ...]]] = []
         self.lost = self._to_lose = 0
         self.plugged = True
 
     @property
     def sent(self) -> int:
-        return len(self.kept)
+        return len(self.samples)
 
     def push(self, device_ns: int, q_world_sensor: tuple[float, float, float, float]) -> None:
         if self._to_lose:
             self._to_lose -= 1
             self.lost += 1
         elif not self.full:
-            self.kept.append((device_ns, q_world_sensor))
+            self.samples.append((device_ns, q_world_sensor))
 
     def lose(self, count: int) -> None:
         self._to_lose += count
@@ -54,12 +54,12 @@ class Listed:
     async def run(self) -> None: ...
 
 
-def stream(knobs: Knobs, device: Listed, *, shared: bool = False) -> ImuStream:
+def stream(knobs: Knobs, device: StoringDevice, *, shared: bool = False) -> ImuStream:
     return ImuStream(knobs, "S1", device, latency_ms=2.0, shared_wire=shared, now_ns=NOW)
 
 
 def play(source: ImuStream, seconds: int, begin_s: int = 0, *, sending: bool = True) -> int:
-    """Send so many seconds of standing upright; return how many samples were taken."""
+    """Send some seconds of upright stance; return the number of samples taken."""
     begin = NOW + begin_s * NS
     instants = source.plan(begin, begin + seconds * NS)
     assert np.all((instants >= begin) & (instants < begin + seconds * NS))
@@ -71,7 +71,7 @@ def play(source: ImuStream, seconds: int, begin_s: int = 0, *, sending: bool = T
 
 @pytest.mark.parametrize("skew", [0, 50])
 def test_every_sample_is_sent_dropped_or_refused(skew: int) -> None:
-    device = Listed()
+    device = StoringDevice()
     source = stream(
         apply_settings(perfect(Knobs()), ["dropout=0.1", f"clock_skew_ppm={skew}"]), device
     )
@@ -85,12 +85,12 @@ def test_every_sample_is_sent_dropped_or_refused(skew: int) -> None:
     assert source.unheard == 0
 
 
-def test_unreceived_samples_are_counted_separately() -> None:
-    device = Listed()
+def test_samples_without_a_receiver_are_counted_separately() -> None:
+    device = StoringDevice()
     source = stream(perfect(Knobs()), device, shared=True)
     source.unplug()
     unheard = play(source, 1)
-    assert device.plugged  # others are on that wire
+    assert device.plugged  # other devices share the wire
     source.plug()
     unheard += play(source, 1, 1, sending=False)
     device.streaming = False
@@ -98,8 +98,8 @@ def test_unreceived_samples_are_counted_separately() -> None:
     assert (device.sent, source.unheard) == (0, unheard)
 
 
-def test_a_wire_of_its_own_is_taken_away() -> None:
-    device = Listed()
+def test_unplugging_disconnects_an_unshared_wire() -> None:
+    device = StoringDevice()
     source = stream(perfect(Knobs()), device)
     source.unplug()
     assert not device.plugged
@@ -107,8 +107,8 @@ def test_a_wire_of_its_own_is_taken_away() -> None:
     assert device.plugged
 
 
-def test_stamps_are_the_devices_own_time_of_the_true_instant() -> None:
-    device = Listed()
+def test_stamps_are_device_times_of_the_true_instants() -> None:
+    device = StoringDevice()
     source = stream(
         apply_settings(perfect(Knobs()), ["clock_skew_ppm=50", "latency_jitter_ms=5"]), device
     )
@@ -117,11 +117,11 @@ def test_stamps_are_the_devices_own_time_of_the_true_instant() -> None:
         source.emit()
     clock = source.timing.clock
     shown = [clock.device_ns(int(t)) for t in instants]
-    assert np.abs(np.subtract([stamp for stamp, _ in device.kept], shown)).max() <= 2
+    assert np.abs(np.subtract([stamp for stamp, _ in device.samples], shown)).max() <= 2
     assert clock.skew != 0
 
 
-def test_a_track_of_either_sign_is_one_rotation() -> None:
+def test_interpolation_does_not_depend_on_quaternion_signs() -> None:
     t = np.linspace(0.0, 1.0, 40)
     turns = Rotation.from_rotvec(np.outer(t, [0.3, 2.0, -0.5]))
     quaternions = turns.as_quat(scalar_first=True)

@@ -1,4 +1,4 @@
-"""The program as its users run it: one ready line, commands on stdin, an honest account."""
+"""The program jointfit-sim as a process: ready line, commands on stdin, final counts."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ class Sim:
             found: dict[str, Any] = json.loads(await self.process.stdout.readline())
         return found
 
-    async def tell(self, command: str) -> None:
+    async def send(self, command: str) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(f"{command}\n".encode())
         await self.process.stdin.drain()
 
     async def ask(self, command: str = "status") -> dict[str, Any]:
-        await self.tell(command)
+        await self.send(command)
         return await self.line()
 
 
 def close_pipes(process: Any) -> None:
-    """Close what asyncio leaves to the garbage collector: its pipes would outlive the test."""
+    """Close the pipes that asyncio leaves to the garbage collector, which runs after the test."""
     process._transport.close()
 
 
@@ -73,110 +73,110 @@ async def playing(directory: Path, *options: str) -> AsyncIterator[tuple[Sim, di
         close_pipes(process)
 
 
-async def listen(source: Source, heard: list[Decoded]) -> None:
+async def listen(source: Source, received: list[Decoded]) -> None:
     driver = source.driver_class(source.settings)
     decoder = driver.decoder()
 
     def emit(chunk: Chunk) -> None:
-        heard.extend(decoder.feed(chunk))
+        received.extend(decoder.feed(chunk))
 
     await driver.run(emit)
 
 
-def counts(heard: dict[str, list[Decoded]]) -> dict[str, int]:
+def counts(received: dict[str, list[Decoded]]) -> dict[str, int]:
     return {
         name: sum(isinstance(item, ImuSample | MocapFrame) for item in items)
-        for name, items in heard.items()
+        for name, items in received.items()
     }
 
 
-async def quiet(sim: Sim, heard: dict[str, list[Decoded]]) -> Counter[str]:
-    """Pause until nothing is under way; return what was sent and not heard by then.
+async def unreceived(sim: Sim, received: dict[str, list[Decoded]]) -> Counter[str]:
+    """Pause until no message is in transit; return the numbers of samples sent and not received.
 
-    Shorter than the silence after which a driver gives a device up.
+    The pause is shorter than the silence after which a driver reports a lost device.
     """
-    await sim.tell("pause on")
+    await sim.send("pause on")
     await asyncio.sleep(0.4)
     status = await sim.ask()
-    await sim.tell("pause off")
+    await sim.send("pause off")
     sent = Counter({name: device["sent"] for name, device in status["devices"].items()})
     sent["mocap"] = status["mocap"]["sent"]
-    sent.subtract(counts(heard))
+    sent.subtract(counts(received))
     return sent
 
 
-async def test_drivers_receive_every_simulated_sample(tmp_path: Path) -> None:
+async def test_drivers_receive_every_sample_sent(tmp_path: Path) -> None:
     async with playing(tmp_path, "--programme", "walk") as (sim, ready):
         rig = load_rig(tmp_path / "rig.toml")
         assert ready["ready"] is True
         assert ready["rig"] == str(tmp_path / "rig.toml")
-        heard: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
+        received: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
         async with asyncio.TaskGroup() as tasks:
             listening = [
-                tasks.create_task(listen(source, heard[source.id])) for source in rig.sources
+                tasks.create_task(listen(source, received[source.id])) for source in rig.sources
             ]
-            await asyncio.sleep(1.5)  # until all have their handshakes and the optical model
-            at_first = await quiet(sim, heard)
-            before = counts(heard)
+            await asyncio.sleep(1.5)  # handshakes and model description
+            at_first = await unreceived(sim, received)
+            before = counts(received)
             await asyncio.sleep(3.0)
-            at_last = await quiet(sim, heard)
+            at_last = await unreceived(sim, received)
             for task in listening:
                 task.cancel()
-        await sim.tell("quit")
+        await sim.send("quit")
         account = await sim.line()
         assert await sim.process.wait() == 0
     assert at_first == at_last
     assert all(at_first[name] <= 3 for name in ("S1", "S2", "S3", "S4"))
-    assert min(n - before[name] for name, n in counts(heard).items()) > 200
+    assert min(n - before[name] for name, n in counts(received).items()) > 200
     assert sum(account["dropped_out"].values()) > 0
     assert sum(account["refused"].values()) == 0
-    assert not any(isinstance(item, Corrupt) for items in heard.values() for item in items)
+    assert not any(isinstance(item, Corrupt) for items in received.values() for item in items)
 
 
-async def test_received_orientations_equal_the_truth_without_imperfections(tmp_path: Path) -> None:
+async def test_measurements_without_errors_equal_the_ground_truth(tmp_path: Path) -> None:
     async with playing(tmp_path, "--perfect", "--programme", "squat", "--rate", "200") as (sim, _):
         rig = load_rig(tmp_path / "rig.toml")
-        heard: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
+        received: dict[str, list[Decoded]] = {source.id: [] for source in rig.sources}
         async with asyncio.TaskGroup() as tasks:
             listening = [
-                tasks.create_task(listen(source, heard[source.id])) for source in rig.sources
+                tasks.create_task(listen(source, received[source.id])) for source in rig.sources
             ]
             await asyncio.sleep(3.0)
             for task in listening:
                 task.cancel()
-        await sim.tell("quit")
+        await sim.send("quit")
         await sim.line()
     first, *truth = map(json.loads, (tmp_path / "truth.jsonl").read_text().splitlines())
     t_ns = np.array([row["t_ns"] for row in truth])
     for name, segment in first["sensors"].items():
-        samples = [item for item in heard[name] if isinstance(item, ImuSample)]
+        samples = [item for item in received[name] if isinstance(item, ImuSample)]
         boot = first["clocks"][name]["boot_ns"]
         ticks = np.unwrap([float(s.ticks or 0) for s in samples], period=2.0**32)
         wraps = np.round((samples[0].arrival_ns - boot) / 1e5 / 2**32 - ticks[0] / 2**32)
         at_ns = boot + (ticks + wraps * 2**32) * 1e5
-        said = Rotation.from_quat([s.q_world_sensor for s in samples], scalar_first=True)
-        near = np.clip(np.searchsorted(t_ns, at_ns), 1, len(t_ns) - 1)
-        near -= at_ns - t_ns[near - 1] < t_ns[near] - at_ns
-        was = Rotation.from_quat(
-            [truth[i]["q_world_segment"][segment] for i in near], scalar_first=True
+        measured = Rotation.from_quat([s.q_world_sensor for s in samples], scalar_first=True)
+        nearest = np.clip(np.searchsorted(t_ns, at_ns), 1, len(t_ns) - 1)
+        nearest -= at_ns - t_ns[nearest - 1] < t_ns[nearest] - at_ns
+        expected = Rotation.from_quat(
+            [truth[i]["q_world_segment"][segment] for i in nearest], scalar_first=True
         )
-        apart = np.degrees((said.inv() * was).magnitude())
+        apart = np.degrees((measured.inv() * expected).magnitude())
         assert apart.max() < 1.5  # 5 ms of a squat
         assert np.median(apart) < 0.5
 
 
-async def test_commands_change_the_scene_and_invalid_ones_return_an_error(tmp_path: Path) -> None:
+async def test_commands_change_the_scene_and_invalid_ones_are_reported(tmp_path: Path) -> None:
     async with playing(tmp_path, "--no-mocap") as (sim, _):
         assert (await sim.ask())["motion"] == "stand"
-        await sim.tell("play walk")
-        await sim.tell("unplug S1")
+        await sim.send("play walk")
+        await sim.send("unplug S1")
         await asyncio.sleep(0.5)
         assert (await sim.ask())["motion"] == "walk"
         assert not (tmp_path / "ttyS1").is_symlink()
-        await sim.tell("plug S1")
+        await sim.send("plug S1")
         await sim.ask()
         assert (tmp_path / "ttyS1").exists()
-        await sim.tell("unplug can0")
+        await sim.send("unplug can0")
         await sim.ask()
         assert not (tmp_path / "ttyCAN0").is_symlink()
         for command, hint in (
@@ -189,13 +189,13 @@ async def test_commands_change_the_scene_and_invalid_ones_return_an_error(tmp_pa
         ):
             assert hint in (await sim.ask(command))["error"]
         for command in ("stick S3", "free S3", "slip S3 5", "drift S3 -1.5"):
-            await sim.tell(command)
+            await sim.send(command)
         for command in ("reboot S3", "occlude on", "mocap stop", "mocap start", "pause off", ""):
-            await sim.tell(command)
+            await sim.send(command)
         assert (await sim.ask())["motion"] == "walk"
 
 
-async def test_the_truth_is_written_while_it_happens(tmp_path: Path) -> None:
+async def test_ground_truth_is_written_in_real_time(tmp_path: Path) -> None:
     async with playing(tmp_path, "--no-mocap", "--programme", "stand:1,walk") as _:
         await asyncio.sleep(2.5)
         lines = (tmp_path / "truth.jsonl").read_text().splitlines()
@@ -215,7 +215,9 @@ async def test_the_truth_is_written_while_it_happens(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_a_signal_ends_it_with_its_account(tmp_path: Path, number: signal.Signals) -> None:
+async def test_signal_stops_the_simulator_with_its_counts(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     async with playing(tmp_path) as (sim, _):
         os.kill(sim.process.pid, number)
         assert set(await sim.line()) == {"sent", "dropped_out", "refused", "unheard"}
@@ -223,7 +225,7 @@ async def test_a_signal_ends_it_with_its_account(tmp_path: Path, number: signal.
     assert not (tmp_path / "ttyS1").is_symlink()
 
 
-async def test_a_recorded_trial_plays_from_the_command_line(
+async def test_recorded_trial_plays_from_the_command_line(
     tmp_path: Path, shared_data: Path
 ) -> None:
     semireal = shared_data / "semireal_knee4imu"
@@ -244,14 +246,14 @@ async def test_a_recorded_trial_plays_from_the_command_line(
         (["--trial", "nothing.npz"], "nothing.npz"),
     ],
 )
-async def test_wrong_command_line_exits_with_2_and_a_message(
+async def test_invalid_command_line_exits_with_2_and_a_reason(
     tmp_path: Path, options: list[str], message: str
 ) -> None:
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "jointfit_simulators", "play", "--directory", str(tmp_path), *options,
         stdin=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
-    _, said = await process.communicate()
+    _, message_bytes = await process.communicate()
     close_pipes(process)
     assert process.returncode == 2
-    assert message in said.decode()
+    assert message in message_bytes.decode()

@@ -1,4 +1,4 @@
-"""The simulated Xbus device: what real ones do, byte for byte, without a driver."""
+"""Simulated Xbus device: messages of real devices, without a driver."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PERIOD_NS = 10_000_000
 
 
 class Host:
-    """The host's end of the line, bare."""
+    """Host end of the line, without a driver."""
 
     def __init__(self, link: Path, **options: Any) -> None:
         self.device = XbusDevice(link, options=XbusDeviceOptions(**options))
@@ -36,21 +36,21 @@ class Host:
         os.close(self._fd)
         self.device.unplug()
 
-    def hear(self) -> list[XbusMessage]:
+    def receive(self) -> list[XbusMessage]:
         data = b""
-        while select.select([self._fd], [], [], 0.05)[0]:  # the kernel delivers when it likes
+        while select.select([self._fd], [], [], 0.05)[0]:  # until the kernel delivers no more
             data += os.read(self._fd, 65536)
         return [event for event in self._decoder.feed(data) if isinstance(event, XbusMessage)]
 
     async def ask(self, mid: int, data: bytes = b"") -> list[XbusMessage]:
         os.write(self._fd, encode(mid, data))
         await asyncio.sleep(0.02)
-        return self.hear()
+        return self.receive()
 
     def items(self) -> list[dict[int, Any]]:
         return [
             {data_id: decode_item(data_id, raw) for data_id, raw in split(message.data) or []}
-            for message in self.hear()
+            for message in self.receive()
         ]
 
 
@@ -66,7 +66,7 @@ def streams(**options: Any) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("host", [more], indirect=True, ids=[""])
 
 
-async def test_a_bad_output_list_is_error_21(host: Host) -> None:
+async def test_invalid_output_configuration_returns_error_21(host: Host) -> None:
     serve = asyncio.create_task(host.device.run())
     for outputs in ([(0x7777, 100)], [(0x2010, 401)]):
         (reply,) = await host.ask(XbusMessageId.OUTPUT_CONFIGURATION, setup.encode_outputs(outputs))
@@ -77,7 +77,7 @@ async def test_a_bad_output_list_is_error_21(host: Host) -> None:
 
 
 @pytest.mark.parametrize(("asked", "used"), [(100, 100), (120, 100), (0xFFFF, 400), (150, 133)])
-async def test_acknowledgement_contains_the_actual_rates(host: Host, asked: int, used: int) -> None:
+async def test_acknowledgement_contains_the_rates_in_use(host: Host, asked: int, used: int) -> None:
     serve = asyncio.create_task(host.device.run())
     wanted = setup.encode_outputs([(0x1020, 100), (0x2010, asked)])
     (reply,) = await host.ask(XbusMessageId.OUTPUT_CONFIGURATION, wanted)
@@ -88,10 +88,10 @@ async def test_acknowledgement_contains_the_actual_rates(host: Host, asked: int,
 
 
 @pytest.mark.parametrize("host", [{"wakes_up": True}], indirect=True, ids=[""])
-async def test_left_alone_after_waking_up_it_measures(host: Host) -> None:
+async def test_device_measures_if_wake_up_is_not_acknowledged(host: Host) -> None:
     serve = asyncio.create_task(host.device.run())
     await asyncio.sleep(0.05)
-    assert [message.mid for message in host.hear()] == [XbusMessageId.WAKE_UP]
+    assert [message.mid for message in host.receive()] == [XbusMessageId.WAKE_UP]
     before = host.device.streaming
     await asyncio.sleep(WAKE_UP_S)
     assert (before, host.device.streaming) == (False, True)
@@ -100,9 +100,7 @@ async def test_left_alone_after_waking_up_it_measures(host: Host) -> None:
 
 
 @pytest.mark.parametrize("host", [{"wakes_up": True}], indirect=True, ids=[""])
-async def test_simulated_device_remains_in_configuration_after_a_wake_up_acknowledgement(
-    host: Host,
-) -> None:
+async def test_device_enters_configuration_if_wake_up_is_acknowledged(host: Host) -> None:
     serve = asyncio.create_task(host.device.run())
     await asyncio.sleep(0.05)
     await host.ask(XbusMessageId.WAKE_UP_ACK)
@@ -113,7 +111,7 @@ async def test_simulated_device_remains_in_configuration_after_a_wake_up_acknowl
 
 
 @streams(product_code="MTi-300-AHRS", first_tick=863_999_850)
-def test_a_device_with_a_day_clock_wraps_at_midnight(host: Host) -> None:
+def test_device_with_a_day_clock_wraps_at_midnight(host: Host) -> None:
     for number in range(3):
         host.device.push(number * PERIOD_NS, IDENTITY)
     assert [items[Item.SAMPLE_TIME_FINE] for items in host.items()] == [
@@ -122,20 +120,20 @@ def test_a_device_with_a_day_clock_wraps_at_midnight(host: Host) -> None:
 
 
 @streams(gnss=True)
-def test_foreign_messages_take_counters_and_hold_no_orientation(host: Host) -> None:
+def test_gnss_messages_increment_the_counter_without_an_orientation(host: Host) -> None:
     for number in range(40):
         host.device.push(number * PERIOD_NS, IDENTITY)
     found = host.items()
-    foreign = [items for items in found if Item.QUATERNION not in items]
+    gnss = [items for items in found if Item.QUATERNION not in items]
     times = [items[Item.SAMPLE_TIME_FINE] for items in found]
-    assert len(found) - len(foreign) == host.device.sent == 40
-    assert len(foreign) == 3
+    assert len(found) - len(gnss) == host.device.sent == 40
+    assert len(gnss) == 3
     assert [items[Item.PACKET_COUNTER] for items in found] == list(range(43))
     assert any(after < before for before, after in itertools.pairwise(times))
 
 
 @streams(first_counter=65534)
-def test_lost_messages_take_counters_and_are_not_sent(host: Host) -> None:
+def test_lost_messages_increment_the_counter_and_are_not_sent(host: Host) -> None:
     host.device.push(0, IDENTITY)
     host.device.lose(2)
     for number in range(1, 4):
@@ -145,7 +143,7 @@ def test_lost_messages_take_counters_and_are_not_sent(host: Host) -> None:
 
 
 @streams()
-def test_unread_line_loses_complete_samples(host: Host) -> None:
+def test_full_line_loses_complete_samples(host: Host) -> None:
     for number in range(5000):
         host.device.push(number * PERIOD_NS, IDENTITY)
     assert host.device.sent < 5000
@@ -158,7 +156,7 @@ def test_unread_line_loses_complete_samples(host: Host) -> None:
     assert host._decoder.discarded == host._decoder.pending == 0
 
 
-def test_device_in_configuration_sends_no_sample(host: Host) -> None:
+def test_device_in_configuration_sends_nothing(host: Host) -> None:
     host.device.push(0, IDENTITY)
     assert host.items() == []
     assert host.device.sent == 0

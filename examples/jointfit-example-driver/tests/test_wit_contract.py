@@ -1,4 +1,4 @@
-"""The driver against the conformance suite that jointfitd ships for every driver."""
+"""Conformance suite of jointfitd, run for the WitMotion driver."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import WireNoise
 
 
-class Typewriter:
-    """Sends words all the time: what is no WitMotion device."""
+class TextDevice:
+    """Device that is no WitMotion IMU: it sends text."""
 
     def __init__(self, link: Path) -> None:
         self._line = PtyLine(link)
@@ -40,15 +40,15 @@ class TestWit(DriverContract):
         port = str(folder / "imu")
         return WitImu(WitSettings(id="S1", segment="thigh", driver="wit", port=port, silence_s=0.4))
 
-    def make_wrong_device(self, folder: Path) -> Typewriter:
-        return Typewriter(folder / "imu")
+    def make_wrong_device(self, folder: Path) -> TextDevice:
+        return TextDevice(folder / "imu")
 
 
-class TestWitThatMustBeToldToSendQuaternions(TestWit):
+class TestWitWithoutQuaternionOutput(TestWit):
     def make_device(self, folder: Path, wire_noise: WireNoise) -> WitDevice:
         return WitDevice(folder / "imu", quaternions=False, wire_noise=wire_noise)
 
-    def test_flash_is_left_alone(self, tmp_path: Path) -> None:
+    def test_driver_does_not_write_flash(self, tmp_path: Path) -> None:
         device = self.make_device(tmp_path, lambda data: data)
 
         async def scene() -> None:

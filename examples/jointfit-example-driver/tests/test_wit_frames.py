@@ -1,4 +1,4 @@
-"""The wire format: documented bytes, any cut, every byte counted."""
+"""Codec of WitMotion frames: documented bytes, any split of the stream, counted bytes."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import random
 
 import pytest
 
-from jointfit_wit.frames import QUATERNION, WitDecoder, WitFrame, encode, write_register
+from jointfit_wit.frames import QUATERNION, WitCodec, WitFrame, encode, write_register
 
 
 def decode(chunks: list[bytes]) -> tuple[list[WitFrame], int]:
-    decoder = WitDecoder()
-    found = [event for chunk in chunks for event in decoder.feed(chunk)] + decoder.flush()
-    return [event for event in found if isinstance(event, WitFrame)], decoder.discarded
+    codec = WitCodec()
+    found = [event for chunk in chunks for event in codec.feed(chunk)] + codec.flush()
+    return [event for event in found if isinstance(event, WitFrame)], codec.discarded
 
 
-def test_documented_bytes() -> None:
+def test_codec_reproduces_documented_bytes() -> None:
     wire = bytes.fromhex("5559004000c0cd0c9a597a")
     (frame,), lost = decode([wire])
     assert lost == 0
@@ -26,7 +26,7 @@ def test_documented_bytes() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_cut_changes_nothing_and_every_byte_is_counted(seed: int) -> None:
+def test_frames_do_not_depend_on_the_split_and_every_byte_is_counted(seed: int) -> None:
     chance = random.Random(seed)
     parts = [
         encode(QUATERNION, (chance.randrange(-99, 99), 1, 2, 3))

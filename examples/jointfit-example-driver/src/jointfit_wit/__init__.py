@@ -1,1 +1,1 @@
-"""WitMotion IMUs for jointfitd: a driver that lives outside of it."""
+"""Driver for WitMotion IMUs, as an example of a driver in a package of its own."""

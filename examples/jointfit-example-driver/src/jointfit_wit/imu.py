@@ -1,7 +1,8 @@
-"""The driver: one WitMotion IMU on a serial port, orientation only, stamped on arrival.
+"""Driver for one WitMotion IMU on a serial port: orientation only, stamped on arrival.
 
-Law: two halves. ``WitEvents`` is pure; ``WitImu.run`` opens, configures and reads. Between them
-nothing but chunks.
+``WitDecoder`` converts chunks to samples without I/O; ``WitImu.run`` opens, configures and reads.
+
+Invariant: the two exchange chunks only.
 """
 
 from __future__ import annotations
@@ -22,10 +23,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_protocols.corrupt import CorruptBytes
 
-_BITS = 10  # of one byte on the line, 8N1
-_SILENCE_NS = 250_000_000  # longer than any stall of a host between two halves of a frame
-_LISTEN_S = 0.5  # five frames at the factory rate of 10 Hz
-_COMMAND_PAUSE_S = 0.1  # the vendor asks for it
+_BITS = 10
+"""Bits of one byte on the line (8N1)."""
+_SILENCE_NS = 250_000_000
+"""Silence that ends an incomplete frame, ns; longer than the stalls of a host within a frame."""
+_LISTEN_S = 0.5
+"""Time to detect quaternions, s: five frames at the factory rate of 10 Hz."""
+_COMMAND_PAUSE_S = 0.1
+"""Pause after a command, as required by the vendor, s."""
 
 
 class WitSettings(ImuSettings):
@@ -35,51 +40,53 @@ class WitSettings(ImuSettings):
     baud: int = Field(115_200, gt=0, description="speed the device runs at, baud")
     world: Literal["ENU", "NED", "NWU"] = Field("ENU", description="world of its quaternion")
     world_to_sensor: bool = Field(False, description="its quaternion is the inverse")
-    persist: bool = Field(False, description="store what had to be changed in the device's flash")
+    persist: bool = Field(False, description="store changed settings in the device's flash")
 
     @field_validator("rate_hz")
     @classmethod
-    def _rate_the_device_has(cls, rate_hz: float) -> float:
+    def _check_rate(cls, rate_hz: float) -> float:
         if rate_hz not in frames.RATES:
-            raise ValueError(f"one of {', '.join(map(str, frames.RATES))} Hz, found {rate_hz:g}")
+            raise ValueError(
+                f"expected one of {', '.join(map(str, frames.RATES))} Hz, found {rate_hz:g}"
+            )
         return rate_hz
 
 
-class WitEvents:
-    """The pure half: chunks in, samples in SI and canonical orientation out."""
+class WitDecoder:
+    """Converts chunks to samples in SI units with canonical orientation; no I/O."""
 
     tick_clock = None  # the quaternion frame has no time
 
     def __init__(self, settings: WitSettings) -> None:
         self._settings = settings
         self._byte_ns = _BITS * 1e9 / settings.baud
-        self._wit = frames.WitDecoder()
+        self._codec = frames.WitCodec()
         self._gate = OrientationGate()
-        self._last_ns = self._arrival_ns = self._refused = 0
+        self._last_ns = self._arrival_ns = self._rejected = 0
 
     @property
     def messages(self) -> int:
-        """Well-formed frames so far."""
-        return self._wit.frames - self._refused
+        """Number of valid frames."""
+        return self._codec.frames - self._rejected
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes that belong to no frame so far, or to one that made no sense."""
-        return self._wit.discarded + self._refused * frames.SIZE
+        """Number of bytes that belong to no frame or to a frame with an invalid quaternion."""
+        return self._codec.discarded + self._rejected * frames.SIZE
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return what `chunk` completed, in wire order; never raises."""
+        """Return the samples completed by `chunk`, in wire order; never raises."""
         out: list[Decoded] = []
-        if self._wit.pending and chunk.t_ns - self._last_ns > _SILENCE_NS:
-            out = self.flush()  # the rest of what waits will never come
+        if self._codec.pending and chunk.t_ns - self._last_ns > _SILENCE_NS:
+            out = self.flush()
         self._last_ns = chunk.t_ns
-        return out + self._take(self._wit.feed(chunk.data))
+        return out + self._convert(self._codec.feed(chunk.data))
 
     def flush(self) -> list[Decoded]:
-        """Give up waiting for the rest of a pending frame."""
-        return self._take(self._wit.flush())
+        """Discard an incomplete frame."""
+        return self._convert(self._codec.flush())
 
-    def _take(self, found: list[frames.WitFrame | CorruptBytes]) -> list[Decoded]:
+    def _convert(self, found: list[frames.WitFrame | CorruptBytes]) -> list[Decoded]:
         out: list[Decoded] = []
         for event in found:
             if not isinstance(event, frames.WitFrame):
@@ -94,9 +101,11 @@ class WitEvents:
         turned = canonical((w, x, y, z), settings.world, world_to_sensor=settings.world_to_sensor)
         q = self._gate.admit(turned)
         if q is None:
-            self._refused += 1
+            self._rejected += 1
             return Corrupt(frames.SIZE, "quaternion norm is not 1")
-        since = self._wit.fed - frame.end + frames.SIZE  # back to the frame's first byte
+
+        # back-date the arrival to the first byte of the frame; stamps never decrease
+        since = self._codec.fed - frame.end + frames.SIZE
         at_ns = self._last_ns - round(since * self._byte_ns)
         self._arrival_ns = max(self._arrival_ns, at_ns)
         return ImuSample(self._arrival_ns, q, (w, x, y, z), ticks=None, counter=None)
@@ -111,35 +120,38 @@ class WitImu:
     def __init__(self, settings: WitSettings) -> None:
         self._settings = settings
 
-    def decoder(self) -> WitEvents:
-        """Return the pure half. Live and replay use the same."""
-        return WitEvents(self._settings)
+    def decoder(self) -> WitDecoder:
+        """Return a new decoder, for live data and for replay."""
+        return WitDecoder(self._settings)
 
     async def run(self, emit: Emit) -> None:
-        """Open the port, have the device send quaternions, read until cancelled.
+        """Open the port, configure the device to send quaternions, read until cancelled.
 
         Raises
         ------
         DeviceLostError
-            Port absent, taken, unplugged or silent; worth another try.
+            The port is absent, in use, unplugged or silent; the daemon retries.
         DeviceMisconfiguredError
             Not a serial port, or not a WitMotion device at this speed.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:
-            port.flush_input()  # drivers and bridges keep a few kilobytes of an earlier run
-            if not await self._quaternions_come(port, emit):
-                await self._ask_for_quaternions(port)
-                if not await self._quaternions_come(port, emit):
+            port.flush_input()  # system and bridge buffer a few kilobytes of an earlier run
+            if not await self._receives_quaternions(port, emit):
+                await self._request_quaternions(port)
+                if not await self._receives_quaternions(port, emit):
                     raise DeviceMisconfiguredError(
-                        f"{settings.id} ({settings.port}): sends frames but no quaternions, even "
-                        "when told to: set content bit 9 with the vendor's tool"
+                        f"{settings.id} ({settings.port}): the device sends frames but no "
+                        "quaternions, even on request: set content bit 9 with the vendor's tool"
                     )
             await port.pump(emit, settings.silence_s)
 
-    async def _quaternions_come(self, port: SerialPort, emit: Emit) -> bool:
-        """Listen before writing: most devices need not be changed. All heard is emitted."""
-        settings, watch, heard = self._settings, frames.WitDecoder(), b""
+    async def _receives_quaternions(self, port: SerialPort, emit: Emit) -> bool:
+        """Return whether the device sends quaternions; all received chunks are emitted.
+
+        Reading before writing leaves a configured device unchanged.
+        """
+        settings, codec, received = self._settings, frames.WitCodec(), b""
         loop = asyncio.get_running_loop()
         until = loop.time() + _LISTEN_S
         while (left := until - loop.time()) > 0:
@@ -147,22 +159,28 @@ class WitImu:
             if chunk is None:
                 break
             emit(chunk)
-            heard += chunk.data
-            for event in watch.feed(chunk.data):
+            received += chunk.data
+            for event in codec.feed(chunk.data):
                 if isinstance(event, frames.WitFrame) and event.kind == frames.QUATERNION:
                     return True
-        if watch.frames:
+        if codec.frames:
             return False
-        if not heard:
-            raise DeviceLostError(f"{settings.id} ({settings.port}): silent: check its power")
-        found = "it is of the 55 61 kind" if frames.OTHER_VARIANT in heard else "set `port`"
+
+        where = f"{settings.id} ({settings.port})"
+        if not received:
+            raise DeviceLostError(f"{where}: no data: check its power")
+        remedy = (
+            "the device is a Bluetooth or SD model (55 61), which has none"
+            if frames.OTHER_VARIANT in received
+            else "set `port`, or `baud` (factory: 9600)"
+        )
         raise DeviceMisconfiguredError(
-            f"{settings.id} ({settings.port}): {len(heard)} bytes at {settings.baud} baud, none "
-            f"of them a WitMotion frame: {found}, or `baud` (factory: 9600)"
+            f"{where}: {len(received)} bytes at {settings.baud} baud without a valid WitMotion "
+            f"frame: {remedy}"
         )
 
-    async def _ask_for_quaternions(self, port: SerialPort) -> None:
-        """Write content and rate; nothing acknowledges, so the stream is the proof."""
+    async def _request_quaternions(self, port: SerialPort) -> None:
+        """Write content and rate; the device acknowledges nothing."""
         rate = frames.RATES[int(self._settings.rate_hz)]
         commands = [
             frames.UNLOCK,

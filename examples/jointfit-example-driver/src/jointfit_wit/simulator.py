@@ -1,7 +1,9 @@
-"""A virtual WitMotion device on a pty, for the tests.
+"""Virtual WitMotion device on a pty, for the tests.
 
-Law: the same wire format as the driver's, nothing else in common with it. As real ones it sends no
-quaternions until told to, acknowledges nothing, and obeys only for 10 s after it was unlocked.
+Like a real device, it sends quaternions only after configuration, acknowledges nothing, and accepts
+commands only for 10 s after the unlock command.
+
+Invariant: driver and simulator share the codec only.
 """
 
 from __future__ import annotations
@@ -20,23 +22,25 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 _UNLOCKED_S = 10.0
-_COMMAND = 5  # bytes
+"""Time after the unlock command in which commands are accepted, s."""
+_COMMAND = 5
+"""Length of a command, bytes."""
 
 
 class WitDevice:
-    """An ``ImuDevice``; see there.
+    """Device with the interface of `jointfit_simulators.imu_device.ImuDevice`.
 
     Parameters
     ----------
     link
-        Where the host finds the port.
+        Symbolic link to the host's port.
     quaternions
-        Whether they are switched on from the start.
+        Whether the device sends quaternions from the start.
     wire_noise
-        What the wire does to each frame on its way to the host.
+        Noise applied to each frame to the host.
     """
 
-    streaming = True  # from power-on, whatever the host does
+    streaming = True  # from power-on, independent of the host
     rate_hz = 100.0
 
     def __init__(
@@ -47,9 +51,9 @@ class WitDevice:
         self._noise = wire_noise
         self._unlocked_until = 0.0
         self.sent = 0
-        """Quaternions written to the wire so far."""
+        """Number of quaternions written to the wire."""
         self.saved = 0
-        """Times it was told to store its registers."""
+        """Number of commands to store the registers."""
         self.unplug, self.plug = self._line.unplug, self._line.plug
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:  # noqa: ARG002 - no clock
@@ -64,13 +68,13 @@ class WitDevice:
 
     async def run(self) -> None:
         """Serve until cancelled."""
-        await self._line.serve(self._take)
+        await self._line.serve(self._receive)
 
-    def _take(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         for at in range(0, len(data) - _COMMAND + 1, _COMMAND):
-            self._obey(data[at : at + _COMMAND])
+            self._execute(data[at : at + _COMMAND])
 
-    def _obey(self, command: bytes) -> None:
+    def _execute(self, command: bytes) -> None:
         if command == frames.UNLOCK:
             self._unlocked_until = time.monotonic() + _UNLOCKED_S
         elif time.monotonic() > self._unlocked_until:
