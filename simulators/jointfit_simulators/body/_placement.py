@@ -77,6 +77,8 @@ def marker_templates(
             (0.0, 0.13, -0.05),
         ],
     }
+
+    # placement errors of the operator
     return {
         part: np.array(points) + random.normal(0.0, _PLACEMENT_M, (len(points), 3))
         for part, points in nominal.items()

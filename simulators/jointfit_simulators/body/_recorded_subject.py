@@ -176,6 +176,7 @@ class RecordedSubject:
         place, share = np.zeros_like(t_s), np.zeros_like(t_s)
         before = _STAND
         for start_s, name, begin_s, end_s in self._switches:
+            # a later switch overrides the earlier ones from its start on
             begun = t_s >= start_s
             fade = smootherstep((t_s[begun] - start_s) / self._transition_s)
             if name == _STAND:
@@ -194,6 +195,8 @@ class RecordedSubject:
         for start_s, name, begin_s, end_s in self._switches:
             begun = t_s >= start_s
             since = t_s[begun] - start_s - self._transition_s
+
+            # a blend between two standing phases is not synthetic
             blending = since < -_ROUNDING_S
             if name == _STAND:
                 synthetic[begun] = blending & (before != _STAND)

@@ -227,6 +227,7 @@ class SimulatedSubject:
             )
             for part in PARTS
         ]
+
         plate = Rotation.from_rotvec(coordinates[:, PLATE_TURN])
         template = np.broadcast_to(PLATE_TEMPLATE, (len(t_s), *PLATE_TEMPLATE.shape))
         markers.append(_to_world(plate, coordinates[:, PLATE_POSITION], template))

@@ -49,6 +49,7 @@ class InertialSignals:
         """Return an item for the last interval; None for items that are not inertial signals."""
         x, y, z = self._turn
         step_s = self._step_s
+
         match item:
             case Item.RATE_OF_TURN:
                 return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)

@@ -90,6 +90,11 @@ class NatNetServer:
     def __init__(self, options: NatNetServerOptions | None = None) -> None:
         self.options = options or NatNetServerOptions()
         self._port = NatNetPort(self.options.command_port, self.options.data_port)
+        self.command_port = self._port.command_port
+        """UDP port for commands of clients."""
+        self.data_port = self._port.data_port
+        """UDP port of multicast frames."""
+
         self._builder = NatNetFrameBuilder(
             self.options.bodies, self.options.up_axis, self.options.hiding
         )
@@ -102,16 +107,6 @@ class NatNetServer:
         self.edit_mode = False
         self.number = 0
         self._sent_before = 0
-
-    @property
-    def command_port(self) -> int:
-        """UDP port for commands of clients."""
-        return self._port.command_port
-
-    @property
-    def data_port(self) -> int:
-        """UDP port of multicast frames."""
-        return self._port.data_port
 
     @property
     def clients(self) -> tuple[Client, ...]:
@@ -202,6 +197,7 @@ class NatNetServer:
         received = exposure_ns + options.received_after_ns
         params = FRAME_MODEL_CHANGED if self._model_changed else 0
         params |= FRAME_EDIT_MODE if self.edit_mode else 0
+
         return FrameStamps(
             self.number,
             self.number / options.rate_hz,
@@ -296,6 +292,7 @@ class NatNetServer:
 
     def _answer(self, command: str, client: Client | None) -> Message:
         word, _, rest = command.partition(",")
+
         match word:
             case "FrameRate":
                 return CommandResponse(struct.pack("<f", self.options.rate_hz))

@@ -113,12 +113,15 @@ class XbusDevice:
         self._inertial = InertialSignals()
         self._decoder = XbusCodec()
 
-        self._outputs = tuple(setup.Output(*output) for output in options.outputs)
+        self.outputs = tuple(setup.Output(*output) for output in options.outputs)
+        """Output configuration in force."""
         self._alignment = dict.fromkeys((0, 1), options.alignment)
         self._modulus = setup.fine_time_modulus(options.product_code) or setup.WRAP_32_BIT
-        self._measuring = options.measures_at_once or options.stuck
+        self.streaming = options.measures_at_once or options.stuck
+        """Whether the device is in measurement mode."""
         self._stuck, self._waking = options.stuck, False
-        self._counter = options.first_counter
+        self.counter = options.first_counter
+        """Number of the next message."""
         self._epoch_ns = self._last_ns = self._messages = self._to_lose = 0
         self._random = random.Random(3)  # noqa: S311 - the same GNSS times in every run
         self._timer: asyncio.TimerHandle | None = None
@@ -130,22 +133,12 @@ class XbusDevice:
     # --- control by the simulation ------------------------------------------------------------
 
     @property
-    def streaming(self) -> bool:
-        """Whether the device is in measurement mode."""
-        return self._measuring
-
-    @property
     def rate_hz(self) -> float:
         """Configured samples per second; 0 without an item that defines it."""
-        for data_id, rate in self._outputs:
+        for data_id, rate in self.outputs:
             if data_id & 0xFFF0 in _MEASURED:
                 return float(FILTER_RATE_HZ if rate in {0, setup.MAX_RATE} else rate)
         return 0.0
-
-    @property
-    def counter(self) -> int:
-        """Number of the next message."""
-        return self._counter
 
     @property
     def line_ns(self) -> int:
@@ -154,16 +147,11 @@ class XbusDevice:
         size = len(encode(XbusMessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
         return size * _BITS * 1_000_000_000 // baud if baud else 0
 
-    @property
-    def outputs(self) -> tuple[setup.Output, ...]:
-        """Output configuration in force."""
-        return self._outputs
-
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now in measurement mode, as described in `ImuDevice.push`."""
         self._last_ns = device_ns
         self._inertial.update(device_ns, q_world_sensor)
-        if not self._measuring:
+        if not self.streaming:
             return
         if self._options.gnss and self._messages % _FOREIGN_EVERY == _FOREIGN_EVERY - 1:
             self._measure(self._ticks(device_ns) - self._random.randrange(300, 600), None)
@@ -185,14 +173,14 @@ class XbusDevice:
 
     def power_cycle(self) -> None:
         """Interrupt the power supply: clock and counter restart, and WakeUp is sent."""
-        self._stuck, self._measuring = False, False
-        self._epoch_ns, self._counter = self._last_ns, self._options.first_counter
+        self._stuck, self.streaming = False, False
+        self._epoch_ns, self.counter = self._last_ns, self._options.first_counter
         self._sync.reset()
         self._send(XbusMessageId.WAKE_UP)
         self._waking = True
 
         def measure() -> None:
-            self._waking, self._measuring = False, True
+            self._waking, self.streaming = False, True
 
         self._after(WAKE_UP_S, measure)
 
@@ -232,11 +220,12 @@ class XbusDevice:
         elif message.mid == XbusMessageId.WAKE_UP_ACK and self._waking:
             self._stop()
         elif message.mid == XbusMessageId.GOTO_CONFIG:
-            if self._measuring and self._options.config_delay_s:
+            # the device streams until it acknowledges
+            if self.streaming and self._options.config_delay_s:
                 self._after(self._options.config_delay_s, lambda: self._configure(message.bid))
             else:
                 self._configure(message.bid)
-        elif not self._measuring and (reply := self._reply(message.mid, message.data)):
+        elif not self.streaming and (reply := self._reply(message.mid, message.data)):
             self._send(*reply, message.bid)
 
     def _configure(self, bid: int) -> None:
@@ -244,7 +233,7 @@ class XbusDevice:
         self._send(XbusMessageId.GOTO_CONFIG_ACK, b"", bid)
 
     def _stop(self) -> None:
-        self._measuring = self._waking = False
+        self.streaming = self._waking = False
         if self._timer is not None:
             self._timer.cancel()
 
@@ -255,7 +244,7 @@ class XbusDevice:
         match mid:
             case XbusMessageId.GOTO_MEASUREMENT:
                 self._send(XbusMessageId.CONFIGURATION, bytes(118))  # sent first by some devices
-                self._measuring = True
+                self.streaming = True
                 reply = XbusMessageId.GOTO_MEASUREMENT_ACK, b""
             case XbusMessageId.REQ_DEVICE_ID:
                 reply = XbusMessageId.DEVICE_ID, options.device_id
@@ -293,9 +282,9 @@ class XbusDevice:
         if not all(map(_supported, wanted)):
             return XbusMessageId.ERROR, _PARAMETER
         if wanted:
-            self._outputs = tuple(map(_effective, wanted))
+            self.outputs = tuple(map(_effective, wanted))
             self.flash_writes += 1
-        return XbusMessageId.OUTPUT_CONFIGURATION_ACK, setup.encode_outputs(self._outputs)
+        return XbusMessageId.OUTPUT_CONFIGURATION_ACK, setup.encode_outputs(self.outputs)
 
     def _sync_settings(self, data: bytes) -> tuple[int, bytes]:
         if not data:
@@ -327,13 +316,13 @@ class XbusDevice:
 
     def _measure(self, ticks: int, q: Quaternion | None) -> bool:
         """Send one MTData2; return whether all of it was sent."""
-        counter = self._counter
-        self._counter = (counter + 1) % _COUNTS
+        counter = self.counter
+        self.counter = (counter + 1) % _COUNTS
         self._messages += 1
         if self._to_lose:
             self._to_lose -= 1
             return False
-        edges = self._sync.next_triggers([data_id for data_id, _ in self._outputs])
+        edges = self._sync.next_triggers([data_id for data_id, _ in self.outputs])
         data = self._content(counter, ticks % self._modulus, q, edges)
         return self._send(XbusMessageId.MT_DATA2, data)
 
@@ -343,7 +332,7 @@ class XbusDevice:
         """Return the data of one MTData2; an orientation of None is a message of the GNSS."""
         values = (
             (data_id, edges.get(data_id, _value(data_id, counter, ticks, q, self._inertial)))
-            for data_id, _ in self._outputs
+            for data_id, _ in self.outputs
         )
         return mtdata2.encode_items((item, value) for item, value in values if value is not None)
 

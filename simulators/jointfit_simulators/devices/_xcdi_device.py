@@ -60,7 +60,10 @@ class XcdiDevice:
     def __init__(self, wire: CanWire, options: XcdiDeviceOptions | None = None) -> None:
         self.wire = wire
         self._options = options or XcdiDeviceOptions()
-        self._counter = self._options.first_counter
+        self.rate_hz = self._options.rate_hz
+        """Configured groups per second."""
+        self.counter = self._options.first_counter
+        """Number of the next group."""
         self._epoch_ns = self._last_ns = 0
         self._to_lose: dict[DataId | None, int] = {}  # None: whole groups
         self.sent = 0
@@ -71,18 +74,8 @@ class XcdiDevice:
         """Whether the bus is open."""
         return self.wire.is_open
 
-    @property
-    def rate_hz(self) -> float:
-        """Configured groups per second."""
-        return self._options.rate_hz
-
     def edge(self, device_ns: int) -> None:
         """Ignore an edge on the sync input; XCDI has no message for it."""
-
-    @property
-    def counter(self) -> int:
-        """Number of the next group."""
-        return self._counter
 
     @property
     def line_ns(self) -> int:
@@ -94,6 +87,7 @@ class XcdiDevice:
             DataId.STATUS_WORD: ids.status_word,
             DataId.QUATERNION: ids.quaternion,
         }
+
         bits = sum(
             frame_bits(struct.calcsize(f"<{layout(data_id).fields}"), ids.extended)
             for data_id, number in sent.items()
@@ -110,7 +104,7 @@ class XcdiDevice:
     def group(self, device_ns: int, q_world_sensor: Quaternion) -> list[CanFrame]:
         """Return the next group, without the frames to be lost."""
         self._last_ns = device_ns
-        counter, self._counter = self._counter, (self._counter + 1) % COUNTER_MODULUS
+        counter, self.counter = self.counter, (self.counter + 1) % COUNTER_MODULUS
         tick_ns = TICK_NS[self._options.sample_time_unit]
         ticks = self._options.first_tick + (device_ns - self._epoch_ns) // tick_ns
         if self._lost(None):
@@ -146,7 +140,7 @@ class XcdiDevice:
 
     def power_cycle(self) -> None:
         """Interrupt the power supply: clock and counter restart."""
-        self._epoch_ns, self._counter = self._last_ns, self._options.first_counter
+        self._epoch_ns, self.counter = self._last_ns, self._options.first_counter
 
     def unplug(self) -> None:
         """Disconnect the wire."""

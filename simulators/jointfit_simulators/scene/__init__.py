@@ -2,14 +2,13 @@
 
 from jointfit_simulators.scene._hardware import ids_toml
 from jointfit_simulators.scene._phase_follower import PhaseFollower
-from jointfit_simulators.scene._play_directory import PlayDirectory, play_directory
+from jointfit_simulators.scene._play_directory import play_directory
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
 from jointfit_simulators.scene._scene import InvalidCommandError, Scene, SceneOptions
 
 __all__ = [
     "InvalidCommandError",
     "PhaseFollower",
-    "PlayDirectory",
     "RigOptions",
     "Scene",
     "SceneOptions",

@@ -140,6 +140,7 @@ def _xbus_device(knobs: Knobs, name: str, port: Path, sync: tuple[SyncSetting, .
         (Item.QUATERNION, round(knobs.rate_hz)),
         *(((Item.TRIGGER_IN1, _EVERY_MESSAGE),) if sync else ()),
     )
+
     device_id = bytes([0x03, 0x60, 0xA1, *name.encode()[-1:]])
     return XbusDevice(
         port,
@@ -162,6 +163,7 @@ def _add_bus(hardware: SceneHardware, knobs: Knobs, directory: Path, can: str) -
                 f"--can {can}: cannot open the interface ({error.strerror}): check that it exists"
                 " and is up (ip link)"
             ) from error
+
     hardware.ports[BUS] = channel
     hardware.tables.append(f'[can.{BUS}]\ninterface = "{interface}"\nchannel = "{channel}"\n')
     return wire

@@ -95,6 +95,7 @@ def play_directory(path: Path) -> Iterator[PlayDirectory]:
                 f"{path}: another simulator (process {pid}) uses this directory: stop it"
                 f" (kill {pid}), or select another --directory"
             ) from None
+
         directory = PlayDirectory(path, file)
         directory.remember(None)
         yield directory

@@ -58,6 +58,7 @@ def rig_toml(
         for end, part in (("proximal", "pelvis"), ("distal", "foot"))
         if part in clusters and mocap
     ]
+
     chain = [
         "[chain]",
         'joints = ["hip", "knee", "ankle"]',
@@ -71,6 +72,7 @@ def rig_toml(
         "\n".join([*chain, ""]),
         *devices,
     ]
+
     if mocap:
         lines = ['plate = "Plate"'] if plate else []
         for part, names in clusters.items():
@@ -79,6 +81,7 @@ def rig_toml(
                 lines.append(f"markers.{part} = [{listed}]")
         lines += [f'rigid_body.{bone} = "{bone.capitalize()}"' for bone in bones]
         tables.append("\n".join([mocap, *lines, ""]))
+
     tables.append(
         f'[calibration]\nstore = "{options.store}"\nmethod = "{options.method}"\n'
         f"align_s = {options.align_s:g}\nstatic_s = {options.static_s:g}\n"

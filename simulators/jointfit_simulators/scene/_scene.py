@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_simulators.body import InstrumentedSubject
-    from jointfit_simulators.devices import ClockFault
+    from jointfit_simulators.devices import ClockFault, NatNetServer
     from jointfit_simulators.scene._player import PlannedStream
     from jointfit_simulators.scene._streams import ImuStream
     from jointfit_simulators.settings import Knobs
@@ -111,8 +111,9 @@ class Scene:
             self._timings[name].set_fault(fault, now_ns)
 
         cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
-        self._server = (
-            optical_server(
+        self._server: NatNetServer | None = None
+        if options.mocap:
+            self._server = optical_server(
                 knobs,
                 subject.clusters,
                 cameras.bodies,
@@ -120,9 +121,6 @@ class Scene:
                 ptp=options.ptp,
                 command_port=options.command_port,
             )
-            if options.mocap
-            else None
-        )
         self._optical = OpticalStream(knobs, cameras, timing, self._server)
 
         samples = SampleLog(options.directory / SAMPLES_FILE) if options.sample_log else None
@@ -270,6 +268,7 @@ class Scene:
         verb, _, rest = line.strip().partition(" ")
         if verb == "status":
             return self.status()
+
         if verb not in self._commands:
             raise InvalidCommandError(
                 f"no command {verb!r}; there are: {', '.join(self._commands)}, status"

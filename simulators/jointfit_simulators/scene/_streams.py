@@ -88,6 +88,7 @@ class ImuStream:
         self.name, self.device = name, device
         self.on_sample: SampleCallback | None = None
         """Called for every sample sent."""
+
         self.sensor, self.faults = OrientationSensor(knobs, name), SensorFaults()
         self.timing = SampleTiming(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
         self._default_hz, self._shared = knobs.rate_hz, shared_wire

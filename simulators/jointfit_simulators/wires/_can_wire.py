@@ -87,25 +87,18 @@ class SlcanAdapter:
         self._noise, self._bus_bitrate, self._mute = wire_noise, bus_bitrate, mute
         self._decoder = SlcanCodec(115_200, "adapter")
         self._serving = asyncio.Lock()
-        self._open = self._stamping = False
+        self.is_open = False
+        """Whether the host opened the bus."""
+        self._stamping = False
         self.bitrate: int | None = None
         """Bit rate set by the host, bit/s."""
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the host opened the bus."""
-        return self._open
-
     def send(self, frames: Iterable[CanFrame]) -> bool:
         """Send `frames` to the host; either all or none."""
-        if not self._open or self._bus_bitrate not in {None, self.bitrate}:
+        if not self.is_open or self._bus_bitrate not in {None, self.bitrate}:
             return False
         stamp = time.monotonic_ns() // _NS_PER_MS if self._stamping else None
         return self._line.write(self._noise(b"".join(encode_frame(f, stamp) for f in frames)))
-
-    def send_bytes(self, data: bytes) -> bool:
-        """Write raw bytes to the host's port."""
-        return self._line.write(data)
 
     async def run(self) -> None:
         """Serve until cancelled; wait while another device serves the adapter."""
@@ -115,7 +108,7 @@ class SlcanAdapter:
     def unplug(self) -> None:
         """Disconnect the adapter; it loses power and its settings."""
         self._line.unplug()
-        self._open = self._stamping = False
+        self.is_open = self._stamping = False
         self.bitrate = None
 
     def plug(self) -> None:
@@ -133,14 +126,14 @@ class SlcanAdapter:
         if line.letter in _ANSWERS:
             return _ANSWERS[line.letter]
 
-        if line.letter == "S" and not self._open and line.argument in set("012345678"):
+        if line.letter == "S" and not self.is_open and line.argument in set("012345678"):
             self.bitrate = BITRATES[int(line.argument)]
-        elif line.letter == "Z" and not self._open and line.argument in {"0", "1"}:
+        elif line.letter == "Z" and not self.is_open and line.argument in {"0", "1"}:
             self._stamping = line.argument == "1"
-        elif line.letter in "OL" and not self._open and self.bitrate is not None:
-            self._open = True
-        elif line.letter == "C" and self._open:
-            self._open = False
+        elif line.letter in "OL" and not self.is_open and self.bitrate is not None:
+            self.is_open = True
+        elif line.letter == "C" and self.is_open:
+            self.is_open = False
         else:
             return REFUSED
         return DONE
@@ -170,6 +163,7 @@ class PythonCanWire:
         """Send `frames`; return False if the bus is absent, down or full."""
         if self._bus is None:
             return False
+
         try:
             for frame in frames:
                 message = can.Message(

@@ -242,7 +242,7 @@ async def test_lost_bytes_of_a_line_are_counted_by_one_device_only(tmp_path: Pat
     async with serving(adapter):
         runs = [DriverRun(xcdi_driver("S3", bus, 0x100)), DriverRun(xcdi_driver("S4", bus, 0x200))]
         await opened(adapter)
-        adapter.send_bytes(b"what is this\r")
+        adapter._line.write(b"what is this\r")
         await asyncio.sleep(0.1)
         found = [event for run in runs for event in run.events]
         assert found == [Corrupt(13, "no SLCAN line")]
@@ -290,7 +290,7 @@ async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path
         run = DriverRun(xcdi_driver("S3", bus))
         await opened(adapter)
         await run.cancel()
-        adapter._open = True  # the host died without a word
+        adapter.is_open = True  # the host died without a word
         for number in range(50):
             device.push(number * 10_000_000, IDENTITY)
         run = DriverRun(xcdi_driver("S3", bus))
