@@ -254,7 +254,7 @@ async def _play(options: argparse.Namespace) -> None:
             hardware = dataclasses.replace(hardware, command_port=port)
         now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS
         scene = Scene(knobs, subject, hardware, now_ns=now_ns)
-        directory.remember(scene.command_port)
+        directory.store_command_port(scene.command_port)
         await _run_scene(scene, rig if options.follow else None)
 
 

@@ -46,15 +46,15 @@ def test_second_simulator_in_a_directory_is_rejected_with_process_and_remedy(
 def test_command_port_of_the_previous_run_is_used_if_free(tmp_path: Path, used_port: int) -> None:
     with play_directory(tmp_path) as first:
         assert first.command_port(None) == 0
-        first.remember(used_port)
+        first.store_command_port(used_port)
     with play_directory(tmp_path) as second:
         assert second.command_port(None) == 0  # in use by another program
-        second.remember(None)
+        second.store_command_port(None)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         free = probe.getsockname()[1]
     with play_directory(tmp_path) as third:
-        third.remember(free)
+        third.store_command_port(free)
     with play_directory(tmp_path) as fourth:
         assert fourth.command_port(None) == free
         assert fourth.command_port(free) == free

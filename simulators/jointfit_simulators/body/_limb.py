@@ -16,7 +16,7 @@ import numpy as np
 from jointfit_simulators.body._orientation import Rotation
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 PARTS = ("pelvis", "thigh", "shank", "foot")
 
@@ -67,11 +67,11 @@ class LegPose(NamedTuple):
 
     orientations: dict[str, Rotation]
     """Rotations of each part (n): part coordinates to base world."""
-    origins: dict[str, NDArray[np.float64]]
+    origins: dict[str, Array]
     """Origin of each part, shape (n, 3), m: pelvis origin, hip, knee, ankle."""
 
 
-def joint_rotation(flexion_sign: int, angles: NDArray[np.float64]) -> Rotation:
+def joint_rotation(flexion_sign: int, angles: Array) -> Rotation:
     r"""Return the rotation of a joint of a right leg from its clinical angles.
 
     .. math:: R = R_x(s f) R_y(a) R_z(i)
@@ -89,7 +89,7 @@ def joint_rotation(flexion_sign: int, angles: NDArray[np.float64]) -> Rotation:
     return Rotation.from_euler("XYZ", angles * np.array([flexion_sign, 1, 1]))
 
 
-def leg_pose(geometry: LegGeometry, coordinates: NDArray[np.float64]) -> LegPose:
+def leg_pose(geometry: LegGeometry, coordinates: Array) -> LegPose:
     """Return the bones for coordinates of shape (n, COORDINATES)."""
     pelvis = Rotation.from_euler("ZXY", coordinates[:, PELVIS_TURN])
     thigh = pelvis * joint_rotation(1, coordinates[:, HIP])
@@ -106,7 +106,7 @@ def leg_pose(geometry: LegGeometry, coordinates: NDArray[np.float64]) -> LegPose
     )
 
 
-def included_angle(thigh: Rotation, shank: Rotation) -> NDArray[np.float64]:
+def included_angle(thigh: Rotation, shank: Rotation) -> Array:
     """Return the inner angle of two long axes, rad, shape (n,); pi if straight."""
     down = np.array([0.0, 0.0, -1.0])
     a, b = thigh.apply(down), shank.apply(down)

@@ -45,11 +45,11 @@ from jointfit_simulators.body._posture import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
-Motion = Callable[["NDArray[np.float64]"], "NDArray[np.float64]"]
+Motion = Callable[["Array"], "Array"]
 """Function from time since the start, s, shape (n,), to coordinates, shape (n, COORDINATES)."""
-StyledMotion = Callable[[MovementStyle, "NDArray[np.float64]"], "NDArray[np.float64]"]
+StyledMotion = Callable[[MovementStyle, "Array"], "Array"]
 """Motion that depends on the movement style of a subject."""
 
 
@@ -74,7 +74,7 @@ _CHAIR_S = 5.0
 """Duration of one cycle, s."""
 
 
-def stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def stand(style: MovementStyle, t: Array) -> Array:
     """Stand upright with a sway of tenths of a degree."""
     coordinates = upright(style, t)
     coordinates[:, LEG_ANGLES] += style.sway.at(t)
@@ -84,7 +84,7 @@ def stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-def walk(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def walk(style: MovementStyle, t: Array) -> Array:
     """Walk on a treadmill with a constant mean heading."""
     coordinates = upright(style, t)
     share = t / _STRIDE_S
@@ -112,14 +112,7 @@ def walk(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates
 
 
-def _sagittal(
-    style: MovementStyle,
-    t: NDArray[np.float64],
-    *,
-    knee: NDArray[np.float64],
-    thigh: NDArray[np.float64],
-    lean: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _sagittal(style: MovementStyle, t: Array, *, knee: Array, thigh: Array, lean: Array) -> Array:
     """Flex hip, knee and ankle over a flat foot; `thigh` and `lean` are pitch angles in space."""
     coordinates = upright(style, t)
     coordinates[:, column(PELVIS_TURN, TILT)] = -lean
@@ -137,7 +130,7 @@ def _sagittal(
     return coordinates
 
 
-def squat(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def squat(style: MovementStyle, t: Array) -> Array:
     """Squat every 3 s with varying depth."""
     depth = (1 - np.cos(2 * np.pi * t / 3.0)) / 2 * (0.9 + 0.1 * np.cos(0.37 * t))
     return _sagittal(
@@ -149,7 +142,7 @@ def squat(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def sit_to_stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def sit_to_stand(style: MovementStyle, t: Array) -> Array:
     """Sit on a chair and stand up again, every 5 s."""
     share = (t / _CHAIR_S + 0.5) % 1.0  # start in upright stance
     return _sagittal(
@@ -157,7 +150,7 @@ def sit_to_stand(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.flo
     )
 
 
-def hip_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def hip_circles(style: MovementStyle, t: Array) -> Array:
     """Swing the almost straight leg in arcs of rotating direction (star-arc movement)."""
     coordinates = upright(style, t)
     swing = np.sin(2 * np.pi * 0.5 * t)
@@ -176,7 +169,7 @@ def hip_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.floa
     return coordinates
 
 
-def knee_swings(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def knee_swings(style: MovementStyle, t: Array) -> Array:
     """Swing the shank with a raised thigh; internal rotation varies with knee flexion."""
     coordinates = upright(style, t)
     bend = np.radians(55 + 43 * np.sin(2 * np.pi * 0.55 * t))
@@ -194,7 +187,7 @@ def knee_swings(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.floa
     return coordinates
 
 
-def ankle_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def ankle_circles(style: MovementStyle, t: Array) -> Array:
     """Move the raised foot in circles."""
     coordinates = upright(style, t)
     phase = 2 * np.pi * 0.7 * t
@@ -211,14 +204,14 @@ def ankle_circles(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.fl
     return coordinates
 
 
-def turn(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn(style: MovementStyle, t: Array) -> Array:
     """Walk with a heading that oscillates by 90 degrees to either side, with a period of 16 s."""
     coordinates = walk(style, t)
     coordinates[:, column(PELVIS_TURN, HEADING)] += np.radians(90) * np.sin(2 * np.pi * t / 16.0)
     return coordinates
 
 
-def plate(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def plate(style: MovementStyle, t: Array) -> Array:
     """Stand and rotate the plate with all sensors by hand, about every axis."""
     coordinates = stand(style, t)
     coordinates[:, ON_PLATE] = 1.0
@@ -236,7 +229,7 @@ _MIX_BLEND_S = 1.0
 """Duration of the blend between two of them, s."""
 
 
-def functional(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def functional(style: MovementStyle, t: Array) -> Array:
     """Repeat walking, hip circles, squats, knee swings and ankle circles, 4 s each."""
     coordinates = np.zeros((len(t), COORDINATES))
     place = (t / _MIX_S) % len(_MIX)

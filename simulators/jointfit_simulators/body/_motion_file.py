@@ -33,15 +33,14 @@ from jointfit_simulators.body._posture import MovementStyle, upright
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body._motion import Motion
 
 _ANGLES = {"hip": HIP, "knee": KNEE, "ankle": ANKLE, "pelvis": PELVIS_TURN}
 _PARTS = {**_ANGLES, "position": PELVIS_POSITION}
 
 
-def _read_toml(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+def _read_toml(path: Path) -> tuple[Array, dict[str, Array], bool]:
     table = read_toml(path)
     keys = table.get("key", [])
     t_s = np.array([key["t_s"] for key in keys], dtype=np.float64)
@@ -51,7 +50,7 @@ def _read_toml(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.fl
     return t_s, angles, bool(table.get("loop", False))
 
 
-def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+def _read_npz(path: Path) -> tuple[Array, dict[str, Array], bool]:
     with np.load(path, allow_pickle=False) as arrays:
         t_s = np.asarray(arrays["t"], dtype=np.float64)
         angles = {
@@ -60,11 +59,11 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.flo
     return t_s, angles, False
 
 
-def _read_opensim(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]], bool]:
+def _read_opensim(path: Path) -> tuple[Array, dict[str, Array], bool]:
     table = read_sto(path)
     unit = np.pi / 180 if table.in_degrees else 1.0
 
-    def columns(*names: str) -> NDArray[np.float64]:
+    def columns(*names: str) -> Array:
         return np.column_stack([table.column(name) for name in names])
 
     hip = unit * columns("hip_flexion_r", "hip_adduction_r", "hip_rotation_r")
@@ -102,7 +101,7 @@ def motion_from_file(path: Path, style: MovementStyle) -> Motion:
     curves = {part: CubicSpline(t_s, values, bc_type=ends) for part, values in angles.items()}
     length = float(t_s[-1] - t_s[0])
 
-    def motion(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def motion(t: Array) -> Array:
         place = t_s[0] + (t % length if loop else np.clip(t, 0.0, length))
         coordinates = upright(style, t)
         for part, curve in curves.items():

@@ -14,8 +14,7 @@ from jointfit_simulators.body._posture import smootherstep
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body._motion import Motion
 
 
@@ -107,7 +106,7 @@ class MotionScript:
         if covered:
             del self._layers[: covered[-1]]
 
-    def coordinates(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def coordinates(self, t_s: Array) -> Array:
         """Return the coordinates at instants `t_s` of shape (n,), shape (n, COORDINATES)."""
         start, name = self._layers[0]
         blended = self._motions[name](t_s - start)

@@ -14,19 +14,19 @@ from scipy.spatial.transform import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 __all__ = ["Rotation", "from_wxyz", "heading", "to_wxyz"]
 
 
-def from_wxyz(quaternions: NDArray[np.float64]) -> Rotation:
+def from_wxyz(quaternions: Array) -> Rotation:
     """Return rotations of Hamilton quaternions (w, x, y, z), shape (..., 4)."""
     return Rotation.from_quat(quaternions[..., [1, 2, 3, 0]])
 
 
-def to_wxyz(rotations: Rotation) -> NDArray[np.float64]:
+def to_wxyz(rotations: Rotation) -> Array:
     """Return Hamilton quaternions (w, x, y, z), shape (4,) or (n, 4)."""
-    quaternions: NDArray[np.float64] = np.asarray(rotations.as_quat())[..., [3, 0, 1, 2]]
+    quaternions: Array = np.asarray(rotations.as_quat())[..., [3, 0, 1, 2]]
     return quaternions
 
 

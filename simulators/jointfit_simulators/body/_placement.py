@@ -9,8 +9,7 @@ import numpy as np
 from jointfit_simulators.body._orientation import Rotation
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body._limb import LegGeometry
 
 CLUSTERS: dict[str, tuple[str, ...]] = {
@@ -42,9 +41,7 @@ def random_misalignment(random: np.random.Generator, most_rad: float) -> Rotatio
     return Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0, most_rad))
 
 
-def marker_templates(
-    random: np.random.Generator, geometry: LegGeometry
-) -> dict[str, NDArray[np.float64]]:
+def marker_templates(random: np.random.Generator, geometry: LegGeometry) -> dict[str, Array]:
     """Return marker positions in the frame of each part, upright stance, shape (4, 3).
 
     Pelvis: anterior and posterior iliac spines. Thigh and shank: clusters of four on the lateral

@@ -22,7 +22,7 @@ from jointfit_simulators.body._limb import (
 from jointfit_simulators.body._random_signal import RandomSignal
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 PLATE_ON_TABLE = (0.55, 0.35, 0.90)
 """Position of the plate on its table, m."""
@@ -57,7 +57,7 @@ def draw_style(geometry: LegGeometry, random: np.random.Generator) -> MovementSt
     )
 
 
-def upright(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright(style: MovementStyle, t: Array) -> Array:
     """Return upright stance over the origin, with the plate on its table."""
     coordinates = np.zeros((len(t), COORDINATES))
     coordinates[:, PELVIS_POSITION] = style.geometry.standing_pelvis
@@ -65,7 +65,7 @@ def upright(style: MovementStyle, t: NDArray[np.float64]) -> NDArray[np.float64]
     return coordinates
 
 
-def couple_knee(coordinates: NDArray[np.float64]) -> None:
+def couple_knee(coordinates: Array) -> None:
     """Add the adduction and internal rotation that accompany knee flexion.
 
     Over 90 degrees of flexion the tibia rotates internally by about 8 degrees and adducts by about
@@ -76,20 +76,20 @@ def couple_knee(coordinates: NDArray[np.float64]) -> None:
     coordinates[:, column(KNEE, ROTATION)] += np.radians(11.0) * bend
 
 
-def vary(style: MovementStyle, t: NDArray[np.float64], coordinates: NDArray[np.float64]) -> None:
+def vary(style: MovementStyle, t: Array, coordinates: Array) -> None:
     """Add the movement variability of the subject."""
     deviation = style.variability.at(t)
     deviation[:, 4:6] *= 0.3  # the knee has little voluntary adduction and rotation
     coordinates[:, LEG_ANGLES] += deviation
 
 
-def ground(style: MovementStyle, coordinates: NDArray[np.float64]) -> None:
+def ground(style: MovementStyle, coordinates: Array) -> None:
     """Translate the pelvis so that the ankle has its position in upright stance."""
     ankle = leg_pose(style.geometry, coordinates).origins["foot"]
     coordinates[:, PELVIS_POSITION] += np.array(style.geometry.standing_ankle) - ankle
 
 
-def smootherstep(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def smootherstep(x: Array) -> Array:
     r"""Return :math:`6x^5 - 15x^4 + 10x^3` of `x` clipped to [0, 1]: two continuous derivatives."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (x * (6 * x - 15) + 10)

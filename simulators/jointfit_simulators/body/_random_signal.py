@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 LINES = 48
 """Number of sinusoids; with fewer, the signal repeats visibly and its RMS fluctuates."""
@@ -53,11 +53,11 @@ class RandomSignal:
         power = np.sum(amplitudes**2, axis=0) / 2
         self._amplitudes = amplitudes * (rms / np.sqrt(power))
 
-    def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, t_s: Array) -> Array:
         """Return the signals at instants `t_s` of shape (n,), shape (n, channels)."""
         phase = t_s[:, None] * self._omega
         waves = np.concatenate((np.cos(phase), np.sin(phase)), axis=1)
-        signals: NDArray[np.float64] = waves @ self._amplitudes
+        signals: Array = waves @ self._amplitudes
         return signals
 
 

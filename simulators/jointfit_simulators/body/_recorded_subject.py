@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body._recorded_trial import RecordedTrial
 
 _STAND = "stand"
@@ -68,7 +69,7 @@ class RecordedSubject:
         Markers of each body part; default: OpenCap's right leg, as far as recorded.
     """
 
-    templates: Mapping[str, NDArray[np.float64]] = {}
+    templates: Mapping[str, Array] = {}
     """Empty: the reference of a recording is its bones."""
 
     def __init__(
@@ -111,14 +112,14 @@ class RecordedSubject:
             self.play(step.name, start_s)
             start_s += step.seconds
 
-    def _place_standing_bones(self) -> Mapping[str, NDArray[np.float64]]:
+    def _place_standing_bones(self) -> Mapping[str, Array]:
         """Return the origins of the bones while standing.
 
         Each bone is attached to the more proximal one as in the first frame, so that the joints
         remain connected when the bones are upright.
         """
-        placed: dict[str, NDArray[np.float64]] = {}
-        above: tuple[Rotation, NDArray[np.float64], NDArray[np.float64]] | None = None
+        placed: dict[str, Array] = {}
+        above: tuple[Rotation, Array, Array] | None = None
         for name, (turns, origins) in self._bones.items():
             turn, origin = from_wxyz(turns.at(_FIRST)[0]), origins.at(_FIRST)[0]
             placed[name] = origin
@@ -168,7 +169,7 @@ class RecordedSubject:
     def discard_before(self, t_s: float) -> None:
         """Discard nothing; the number of switches is small."""
 
-    def _place(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _place(self, t_s: Array) -> tuple[Array, Array]:
         """Return the time within the trial, s, and the share of trial (1) against standing (0).
 
         The recording starts after the blend; during the blend its first posture is held.
@@ -188,7 +189,7 @@ class RecordedSubject:
             before = name
         return place, share
 
-    def _synthetic(self, t_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _synthetic(self, t_s: Array) -> NDArray[np.bool_]:
         """Return whether neither the static pose nor the recording plays, at each instant."""
         synthetic = np.zeros(len(t_s), dtype=np.bool_)
         before = _STAND
@@ -205,12 +206,7 @@ class RecordedSubject:
             before = name
         return synthetic
 
-    def observe(
-        self,
-        sensors: Sequence[NDArray[np.float64]],
-        cameras: NDArray[np.float64],
-        truth: NDArray[np.float64],
-    ) -> Observation:
+    def observe(self, sensors: Sequence[Array], cameras: Array, truth: Array) -> Observation:
         """Return the observation at the instants (s) of each sensor, the cameras, the log."""
         orientations = [
             self._sensor(name, t) for name, t in zip(self.sensors, sensors, strict=True)
@@ -223,12 +219,12 @@ class RecordedSubject:
         bones = {name: self._bone(name, cameras) for name in self._bones}
         return Observation(orientations, markers, bones, self._truth(truth))
 
-    def _sensor(self, name: str, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _sensor(self, name: str, t_s: Array) -> Array:
         bias = self._recording.biases.get(name)
         still = self._tracks[name].at(_FIRST)[0] if bias is None else bias * [1, -1, -1, -1]
         return self._blended(self._tracks[name], still, t_s)
 
-    def _bone(self, name: str, t_s: NDArray[np.float64]) -> tuple[Rotation, NDArray[np.float64]]:
+    def _bone(self, name: str, t_s: Array) -> tuple[Rotation, Array]:
         turns, origins = self._bones[name]
         upright = np.array([1.0, 0.0, 0.0, 0.0])
         still = upright if self._recording.biases else turns.at(_FIRST)[0]
@@ -238,9 +234,7 @@ class RecordedSubject:
         origin[self._synthetic(t_s)] = np.nan
         return from_wxyz(self._blended(turns, still, t_s)), origin
 
-    def _blended(
-        self, track: InterpolatedTrack, still: NDArray[np.float64], t_s: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _blended(self, track: InterpolatedTrack, still: Array, t_s: Array) -> Array:
         """Return a track blended with its value while standing, along the shortest arc."""
         place, share = self._place(t_s)
         moving = track.at(place)
@@ -251,7 +245,7 @@ class RecordedSubject:
             moving[blending] = to_wxyz(rest * Rotation.from_rotvec(arc))
         return moving
 
-    def _truth(self, t_s: NDArray[np.float64]) -> GroundTruth:
+    def _truth(self, t_s: Array) -> GroundTruth:
         bones = {name: self._bone(name, t_s) for name in self._bones}
         unknown = np.full((len(t_s), 3), np.nan)
         joints = {"hip": unknown, "knee": unknown, "ankle": unknown}

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 BONES = {"femur": "thigh", "tibia": "shank", "thigh": "thigh", "shank": "shank"}
 """Bone names of recordings (without their side) and the segments of the rig."""
@@ -51,7 +51,7 @@ class RecordedTrial:
 
     orientations: OrientationTrial
     markers: MarkerTrajectories | None = None
-    biases: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    biases: Mapping[str, Array] = field(default_factory=dict)
     """q_sensor_segment of the static pose, by sensor."""
 
     @property
@@ -70,7 +70,7 @@ def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
     """
     orientations: list[OrientationTrial] = []
     markers: MarkerTrajectories | None = None
-    biases: dict[str, NDArray[np.float64]] = {}
+    biases: dict[str, Array] = {}
     for path in paths:
         match path.suffix.lower():
             case ".npz":
@@ -115,15 +115,13 @@ class InterpolatedTrack:
         Whether the values are unit quaternions.
     """
 
-    def __init__(
-        self, t_s: NDArray[np.float64], values: NDArray[np.float64], *, rotation: bool
-    ) -> None:
+    def __init__(self, t_s: Array, values: Array, *, rotation: bool) -> None:
         self._t_s, self._values, self._rotation = t_s, values, rotation
         if rotation:
             turned = np.sum(values[1:] * values[:-1], axis=1) < 0
             self._values = values * np.append(1.0, np.cumprod(np.where(turned, -1.0, 1.0)))[:, None]
 
-    def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, t_s: Array) -> Array:
         """Return the values at instants of shape (n,), clipped to the recorded time."""
         right = np.clip(np.searchsorted(self._t_s, t_s, side="right"), 1, len(self._t_s) - 1)
         begin, end = self._t_s[right - 1], self._t_s[right]

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.settings import Knobs
 
 SENSORS = {"S1": "thigh", "S2": "thigh", "S3": "shank", "S4": "shank"}
@@ -93,7 +92,7 @@ class SimulatedSubject:
         self._place_sensors(knobs, reference)
         self._place_markers(knobs, reference)
 
-    def _place_sensors(self, knobs: Knobs, reference: NDArray[np.float64]) -> None:
+    def _place_sensors(self, knobs: Knobs, reference: Array) -> None:
         common = np.radians(knobs.soft_tissue_common_deg)
         single = np.radians(knobs.soft_tissue_sensor_deg)
         parts = sorted(set(self.sensors.values()))
@@ -114,7 +113,7 @@ class SimulatedSubject:
             for place in ("mount", "plate mount")
         )
 
-    def _place_markers(self, knobs: Knobs, reference: NDArray[np.float64]) -> None:
+    def _place_markers(self, knobs: Knobs, reference: Array) -> None:
         templates = marker_templates(knobs.random("markers"), self.geometry)
         self.templates = {**templates, "plate": PLATE_TEMPLATE}
         self._marker_artefacts = {
@@ -157,12 +156,7 @@ class SimulatedSubject:
         """Discard the state for instants before `t_s`, which are not requested again."""
         self._script.discard_before(t_s)
 
-    def observe(
-        self,
-        sensors: Sequence[NDArray[np.float64]],
-        cameras: NDArray[np.float64],
-        truth: NDArray[np.float64],
-    ) -> Observation:
+    def observe(self, sensors: Sequence[Array], cameras: Array, truth: Array) -> Observation:
         """Return the observation at the instants (s) of each sensor, the cameras, the log."""
         # compute the postures of all streams at once, then divide them by stream
         streams = [*sensors, cameras, truth]
@@ -192,13 +186,7 @@ class SimulatedSubject:
         )
         return Observation(orientations, markers, {}, ground_truth)
 
-    def _sensor(
-        self,
-        sensor: str,
-        t_s: NDArray[np.float64],
-        coordinates: NDArray[np.float64],
-        bone: Rotation,
-    ) -> NDArray[np.float64]:
+    def _sensor(self, sensor: str, t_s: Array, coordinates: Array, bone: Rotation) -> Array:
         if not len(t_s):
             return np.empty((0, 4))
         common = self._common[self.sensors[sensor]].at(t_s, coordinates)[:, 0]
@@ -214,9 +202,7 @@ class SimulatedSubject:
         arc = (on_leg.inv() * on_plate).as_rotvec() * share
         return to_wxyz(on_leg * Rotation.from_rotvec(arc))
 
-    def _markers(
-        self, t_s: NDArray[np.float64], coordinates: NDArray[np.float64], pose: LegPose
-    ) -> NDArray[np.float64]:
+    def _markers(self, t_s: Array, coordinates: Array, pose: LegPose) -> Array:
         if not len(t_s):
             return np.empty((0, sum(map(len, CLUSTERS.values())), 3))
         markers = [
@@ -236,7 +222,7 @@ class SimulatedSubject:
 
 def _soft_tissue(
     knobs: Knobs,
-    reference: NDArray[np.float64],
+    reference: Array,
     purpose: str,
     part: str,
     rms: float,
@@ -257,11 +243,9 @@ def _soft_tissue(
     )
 
 
-def _to_world(
-    turn: Rotation, origin: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _to_world(turn: Rotation, origin: Array, points: Array) -> Array:
     """Return world coordinates of points in the frame of a body, shape (n, k, 3)."""
-    turned: NDArray[np.float64] = np.einsum("nij,nkj->nki", turn.as_matrix(), points)
+    turned: Array = np.einsum("nij,nkj->nki", turn.as_matrix(), points)
     return turned + origin[:, None, :]
 
 

@@ -17,7 +17,7 @@ from jointfit_simulators.body._limb import ANKLE, HIP, KNEE
 from jointfit_simulators.body._random_signal import random_vector_signal
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 ADJACENT: dict[str, tuple[slice, ...]] = {
     "pelvis": (HIP,),
@@ -33,7 +33,7 @@ _ROUNDING = 0.05
 """Rounding of the posture magnitude near upright stance, where its derivative is undefined."""
 
 
-def _features(coordinates: NDArray[np.float64], joint: slice) -> NDArray[np.float64]:
+def _features(coordinates: Array, joint: slice) -> Array:
     flexion, adduction, rotation = coordinates[:, joint].T
     return np.column_stack(
         (
@@ -46,17 +46,14 @@ def _features(coordinates: NDArray[np.float64], joint: slice) -> NDArray[np.floa
     )
 
 
-def _rms_length(vectors: NDArray[np.float64]) -> float:
+def _rms_length(vectors: Array) -> float:
     """Return the RMS length of all vectors over time, shape (n, vectors, 3)."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
 
 
 def _mixing(
-    random: np.random.Generator,
-    features: NDArray[np.float64],
-    vectors: int,
-    common_share: float,
-) -> NDArray[np.float64]:
+    random: np.random.Generator, features: Array, vectors: int, common_share: float
+) -> Array:
     """Return random directions for the features of one joint; RMS length 1 over all vectors."""
     kinds = features.shape[1]
     common = random.standard_normal((kinds, 1, 3))
@@ -67,7 +64,7 @@ def _mixing(
     single = random.standard_normal((kinds, vectors, 3))
     single -= single.mean(axis=1, keepdims=True)
     single /= _rms_length(np.tensordot(features, single, 1))
-    mixed: NDArray[np.float64] = np.sqrt(common_share) * common + np.sqrt(1 - common_share) * single
+    mixed: Array = np.sqrt(common_share) * common + np.sqrt(1 - common_share) * single
     return mixed
 
 
@@ -110,7 +107,7 @@ class SoftTissue:
         rms: float,
         random_share: float,
         knee_share: float,
-        reference: NDArray[np.float64],
+        reference: Array,
         common_share: float = 0.0,
     ) -> None:
         self._joints = ADJACENT[part]
@@ -141,19 +138,19 @@ class SoftTissue:
         spread = np.sqrt((1 - common_share) * vectors / max(vectors - 1, 1))
         self._single = None if vectors == 1 else noise(vectors, rms=noise_rms * spread)
 
-    def _repeatable(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _repeatable(self, coordinates: Array) -> Array:
         features = np.concatenate([_features(coordinates, j) for j in self._joints], axis=1)
-        displacements: NDArray[np.float64] = np.tensordot(features, self._mixing, 1)
+        displacements: Array = np.tensordot(features, self._mixing, 1)
         return displacements
 
-    def _magnitude(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _magnitude(self, coordinates: Array) -> Array:
         square = np.full(len(coordinates), _ROUNDING**2)
         for gain, joint in zip(self._gains, self._joints, strict=True):
             square += gain * np.sum(_features(coordinates, joint) ** 2, axis=1)
-        magnitude: NDArray[np.float64] = np.sqrt(square) - _ROUNDING
+        magnitude: Array = np.sqrt(square) - _ROUNDING
         return magnitude
 
-    def at(self, t_s: NDArray[np.float64], coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, t_s: Array, coordinates: Array) -> Array:
         """Return the displacements, shape (n, vectors, 3), in the frame of the part."""
         noise = self._common.at(t_s)[:, None, :]
         if self._single is not None:

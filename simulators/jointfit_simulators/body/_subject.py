@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body._orientation import Rotation
 
 
@@ -18,22 +16,22 @@ class GroundTruth(NamedTuple):
 
     orientations: Mapping[str, Rotation]
     """Orientation of each segment: segment coordinates to base world."""
-    joints: Mapping[str, NDArray[np.float64]]
+    joints: Mapping[str, Array]
     """Centre of each joint, m, shape (n, 3); NaN if unknown."""
-    knee: NDArray[np.float64]
+    knee: Array
     """Flexion (heel back), adduction, internal rotation, rad, shape (n, 3)."""
-    included: NDArray[np.float64]
+    included: Array
     """Inner angle of the knee, rad, shape (n,): pi when straight."""
 
 
 class Observation(NamedTuple):
     """Error-free measurements of one block of time, each stream at its own instants."""
 
-    sensors: Sequence[NDArray[np.float64]]
+    sensors: Sequence[Array]
     """q_base_sensor of each sensor, with alignment and soft-tissue artefact, shape (n, 4)."""
-    markers: NDArray[np.float64]
+    markers: Array
     """Marker positions on the skin, m, shape (m, markers, 3); NaN if not recorded."""
-    bones: Mapping[str, tuple[Rotation, NDArray[np.float64]]]
+    bones: Mapping[str, tuple[Rotation, Array]]
     """Orientation and origin (m) of bones that the cameras stream as bodies."""
     truth: GroundTruth
 
@@ -50,7 +48,7 @@ class InstrumentedSubject(Protocol):
         """Markers of each body part, in the order of `Observation.markers`."""
 
     @property
-    def templates(self) -> Mapping[str, NDArray[np.float64]]:
+    def templates(self) -> Mapping[str, Array]:
         """Markers of each rigid body in the frame of the body, m, shape (markers, 3)."""
 
     @property
@@ -70,10 +68,5 @@ class InstrumentedSubject(Protocol):
     def discard_before(self, t_s: float) -> None:
         """Discard the state for instants before `t_s`, which are not requested again."""
 
-    def observe(
-        self,
-        sensors: Sequence[NDArray[np.float64]],
-        cameras: NDArray[np.float64],
-        truth: NDArray[np.float64],
-    ) -> Observation:
+    def observe(self, sensors: Sequence[Array], cameras: Array, truth: Array) -> Observation:
         """Return the observation at the instants (s) of each sensor, the cameras, the log."""

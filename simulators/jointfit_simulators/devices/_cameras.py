@@ -17,6 +17,7 @@ from jointfit_simulators.body import Rotation, heading, to_wxyz
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body import InstrumentedSubject, Observation
     from jointfit_simulators.settings import Knobs
 
@@ -28,11 +29,11 @@ _UP_TO_Y = Rotation.from_euler("x", 90, degrees=True)
 class CameraFrames(NamedTuple):
     """Camera frames of one block; occluded markers and untracked bodies are NaN."""
 
-    markers: NDArray[np.float64]
+    markers: Array
     """Shape (n, markers, 3)."""
-    body_positions: NDArray[np.float64]
+    body_positions: Array
     """Shape (n, bodies, 3)."""
-    body_orientations: NDArray[np.float64]
+    body_orientations: Array
     """q_world_body, shape (n, bodies, 4)."""
 
 
@@ -83,7 +84,7 @@ class Cameras:
     def capture(self, observation: Observation) -> CameraFrames:
         """Return the camera frames of one block."""
         n = len(observation.markers)
-        markers: NDArray[np.float64] = observation.markers @ self.world.as_matrix().T
+        markers: Array = observation.markers @ self.world.as_matrix().T
         markers = markers + self._random.standard_normal(markers.shape) * self._noise_m
         markers[self._occluded(n)] = np.nan
 
@@ -114,9 +115,7 @@ class Cameras:
         return hidden | self.covered
 
 
-def _fit(
-    template: NDArray[np.float64], markers: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _fit(template: Array, markers: Array) -> tuple[Array, Array]:
     """Return position (n, 3) and orientation (n, 4) of a body from its markers (n, k, 3).
 
     The rotation over the visible markers is Kabsch's; with fewer than three it is NaN.

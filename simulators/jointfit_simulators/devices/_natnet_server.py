@@ -64,8 +64,8 @@ class Client:
 
     address: Address
     version: Version
-    heard_ns: int
-    since_ns: int
+    last_message_ns: int
+    connected_ns: int
     described: bool = False
     changed: int = 0
     """Number of frames that still announce the new bitstream."""
@@ -181,10 +181,10 @@ class NatNetServer:
             return
         now_ns = time.monotonic_ns()
         for client in self.clients:
-            if now_ns - client.heard_ns > self.options.keepalive_s * _NS:
+            if now_ns - client.last_message_ns > self.options.keepalive_s * _NS:
                 self._send(Bare(NatNetMessageId.DISCONNECTBYTIMEOUT), client.address)
                 self._disconnect(client)
-            elif client.described or now_ns - client.since_ns > _PATIENCE_NS:
+            elif client.described or now_ns - client.connected_ns > _PATIENCE_NS:
                 self._send_frame(client, frame)
 
     # --- frames -------------------------------------------------------------------------------
@@ -238,7 +238,7 @@ class NatNetServer:
         message = decode(data, self.options.bitstream)
         client = self._clients.get(address)
         if client is not None:
-            client.heard_ns = time.monotonic_ns()
+            client.last_message_ns = time.monotonic_ns()
 
         match message:
             case Discovery():

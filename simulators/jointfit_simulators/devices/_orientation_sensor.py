@@ -9,8 +9,7 @@ import numpy as np
 from jointfit_simulators.body import Rotation, from_wxyz, heading, random_vector_signal, to_wxyz
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.settings import Knobs
 
 _DRIFT_HZ = (0.005, 0.1)
@@ -53,9 +52,7 @@ class OrientationSensor:
         self._white = knobs.random(f"white error {name}")
         self._white_rad = np.radians(knobs.orientation_white_deg) / np.sqrt(3)
 
-    def report(
-        self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def report(self, t_s: Array, q_base_sensor: Array) -> Array:
         """Return the measured q_world_sensor, shape (n, 4); NaN inputs give NaN."""
         known = np.isfinite(q_base_sensor[:, 0])
         measured = np.full_like(q_base_sensor, np.nan)

@@ -13,7 +13,7 @@ import numpy as np
 from jointfit_simulators.body import Rotation, from_wxyz, to_wxyz
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 SLIP_S = 0.3
 """Duration of a slip, s."""
@@ -26,7 +26,7 @@ class SensorFaults:
 
     def __init__(self) -> None:
         self._stuck = False
-        self._held: NDArray[np.float64] | None = None
+        self._held: Array | None = None
         self._slipped_rad, self._slip_s, self._before_rad = 0.0, -np.inf, 0.0
         self._rate_rad_s, self._turned_rad = 0.0, 0.0
         self._now_s = -np.inf
@@ -49,7 +49,7 @@ class SensorFaults:
         """Rotate the sensor's world about the vertical from now on; 0 stops at that heading."""
         self._rate_rad_s = rate_rad_s
 
-    def apply(self, t_s: NDArray[np.float64], measured: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, t_s: Array, measured: Array) -> Array:
         """Return q_world_sensor with the faults, shape (n, 4); NaN inputs give NaN."""
         if not len(t_s):
             return measured

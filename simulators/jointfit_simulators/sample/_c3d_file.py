@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from jointfit_daemon.arrays import Array
 
 _BLOCK = 512
 """Bytes per block."""
@@ -33,9 +33,7 @@ _MISSING = -1.0
 """Residual of a missing point."""
 
 
-def c3d_bytes(
-    names: Sequence[str], positions: NDArray[np.float64], *, rate_hz: float, up: str
-) -> bytes:
+def c3d_bytes(names: Sequence[str], positions: Array, *, rate_hz: float, up: str) -> bytes:
     """Return a C3D file.
 
     Parameters

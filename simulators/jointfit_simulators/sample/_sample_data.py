@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_protocols.can import CanFrame
     from jointfit_simulators.devices import Pose, Vector
     from jointfit_simulators.imu_device import Quaternion
@@ -51,13 +50,7 @@ CAPTURE_S = 2.0
 """Duration of the captures, s."""
 APART_S = 200.0
 """Time between the starts of two trials, s, so that their noise is independent."""
-TRIALS = {
-    "standing": 5.0,
-    "squats": 8.0,
-    "walking": 8.0,
-    "knee_swings": 8.0,
-    "sit_to_stand": 8.0,
-}
+TRIALS = {"standing": 5.0, "squats": 8.0, "walking": 8.0, "knee_swings": 8.0, "sit_to_stand": 8.0}
 """Names and durations of the trials, s."""
 _MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}
 """Motions of trials that have another name."""
@@ -71,15 +64,15 @@ _IDS = {
 class SampleTrial(NamedTuple):
     """Recorded data of one trial, z up."""
 
-    t_s: NDArray[np.float64]
-    sensors: Mapping[str, NDArray[np.float64]]
+    t_s: Array
+    sensors: Mapping[str, Array]
     """q_world_sensor, shape (n, 4)."""
-    bones: Mapping[str, NDArray[np.float64]]
+    bones: Mapping[str, Array]
     """q_world_segment, shape (n, 4)."""
     markers: tuple[str, ...]
-    positions: NDArray[np.float64]
+    positions: Array
     """Marker positions, m, shape (n, len(markers), 3); NaN if occluded."""
-    bodies: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+    bodies: Mapping[str, tuple[Array, Array]]
     """Rigid bodies of the cameras: positions, m, shape (n, 3), and q_world_body, shape (n, 4)."""
 
 

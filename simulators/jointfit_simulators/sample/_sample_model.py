@@ -14,8 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body import LegGeometry
 
 LOCKED = ("P1", "P2")
@@ -59,7 +58,7 @@ def leg_parts(geometry: LegGeometry) -> list[Part]:
 def misplaced_markers(
     random: np.random.Generator,
     clusters: Mapping[str, Sequence[str]],
-    templates: Mapping[str, NDArray[np.float64]],
+    templates: Mapping[str, Array],
     parts: Sequence[Part],
 ) -> list[SampleMarker]:
     """Return the markers of `parts`, displaced at random except those of the pelvis."""

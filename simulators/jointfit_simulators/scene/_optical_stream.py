@@ -40,11 +40,7 @@ class OpticalStream:
     """
 
     def __init__(
-        self,
-        knobs: Knobs,
-        cameras: Cameras,
-        timing: SampleTiming,
-        server: NatNetServer | None,
+        self, knobs: Knobs, cameras: Cameras, timing: SampleTiming, server: NatNetServer | None
     ) -> None:
         self.cameras = cameras
         self.on_sample: SampleCallback | None = None

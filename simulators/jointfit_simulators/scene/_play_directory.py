@@ -68,7 +68,7 @@ class PlayDirectory:
             return before
         return 0
 
-    def remember(self, command_port: int | None) -> None:
+    def store_command_port(self, command_port: int | None) -> None:
         """Store the port for the next run; None leaves the stored port unchanged."""
         stored = self._before.get("command_port") if command_port is None else command_port
         os.ftruncate(self._file, 0)
@@ -97,7 +97,7 @@ def play_directory(path: Path) -> Iterator[PlayDirectory]:
             ) from None
 
         directory = PlayDirectory(path, file)
-        directory.remember(None)
+        directory.store_command_port(None)
         yield directory
     finally:
         os.close(file)

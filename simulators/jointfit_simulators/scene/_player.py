@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.body import InstrumentedSubject
     from jointfit_simulators.scene._optical_stream import OpticalStream
     from jointfit_simulators.scene._streams import ImuStream, SampleCallback
@@ -162,5 +163,5 @@ class ScenePlayer:
         self._planned_ns = end_ns
         self._subject.discard_before((begin_ns - self._origin_ns) / NS)
 
-    def _seconds(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _seconds(self, t_ns: NDArray[np.int64]) -> Array:
         return (t_ns - self._origin_ns) / NS

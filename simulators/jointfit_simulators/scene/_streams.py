@@ -18,6 +18,7 @@ from jointfit_simulators.imu_device import ImuDevice
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from jointfit_daemon.arrays import Array
     from jointfit_simulators.imu_device import Quaternion
     from jointfit_simulators.settings import Knobs
 
@@ -112,7 +113,7 @@ class ImuStream:
         self._block = self.timing.samples(begin_ns, end_ns, NS / rate_hz)
         return self._block.host_ns
 
-    def fill(self, t_s: NDArray[np.float64], q_base_sensor: NDArray[np.float64]) -> list[int]:
+    def fill(self, t_s: Array, q_base_sensor: Array) -> list[int]:
         """Add orientations to the planned samples and return the transmission times, ns."""
         measured = self.faults.apply(t_s, self.sensor.report(t_s, q_base_sensor))
         lost = self._block.dropped | ~np.isfinite(measured[:, 0])
