@@ -6,6 +6,10 @@ With ``--experiments`` the tests with the marker ``experiment`` run, otherwise a
 leaves a JUnit report in ``build/tests`` or ``build/experiments``; the last line counts the tests of
 both parts and the seconds.
 
+System tests start daemons in real time, which other tests on the same cores can starve. One that
+fails beside others is repeated once, alone: it passes only if it passes then, and the summary names
+it. All other tests get no second chance.
+
 Invariant: the exit status is 0 only if both parts passed.
 """
 
@@ -22,6 +26,8 @@ from pathlib import Path
 BUILD = Path(__file__).resolve().parents[1] / "build"
 WORKERS_PER_CORE = 2
 """Half of the time of the long tests is waiting, for devices and daemons in real time."""
+TESTS_FAILED = 1
+"""Exit status of pytest when tests failed."""
 NO_TESTS = 5
 """Exit status of pytest when it collected nothing."""
 
@@ -43,26 +49,55 @@ def main(arguments: list[str]) -> int:
 
     # An idle worker takes tests from the others: there are few long ones.
     parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])
+    disturbed: list[str] = []
+    if parallel == TESTS_FAILED and not experiments:
+        disturbed = _repeat_system_tests(reports)
+        parallel = 0 if disturbed else parallel
     alone = _run(parts[1], reports, arguments)
 
     duration_s = time.monotonic() - began
-    print(f"{name}: {_counts(reports)} in {duration_s:.0f} s on {cores} cores", flush=True)
+    for test in disturbed:
+        print(f"failed beside others, passed alone: {test}")
+    print(
+        f"{name}: {_counts(reports, disturbed)} in {duration_s:.0f} s on {cores} cores", flush=True
+    )
     failed = [status for status in (parallel, alone) if status not in {0, NO_TESTS}]
     if failed:
         return failed[0]
     return min(parallel, alone)  # nothing was collected only if neither part collected anything
 
 
-def _run(part: str, reports: Path, arguments: list[str]) -> int:
-    report = reports / f"{part}.xml"
-    command = [sys.executable, "-m", "pytest", "--part", part, f"--junitxml={report}", *arguments]
+def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> int:
+    path = reports / f"{report or part}.xml"
+    command = [sys.executable, "-m", "pytest", "--part", part, f"--junitxml={path}", *arguments]
     return subprocess.run(command, check=False).returncode  # noqa: S603 - our own command
 
 
-def _counts(reports: Path) -> str:
+def _repeat_system_tests(reports: Path) -> list[str]:
+    """Repeat the failed system tests alone; return their names if this cleared all failures."""
+    selection = ["--last-failed", "--last-failed-no-failures=none", "-m", "system"]
+    if _run("parallel", reports, selection, report="repeated") != 0:
+        return []
+    failed = {
+        name
+        for name, case in _cases(reports / "parallel.xml")
+        if {"failure", "error"} & {child.tag for child in case}
+    }
+    repeated = {name for name, _ in _cases(reports / "repeated.xml")}
+    return sorted(failed) if failed <= repeated else []
+
+
+def _cases(report: Path) -> list[tuple[str, ET.Element]]:
+    """Return the tests of a report by name."""
+    cases = ET.parse(report).getroot().iter("testcase")  # noqa: S314 - pytest's, just made
+    return [(f"{case.get('classname')}::{case.get('name')}", case) for case in cases]
+
+
+def _counts(reports: Path, disturbed: list[str]) -> str:
     suites = [
         suite
         for report in sorted(reports.glob("*.xml"))
+        if report.stem != "repeated"
         for suite in ET.parse(report).getroot().iter("testsuite")  # noqa: S314 - pytest's, just made
     ]
     total, failed, errors, skipped = (
@@ -70,6 +105,8 @@ def _counts(reports: Path) -> str:
         for key in ("tests", "failures", "errors", "skipped")
     )
     passed = total - failed - errors - skipped
+    if disturbed:  # they have passed alone
+        passed, failed, errors = passed + failed + errors, 0, 0
     return f"{passed} passed, {failed} failed, {errors} errors, {skipped} skipped"
 
 
