@@ -67,7 +67,7 @@ class MocapRouter:
             if lags is not None and stamp.synced:
                 lags.add_mocap(stamp.t_ns, frame, stamp.epoch)
                 collector.add_mocap(stamp.t_ns, frame, stamp.epoch)
-            if session.collecting:
+            if session.collecting and stamp.synced:
                 used = True
                 session.add_mocap(stamp.t_ns, frame)
             if self._locator is not None:

@@ -1,9 +1,9 @@
 """One connection to a NatNet server, from CONNECT to silence.
 
 1. CONNECT every 0.5 s until SERVERINFO, which determines the data socket.
-2. Ten echo requests, 50 ms apart, for the clock.
-3. REQUEST_MODELDEF every 0.5 s until MODELDEF.
-4. Frames; one echo request a second, and in unicast one KEEPALIVE a second.
+2. REQUEST_MODELDEF every 0.5 s until MODELDEF: frames cannot be used without it.
+3. Frames; ten echo requests, 50 ms apart, then one a second, and in unicast one KEEPALIVE a second.
+   Frames before the tenth answer are unsynchronized.
 
 Every accepted datagram is emitted before it is processed here, so that a replay has the same input.
 The receiver of the chunks decodes the frames. This module reads only their flags, and decodes one
@@ -114,12 +114,6 @@ class NatNetSession:
                     asked = natnet.CommandRequest(f"Bitstream,{self._settings.bitstream}")
                     await self._request(asked, RETRY_S, lambda: self._confirmed)
 
-                for _ in range(FIRST_ECHOES):
-                    next_at = time.monotonic() + FIRST_ECHO_S
-                    self._send(natnet.EchoRequest(time.monotonic_ns()))
-                    while (left := next_at - time.monotonic()) > 0:
-                        await link.pause(left)
-
                 model = natnet.Bare(NatNetMessageId.REQUEST_MODELDEF)
                 await self._request(model, MODEL_S, lambda: self._known is not None)
                 if self._known is None:
@@ -217,13 +211,16 @@ class NatNetSession:
     async def _stream(self, info: natnet.ServerInfo, unicast: bool) -> None:
         began_ns = time.monotonic_ns()
         echo_at = alive_at = ask_at = 0.0
+        echoes = 0
         while True:
             now = time.monotonic()
             self._check_alive(info, unicast, max(self._frame_ns, began_ns))
 
             if now >= echo_at:
                 self._send(natnet.EchoRequest(time.monotonic_ns()))
-                echo_at = now + random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
+                echoes += 1
+                usual_s = random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
+                echo_at = now + (FIRST_ECHO_S if echoes < FIRST_ECHOES else usual_s)
 
             if unicast and now >= alive_at:
                 self._link.send(natnet.Bare(NatNetMessageId.KEEPALIVE))
