@@ -28,6 +28,8 @@ _FORBIDDEN = "+#/"
 _FOLDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _LONGEST_M = 3.0
 """Upper limit of a segment length, m; larger numbers are probably millimetres."""
+_STANDARD_MAX = 0x7FF
+"""Largest 11-bit CAN identifier."""
 _LEAST_MARKERS = 3
 """Smallest number of markers that defines an orientation."""
 
@@ -189,16 +191,27 @@ def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) 
 
 
 def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
-    """Check that every message id on a bus belongs to one sensor."""
-    owners: dict[tuple[str, int], str] = {}
+    """Check that every message id on a bus belongs to one sensor.
+
+    An 11-bit and a 29-bit identifier of the same number are different identifiers.
+    """
+    owners: dict[tuple[str, int, bool], str] = {}
     for source in sources:
-        bus = getattr(source.settings, "can", None)
+        settings = source.settings
+        bus = getattr(settings, "can", None)
         if bus is None:
             continue
-        for message, number in _numbers(getattr(source.settings, "ids", None)):
-            user = f"{source.id} ({message})"
-            if (owner := owners.setdefault((repr(bus), number), user)) != user:
+
+        ids = getattr(settings, "ids", None)
+        for message, number in _numbers(ids):
+            extended = getattr(settings, "extended_ids", False) or number > _STANDARD_MAX
+            derived = " derived from its other ids" if getattr(ids, message, 0) is None else ""
+            user = f"{source.id} ({message}{derived})"
+            owner = owners.setdefault((repr(bus), number, extended), user)
+            if owner != user:
                 text = f"id {number:#x} on this bus belongs to {owner}; expected a unique id"
+                if derived:
+                    text = f"{text}. It is{derived}: set it to an unused one"
                 yield Fault(f"imu[{source.id}].ids.{message}", text)
 
 

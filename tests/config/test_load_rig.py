@@ -399,6 +399,30 @@ def real_rig(**changed: Any) -> Table:
 
 
 @pytest.mark.parametrize(
+    ("base", "line"),
+    [
+        (0x0C, "imu[S4].ids.sample_time: id 0x11 on this bus belongs to S3 (status_word derived "
+         "from its other ids); expected a unique id"),
+        (0x05, "imu[S4].ids.error: id 0x6 on this bus belongs to S3 (group_counter); expected a "
+         "unique id. It is derived from its other ids: set it to an unused one"),
+    ],
+)  # fmt: skip
+def test_identifiers_derived_for_a_sensor_must_not_belong_to_another(base: int, line: str) -> None:
+    table = real_rig()
+    ids = {"sample_time": 0x05, "group_counter": 0x06, "quaternion": 0x21}
+    table["imu"][1]["ids"] = ids
+    table["imu"][2]["ids"] = {name: number + base for name, number in ids.items()}
+    assert complaints(table) == [line]
+
+
+def test_an_11_bit_and_a_29_bit_identifier_of_one_number_are_different() -> None:
+    table = real_rig()
+    del table["imu"][2]["ids"]
+    table["imu"][2]["extended_ids"] = True
+    assert len(parse_rig(table).sources) == 3
+
+
+@pytest.mark.parametrize(
     ("changed", "said"),
     [
         ({"xbus": {"baud": 9600}},

@@ -30,6 +30,7 @@ _LONGEST_SILENCE_S = 30.0
 """Longest wait for an absent sensor, s. It stays subscribed, and its first frame is received at
 once."""
 _SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
+_ID_NAMES = XcdiIds._fields[:5]
 _RAW_FRAMES = 20
 """Frames logged at debug level, so that the log shows the raw data of a device."""
 
@@ -60,9 +61,16 @@ class XcdiIdSettings(Settings):
         """Refuse identifiers that are not distinct, or whose order would split groups."""
         ids = self.resolved()
 
-        given = [number for number in ids[:5] if number is not None]
-        if len(set(given)) < len(given):
-            raise ValueError("each identifier once: found one twice")
+        owners: dict[int, str] = {}
+        for name, number in zip(_ID_NAMES, ids, strict=False):  # without `extended`
+            if number is None:
+                continue
+            if (owner := owners.setdefault(number, name)) != name:
+                derived = [key for key in (owner, name) if getattr(self, key) is None]
+                hint = f" ({derived[0]} is derived from the others: set it, too)" if derived else ""
+                raise ValueError(
+                    f"each identifier once: found 0x{number:X} for {owner} and {name}{hint}"
+                )
         if not self.sample_time < self.group_counter < self.quaternion:
             raise ValueError(
                 "sample_time < group_counter < quaternion: the lowest identifier leaves first, and "

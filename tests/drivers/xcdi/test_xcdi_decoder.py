@@ -357,11 +357,25 @@ def test_identifiers_left_out_move_with_their_block() -> None:
     assert (alone.resolved().error, alone.resolved().status_word) == (None, None)
 
 
+@pytest.mark.parametrize("base", [-1, 0, 1, 0x7DE, 0x7DF, 0x7FE])
+def test_derived_identifiers_never_leave_the_range_of_the_given_ones(base: int) -> None:
+    """The block's largest identifier is the quaternion's, which is always given and checked."""
+    ids = {"sample_time": base + 5, "group_counter": base + 6, "quaternion": base + 0x21}
+    if base + 0x21 > 0x7FF:
+        with pytest.raises(ValidationError, match="above 0x7FF, the greatest 11-bit identifier"):
+            settings(ids=ids)
+    else:
+        found = XcdiIdSettings(**ids).resolved()
+        assert all(0 <= number <= 0x7FF for number in found[:5] if number is not None)
+        assert (found.error is None) == (base < 0)
+
+
 @pytest.mark.parametrize(
     ("ids", "words"),
     [
         ({"sample_time": 0x130}, "sample_time < group_counter < quaternion"),
-        ({"error": 0x05}, "found one twice"),
+        ({"error": 0x05}, "found 0x5 for sample_time and error"),
+        ({"status_word": 0x01}, "0x1 for status_word and error .error is derived from the others"),
         ({"quaternion": 2**29}, "less than or equal"),
         ({"quaternion": 0x821}, "ids.quaternion = 0x821 is above 0x7FF.*extended_ids = true"),
         ({"quaternions": 3}, "Extra inputs"),
