@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import datetime
+import resource
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,7 @@ from jointfit_daemon.supervisor.daemon import Daemon
 from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from jointfit_daemon.pipeline.events import Event, Output
@@ -176,6 +179,55 @@ async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_store
     found = _calibration_store.load_latest(rig).calibration
     assert found is not None
     assert found.notes == ("new",)
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """Let no file grow beyond 1000 bytes: the kernel refuses the rest, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+async def test_a_calibration_on_a_full_disk_is_published_and_stored_when_there_is_space(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.RETRY_S", 0.05)
+    _calibration_store.save(rig, calibration_of(rig, "old"))
+    folder = _calibration_store.store_of(rig).path(1).parent
+    core = ReadyCore(calibration_of(rig, "new"))
+    daemon = Daemon(tmp_path / "rig.toml", rig, core)
+    running = asyncio.create_task(daemon.run())
+    async with asyncio.timeout(20):
+        while not core.events:
+            await asyncio.sleep(0.01)
+        with full_disk():
+            daemon._core.feed(Request(1, "calibrate", "t", {}))
+            while daemon._calibrations.fault is None:
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.2)  # some more attempts
+            assert "File too large" in daemon._calibrations.fault
+            published = daemon._outbox.retained["jointfit/bench-1/calibration"]
+            assert b"in force but not stored" in published
+            daemon._publish_health()
+            health = daemon._outbox.retained["jointfit/bench-1/bridge/health"]
+            assert b'"not_stored":"' in health
+            assert not (folder / "0002.json").exists()
+        while not any(isinstance(event, CalibrationStored) for event in core.events):
+            await asyncio.sleep(0.01)
+    daemon._publish_health()
+    health = daemon._outbox.retained["jointfit/bench-1/bridge/health"]
+    assert b'"not_stored":null' in health
+    running.cancel()
+    await asyncio.wait([running])
+    assert sorted(path.name for path in folder.iterdir()) == ["0001.json", "0002.json"]
+    found = _calibration_store.load_latest(rig)
+    assert (found.version, found.warnings) == (2, ())
+    assert found.calibration is not None
+    assert found.calibration.notes == ("new",)
 
 
 async def test_failed_write_is_retried(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
