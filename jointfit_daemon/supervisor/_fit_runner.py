@@ -90,7 +90,12 @@ async def _in_worker(job: FitJob) -> dict[str, Any]:
         async with asyncio.TaskGroup() as pipes:
             answer = pipes.create_task(_read(worker.stdout), name="fit result")
             printed = pipes.create_task(_read(worker.stderr), name="fit output")
-            pipes.create_task(_write(worker.stdin, data), name="fit job")
+            # The pipe stays open: the worker exits when it closes. If the worker ended early, its
+            # missing answer is reported.
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                if worker.stdin is not None:
+                    worker.stdin.write(HEADER.pack(len(data)) + data)
+                    await worker.stdin.drain()
         code = await worker.wait()
     finally:
         with contextlib.suppress(ProcessLookupError):
@@ -108,12 +113,3 @@ async def _in_worker(job: FitJob) -> dict[str, Any]:
 
 async def _read(pipe: asyncio.StreamReader | None) -> bytes:
     return b"" if pipe is None else await pipe.read()
-
-
-async def _write(pipe: asyncio.StreamWriter | None, data: bytes) -> None:
-    """Send the job and keep the pipe open: the worker exits when it closes."""
-    if pipe is not None:
-        # If the worker ended early, its missing answer is reported.
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            pipe.write(HEADER.pack(len(data)) + data)
-            await pipe.drain()
