@@ -33,7 +33,7 @@ _GAIT = ("Upper", "Front", "Rear")
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class ModelJoint:
     """Joint to estimate: its name in the model and the markers of its two segments."""
 
     name: str
@@ -43,10 +43,10 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class EstimatedCenters:
     """Estimates of one joint and the center of the model."""
 
-    joint: Joint
+    joint: ModelJoint
     reduced: ParentFrameMotion
     model: NDArray[np.float64]
     """Mean center of the model in parent coordinates over its frames, m."""
@@ -85,31 +85,31 @@ def hinge(reduced: ParentFrameMotion) -> NDArray[np.float64]:
     return np.asarray(vectors[:, 0])
 
 
-def opencap_joints() -> tuple[Joint, ...]:
+def opencap_joints() -> tuple[ModelJoint, ...]:
     sides = (("right", "r", "r"), ("left", "L", "l"))
     return tuple(
         joint
         for word, S, s in sides
         for joint in (
-            Joint(f"{word} hip", f"hip_{s}", _PELVIS, _THIGHS[S]),
-            Joint(f"{word} knee", f"walker_knee_{s}", _THIGHS[S], _SHANKS[S]),
+            ModelJoint(f"{word} hip", f"hip_{s}", _PELVIS, _THIGHS[S]),
+            ModelJoint(f"{word} knee", f"walker_knee_{s}", _THIGHS[S], _SHANKS[S]),
         )
     )
 
 
-def gait_joints() -> tuple[Joint, ...]:
+def gait_joints() -> tuple[ModelJoint, ...]:
     pelvis = ("R.ASIS", "L.ASIS", "V.Sacral")
     found = []
     for word, side in (("right", "R"), ("left", "L")):
         thigh = tuple(f"{side}.Thigh.{place}" for place in _GAIT)
         shank = tuple(f"{side}.Shank.{place}" for place in _GAIT)
-        found.append(Joint(f"{word} hip", f"hip_{side.lower()}", pelvis, thigh))
-        found.append(Joint(f"{word} knee", f"knee_{side.lower()}", thigh, shank))
+        found.append(ModelJoint(f"{word} hip", f"hip_{side.lower()}", pelvis, thigh))
+        found.append(ModelJoint(f"{word} knee", f"knee_{side.lower()}", thigh, shank))
     return tuple(found)
 
 
 @cache
-def judged(data: Path, trial: str, methods: tuple[str, ...]) -> tuple[Judged, ...]:
+def judged(data: Path, trial: str, methods: tuple[str, ...]) -> tuple[EstimatedCenters, ...]:
     """Estimate all joints of a trial: ``gait2354`` or one of `OPENCAP`."""
     if trial == "gait2354":
         model, joints = gait2354(data), gait_joints()
@@ -118,7 +118,7 @@ def judged(data: Path, trial: str, methods: tuple[str, ...]) -> tuple[Judged, ..
     return tuple(_judge(model, joint, methods) for joint in joints)
 
 
-def _judge(model: ModelTrial, joint: Joint, methods: tuple[str, ...]) -> Judged:
+def _judge(model: ModelTrial, joint: ModelJoint, methods: tuple[str, ...]) -> EstimatedCenters:
     reduced = reduce(model.markers, joint.parent, joint.child, None)
     frames = model.frames
     poses = type(reduced.poses)(reduced.poses.q[frames], reduced.poses.t[frames])
@@ -126,4 +126,4 @@ def _judge(model: ModelTrial, joint: Joint, methods: tuple[str, ...]) -> Judged:
     mean = np.nanmean(local, axis=0)
     wander = float(np.sqrt(np.nanmean(((local - mean) ** 2).sum(axis=1))))
     found = {method: estimate_center(reduced.movement, method) for method in methods}
-    return Judged(joint, reduced, mean, wander, found)
+    return EstimatedCenters(joint, reduced, mean, wander, found)

@@ -28,7 +28,7 @@ METHODS = ("single", "mean", "markley", "patent6", "patent12", "linear", "anchor
 """``anchored`` is the default of the program."""
 
 
-class Segment(NamedTuple):
+class SegmentInputs(NamedTuple):
     """Inputs of one segment's model."""
 
     sensors: list[Array]
@@ -36,11 +36,11 @@ class Segment(NamedTuple):
     bone: Array
 
 
-def segments(trial: KneeTrial) -> tuple[Segment, Segment]:
+def segments(trial: KneeTrial) -> tuple[SegmentInputs, SegmentInputs]:
     """Return the inputs of thigh and shank; each uses the mean of its neighbour's sensors."""
     a, b, c, d = trial.sensors
     thigh, shank = fuse([a, b], (0.5, 0.5)), fuse([c, d], (0.5, 0.5))
-    return Segment([a, b], shank, trial.thigh), Segment([c, d], thigh, trial.shank)
+    return SegmentInputs([a, b], shank, trial.thigh), SegmentInputs([c, d], thigh, trial.shank)
 
 
 def fit(method: str, trials: Sequence[KneeTrial]) -> Predict:
@@ -74,7 +74,7 @@ def _training(trials: Sequence[KneeTrial]) -> Iterator[SegmentTraining]:
         yield SegmentTraining.of(sensors, other, bone, labels)
 
 
-def axis_deviations(model: SegmentModel, segment: Segment) -> Array:
+def axis_deviations(model: SegmentModel, segment: SegmentInputs) -> Array:
     """Return predicted standard deviations about x, y and z of the segment, rad, shape (n, 3)."""
     rows = []
     for i, other in enumerate(segment.other):

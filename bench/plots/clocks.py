@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bench.rigs.core_trace import traced, true_errors
-from bench.subjects.simulated_clocks import Run, simulated
+from bench.subjects.simulated_clocks import SimulatedRun, simulated
 from jointfit_daemon.outputs.recording import read_events
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def run(directory: Path, recorded: Path | None) -> list[Path]:
     if recorded is None:
         drawn = simulated()
     else:
-        drawn = Run(list(read_events(recorded)), title=f"replayed from {recorded.name}")
+        drawn = SimulatedRun(list(read_events(recorded)), title=f"replayed from {recorded.name}")
     trace = traced(drawn.events)
     directory.mkdir(parents=True, exist_ok=True)
     pictures = {
@@ -62,7 +62,9 @@ def run(directory: Path, recorded: Path | None) -> list[Path]:
 # --- common parts ------------------------------------------------------------------------------
 
 
-def _figure(title: str, panels: Sequence[str], about: Run, *, height: float = 2.0) -> Figure:
+def _figure(
+    title: str, panels: Sequence[str], about: SimulatedRun, *, height: float = 2.0
+) -> Figure:
     """Return a figure with panels one below the other and a common time axis."""
     figure = Figure(figsize=(11, 1.1 + height * len(panels)), layout="constrained")
     figure.suptitle(f"{title}\n{about.title}", fontsize=11, x=0.01, ha="left")
@@ -100,7 +102,7 @@ def _legend(figure: Figure, colors: dict[str, str], axis: Axes) -> None:
 # --- plots -------------------------------------------------------------------------------------
 
 
-def clocks(trace: Trace, about: Run) -> Figure:
+def clocks(trace: Trace, about: SimulatedRun) -> Figure:
     """Offset, skew, sigma, jitter, rate and gaps of every stream."""
     labels = ("offset − first, ms", "skew, ppm", "sigma, µs", "jitter, ms", "rate, Hz", "gaps")
     figure = _figure("Clocks of all streams", labels, about, height=1.7)
@@ -158,7 +160,7 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
         gaps.vlines(t_s[i], row - size, row + size, color=color, lw=0.9)
 
 
-def delays(trace: Trace, about: Run) -> Figure:
+def delays(trace: Trace, about: SimulatedRun) -> Figure:
     """Arrival minus stamp: the delay beyond the minimum delay (beyond exposure, with echoes)."""
     names = sorted(trace.stamps)
     figure = Figure(figsize=(11, 1.1 + 1.5 * len(names)), layout="constrained")
@@ -189,7 +191,7 @@ def delays(trace: Trace, about: Run) -> Figure:
     return figure
 
 
-def alignment(trace: Trace, about: Run) -> Figure:
+def alignment(trace: Trace, about: SimulatedRun) -> Figure:
     """Error of the stamps where truth is known; waiting time of the frames."""
     errors = true_errors(trace, about.taken_ns, about.unseen_ns) if about.taken_ns else {}
     panels = [f"{name}: error, ms" for name in sorted(errors)]
@@ -232,7 +234,7 @@ def _latency(axis: Axes, trace: Trace) -> None:
     axis.legend(loc="upper right", frameon=False, fontsize=8, markerscale=4, ncols=4)
 
 
-def lags(trace: Trace, about: Run) -> Figure:
+def lags(trace: Trace, about: SimulatedRun) -> Figure:
     """Lag windows of every sensor with their sigmas; rejected windows are crosses at the bottom."""
     names = sorted(trace.lags)
     figure = _figure("IMU later than cameras, windows of 10 s, ± 2 sigma",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.baselines.center_estimators import Judged, hinge, judged
+from bench.baselines.center_estimators import EstimatedCenters, hinge, judged
 from bench.experiments.joint_center.real_trials import METHODS, TRIALS
 from bench.framework.experiment import DATA
 from jointfit_daemon.center_of_rotation.planar import plane_of
@@ -49,7 +49,7 @@ def draw(folder: Path) -> Iterator[Path]:
         yield path
 
 
-def _title(found: Judged) -> str:
+def _title(found: EstimatedCenters) -> str:
     lines = [found.joint.name]
     for method in METHODS:
         e = found.estimates[method]
@@ -65,7 +65,9 @@ def _title(found: Judged) -> str:
     return "\n".join(lines)
 
 
-def _panel(axes: Any, found: Judged, view: NDArray[np.float64], labels: tuple[str, str]) -> None:
+def _panel(
+    axes: Any, found: EstimatedCenters, view: NDArray[np.float64], labels: tuple[str, str]
+) -> None:
     """Draw one view: `view` maps parent coordinates to those of the panel, shape (3, 2)."""
     points = found.reduced.movement.points
     assert points is not None

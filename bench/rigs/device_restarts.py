@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
-from bench.rigs.timestamp_errors import OPTICAL, WatchedCore, judge, unexcused
+from bench.rigs.timestamp_errors import OPTICAL, ObservedCore, judge, unexcused
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from tests.system.station import SENSORS, Listener, Station, running, stopped
 
@@ -27,10 +27,10 @@ PATIENCE_S = 40.0
 """Time limit for a step that takes three seconds on an idle machine, s."""
 
 
-class Outcome(NamedTuple):
+class RestartRun(NamedTuple):
     """Results of one run."""
 
-    core: WatchedCore
+    core: ObservedCore
     replayed: bool
     """The event log replays to byte-identical limb states."""
 
@@ -89,7 +89,7 @@ async def recovers(listener: Listener, name: str) -> None:
 
 async def live(
     folder: Path, port: int, reboots: Sequence[str], rest_s: float, more: Sequence[str] = ()
-) -> Outcome:
+) -> RestartRun:
     """Run a rig, reboot devices one by one, and evaluate the recorded stamps.
 
     Parameters
@@ -119,4 +119,4 @@ async def live(
     (log,) = (folder / "state" / "recordings").iterdir()
     core, states = judge(read_events(log), folder / "samples.jsonl", DELAY_MS)
     same = [encode_state(state) for state in states] == list(read_states(log))
-    return Outcome(core, same)
+    return RestartRun(core, same)

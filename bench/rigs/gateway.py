@@ -39,7 +39,7 @@ CONNECT_S, END_S = 40.0, 20.0
 FLOOD_START_S = 0.5
 """Time in which the flooding process imports and connects, not measured, s."""
 ROOT = Path(__file__).resolve().parents[2]
-VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
+OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
 TOPICS = ("pose", "bridge/health", "bridge/state", "device/+/availability")
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
@@ -59,7 +59,7 @@ class Load:
 
 
 @dataclass(slots=True)
-class Heard:
+class ReceivedMessages:
     """Messages that the subscriber received."""
 
     latencies_ms: list[float] = field(default_factory=list)
@@ -137,7 +137,7 @@ class _Gateway:
 
     hardware: Simulator
     pid: int
-    heard: Heard
+    heard: ReceivedMessages
     began_s: float
     """Monotonic start time of the daemon."""
 
@@ -223,9 +223,9 @@ async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gatewa
 
 
 @asynccontextmanager
-async def subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
+async def subscriber(settings: MqttSettings) -> AsyncIterator[ReceivedMessages]:
     """Collect the messages of the daemon until the block ends; yield them."""
-    heard = Heard()
+    heard = ReceivedMessages()
     async with MqttClient(settings) as client:
         await client.subscribe(*TOPICS)
         listening = asyncio.create_task(heard.listen(client), name="subscriber")
@@ -237,7 +237,7 @@ async def subscriber(settings: MqttSettings) -> AsyncIterator[Heard]:
 
 
 async def _measure(
-    pid: int, heard: Heard, seconds: float
+    pid: int, heard: ReceivedMessages, seconds: float
 ) -> tuple[list[float], float, float, float, float, float]:
     gc.collect()
     gc.freeze()  # garbage collection here would be measured as latency of the daemon
@@ -251,7 +251,7 @@ async def _measure(
     return latencies, took_s, spent, loop_s(), waited, rss_mb(pid)
 
 
-async def _last_health(heard: Heard) -> dict[str, Any]:
+async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
     """Wait for a health message with all sources offline: no sample is in transit then."""
     async with asyncio.timeout(END_S):
         while any(  # noqa: ASYNC110 - it hangs on what a message says, not on its coming
@@ -266,7 +266,7 @@ def _unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> in
     lost = 0
     for name, device in devices.items():
         received = device["received"]
-        lost += abs(sent[name] - received) + abs(received - sum(device[v] for v in VERDICTS))
+        lost += abs(sent[name] - received) + abs(received - sum(device[v] for v in OUTCOMES))
     return lost
 
 

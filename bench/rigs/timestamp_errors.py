@@ -42,7 +42,7 @@ MOST_NS = 2_000_000_000
 """Upper limit of the transport delay of a sample."""
 
 
-class Judged(NamedTuple):
+class ObservedSample(NamedTuple):
     """One sample."""
 
     source: str
@@ -119,7 +119,7 @@ class _Recent:
         return max(excused_ns, self.excused_ns[-1] - round(SLEW * (stamp.t_ns - self.t_ns[-1])))
 
 
-class WatchedCore(Core):
+class ObservedCore(Core):
     """Core whose stamps and frames are recorded.
 
     Parameters
@@ -134,7 +134,7 @@ class WatchedCore(Core):
         super().__init__()
         self._truth, self._delay_ns = truth, delay_ns
         self._recent: defaultdict[str, _Recent] = defaultdict(_Recent)
-        self.samples: list[Judged] = []
+        self.samples: list[ObservedSample] = []
         self.frames: list[JudgedFrame] = []
 
     @override
@@ -163,7 +163,9 @@ class WatchedCore(Core):
         late_ns = None if taken_ns is None else measured.arrival_ns - taken_ns - delay_ns
         excused_ns = 0 if known else recent.excuse(late_ns, stamp)
         self.samples.append(
-            Judged(source, arrival_ns, t_ns, stamp.synced, state.clock.state, error_ns, excused_ns)
+            ObservedSample(
+                source, arrival_ns, t_ns, stamp.synced, state.clock.state, error_ns, excused_ns
+            )
         )
         recent.t_ns.append(t_ns)
         recent.error_ns.append(error_ns)
@@ -202,10 +204,10 @@ def unexcused(error_ns: int, excused_ns: int) -> int:
 
 def judge(
     events: Iterable[Event], samples: Path, delay_ms: Mapping[str, float]
-) -> tuple[WatchedCore, list[LimbState]]:
+) -> tuple[ObservedCore, list[LimbState]]:
     """Return the observed core after all events, and its limb states."""
     delays = {name: round(delay * _NS_PER_MS) for name, delay in delay_ms.items()}
-    core = WatchedCore(Truth(samples), delays)
+    core = ObservedCore(Truth(samples), delays)
     states: list[LimbState] = []
     for event in events:
         states += [output for output in core.feed(event) if isinstance(output, LimbState)]

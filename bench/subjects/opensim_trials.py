@@ -30,7 +30,7 @@ _STEPS = {"walking1": 1, "squats1": 10, "DJ1": 2, "STS1": 10}
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class OpensimSubject:
     """Model and trials of one subject."""
 
     model: Path
@@ -59,7 +59,7 @@ class Subject:
         return {name: judge(self.model, self.judged[name], refined) for name in trials}
 
 
-def gait2354(data: Path) -> Subject:
+def gait2354(data: Path) -> OpensimSubject:
     """Return the example of OpenSim, scaled, its markers not adjusted: 73 frames, 31 markers."""
     folder = data / GAIT
     model, path = folder / "subject01_scaledOnly.osim", folder / "subject01_walk1.trc"
@@ -72,10 +72,10 @@ def gait2354(data: Path) -> Subject:
         frames=whole.frames[some],
         positions=whole.positions[some],
     )
-    return Subject(model, names, {"walk1": walk}, {"walk1": walk})
+    return OpensimSubject(model, names, {"walk1": walk}, {"walk1": walk})
 
 
-def opencap(data: Path, coarser: int = 2, *, computed: bool = False) -> Subject:
+def opencap(data: Path, coarser: int = 2, *, computed: bool = False) -> OpensimSubject:
     """Return OpenCap subject 4, scaled manually.
 
     Parameters
@@ -90,7 +90,7 @@ def opencap(data: Path, coarser: int = 2, *, computed: bool = False) -> Subject:
     paths = {name: folder / "trc" / f"{name}.trc" for name in _STEPS}
     hips = () if computed else ("R_HJC", "L_HJC")
     names = shared_markers(model, paths["walking1"], hips)
-    return Subject(
+    return OpensimSubject(
         model,
         names,
         {n: trial_frames(paths[n], names, k) for n, k in _STEPS.items()},

@@ -56,7 +56,7 @@ DOWN_NS = 1_500_000_000
 
 
 @dataclass(frozen=True)
-class Run:
+class SimulatedRun:
     """Input of a plot."""
 
     events: Sequence[Event]
@@ -79,7 +79,7 @@ class _Made:
     taken_ns: dict[tuple[str, int], int] = field(default_factory=dict)
 
 
-def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
+def simulated(seconds: float = 90.0, seed: int = 1) -> SimulatedRun:
     """Return a run of four IMUs and a camera system, each with its own clock."""
     knobs = Knobs(
         seed=seed,
@@ -116,7 +116,7 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> Run:
     events += [SourceOpened(BEGIN_NS, source.id) for source in rig.sources]
     events += [ChunkArrived(name, Chunk(t, data)) for t, name, data in sorted(made.chunks)]
     unseen_ns = {name: round(_latency_ms(knobs, name) * 1e6) for name in SENSORS}
-    return Run(
+    return SimulatedRun(
         events,
         made.taken_ns,
         unseen_ns,

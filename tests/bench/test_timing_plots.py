@@ -13,7 +13,7 @@ import pytest
 
 from bench.plots import __main__ as plots
 from bench.rigs.core_trace import Trace, traced, true_errors
-from bench.subjects.simulated_clocks import Run, simulated
+from bench.subjects.simulated_clocks import SimulatedRun, simulated
 from jointfit_daemon.outputs.recording._event_log import FORMAT, encode_event
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,7 +22,7 @@ STREAMS = {"S1", "S2", "S3", "S4", "mocap"}
 
 
 @cache
-def watched() -> tuple[Run, Trace]:
+def watched() -> tuple[SimulatedRun, Trace]:
     run = simulated(SECONDS)
     return run, traced(run.events)
 

@@ -28,7 +28,7 @@ EPOCH = 1_000 * S
 # --- wall clocks ------------------------------------------------------------------------------
 
 
-class Host:
+class ArrivalHost:
     """Two clocks; every reading takes 40 ns. The wall clock is stepped at an instant."""
 
     def __init__(self, step_at_ns: int, step_ns: int) -> None:
@@ -46,7 +46,9 @@ class Host:
         return self.unix_at(self.now)
 
 
-def received(host: Host, arrivals: list[int], wake_ups: list[int], cap: int = 64) -> list[int]:
+def received(
+    host: ArrivalHost, arrivals: list[int], wake_ups: list[int], cap: int = 64
+) -> list[int]:
     """Return the stamps of datagrams that a loop reads at its wake-ups, at most `cap` at each."""
     wall = WallClock(host.monotonic_ns, host.unix_ns)
     stamps: list[int] = []
@@ -73,7 +75,7 @@ def test_a_wall_clock_stepped_by_an_hour_in_a_burst_moves_no_arrival(
     hours: int, step_at: int, gaps: list[int]
 ) -> None:
     arrivals = [EPOCH + 1_000_000 + sum(gaps[: i + 1]) for i in range(len(gaps))]
-    host = Host(EPOCH + step_at, hours * HOUR)
+    host = ArrivalHost(EPOCH + step_at, hours * HOUR)
     wake_ups = [
         EPOCH + k * 4_000_000 for k in range(1, 40)
     ]  # a loop that is blocked 4 ms at a time
@@ -86,7 +88,7 @@ def test_a_wall_clock_stepped_by_an_hour_in_a_burst_moves_no_arrival(
 
 def test_arrivals_after_an_hour_of_suspend_are_a_step() -> None:
     """While a host is suspended CLOCK_MONOTONIC stands still and the wall clock goes on."""
-    host = Host(EPOCH + 5_000_000, HOUR)
+    host = ArrivalHost(EPOCH + 5_000_000, HOUR)
     arrivals = [EPOCH + k * 1_000_000 for k in range(1, 10)]
     assert received(host, arrivals, [EPOCH + 20_000_000]) == pytest.approx(arrivals, abs=1_000)
 

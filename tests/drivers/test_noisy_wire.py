@@ -31,7 +31,7 @@ MESSAGES = SECONDS * RATE_HZ
 SEEDS = range(5)
 
 
-class Outcome(NamedTuple):
+class NoisyRun(NamedTuple):
     """What a decoder and the clock behind it reported of one run."""
 
     received: int
@@ -49,7 +49,7 @@ def measurement(number: int) -> bytes:
     return encode(XbusMessageId.MT_DATA2, encode_items(items))
 
 
-def outcome(decoder: Decoder, chunks: list[bytes]) -> Outcome:
+def outcome(decoder: Decoder, chunks: list[bytes]) -> NoisyRun:
     clock = DeviceClock(PERIOD_NS)
     received = lost = restarts = 0
     for number, data in enumerate(chunks):
@@ -63,7 +63,7 @@ def outcome(decoder: Decoder, chunks: list[bytes]) -> Outcome:
                 restarts += event.kind == "restart"
                 count = event.data.get("lost", 0)
                 lost += count if isinstance(count, int) else 0
-    return Outcome(received, lost, restarts)
+    return NoisyRun(received, lost, restarts)
 
 
 def with_flipped_bits(chance: random.Random, data: bytes) -> bytes:
@@ -107,7 +107,7 @@ def lines(chance: random.Random, number: int, share: float) -> bytes:
     return group
 
 
-def xcdi_outcome(seed: int, share: float) -> Outcome:
+def xcdi_outcome(seed: int, share: float) -> NoisyRun:
     slcan, chance = SlcanCodec(None), random.Random(seed)
     chunks = []
     for number in range(MESSAGES):

@@ -28,7 +28,7 @@ S, MS = 1_000_000_000, 1_000_000
 BEGIN_UNIX_NS = 1_795_250_000 * S
 
 
-class Host:
+class SuspendedHost:
     """Both clocks of a host: monotonic time goes on by itself, UNIX time can be set."""
 
     def __init__(self) -> None:
@@ -44,14 +44,14 @@ class Host:
 
 
 @pytest.fixture
-def host(monkeypatch: pytest.MonkeyPatch) -> Host:
-    host = Host()
+def host(monkeypatch: pytest.MonkeyPatch) -> SuspendedHost:
+    host = SuspendedHost()
     monkeypatch.setattr(time, "monotonic_ns", host.monotonic_ns)
     monkeypatch.setattr(time, "time_ns", host.time_ns)
     return host
 
 
-def test_unix_clock_preserves_intervals_of_stamps(host: Host) -> None:
+def test_unix_clock_preserves_intervals_of_stamps(host: SuspendedHost) -> None:
     clock = UnixClock()
     before = clock.offset_ns()
     host.offset_ns += 3_600 * S
@@ -60,7 +60,7 @@ def test_unix_clock_preserves_intervals_of_stamps(host: Host) -> None:
 
 
 @pytest.mark.parametrize("step_s", [3_600.0, -3_600.0, 0.01, -0.01, 0.0002])
-def test_step_is_followed_within_a_second(host: Host, step_s: float) -> None:
+def test_step_is_followed_within_a_second(host: SuspendedHost, step_s: float) -> None:
     clock = UnixClock()
     before = clock.offset_ns()
     host.offset_ns += round(step_s * S)
@@ -69,7 +69,7 @@ def test_step_is_followed_within_a_second(host: Host, step_s: float) -> None:
     assert clock.offset_ns() == pytest.approx(before + step_s * S, abs=1_000)
 
 
-def test_slow_clock_readings_are_no_step(host: Host) -> None:
+def test_slow_clock_readings_are_no_step(host: SuspendedHost) -> None:
     waits = iter([100, 20 * MS, 100, 100, 30 * MS] * 100)
     host.wait_ns = lambda: next(waits)
     clock = UnixClock()
@@ -92,7 +92,7 @@ async def sent(outbox: Outbox) -> dict[str, list[Any]]:
 
 
 async def test_mono_us_is_monotonic_across_a_step_of_unix_time(
-    table: dict[str, Any], host: Host
+    table: dict[str, Any], host: SuspendedHost
 ) -> None:
     outbox = Outbox("b/bridge/state")
     reporter = TopicWriter(parse_rig(table | {"mqtt": {"base": "b"}}), outbox, UnixClock())

@@ -94,7 +94,7 @@ class Sent:
         return [ChunkArrived(self.name, Chunk(self.arrival_ns, data))] * self.copies
 
 
-class WatchedCore(Core):
+class TimeFaultCore(Core):
     """The core with access to its frames: uncalibrated states name no sensor."""
 
     def __init__(self) -> None:
@@ -158,7 +158,7 @@ def live(
             if sent is not None:
                 sent.arrival_ns = sent.arrival_ns or taken_ns + late_ns
                 events += sent.chunks()
-    core = WatchedCore()
+    core = TimeFaultCore()
     bench = Bench(core)
     bench.feed(opening(mocap=False))
     bench.feed(sorted(events, key=arrival_ns))

@@ -40,7 +40,7 @@ TAI_NS = 37 * S
 HOUR_NS = 3_600 * S
 
 
-class WatchedCore(Core):
+class UnixTimeCore(Core):
     """Records every stamp of a mocap frame, with the clock's health at that time."""
 
     def __init__(self) -> None:
@@ -70,10 +70,10 @@ def frame(number: int) -> ChunkArrived:
 
 
 @dataclass
-class Rig:
+class UnixTimeRig:
     """Four IMUs and cameras on PTP, and a host whose UNIX time may be set."""
 
-    core: WatchedCore = field(default_factory=WatchedCore)
+    core: UnixTimeCore = field(default_factory=UnixTimeCore)
     number: int = 0
 
     def __post_init__(self) -> None:
@@ -125,11 +125,11 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Rig:
-    return Rig()
+def rig() -> UnixTimeRig:
+    return UnixTimeRig()
 
 
-def test_ptp_mocap_stamps_are_exact_and_health_reports_direct(rig: Rig) -> None:
+def test_ptp_mocap_stamps_are_exact_and_health_reports_direct(rig: UnixTimeRig) -> None:
     rig.start()
     rig.stream(6)
     assert rig.state() == "direct"
@@ -138,7 +138,7 @@ def test_ptp_mocap_stamps_are_exact_and_health_reports_direct(rig: Rig) -> None:
     assert not rig.notices()
 
 
-def test_ptp_stamps_are_unused_without_unix_time(rig: Rig) -> None:
+def test_ptp_stamps_are_unused_without_unix_time(rig: UnixTimeRig) -> None:
     rig.start()
     rig.core._unix_offset_ns = None
     for state in rig.core._sources.values():
@@ -149,7 +149,7 @@ def test_ptp_stamps_are_unused_without_unix_time(rig: Rig) -> None:
 
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS, 40 * MS, -40 * MS])
 def test_wrong_unix_time_moves_no_stamp_and_is_used_again_when_corrected(
-    rig: Rig, step_ns: int
+    rig: UnixTimeRig, step_ns: int
 ) -> None:
     rig.start()
     rig.stream(6)
@@ -170,7 +170,7 @@ def test_wrong_unix_time_moves_no_stamp_and_is_used_again_when_corrected(
     assert sum("sync time differs" in n.text for n in rig.notices()) == 1
 
 
-def test_start_with_a_wrong_date_gives_no_wrong_sync(rig: Rig) -> None:
+def test_start_with_a_wrong_date_gives_no_wrong_sync(rig: UnixTimeRig) -> None:
     rig.start(UNIX_NS - 5 * HOUR_NS)
     rig.stream(4)
     assert rig.state() in {"settling", "passive"}
@@ -181,7 +181,7 @@ def test_start_with_a_wrong_date_gives_no_wrong_sync(rig: Rig) -> None:
     assert rig.errors_ms(rig.number - 10) == [0.0] * 10
 
 
-def test_reload_preserves_the_unix_offset(rig: Rig) -> None:
+def test_reload_preserves_the_unix_offset(rig: UnixTimeRig) -> None:
     rig.start()
     rig.stream(1)
     layout = table()
@@ -192,7 +192,7 @@ def test_reload_preserves_the_unix_offset(rig: Rig) -> None:
     assert clock._unix_offset_ns == UNIX_NS
 
 
-def test_steps_of_unix_time_replay_byte_for_byte(rig: Rig) -> None:
+def test_steps_of_unix_time_replay_byte_for_byte(rig: UnixTimeRig) -> None:
     rig.start()
     rig.stream(3)
     rig.set_unix_time(UNIX_NS + HOUR_NS)

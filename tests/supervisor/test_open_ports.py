@@ -75,7 +75,7 @@ def test_the_daemon_listens_on_no_tcp_port(tmp_path: Path, broker: Broker) -> No
             assert listening(daemon.pid) == []
         finally:
             daemon.terminate()
-            daemon.communicate(timeout=10)
+            daemon.communicate(timeout=60)
 
 
 def test_the_demos_broker_is_reached_from_this_machine_only(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_frame_rate_is_that_since_the_last_call() -> None:
     assert pace.rate_hz(507, 120.0) == 0.0
 
 
-class Driver:
+class StatusLineDriver:
     """Sends one byte, or ends as it is told to, when it is let go."""
 
     def __init__(self, settings: str) -> None:
@@ -88,7 +88,7 @@ async def sources() -> Any:
     GO.update((name, asyncio.Event()) for name in names)
     async with asyncio.TaskGroup() as tasks:
         made = SourceTasks(tasks, lambda _: None)
-        await made.apply([source(name, driver=Driver) for name in names])
+        await made.apply([source(name, driver=StatusLineDriver) for name in names])
         yield made
         await made.stop()
 

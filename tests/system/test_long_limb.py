@@ -1,4 +1,4 @@
-"""Three segments with three, two and one sensors, live: calibrated, followed, put on anew."""
+"""Live chain of three segments with six sensors: calibration, tracking, re-donning."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ CHAIN = (
 
 
 @contextlib.asynccontextmanager
-async def played(folder: Path, port: int) -> AsyncIterator[Scene]:
+async def playing(folder: Path, port: int) -> AsyncIterator[Scene]:
     knobs = apply_settings(perfect(Knobs()), SETTINGS)
     rig = RigOptions(mqtt_port=port, mqtt_base=BASE, axes="static")  # the truth's axes
     options = SceneOptions(folder, wires=WIRES, rig=rig)
@@ -54,7 +54,7 @@ async def played(folder: Path, port: int) -> AsyncIterator[Scene]:
         yield scene
 
 
-async def taken(scene: Scene, listener: Listener, motion: str, *phase: Any) -> Any:
+async def record_phase(scene: Scene, listener: Listener, motion: str, *phase: Any) -> Any:
     scene.command(f"play {motion}")
     await asyncio.sleep(SETTLE_S)
     return await listener.phase(*phase, force=True)
@@ -74,9 +74,9 @@ async def errors_deg(scene: Scene, listener: Listener, folder: Path) -> dict[str
     for pose in poses:
         known = truth.track.at(pose["t_us"] * 1000 - offset_ns)
         for name, angles in off.items():
-            said = pose["segments"][name]["q"]
-            if known is not None and said is not None:
-                angles.append(float(rotation.angle_between(said, known.orientations[name])))
+            q = pose["segments"][name]["q"]
+            if known is not None and q is not None:
+                angles.append(float(rotation.angle_between(q, known.orientations[name])))
     assert min(map(len, off.values())) > 60
     return {n: math.degrees(np.sqrt(np.mean(np.square(angles)))) for n, angles in off.items()}
 
@@ -86,28 +86,28 @@ async def test_chain_of_three_segments_with_six_sensors_is_calibrated_tracked_an
     tmp_path: Path, broker: Broker
 ) -> None:
     station = Station(tmp_path, broker.port)
-    async with played(tmp_path, broker.port) as scene:
+    async with playing(tmp_path, broker.port) as scene:
         station.write_rig(*CHAIN)
         async with station.daemon(), listening(station.port) as listener:
             await listener.connected({*SENSORS, "mocap"})
-            await taken(scene, listener, "stand", "static", 2.0)
-            status = await taken(scene, listener, "functional", "functional", 8.0)
+            await record_phase(scene, listener, "stand", "static", 2.0)
+            status = await record_phase(scene, listener, "functional", "functional", 8.0)
             assert status["phase"] == "calibrated", status
-            worn = await errors_deg(scene, listener, tmp_path)
-            everyone = [pose for pose in listener.poses[-100:] if sensors_in(pose) == {*SENSORS}]
-            assert len(everyone) > 10  # on a busy machine samples are late
+            donned = await errors_deg(scene, listener, tmp_path)
+            complete = [pose for pose in listener.poses[-100:] if sensors_in(pose) == {*SENSORS}]
+            assert len(complete) > 10  # on a busy machine samples are late
             for joint in ("knee", "ankle"):
-                assert everyone[-1]["joints"][joint]["flexion_deg"] is not None
-                assert everyone[-1]["joints"][joint]["flexion_deg_s"] is not None
+                assert complete[-1]["joints"][joint]["flexion_deg"] is not None
+                assert complete[-1]["joints"][joint]["flexion_deg_s"] is not None
             for name in SENSORS:
                 scene.command(f"slip {name} 15")
             slipped = await errors_deg(scene, listener, tmp_path)
-            status = await taken(scene, listener, "stand", "static", 2.0)
+            status = await record_phase(scene, listener, "stand", "static", 2.0)
             assert status["phase"] == "posed", status
-            again = await errors_deg(scene, listener, tmp_path)
+            redonned = await errors_deg(scene, listener, tmp_path)
             assert not [flag for flag in listener.poses[-1]["flags"] if "disagree" in flag]
     for name in ("thigh", "shank", "foot"):
-        assert worn[name] < 5.0, worn
-        assert slipped[name] > worn[name] + 5.0, slipped
-        assert again[name] < worn[name] + 1.5, again
+        assert donned[name] < 5.0, donned
+        assert slipped[name] > donned[name] + 5.0, slipped
+        assert redonned[name] < donned[name] + 1.5, redonned
     assert "Traceback" not in station.log

@@ -1,8 +1,7 @@
-"""Real squats as bytes through the real daemon give the figures that were measured offline.
+"""Recorded squats, sent as bytes through the daemon, reproduce the offline errors.
 
-Nothing is tuned to pass: the scene has no imperfections but those of the recording, the optical
-system streams the reference bones, segments keep the axes of the static pose (the patent's), and
-the daemon calibrates itself on the first 60 %.
+The only imperfections are those of the recording. The optical system streams the reference bones,
+segments have the axes of the static pose, and the daemon calibrates itself on the first 60 %.
 """
 
 from __future__ import annotations
@@ -51,8 +50,7 @@ def test_recorded_squats_through_the_daemon_match_the_offline_errors(
             devices, 0
         )
         assert sum(device["corrupt"] for device in devices.values()) == 0
-        # the daemon's own judge saw these squats, too: it says what it would do unseen
         assert live.calibration.method == method
         assert live.calibration.joint["knee"].source == "fit"
-        if live.frames == len(knee.held):  # else this machine was too busy for some of them
+        if live.frames == len(knee.held):  # otherwise this machine was too slow for some
             assert live.errors == pytest.approx(PUBLISHED[method], abs=0.1)

@@ -1,4 +1,4 @@
-"""Real processes, clocks that drift and begin anew: no frame calls itself synced and is not."""
+"""Drifting and restarting clocks of separate processes: every synced frame has correct time."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.alone, pytest.mark.experiment]
 
 MOST_ERROR_NS = 500_000
-"""Beyond what a machine short of time excuses; a quiet one meets live-rig-restarts."""
+"""Limit of the part that machine load does not explain; live-rig-restarts is stricter, ns."""
 MOST_TIED_ERROR_NS = 250_000
-"""Ticks of 100 us, 20 us of jitter on each stamp, and the camera clock's own error."""
+"""Ticks of 100 us, jitter of 20 us on each stamp, and the error of the camera clock, ns."""
 MOST_PTP_ERROR_NS = 50_000
-"""Both processes read the same clocks, each once; a microsecond where nothing else runs."""
+"""Both processes read the same clock once; a microsecond on an idle machine, ns."""
 
 
 @pytest.mark.timeout(180)
@@ -36,29 +36,29 @@ async def test_every_synced_frame_has_correct_time(tmp_path: Path, broker: Broke
     frames = [frame.unexcused_ns for frame in found.core.frames if frame.synced]
     assert len(frames) > 300
     assert max(frames) <= MOST_ERROR_NS
-    # before a clock has settled it may be wrong, and the judge sees that
+    # Stamps of unsettled clocks are wrong, and the evaluation detects it.
     unsynced = [s.error_ns for s in found.core.samples if not s.synced and s.error_ns is not None]
     assert max(map(abs, unsynced)) > MOST_ERROR_NS
 
 
 @pytest.mark.timeout(180)
 async def test_wired_sync_line_removes_the_transport_delay(tmp_path: Path, broker: Broker) -> None:
-    """Stamps of a tied clock are right without anybody knowing what the transport takes."""
+    """Stamps of a clock with sync edges are correct although the transport delay is unknown."""
     found = await live(tmp_path, broker.port, (), rest_s=9.0, more=("--sync-line",))
     assert found.replayed
     for source in ("S1", "S3"):
         errors = found.errors_ns(source, "direct")
         assert len(errors) > 500, source
-        # before, the stamps slew to their new place: 2 ms at 500 ppm take 4 s
+        # Earlier stamps still slew to the new offset: 2 ms at 500 ppm take 4 s.
         assert max(map(abs, errors[-100:])) <= MOST_TIED_ERROR_NS, source
 
 
 @pytest.mark.timeout(180)
 async def test_cameras_on_ptp_need_no_echo_and_no_settling(tmp_path: Path, broker: Broker) -> None:
-    """The daemon knows its own UNIX time, and that is what cameras on PTP stamp frames with."""
+    """Cameras on PTP stamp frames with UNIX time, which the daemon knows."""
     found = await live(tmp_path, broker.port, (), rest_s=3.0, more=("--ptp",))
     assert found.replayed
     errors = found.errors_ns(OPTICAL, "direct")
     assert len(errors) > 500
     assert max(map(abs, errors)) <= MOST_PTP_ERROR_NS
-    assert len(found.errors_ns(OPTICAL)) == len(errors)  # it was never told in another way
+    assert len(found.errors_ns(OPTICAL)) == len(errors)  # no stamp has another source

@@ -1,4 +1,4 @@
-"""Sensor worlds that point elsewhere, hidden markers and NaN: the calibration copes, or says so."""
+"""Rotated sensor worlds, occluded markers and NaN: aligned by the calibration, or flagged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ASSUMED = "headings_from_static"
 
 
 class SpoiledScene(Scene):
-    """Virtual hardware whose cameras give NaN for some markers, in every fifth frame."""
+    """Simulated devices whose cameras send NaN for some markers in every fifth frame."""
 
     async def say(self, line: str) -> None:
         self.command(line)
@@ -56,7 +56,7 @@ class SpoiledScene(Scene):
 
 
 @contextlib.asynccontextmanager
-async def played(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
+async def playing(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
     knobs = apply_settings(perfect(Knobs()), SETTINGS)
     options = SceneOptions(folder, rig=RigOptions(mqtt_port=port, mqtt_base=BASE))
     subject = SimulatedSubject(knobs, parse_motion_script("stand"))
@@ -66,22 +66,24 @@ async def played(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
         yield scene
 
 
-async def taken(simulator: SpoiledScene, listener: Listener, motion: str, *phase: Any) -> Any:
+async def record_phase(
+    simulator: SpoiledScene, listener: Listener, motion: str, *phase: Any
+) -> Any:
     await simulator.say(f"play {motion}")
     await asyncio.sleep(SETTLE_S)
     return await listener.phase(*phase, force=True)
 
 
 async def functional(simulator: SpoiledScene, listener: Listener) -> Any:
-    """Move, with all markers hidden for a second in the middle."""
-    hiding = asyncio.create_task(hidden(simulator, 4.0), name="hiding")
+    """Record the functional phase with all markers occluded for a second."""
+    occlusion = asyncio.create_task(occlude(simulator, 4.0), name="occlusion")
     try:
-        return await taken(simulator, listener, "functional", "functional", 10.0)
+        return await record_phase(simulator, listener, "functional", "functional", 10.0)
     finally:
-        await hiding
+        await occlusion
 
 
-async def hidden(simulator: SpoiledScene, after_s: float) -> None:
+async def occlude(simulator: SpoiledScene, after_s: float) -> None:
     await asyncio.sleep(after_s)
     await simulator.say("occlude on")
     await asyncio.sleep(1.0)
@@ -90,9 +92,7 @@ async def hidden(simulator: SpoiledScene, after_s: float) -> None:
 
 async def pose_after(listener: Listener, status: Any) -> dict[str, Any]:
     """Return a pose of an instant after `status`: a retained message overtakes queued poses."""
-    pose: dict[str, Any] = {"t_us": 0}
-    while pose["t_us"] <= status["t_us"]:
-        pose = (await listener.more_poses(1))[0]
+    (pose,) = await listener.poses_after(status["t_us"])
     return pose
 
 
@@ -117,26 +117,26 @@ async def test_sensor_worlds_a_right_angle_apart_are_aligned_or_flagged_as_assum
     tmp_path: Path, broker: Broker
 ) -> None:
     station = Station(tmp_path, broker.port)
-    async with played(tmp_path, broker.port) as simulator:
+    async with playing(tmp_path, broker.port) as simulator:
         station.write_rig()
-        await calibrated_twice(station, simulator)
+        await calibrate_twice(station, simulator)
     assert "output of the worker" not in station.log  # fits print nothing
     assert "Traceback" not in station.log
 
 
-async def calibrated_twice(station: Station, simulator: SpoiledScene) -> None:
-    """Once without an align phase, once with it."""
+async def calibrate_twice(station: Station, simulator: SpoiledScene) -> None:
+    """Calibrate without an align phase, then with it, and check flag and error."""
     async with station.daemon(), listening(station.port) as listener:
         await listener.connected({*SENSORS, "mocap"})
         facts = orjson.loads((station.folder / "truth.jsonl").read_bytes().split(b"\n", 1)[0])
         headings = list(facts["sensor_heading_rad"].values())
         apart = max(abs(a - b) for a, b in itertools.combinations(headings, 2))
-        assert apart > math.radians(45), apart  # the seed does what the test is about
-        await taken(simulator, listener, "stand", "static", 3.0)
+        assert apart > math.radians(45), apart  # the seed rotates the worlds as the test requires
+        await record_phase(simulator, listener, "stand", "static", 3.0)
         status = await functional(simulator, listener)
         assert ASSUMED in (await pose_after(listener, status))["flags"]
-        await taken(simulator, listener, "plate", "align", 8.0)
-        await taken(simulator, listener, "stand", "static", 3.0)
+        await record_phase(simulator, listener, "plate", "align", 8.0)
+        await record_phase(simulator, listener, "stand", "static", 3.0)
         status = await functional(simulator, listener)
         assert ASSUMED not in (await pose_after(listener, status))["flags"]
         await simulator.say("play squat")

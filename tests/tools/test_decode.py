@@ -138,7 +138,7 @@ def test_the_natnet_capture_holds_550_messages(shared_data: Path) -> None:
 # --- XCDI -------------------------------------------------------------------------------------
 
 
-class Tape:
+class CaptureTape:
     """A CAN wire that keeps what is sent."""
 
     is_open = True
@@ -152,7 +152,7 @@ class Tape:
 
 
 def test_a_candump_log_of_one_sensor_among_others_is_decoded(tmp_path: Path) -> None:
-    tape = Tape()
+    tape = CaptureTape()
     ids = XcdiIds(0x105, 0x106, 0x121, status_word=None, error=None)
     device = XcdiDevice(tape, XcdiDeviceOptions(ids=ids))  # type: ignore[arg-type]
     for number in range(50):

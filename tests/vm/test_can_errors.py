@@ -12,7 +12,7 @@ from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.xcdi import XcdiImu
 from jointfit_simulators.devices import XcdiDevice
-from tests.vm.vcan_link import NEEDS_VCAN, Heard, identity, running, settings
+from tests.vm.vcan_link import NEEDS_VCAN, ReceivedFrames, identity, running, settings
 
 if TYPE_CHECKING:
     from jointfit_simulators.wires import PythonCanWire
@@ -30,7 +30,7 @@ def error_frame(wire: PythonCanWire, kind: int, data: bytes = bytes(8)) -> None:
     )
 
 
-def errors_of(heard: Heard) -> list[DeviceEvent]:
+def errors_of(heard: ReceivedFrames) -> list[DeviceEvent]:
     return [e for e in heard.events if isinstance(e, DeviceEvent) and e.kind == "error"]
 
 
@@ -61,7 +61,7 @@ async def test_after_bus_off_the_silence_is_a_loss_and_a_restart_brings_the_sens
     wire: PythonCanWire,
 ) -> None:
     driver = XcdiImu(settings())
-    heard = Heard(driver)
+    heard = ReceivedFrames(driver)
     task = asyncio.create_task(driver.run(heard.emit))
     await asyncio.sleep(0.05)
     identity(XcdiDevice(wire), 5)

@@ -23,7 +23,16 @@ from jointfit_protocols.xcdi import XcdiIds, id_block
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 from jointfit_simulators.driver_contract import DriverContract
 from jointfit_simulators.wires import PythonCanWire
-from tests.vm.vcan_link import BUS, LINK, NEEDS_VCAN, Heard, identity, ip, running, settings
+from tests.vm.vcan_link import (
+    BUS,
+    LINK,
+    NEEDS_VCAN,
+    ReceivedFrames,
+    identity,
+    ip,
+    running,
+    settings,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -112,7 +121,7 @@ async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanW
         for name, base in bases.items()
     ]
     async with asyncio.TaskGroup() as group:
-        heard = [Heard(driver) for driver in drivers]
+        heard = [ReceivedFrames(driver) for driver in drivers]
         tasks = [
             group.create_task(driver.run(each.emit))
             for driver, each in zip(drivers, heard, strict=True)

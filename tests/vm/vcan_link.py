@@ -56,7 +56,7 @@ def settings(name: str = "S3", **more: Any) -> XcdiSettings:
     )
 
 
-class Heard:
+class ReceivedFrames:
     """Everything a driver emitted, decoded."""
 
     def __init__(self, driver: XcdiImu) -> None:
@@ -79,8 +79,8 @@ class Heard:
 
 
 @asynccontextmanager
-async def running(driver: XcdiImu) -> AsyncIterator[Heard]:
-    heard = Heard(driver)
+async def running(driver: XcdiImu) -> AsyncIterator[ReceivedFrames]:
+    heard = ReceivedFrames(driver)
     task = asyncio.create_task(driver.run(heard.emit))
     await asyncio.sleep(0.05)
     try:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from bench.subjects.opensim_reference import Verdict
-    from bench.subjects.opensim_trials import Subject
+    from bench.subjects.opensim_trials import OpensimSubject
     from jointfit_daemon.calibration.marker_refinement import Refinement
 
 _MM, _MM2 = 1000.0, 1e6
@@ -129,7 +129,7 @@ def walking_alone(data: Path) -> list[Result]:
     ]
 
 
-def _to_the_end(subject: Subject, found: Refinement) -> list[Result]:
+def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
     """OpenSim's result for the walk at an accuracy that does not stop it early."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
@@ -183,7 +183,7 @@ def _across(verdicts: Mapping[str, Verdict]) -> float:
 
 
 def refined_evenly(
-    subject: Subject, trained: Sequence[str], power: float, judged: Sequence[str] = ()
+    subject: OpensimSubject, trained: Sequence[str], power: float, judged: Sequence[str] = ()
 ) -> Refinement:
     """Return markers learned from some trials, those with larger errors weighted more."""
     settings = RefinementSettings(huber_m=None, frames=100, evenness=power)
@@ -191,7 +191,7 @@ def refined_evenly(
     return refine_markers(subject.chain(), trials, settings, others)
 
 
-def chosen_evenness(subject: Subject, trained: Sequence[str]) -> float:
+def chosen_evenness(subject: OpensimSubject, trained: Sequence[str]) -> float:
     """Return the largest exponent of the weighting that does not raise the held-out error.
 
     Each training trial is held out in turn. Among the exponents whose mean held-out error is within

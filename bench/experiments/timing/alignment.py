@@ -166,7 +166,7 @@ def board(data: Path) -> list[Result]:
 
 
 @dataclass(slots=True)
-class _Sample:
+class _TimedOrientation:
     t_ns: int
     q: Quaternion
     rate: Vector | None = None
@@ -181,7 +181,7 @@ def _ahead_rms(
     samples = []
     for k in range(0, len(truth), 3):
         x, y, z = (dice.standard_normal(3) * scatter_rad / np.sqrt(3)).tolist()
-        samples.append(_Sample(k * period_ns, multiply_one(truth[k], exp_one((x, y, z)))))
+        samples.append(_TimedOrientation(k * period_ns, multiply_one(truth[k], exp_one((x, y, z)))))
     found = []
     for last in range(2, len(samples) - 1):
         for ahead in (1, 2, 3):

@@ -55,7 +55,7 @@ class Treatment(NamedTuple):
     hz: float = 120.0
 
 
-class Tracks(NamedTuple):
+class LagTracks(NamedTuple):
     """Stamps, ns, and orientations of a sensor and of the cameras."""
 
     t_imu: NDArray[np.int64]
@@ -207,7 +207,7 @@ def quaternion_input(data: Path) -> list[Result]:
 
 def made_up(
     seed: int, seconds: float, lag_ms: float, *, drift: float = 0.0, noise: float = 0.1
-) -> Tracks:
+) -> LagTracks:
     """Return stamps and orientations of a wearer's sensor and of the cameras, with known truth."""
     rng = np.random.default_rng(seed)
 
@@ -229,10 +229,10 @@ def made_up(
         q_imu, rotation.exp(rng.normal(scale=spread / 3, size=(len(q_imu), 3)))
     )
     stamps = np.rint(1e9 * (t_imu * (1.0 + drift)) + lag_ms * MS).astype(np.int64)
-    return Tracks(stamps, q_imu, np.rint(1e9 * t_ref).astype(np.int64), q_ref)
+    return LagTracks(stamps, q_imu, np.rint(1e9 * t_ref).astype(np.int64), q_ref)
 
 
-def estimate_between(tracks: Tracks, low_s: float, high_s: float) -> LagEstimate:
+def estimate_between(tracks: LagTracks, low_s: float, high_s: float) -> LagEstimate:
     t_imu, q_imu, t_ref, q_ref = tracks
     low, high = low_s * 1e9, high_s * 1e9
     near = (t_imu >= low - 3e8) & (t_imu <= high + 3e8)

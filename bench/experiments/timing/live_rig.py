@@ -12,7 +12,7 @@ from bench.framework.material import LIVE_RIG
 from bench.rigs.loopback import delays_ns
 
 if TYPE_CHECKING:
-    from bench.rigs.device_restarts import Outcome
+    from bench.rigs.device_restarts import RestartRun
 
 _NS_PER_MS = 1e6
 _DATAGRAMS = 3000
@@ -30,7 +30,7 @@ def _arrivals(_: Path) -> list[Result]:
     ]
 
 
-async def _live() -> Outcome:
+async def _live() -> RestartRun:
     from bench.rigs.device_restarts import live  # noqa: PLC0415 - a rig needs packages other rows do without
     from tests.broker_fixture import chosen_broker  # noqa: PLC0415 - so do brokers
 

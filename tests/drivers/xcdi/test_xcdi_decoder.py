@@ -27,7 +27,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 MS = 1_000_000
 
 
-class Tape:
+class FrameTape:
     """A wire that keeps what is sent, stamped with a time of the test's own."""
 
     bitrate: int | None = None
@@ -58,7 +58,7 @@ def events(unit: str = "100us", ids: XcdiIds | None = None) -> XcdiDecoder:
     return XcdiDecoder(ids or XcdiIds(), unit, "big")
 
 
-def decoded(tape: Tape, decoder: XcdiDecoder | None = None) -> list[Any]:
+def decoded(tape: FrameTape, decoder: XcdiDecoder | None = None) -> list[Any]:
     decoder = decoder or events()
     return decoder.feed(Chunk(0, pack_frames(tape.frames)))
 
@@ -95,7 +95,7 @@ def test_the_vectors_are_canonical_quaternions_or_refused(shared_data: Path) -> 
 
 
 def test_a_sample_has_the_first_frames_stamp_and_the_devices_time() -> None:
-    tape = Tape()
+    tape = FrameTape()
     tape.play(XcdiDevice(tape, XcdiDeviceOptions(first_tick=2**32 - 50)), range(3))
     found = samples(decoded(tape))
     assert [each.arrival_ns for each in found] == [10**9, 10**9 + 10 * MS, 10**9 + 20 * MS]
@@ -106,7 +106,7 @@ def test_a_sample_has_the_first_frames_stamp_and_the_devices_time() -> None:
 
 @pytest.mark.parametrize(("unit", "tick_ns"), [("100us", 100_000), ("1us", 1_000)])
 def test_unit_of_the_sample_time_is_detected_and_reported(unit: str, tick_ns: int) -> None:
-    tape, decoder = Tape(), events("auto")
+    tape, decoder = FrameTape(), events("auto")
     tape.play(XcdiDevice(tape, XcdiDeviceOptions(sample_time_unit=unit)), range(12))
     clocks = []
     told: list[DeviceEvent] = []
@@ -120,7 +120,7 @@ def test_unit_of_the_sample_time_is_detected_and_reported(unit: str, tick_ns: in
 
 
 def test_wrong_configured_unit_is_reported_and_used() -> None:
-    tape, decoder = Tape(), events("1us")
+    tape, decoder = FrameTape(), events("1us")
     tape.play(XcdiDevice(tape), range(20))
     (told,) = of_kind(decoded(tape, decoder), "warning")
     assert "sample_time_unit" in told.text
@@ -131,7 +131,7 @@ def test_wrong_configured_unit_is_reported_and_used() -> None:
 def test_lost_groups_are_one_gap_and_no_restart() -> None:
     for without_counter in (False, True):
         ids = XcdiIds(group_counter=None) if without_counter else XcdiIds()
-        tape = Tape()
+        tape = FrameTape()
         device = XcdiDevice(tape, XcdiDeviceOptions(ids=ids))
         tape.play(device, range(20))
         device.lose(7)
@@ -143,7 +143,7 @@ def test_lost_groups_are_one_gap_and_no_restart() -> None:
 
 
 def test_a_lost_quaternion_is_a_gap_of_one() -> None:
-    tape = Tape()
+    tape = FrameTape()
     device = XcdiDevice(tape)
     tape.play(device, range(20))
     device.lose_frames(DataId.QUATERNION, 1)
@@ -155,7 +155,7 @@ def test_a_lost_quaternion_is_a_gap_of_one() -> None:
 
 
 def test_a_lost_sample_time_costs_the_time_and_not_the_sample() -> None:
-    tape = Tape()
+    tape = FrameTape()
     device = XcdiDevice(tape)
     tape.play(device, range(20))
     device.lose_frames(DataId.SAMPLE_TIME, 3)
@@ -170,7 +170,7 @@ def test_a_lost_sample_time_costs_the_time_and_not_the_sample() -> None:
 @pytest.mark.parametrize("before", [3, 20])
 @pytest.mark.parametrize("lost", [0, 2])
 def test_a_lost_counter_is_not_taken_for_lost_samples(before: int, lost: int) -> None:
-    tape = Tape()
+    tape = FrameTape()
     device = XcdiDevice(tape)
     tape.play(device, range(before))
     device.lose_frames(DataId.GROUP_COUNTER, 2)
@@ -185,7 +185,7 @@ def test_a_lost_counter_is_not_taken_for_lost_samples(before: int, lost: int) ->
 
 
 def test_wraps_of_counter_and_time_are_no_gap_and_no_restart() -> None:
-    tape = Tape()
+    tape = FrameTape()
     options = XcdiDeviceOptions(first_tick=2**32 - 5000, first_counter=2**16 - 30)
     tape.play(XcdiDevice(tape, options), range(200))
     found = decoded(tape)
@@ -195,7 +195,7 @@ def test_wraps_of_counter_and_time_are_no_gap_and_no_restart() -> None:
 
 def test_a_power_cycle_is_one_restart() -> None:
     for first_tick in (0, 5_000_000, 4_000_000_000):
-        tape = Tape()
+        tape = FrameTape()
         device = XcdiDevice(tape, XcdiDeviceOptions(first_tick=first_tick, first_counter=900))
         tape.play(device, range(50))
         tape.play(XcdiDevice(tape), range(50, 100))
@@ -205,7 +205,7 @@ def test_a_power_cycle_is_one_restart() -> None:
 
 
 def test_device_without_sample_time_is_decoded_and_reported_once() -> None:
-    tape = Tape()
+    tape = FrameTape()
     tape.play(XcdiDevice(tape, XcdiDeviceOptions(ids=XcdiIds(sample_time=None))), range(100))
     found = decoded(tape, events("auto"))
     assert len(samples(found)) == 100
@@ -220,7 +220,7 @@ def test_device_without_sample_time_is_decoded_and_reported_once() -> None:
 def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
     ahead: tuple[int, int], offset_ms: float
 ) -> None:
-    first = Tape()
+    first = FrameTape()
     tape_of_both: list[CanFrame] = []
     a = XcdiDevice(first, XcdiDeviceOptions(first_tick=100))
     b = XcdiDevice(first, XcdiDeviceOptions(first_counter=ahead[0], first_tick=ahead[1]))
@@ -239,7 +239,7 @@ def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
 
 
 def test_two_sensors_that_speak_in_turn_frame_by_frame_are_found_out() -> None:
-    tape = Tape()
+    tape = FrameTape()
     a, b = XcdiDevice(tape), XcdiDevice(tape, XcdiDeviceOptions(first_counter=500))
     for number in range(200):
         groups = [each.group(number * 10 * MS, IDENTITY) for each in (a, b)]
@@ -260,7 +260,7 @@ def interleaved(groups: list[list[CanFrame]], order: random.Random) -> list[CanF
 
 
 def test_interleaved_groups_of_two_sensors_on_one_identifier_are_found_out() -> None:
-    order, tape = random.Random(2), Tape()
+    order, tape = random.Random(2), FrameTape()
     a, b = XcdiDevice(tape), XcdiDevice(tape, XcdiDeviceOptions(first_counter=500))
     frames: list[CanFrame] = []
     for number in range(200):
@@ -272,7 +272,7 @@ def test_interleaved_groups_of_two_sensors_on_one_identifier_are_found_out() -> 
 
 
 def test_when_the_second_sensor_is_gone_the_first_is_used_again() -> None:
-    tape = Tape()
+    tape = FrameTape()
     a, b = XcdiDevice(tape), XcdiDevice(tape, XcdiDeviceOptions(first_counter=500))
     for number in range(100):
         tape.t_ns = number * 10 * MS
@@ -287,7 +287,7 @@ def test_when_the_second_sensor_is_gone_the_first_is_used_again() -> None:
 
 
 def test_a_wrong_byte_order_is_named_after_a_hundred_samples() -> None:
-    tape = Tape()
+    tape = FrameTape()
     device = XcdiDevice(tape)
     for number in range(150):
         device.push(number * 10 * MS, (0.5, -0.5, 0.1, 0.7))
@@ -298,7 +298,7 @@ def test_a_wrong_byte_order_is_named_after_a_hundred_samples() -> None:
 
 
 def test_overflow_is_reported_once_a_second() -> None:
-    tape = Tape()
+    tape = FrameTape()
     device = XcdiDevice(tape)
     for number in range(30):
         tape.t_ns = number * 100 * MS
@@ -387,7 +387,7 @@ def test_identifiers_that_cannot_work_are_refused(ids: dict[str, int], words: st
 
 
 def test_a_candump_log_is_decoded() -> None:
-    tape = Tape()
+    tape = FrameTape()
     tape.play(XcdiDevice(tape), range(100))
     log = "".join(f"({f.t_ns / 1e9:.6f}) can0 {f.can_id:03X}#{f.data.hex()}\n" for f in tape.frames)
     decoder = XcdiImu(settings()).decoder()

@@ -41,7 +41,7 @@ class Spoken:
         return []
 
 
-class Rig:
+class SourceClockRig:
     """A core with two sensors whose decoders are given words."""
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ def sample(t_ns: int, ticks: int) -> ImuSample:
 
 
 def test_restart_detected_by_the_clock_alone_is_published_and_counted() -> None:
-    rig = Rig()
+    rig = SourceClockRig()
     for k in range(1000):
         t = START + k * PERIOD
         ticks = 90_000_000 + k * 10_000 if k < 600 else (k - 590) * 10_000
@@ -107,7 +107,7 @@ def test_restart_detected_by_the_clock_alone_is_published_and_counted() -> None:
 
 
 def test_sync_line_ties_the_clocks_of_two_sensors() -> None:
-    rig = Rig()
+    rig = SourceClockRig()
     for k in range(1500):
         t = START + k * PERIOD
         for name, late, rate in (("A", MS, 10_000), ("B", 3 * MS, 10_001)):

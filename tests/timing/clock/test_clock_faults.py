@@ -33,7 +33,7 @@ def longest_run_back(stamps: list[int]) -> int:
     return most
 
 
-class Run:
+class ClockFaultRun:
     """A device whose clock and host may be tampered with while it streams."""
 
     def __init__(self, seed: int = 0) -> None:
@@ -72,7 +72,7 @@ class Run:
 
 @pytest.mark.parametrize("jump_ms", [-30_000, -3_000, -400, 40, 3_000, 100_000])
 def test_a_clock_that_jumps_while_samples_go_on(jump_ms: int) -> None:
-    run = Run()
+    run = ClockFaultRun()
     run.stream(12)
     run.ahead_ns += jump_ms * MS
     run.stream(8)
@@ -82,7 +82,7 @@ def test_a_clock_that_jumps_while_samples_go_on(jump_ms: int) -> None:
 
 @pytest.mark.parametrize("counted", [True, False])
 def test_a_reboot_within_a_stream_is_reported_as_restart(counted: bool) -> None:
-    run = Run()
+    run = ClockFaultRun()
     run.stream(12, counted=counted)
     run.ahead_ns = -run.k * PERIOD
     run.counter = 0
@@ -92,7 +92,7 @@ def test_a_reboot_within_a_stream_is_reported_as_restart(counted: bool) -> None:
 
 
 def test_a_host_that_slept_while_the_device_ran_on() -> None:
-    run = Run()
+    run = ClockFaultRun()
     run.stream(12)
     asleep_s = 40
     run.asleep_ns += asleep_s * S
@@ -118,7 +118,7 @@ def test_a_server_whose_host_slept_is_found_by_its_frames_and_by_its_echoes() ->
 
 
 def test_a_counter_jump_is_ignored_where_ticks_continue() -> None:
-    run = Run()
+    run = ClockFaultRun()
     run.stream(8)
     run.counter += 5000
     run.stream(8)
@@ -148,7 +148,7 @@ def test_stamps_are_monotonic_and_recover_from_any_clock_fault(
     happened: list[tuple[str, int]],
     counted: bool,
 ) -> None:
-    run = Run(1)
+    run = ClockFaultRun(1)
     run.stream(3, counted=counted)
     for what, amount in happened:
         if what == "jump":

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.demo._command import result_line
-from tests.system.station import restore_signals
+from tests.system.station import PATIENCE_S, restore_signals
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,7 +58,7 @@ def test_a_complete_run_ends_with_its_result_line(
 
 
 @pytest.mark.system
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(180)
 @pytest.mark.parametrize("options", [["--headless"], []])
 async def test_ctrl_c_ends_the_demo_with_a_result_line(tmp_path: Path, options: list[str]) -> None:
     """The signal goes to the whole process group, as a terminal sends it."""
@@ -71,7 +71,7 @@ async def test_ctrl_c_ends_the_demo_with_a_result_line(tmp_path: Path, options: 
         start_new_session=True,
         preexec_fn=restore_signals,
     )
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(2 * PATIENCE_S):
         while not (tmp_path / "rig.toml").exists():
             await asyncio.sleep(0.05)
         await asyncio.sleep(1.0)  # the daemon is starting
