@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jointfit_daemon.files.axes import to_z_up
 from jointfit_daemon.files.mocap import read_marker_trial
-from jointfit_daemon.files.orientations import TimeTable, read_sto, vectors_z_up
+from jointfit_daemon.files.orientations import TimeTable, read_sto
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -120,4 +121,4 @@ def _positions(
         for name in joints:
             child = model.getJointSet().get(name).getChildFrame()
             found[name].append(child.getPositionInGround(state).to_numpy())
-    return {name: vectors_z_up(np.array(rows)) for name, rows in found.items()}
+    return {name: to_z_up(np.array(rows)) for name, rows in found.items()}

@@ -18,8 +18,8 @@ import numpy as np
 
 from bench.subjects.model_joint_centers import quiet
 from jointfit_daemon.calibration.marker_refinement import Carriers
+from jointfit_daemon.files.axes import from_z_up
 from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
-from jointfit_daemon.files.models import to_y_up
 from jointfit_daemon.files.orientations import read_sto
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def judge(
         folder = Path(name)
         loaded = without_forces(model)
         if refined is not None:
-            places = dict(zip(refined.marker_names, to_y_up(refined.positions), strict=True))
+            places = dict(zip(refined.marker_names, from_z_up(refined.positions), strict=True))
             place(loaded, places, [m.segment for m in refined.markers])
         loaded.finalizeConnections()
         loaded.printToXML(os.fspath(folder / "model.osim"))
@@ -194,7 +194,9 @@ class OpenSimFollower:
         """Return body poses, shape (T, B, 3, 4), and squared errors of the visible markers, m²."""
         opensim, model = self._opensim, self._model
         self.runs += 1
-        place(model, dict(zip(self._trial.names, to_y_up(positions), strict=True)), self._segments)
+        place(
+            model, dict(zip(self._trial.names, from_z_up(positions), strict=True)), self._segments
+        )
         state = model.initSystem()
         solver = opensim.InverseKinematicsSolver(
             model, self._measured, opensim.SimTKArrayCoordinateReference()

@@ -13,7 +13,8 @@ import numpy as np
 
 from bench.subjects.opensim_reference import judge, shared_markers, trial_frames
 from jointfit_daemon.calibration.marker_refinement import MotionTrial
-from jointfit_daemon.files.models import read_osim, to_z_up
+from jointfit_daemon.files.axes import to_z_up
+from jointfit_daemon.files.models import read_osim
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

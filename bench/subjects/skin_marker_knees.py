@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench.subjects.recorded_knee import FOLDER, KneeTrial
+from jointfit_daemon.files.axes import to_z_up
 from jointfit_daemon.files.mocap import read_trc
-from jointfit_daemon.files.models import read_osim, to_z_up
+from jointfit_daemon.files.models import read_osim
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
 from jointfit_daemon.limb_model import rigid_fit

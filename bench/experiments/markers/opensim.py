@@ -19,7 +19,7 @@ from bench.framework.material import OPENSIM_MODELS
 from bench.subjects.opensim_reference import CONVERGED, OpenSimFollower, judge
 from bench.subjects.opensim_trials import GAIT, OPENCAP, gait2354, opencap
 from jointfit_daemon.calibration.marker_refinement import RefinementSettings, refine_markers, search
-from jointfit_daemon.files.models import to_z_up
+from jointfit_daemon.files.axes import to_z_up
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
 if TYPE_CHECKING:

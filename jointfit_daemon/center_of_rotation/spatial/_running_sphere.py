@@ -13,7 +13,6 @@ import numpy as np
 
 from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import (
-    center_and_spheres,
     center_of,
 )
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import (
@@ -164,9 +163,7 @@ class RunningSphere:
         Costs more than `feed`: ask when it is to be published, not every frame.
         """
         sums = self.sums()
-        found, spheres = center_and_spheres(
-            sums, near=self._near, shape=self._shape, limits=self._limits
-        )
+        found, spheres = center_of(sums, near=self._near, shape=self._shape, limits=self._limits)
         if self._robust:
             known = spheres is not None and found.refused is None
             self._expected = _expected(sums, found, spheres) if known and spheres else None
@@ -276,4 +273,4 @@ def fit_running(
         As for `RunningSphere`.
     """
     limits = limits or SphereLimits(posture=False)
-    return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)
+    return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)[0]

@@ -53,8 +53,6 @@ class TwoSidedSolution:
     """m, in the child, shape (3,)."""
     parent_axis: Array
     """Unit, the direction least seen, in the parent, shape (3,)."""
-    child_axis: Array
-    """The same in the child."""
     hinge: bool
     """Solved for an axis."""
     ratio: float
@@ -123,7 +121,6 @@ def solve_two_sided(
         parent_point=c[:3],
         child_point=c[3:],
         parent_axis=Vt[5, :3] / np.linalg.norm(Vt[5, :3]),
-        child_axis=Vt[5, 3:] / np.linalg.norm(Vt[5, 3:]),
         hinge=rank == 5,
         ratio=float(s[5] / max(s[4], 1e-300)),
         turn=float(s[4]) / sqrt(float(w.sum())),

@@ -55,7 +55,7 @@ def center_of(
     near: Array | None = None,
     shape: Array | None = None,
     limits: SphereLimits | None = None,
-) -> CenterEstimate:
+) -> tuple[CenterEstimate, ConcentricSpheres | None]:
     """Judge the center that sums over frames show.
 
     Parameters
@@ -74,22 +74,12 @@ def center_of(
 
     Returns
     -------
-    CenterEstimate
+    estimate : CenterEstimate
         NaN only in the center of a refusal that has none, and in the radii of markers that were
         not seen often enough to be used.
+    spheres : ConcentricSpheres or None
+        The markers' spheres; None where they are about no such center.
     """
-    return center_and_spheres(sums, method=method, near=near, shape=shape, limits=limits)[0]
-
-
-def center_and_spheres(
-    sums: SphereSums,
-    *,
-    method: str = "running_sphere",
-    near: Array | None = None,
-    shape: Array | None = None,
-    limits: SphereLimits | None = None,
-) -> tuple[CenterEstimate, ConcentricSpheres | None]:
-    """Return `center_of` and the markers' spheres; None where they are about no such center."""
     limits = limits or SphereLimits()
     d = sums.origin.shape[1]
     usable = sums.counts >= MIN_FRAMES

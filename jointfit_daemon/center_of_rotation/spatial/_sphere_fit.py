@@ -69,7 +69,7 @@ def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
 
 
 def _linear(points: Array, method: str, steps: int, min_direction: float) -> CenterEstimate:
-    judged = center_of(
+    judged, _ = center_of(
         sum_up(points), method=method, limits=SphereLimits(min_direction=min_direction)
     )
     if len(judged.unseen) > 0:
@@ -127,11 +127,11 @@ def fit_sphere(
     options = options or SphereOptions()
     weights = _weights(points, options)
     sums, near = sum_up(points, weights), options.start
-    found = center_of(sums, method="sphere", near=near, limits=limits)
+    found, _ = center_of(sums, method="sphere", near=near, limits=limits)
     if parent is None or not np.isfinite(found.center).all():
         return found
     shape = relative(points, parent, found.center)
-    return center_of(sums, method="sphere", near=near, shape=shape, limits=limits)
+    return center_of(sums, method="sphere", near=near, shape=shape, limits=limits)[0]
 
 
 def _weights(points: Array, options: SphereOptions) -> Array | None:

@@ -1,7 +1,6 @@
 """Marker trials of motion-capture systems: TRC and C3D."""
 
 from jointfit_daemon.files.mocap._marker_trial import (
-    Axis,
     MarkerTrial,
     UnknownMarkerError,
     read_marker_trial,
@@ -9,7 +8,6 @@ from jointfit_daemon.files.mocap._marker_trial import (
 from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc, write_trc
 
 __all__ = [
-    "Axis",
     "MarkerTrajectories",
     "MarkerTrial",
     "UnknownMarkerError",

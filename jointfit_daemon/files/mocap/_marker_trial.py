@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
+from jointfit_daemon.files.axes import Axis, from_z_up, to_z_up
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.mocap._trc import MarkerTrajectories, read_trc
 from jointfit_daemon.files.text import MalformedFileError
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-Axis = Literal["x", "y", "z"]
-_TO_Z_UP: dict[str, list[int]] = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 
 
 class UnknownMarkerError(ValueError):
@@ -72,11 +70,11 @@ class MarkerTrial:
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
         """Return an axis of the file in the world with z up, shape (3,)."""
-        return np.asarray(np.eye(3)["xyz".index(axis)][_TO_Z_UP[self.up_axis]])
+        return to_z_up(np.eye(3)["xyz".index(axis)], self.up_axis)
 
     def to_file(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return vectors (..., 3) in the file's own axes."""
-        return np.asarray(vectors[..., np.argsort(_TO_Z_UP[self.up_axis])])
+        return from_z_up(vectors, self.up_axis)
 
     def _index(self, name: str) -> int | None:
         if name in self.trajectories.names:
@@ -115,11 +113,11 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     else:
         raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d")
 
-    up = up_axis or declared or custom
-    turned = trajectories.positions[..., _TO_Z_UP[up]]
+    up = cast("Axis", up_axis or declared or custom)
+    turned = to_z_up(trajectories.positions, up)
     turned[(turned == 0.0).all(axis=-1)] = np.nan
     return MarkerTrial(
         replace(trajectories, positions=turned),
-        cast("Axis", up),
+        up,
         "caller" if up_axis else "file" if declared else "custom of the format",
     )

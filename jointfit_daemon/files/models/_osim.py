@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.axes import to_z_up
 from jointfit_daemon.files.models._osim_document import GROUND, read_document
 from jointfit_daemon.files.models._osim_joints import nearest_joint
 from jointfit_daemon.files.models._units import require_metres
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import Sample
     from jointfit_daemon.model import Quaternion, Vector
 
-_TO_Z_UP = [2, 0, 1]
-
 
 @dataclass(frozen=True, slots=True)
 class ImportedModel:
@@ -45,16 +44,6 @@ class ImportedModel:
 
     model: ChainModel
     remarks: tuple[str, ...]
-
-
-def to_z_up(vectors: Array) -> Array:
-    """Return vectors (..., 3) in OpenSim's axes in those of chain models."""
-    return np.asarray(np.asarray(vectors)[..., _TO_Z_UP])
-
-
-def to_y_up(vectors: Array) -> Array:
-    """Return vectors (..., 3) in the axes of chain models in those of OpenSim."""
-    return np.asarray(np.asarray(vectors)[..., np.argsort(_TO_Z_UP)])
 
 
 def read_osim(path: Path, *, markers: Collection[str] | None = None) -> ImportedModel:

@@ -2,10 +2,8 @@
 
 from jointfit_daemon.files.orientations._npz import (
     OrientationTrial,
-    quaternions_z_up,
     read_arrays,
     read_orientations_npz,
-    vectors_z_up,
     write_orientations_npz,
 )
 from jointfit_daemon.files.orientations._sto import (
@@ -21,12 +19,10 @@ __all__ = [
     "OrientationTable",
     "OrientationTrial",
     "TimeTable",
-    "quaternions_z_up",
     "read_arrays",
     "read_orientations_npz",
     "read_orientations_sto",
     "read_sto",
-    "vectors_z_up",
     "write_orientations_npz",
     "write_orientations_sto",
     "write_sto",

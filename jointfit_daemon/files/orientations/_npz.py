@@ -9,9 +9,8 @@ the axes of the file. Arrays of a file with n instants::
     p_BONE   (n, 3)   its origin, m
     up       ()       "y" or "z": the vertical axis; default y, with x forward (OpenSim)
 
-A y-up file is converted by cyclic renaming of OpenSim's axes (x forward, y up, z right): a vector
-(x, y, z) becomes (z, x, y), a quaternion (w, x, y, z) becomes (w, z, x, y). The segment axes, which
-are named like those of the world, are renamed as well.
+A y-up file is converted as `jointfit_daemon.files.axes` describes: a quaternion (w, x, y, z)
+becomes (w, z, x, y).
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
+from jointfit_daemon.files.axes import quaternions_to_z_up, to_z_up
 from jointfit_daemon.files.text import MalformedFileError, reject_device, require_times
 
 if TYPE_CHECKING:
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from zipfile import ZipInfo
 
     from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.axes import Axis
 
 _GIB = 1 << 30
 LARGEST = _GIB
@@ -52,17 +55,6 @@ class OrientationTrial:
     """q_world_segment by bone, shape (n, 4), unit."""
     origins: Mapping[str, NDArray[np.float64]]
     """Origin of each bone (its proximal joint center), m, shape (n, 3)."""
-
-
-def vectors_z_up(vectors: ArrayLike) -> NDArray[np.float64]:
-    """Return vectors (x, y, z) in OpenSim's axes as (z, x, y), shape (..., 3)."""
-    return np.asarray(vectors, dtype=np.float64)[..., [2, 0, 1]]
-
-
-def quaternions_z_up(quaternions: ArrayLike) -> NDArray[np.float64]:
-    """Return quaternions (w, x, y, z) in OpenSim's axes as (w, z, x, y), unit, shape (..., 4)."""
-    turned = np.asarray(quaternions, dtype=np.float64)[..., [0, 3, 1, 2]]
-    return _unit(turned)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -135,19 +127,20 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
         raise MalformedFileError(
             f"{path}: arrays t and ID_quat or q_BONE are missing: found {found}; rename or add them"
         )
-    z_up = "up" in arrays and str(arrays["up"]) == "z"
-    turn = _unit if z_up else quaternions_z_up
-    move = np.asarray if z_up else vectors_z_up
+    up: Axis = "z" if "up" in arrays and str(arrays["up"]) == "z" else "y"
+
+    def turned(name: str) -> Array:
+        return quaternions_to_z_up(_numbers(path, arrays, name, (count, 4)), up)
 
     t_s = _numbers(path, arrays, "t", None)
     require_times(path, t_s)
     count = len(t_s)
     return OrientationTrial(
         t_s,
-        {n: turn(_numbers(path, arrays, n + _SENSOR, (count, 4))) for n in names},
-        {b: turn(_numbers(path, arrays, _BONE + b, (count, 4))) for b in bones},
+        {n: turned(n + _SENSOR) for n in names},
+        {b: turned(_BONE + b) for b in bones},
         {
-            b: move(_numbers(path, arrays, _ORIGIN + b, (count, 3)))
+            b: to_z_up(_numbers(path, arrays, _ORIGIN + b, (count, 3)), up)
             for b in bones
             if _ORIGIN + b in arrays
         },
@@ -168,13 +161,6 @@ def _numbers(
             " of t; gaps are NaN"
         )
     return array.astype(np.float64)
-
-
-def _unit(quaternions: ArrayLike) -> NDArray[np.float64]:
-    found = np.asarray(quaternions, dtype=np.float64)
-    norms = np.linalg.norm(found, axis=-1, keepdims=True)
-    unit: NDArray[np.float64] = found / np.where(norms > 0.0, norms, np.nan)  # 0 0 0 0: missing
-    return unit
 
 
 def write_orientations_npz(path: Path, trial: OrientationTrial) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.timing.lag._angular_rates import KERNEL_HALF_S, Interpolant
-from jointfit_daemon.timing.lag._standard_deviation import RIDGE, Columns, lag_sigma
+from jointfit_daemon.timing.lag._standard_deviation import RIDGE, LinearizedLag, lag_sigma
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -62,21 +62,6 @@ class _State(NamedTuple):
     tau: float
     rot: Floats
     bias: Floats
-
-
-class _Linear(NamedTuple):
-    """Linearized problem: residuals r (n, 3), weights w (n,), and the Jacobian."""
-
-    r: Floats
-    w: Floats
-    jac: Floats
-    """Derivatives with respect to rotation and bias, shape (n, 3, 6)."""
-    jtau: Floats
-    """Derivative with respect to the lag, shape (n, 3)."""
-    omega: Floats
-    t_s: Floats
-    give: Floats
-    """See ``Columns``."""
 
 
 def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, LagFit | None]:
@@ -132,20 +117,17 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, Lag
 
     # R and b of the exchanged problem: omega = R^T g - R^T b.
     rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
-    whole = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
-    norm = np.linalg.norm(linear.r, axis=1)
+    norm = np.linalg.norm(linear.residual, axis=1)
     square = float(norm @ norm)
     return LagFit(
         tau_s=-state.tau if swapped else state.tau,
-        sigma_s=lag_sigma(
-            Columns(whole, linear.r, linear.w, linear.give), linear.t_s, 2.0 * KERNEL_HALF_S
-        ),
+        sigma_s=lag_sigma(linear, 2.0 * KERNEL_HALF_S),
         rotation=rot,
         bias=bias,
-        r2=1.0 - square / max(float(np.sum(linear.omega**2)), _TINY),
-        residual_rms=float(np.sqrt(square / linear.r.size)),
+        r2=1.0 - square / max(float(np.sum(linear.rate**2)), _TINY),
+        residual_rms=float(np.sqrt(square / linear.residual.size)),
         mean_weight=float(_clipped(norm, _FIRST_HUBER * _scale(norm)).mean()),
-        pairs=len(linear.r),
+        pairs=len(linear.residual),
         converged=converged,
     )
 
@@ -163,7 +145,8 @@ def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
 
 def _linearize(
     cubic: Interpolant, slow: Rates, state: _State, clip: float | None
-) -> _Linear | None:
+) -> LinearizedLag | None:
+    """Return the problem about a state, with Huber's weights; None if the overlap is too short."""
     g, slope, ok = cubic(slow.t_s + state.tau)
     if ok.sum() < LEAST_PAIRS:
         return None
@@ -172,11 +155,11 @@ def _linearize(
     r = g[ok] - state.bias - turned
     norm = np.linalg.norm(r, axis=1)
     weight = _clipped(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
-    jac = np.concatenate(
-        (rotation.skew(turned), np.broadcast_to(-np.eye(3), (*weight.shape, 3, 3))), axis=2
-    )
+
+    by_bias = np.broadcast_to(-np.eye(3), (*weight.shape, 3, 3))
+    jacobian = np.concatenate((rotation.skew(turned), by_bias, slope[ok][:, :, None]), axis=2)
     give = (weight < 1.0).astype(np.float64)
-    return _Linear(r, weight, jac, slope[ok], omega, slow.t_s[ok], give)
+    return LinearizedLag(jacobian, r, weight, give, omega, slow.t_s[ok])
 
 
 def _scale(norm: Floats) -> float:
@@ -189,13 +172,14 @@ def _clipped(norm: Floats, clip: float) -> Floats:
     return np.minimum(1.0, clip / np.maximum(norm, _TINY))
 
 
-def _best_clip(linear: _Linear) -> float:
+def _best_clip(linear: LinearizedLag) -> float:
     r"""Return the threshold, rad/s, of the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
 
     h is the information of a row about the lag. Correlations between residuals are neglected, since
     they are the same for all thresholds.
     """
-    norm, information = np.linalg.norm(linear.r, axis=1), np.sum(linear.jtau**2, axis=1)
+    norm = np.linalg.norm(linear.residual, axis=1)
+    information = np.sum(linear.jacobian[:, :, 6] ** 2, axis=1)
 
     def variance(clip: float) -> float:
         weight = _clipped(norm, clip)
@@ -206,12 +190,11 @@ def _best_clip(linear: _Linear) -> float:
     return min((huber * _scale(norm) for huber in HUBERS), key=variance)
 
 
-def _step(linear: _Linear, state: _State) -> tuple[_State, float]:
+def _step(linear: LinearizedLag, state: _State) -> tuple[_State, float]:
     """Return the next state and the change of the lag, s."""
-    jac = np.concatenate((linear.jac, linear.jtau[:, :, None]), axis=2)
-    weighted = jac * linear.w[:, None, None]
-    normal = np.einsum("nij,nik->jk", weighted, jac)
-    gradient = np.einsum("nij,ni->j", weighted, linear.r)
+    weighted = linear.jacobian * linear.weight[:, None, None]
+    normal = np.einsum("nij,nik->jk", weighted, linear.jacobian)
+    gradient = np.einsum("nij,ni->j", weighted, linear.residual)
 
     normal[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(normal[:3, :3]), _TINY)
     normal[6, 6] += _TINY

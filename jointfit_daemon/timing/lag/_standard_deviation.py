@@ -44,53 +44,59 @@ _LEAST_FREEDOM = 2.0
 _TINY = 1e-12
 
 
-class Columns(NamedTuple):
-    """A weighted linear least-squares problem in its last iteration."""
+class LinearizedLag(NamedTuple):
+    """Weighted linear least-squares problem of one iteration, with n rows of three axes."""
 
     jacobian: Floats
-    """Columns of rotation, bias and, last, the lag: shape (n, 3, 7)."""
+    """Derivatives by rotation, bias and, last, the lag: shape (n, 3, 7)."""
     residual: Floats
-    """Shape (n, 3)."""
+    """rad/s, shape (n, 3)."""
     weight: Floats
-    """Shape (n,)."""
+    """Huber's, shape (n,)."""
     give: Floats
     """``-d log(weight) / d log |residual|``, shape (n,): 0 where the weight stays 1, 1 where Huber
     clips. A clipped residual no longer holds the lag along itself, only across."""
+    rate: Floats
+    """Rate of the slower track, rad/s, shape (n, 3)."""
+    t_s: Floats
+    """Instants, rising, s, shape (n,)."""
 
 
-def lag_sigma(columns: Columns, t_s: Floats, memory_s: float) -> float:
+def lag_sigma(solved: LinearizedLag, memory_s: float) -> float:
     """Return the standard deviation of the lag, s; infinite where too little carries it.
 
     Parameters
     ----------
-    columns : Columns
+    solved : LinearizedLag
         At the solution.
-    t_s : ndarray, shape (n,)
-        Instants of the rows, rising, s.
     memory_s : float
         How long the filter makes residuals remember, s.
     """
-    normal, gradient = _curvature(columns)
+    normal, gradient = _curvature(solved)
     whole = normal.sum(axis=0)
     whole[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(whole[:3, :3]), _TINY)
     share = np.append(-np.linalg.solve(whole[:6, :6], whole[:6, 6]), 1.0)
-    own = columns.jacobian @ share
+    own = solved.jacobian @ share
     information = np.einsum("i,nij,j->n", share, normal, share)
     if information.sum() <= _TINY:
         return float("inf")
+
+    # blocks no shorter than the filter, at most `MOST_BLOCKS`
+    t_s = solved.t_s
     block = np.floor((t_s - t_s[0]) / memory_s).astype(np.int64)
     period, memory = float(np.median(np.diff(t_s))), memory_s
     while np.unique(block).size > MOST_BLOCKS:
         block, memory = block // 2, 2.0 * memory
-    score = columns.weight * np.sum(own * columns.residual, axis=1)
+
+    score = solved.weight * np.sum(own * solved.residual, axis=1)
     free = _newey_west(score, max(1, round(memory / period)))
     table = np.concatenate((normal.reshape(-1, 49), gradient, information[:, None]), axis=1)
     return _widest(table, block, whole, free / information.sum() ** 2)
 
 
-def _curvature(columns: Columns) -> tuple[Floats, Floats]:
+def _curvature(solved: LinearizedLag) -> tuple[Floats, Floats]:
     """Return each row's contribution to the normal matrix, (n, 7, 7), and the gradient, (n, 7)."""
-    jacobian, residual, weight, give = columns
+    jacobian, residual, weight, give, *_ = solved
     weighted = jacobian * weight[:, None, None]
     gradient = np.einsum("nij,ni->nj", weighted, residual)
     along = gradient / np.maximum(weight * np.linalg.norm(residual, axis=1), _TINY)[:, None]

@@ -14,7 +14,8 @@ from jointfit_daemon.tools.text_output import check_choice, echo_json
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.files.mocap import Axis, MarkerTrial
+    from jointfit_daemon.files.axes import Axis
+    from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.center_of_rotation import CenterEstimate
-    from jointfit_daemon.files.mocap import Axis, MarkerTrial
+    from jointfit_daemon.files.axes import Axis
+    from jointfit_daemon.files.mocap import MarkerTrial
 
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.calibration.phases import OfflineTrial
-    from jointfit_daemon.files.mocap import Axis
+    from jointfit_daemon.files.axes import Axis
     from jointfit_daemon.tools.fuse._trial import LimbDescription
 
 METHODS_WITHOUT_MOTION = ("mean", "single")

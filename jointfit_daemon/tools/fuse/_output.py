@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.files.mocap import Axis
+    from jointfit_daemon.files.axes import Axis
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.tools.fuse._tables import OrientationRecording
 

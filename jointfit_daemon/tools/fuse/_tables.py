@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.axes import quaternions_to_z_up
 from jointfit_daemon.files.orientations import (
-    quaternions_z_up,
     read_arrays,
     read_orientations_npz,
     read_orientations_sto,
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.files.mocap import Axis
+    from jointfit_daemon.files.axes import Axis
 
 
 SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0
@@ -71,7 +71,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
         columns = {name: sto.quaternions[:, k] for k, name in enumerate(sto.names)}
         for name, q in columns.items():
             check_unit_norm(path, name, q)
-        turn = quaternions_z_up if up == "y" else rotation.normalize
+        turn = quaternions_to_z_up if up == "y" else rotation.normalize
         columns = {name: turn(q) for name, q in columns.items()}
         table = OrientationRecording(sto.t_s, columns, columns)
     else:

@@ -15,8 +15,8 @@ from jointfit_daemon.calibration import CalibrationSettings, OpticalTrack
 from jointfit_daemon.calibration.anatomy import static_cluster, track_cluster
 from jointfit_daemon.calibration.phases import OfflineTrial, mounts_of
 from jointfit_daemon.calibration.registration import orientations_at, robust_mean
+from jointfit_daemon.files.axes import quaternions_to_z_up
 from jointfit_daemon.files.mocap import read_marker_trial
-from jointfit_daemon.files.orientations import quaternions_z_up
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import MIN_MARKERS, visible
 from jointfit_daemon.model import Chain
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.registration import RobustMean
-    from jointfit_daemon.files.mocap import Axis
+    from jointfit_daemon.files.axes import Axis
     from jointfit_daemon.limb_model import MarkerCluster
 
 
@@ -276,7 +276,7 @@ def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
             raise UnusableInputError(f"{path}: {unknown_name('sensor', name, mounts)}")
         q = np.asarray(mounts[name], dtype=np.float64)
         check_unit_norm(path, name, q[None])
-        found[name] = rotation.normalize(q) if data.get("up") == "z" else quaternions_z_up(q)
+        found[name] = rotation.normalize(q) if data.get("up") == "z" else quaternions_to_z_up(q)
     return found
 
 

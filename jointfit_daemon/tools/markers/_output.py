@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.axes import from_z_up
 from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
-from jointfit_daemon.files.models import to_y_up, write_model
+from jointfit_daemon.files.models import write_model
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,7 +43,7 @@ def _write_marker_set(path: Path, model: ChainModel) -> None:
     root = ET.Element("OpenSimDocument", Version=_OPENSIM_VERSION)
     whole = ET.SubElement(root, "MarkerSet", name="markerset")
     objects = ET.SubElement(whole, "objects")
-    for marker, at in zip(model.markers, to_y_up(model.positions), strict=True):
+    for marker, at in zip(model.markers, from_z_up(model.positions), strict=True):
         one = ET.SubElement(objects, "Marker", name=marker.name)
         ET.SubElement(one, "socket_parent_frame").text = f"/bodyset/{marker.segment}"
         ET.SubElement(one, "location").text = " ".join(f"{float(v):.9g}" for v in at)

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from jointfit_daemon.files.mocap import Axis, MarkerTrial
+    from jointfit_daemon.files.axes import Axis
+    from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _AXES = "xyz"

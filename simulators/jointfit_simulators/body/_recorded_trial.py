@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.axes import quaternions_to_z_up, to_z_up
 from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc
 from jointfit_daemon.files.orientations import (
     OrientationTrial,
-    quaternions_z_up,
     read_orientations_npz,
     read_orientations_sto,
-    vectors_z_up,
 )
 from jointfit_daemon.files.text import read_json
 
@@ -78,7 +77,7 @@ def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
             case ".sto":
                 table = read_orientations_sto(path)
                 sensors = {
-                    name: quaternions_z_up(table.quaternions[:, i])
+                    name: quaternions_to_z_up(table.quaternions[:, i])
                     for i, name in enumerate(table.names)
                 }
                 orientations.append(OrientationTrial(table.t_s, sensors, {}, {}))
@@ -86,7 +85,7 @@ def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
                 markers = read_trc(path)
             case ".json":
                 q_bias = read_json(path)["q_bias"]
-                biases = {name: quaternions_z_up(q) for name, q in q_bias.items()}
+                biases = {name: quaternions_to_z_up(q) for name, q in q_bias.items()}
             case other:
                 raise ValueError(
                     f"{path}: no trial is read from {other!r} files; expected .npz, .sto, .trc or"
@@ -139,5 +138,5 @@ class InterpolatedTrack:
 
 def interpolated_markers(markers: MarkerTrajectories) -> InterpolatedTrack:
     """Return all markers as one track, z up, flattened to shape (n, 3 * markers)."""
-    flat = vectors_z_up(markers.positions).reshape(len(markers.t_s), -1)
+    flat = to_z_up(markers.positions).reshape(len(markers.t_s), -1)
     return InterpolatedTrack(markers.t_s - markers.t_s[0], flat, rotation=False)
