@@ -13,11 +13,7 @@ import numpy as np
 
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of_spread, variance_inflation
 from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
-from jointfit_daemon.center_of_rotation.planar._circle_fit import (
-    CircleMethod,
-    circle_of,
-    temper,
-)
+from jointfit_daemon.center_of_rotation.planar._circle_fit import CircleMethod, circle_of, temper
 from jointfit_daemon.center_of_rotation.planar._moments import (
     GATE,
     ROUNDING,

@@ -199,13 +199,7 @@ def circle_statistics(
     scale = blurred * bound
 
     return CircleStatistics(
-        noise,
-        residual,
-        bound * (sxx + syy),
-        scale * syy,
-        -scale * m.xy,
-        scale * sxx,
-        scale * long,
+        noise, residual, bound * (sxx + syy), scale * syy, -scale * m.xy, scale * sxx, scale * long
     )
 
 

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
-from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import (
-    center_of,
-)
+from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import center_of
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import (
     LAGS,
     SphereSums,

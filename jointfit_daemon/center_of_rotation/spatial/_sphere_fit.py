@@ -14,10 +14,7 @@ import numpy as np
 from jointfit_daemon.center_of_rotation._path_statistics import radial_residuals
 from jointfit_daemon.center_of_rotation._result import refusal
 from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import paths_of
-from jointfit_daemon.center_of_rotation.spatial._geometric_solver import (
-    SphereOptions,
-    solve_sphere,
-)
+from jointfit_daemon.center_of_rotation.spatial._geometric_solver import SphereOptions, solve_sphere
 from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import relative
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import MIN_FRAMES, center_of

@@ -13,9 +13,7 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chains import exp_matrix, place_coupled, rest_state
-from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
-    marker_slots,
-)
+from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import marker_slots
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

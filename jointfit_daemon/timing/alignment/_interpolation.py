@@ -130,11 +130,7 @@ def _combine(m: float, u: Vector, n: float, v: Vector) -> Vector:
 
 
 def _cross(u: Vector, v: Vector) -> Vector:
-    return (
-        u[1] * v[2] - u[2] * v[1],
-        u[2] * v[0] - u[0] * v[2],
-        u[0] * v[1] - u[1] * v[0],
-    )
+    return (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
 
 
 def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:

@@ -6,12 +6,4 @@ from jointfit_daemon.timing.clock._direct_time import SYNC_STALE_NS
 from jointfit_daemon.timing.clock._stamps import SLEW, Stamp
 from jointfit_daemon.timing.clock._sync_line import Edge, SyncLine
 
-__all__ = [
-    "SLEW",
-    "SYNC_STALE_NS",
-    "DelayPercentiles",
-    "DeviceClock",
-    "Edge",
-    "Stamp",
-    "SyncLine",
-]
+__all__ = ["SLEW", "SYNC_STALE_NS", "DelayPercentiles", "DeviceClock", "Edge", "Stamp", "SyncLine"]
