@@ -15,12 +15,12 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import BOARD, SEEDED
+from bench.subjects.gyro_rates import rates_from_gyro
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.timing.lag import (
     LagEstimate,
     LagTracker,
     estimate_lag_of_rates,
-    rates_from_gyro,
     rates_from_orientations,
 )
 

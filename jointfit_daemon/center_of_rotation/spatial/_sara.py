@@ -9,14 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.center_of_rotation._result import refusal
-from jointfit_daemon.center_of_rotation.spatial._score import (
-    FEW,
-    HINGE_RATIO,
-    MIN_TURN_RAD,
-    solve_two_sided,
-    two_sided_estimate,
-)
+from jointfit_daemon.center_of_rotation.spatial._score import two_sided_estimate
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -52,20 +45,7 @@ def fit_axis(
     CenterEstimate
         `axis` in the parent; refused where the movement went about more than one axis.
     """
-    found = solve_two_sided(parent, child, hinge=True, robust=robust)
-    if found is None:
-        return refusal("sara", 3, 0, FEW)
-    if found.ratio >= HINGE_RATIO and found.turn >= MIN_TURN_RAD:
-        return refusal(
-            "sara",
-            3,
-            found.frames,
-            f"the joint turned about more than one axis (σ₆/σ₅ "
-            f"{found.ratio:.2f}, a hinge has less than {HINGE_RATIO}): use score or sphere, or "
-            "move about one axis only",
-        )
-
-    estimate = two_sided_estimate(found, child, parent, "sara", near)
+    estimate = two_sided_estimate("sara", parent, child, near, hinge=True, robust=robust)
     axis = estimate.axis
     if axis is None or toward is None or float(axis @ toward) >= 0.0:
         return estimate

@@ -1,6 +1,6 @@
 """Lag of an IMU behind motion capture, estimated from the angular rates of both."""
 
-from jointfit_daemon.timing.lag._angular_rates import rates_from_gyro, rates_from_orientations
+from jointfit_daemon.timing.lag._angular_rates import Rates, rates_from_orientations
 from jointfit_daemon.timing.lag._estimate import (
     LagEstimate,
     LagSettings,
@@ -14,10 +14,10 @@ __all__ = [
     "LagEstimate",
     "LagSettings",
     "LagTracker",
+    "Rates",
     "TrackedLag",
     "estimate_in_steps",
     "estimate_lag",
     "estimate_lag_of_rates",
-    "rates_from_gyro",
     "rates_from_orientations",
 ]

@@ -109,21 +109,6 @@ def rates_from_orientations(
     )
 
 
-def rates_from_gyro(t_ns: NDArray[np.int64], w: Floats, origin_ns: int) -> Rates:
-    """Return measured rates, rad/s, shape (n, 3), as a track; rows with NaN are missing."""
-    seen = np.isfinite(w).all(axis=1)
-    t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
-    if t.size < 3:  # noqa: PLR2004 - one rate is no track
-        return _empty()
-
-    step = np.diff(t)
-    period = float(np.median(step))
-    whole = (step > 0) & (step < GAP * period)
-    run = np.concatenate(([0], np.cumsum(~whole)))
-    share = float(step[whole].sum() / (t[-1] - t[0]))
-    return Rates(t, w[seen], run, period, share)
-
-
 def _empty() -> Rates:
     return Rates(np.empty(0), np.empty((0, 3)), np.empty(0, dtype=np.intp), np.inf, 0.0)
 

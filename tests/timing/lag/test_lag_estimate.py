@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.subjects.gyro_rates import rates_from_gyro
 from jointfit_daemon.timing.lag import (
     LagEstimate,
     LagSettings,
     LagTracker,
     estimate_lag,
     estimate_lag_of_rates,
-    rates_from_gyro,
     rates_from_orientations,
 )
 from jointfit_daemon.timing.lag._angular_rates import Interpolant, Rates
