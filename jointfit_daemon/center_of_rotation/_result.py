@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CenterEstimate:
-    """Estimated point that is fixed in both the parent and the child segment."""
+    """Estimated point that is fixed in both the parent and the child segment.
+
+    This is the only result type of centers of rotation. An anatomical `JointCenter` of the
+    calibration contains one, and is placed with the other joints of the chain by priors.
+    """
 
     method: str
     """Name of the estimator: ``hyper``, ``sphere``, ``score``, ..."""

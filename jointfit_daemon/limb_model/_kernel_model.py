@@ -82,8 +82,20 @@ class KernelModel(SegmentModel):
     _tables: KernelTables = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Derive the arrays that are multiplied in every frame."""
-        object.__setattr__(self, "_tables", KernelTables.of(self.plain, self.tilted, self.trend))
+        """Derive the arrays that are multiplied in every frame.
+
+        Raises
+        ------
+        ValueError
+            A width or leverage is zero, a leverage matrix is not positive definite, or a center is
+            out of range.
+        """
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise"):
+                tables = KernelTables.of(self.plain, self.tilted, self.trend)
+        except FloatingPointError as error:
+            raise ValueError(f"kernel width, center or leverage out of range: {error}") from error
+        object.__setattr__(self, "_tables", tables)
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
