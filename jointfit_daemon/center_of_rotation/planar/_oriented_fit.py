@@ -123,7 +123,14 @@ def oriented_estimate(
     if alone.refused and "motion" in alone.refused:
         return replace(alone, method=METHOD)
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
-    Sigma = (noise or AngleNoise()).covariance(times, _smooth(x, theta))
+
+    # The scale's covariance is that of the angles as the path explains them, to second order. It
+    # must not hold their noise, which is correlated with the residuals and would pull the center.
+    d = (x - x.mean(axis=0)) / max(float(x.std()), 1e-9)
+    one, u, v = np.ones(len(x)), d[:, 0], d[:, 1]
+    terms = np.column_stack((one, u, v, u * u, u * v, v * v))
+    smooth = np.asarray(terms @ np.linalg.lstsq(terms, theta, rcond=None)[0])
+    Sigma = (noise or AngleNoise()).covariance(times, smooth)
     try:
         aided = _solve(x, theta, sigma, Sigma)
     except np.linalg.LinAlgError:  # no information in some direction at all
@@ -197,18 +204,6 @@ def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array,
     averaged = averaged / count[:, None]
 
     return averaged[:, :2], averaged[:, 2], averaged[:, 3]
-
-
-def _smooth(x: Array, theta: Array) -> Array:
-    """Return the angles as the path explains them, to second order.
-
-    The scale's covariance must not hold the noise of the angles: correlated with the residuals it
-    would pull the center, by δ²/var θ.
-    """
-    d = (x - x.mean(axis=0)) / max(float(x.std()), 1e-9)
-    one, u, v = np.ones(len(x)), d[:, 0], d[:, 1]
-    terms = np.column_stack((one, u, v, u * u, u * v, v * v))
-    return np.asarray(terms @ np.linalg.lstsq(terms, theta, rcond=None)[0])
 
 
 def _path_noise(x: Array) -> float:

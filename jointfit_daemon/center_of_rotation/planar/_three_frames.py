@@ -107,7 +107,10 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
         return _refusal(p, noise, reason)
 
     spokes = np.stack((-offset, u - offset, v - offset))
-    covariance = _covariance(u, v, float(np.hypot(*offset)), noise)
+    # noise e along the spokes gives u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁), so that
+    # C = σ² r² A⁻¹ [[2, 1], [1, 2]] A⁻ᵀ with A = (u v)ᵀ; the unit of sides and radius cancels
+    moves = float(np.hypot(*offset)) * np.linalg.inv(np.stack((u, v)))
+    covariance = np.asarray(noise**2 * moves @ np.array([[2.0, 1.0], [1.0, 2.0]]) @ moves.T)
     error = sqrt(float(np.trace(covariance)))
     radius = float(size * np.hypot(*offset))
 
@@ -161,19 +164,6 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     below = one_less * np.sqrt(one_more)
     lost = below <= 0.0
     return np.where(lost, inf, error / np.where(lost, 1.0, below))
-
-
-def _covariance(u: Array, v: Array, radius: float, noise: float) -> Array:
-    r"""Return the covariance of the center from noise along the spokes, m².
-
-    .. math:: C = σ^2 r^2 A^{-1} \begin{pmatrix} 2 & 1 \\ 1 & 2 \end{pmatrix} A^{-T},
-              \qquad A = (u\; v)^T
-
-    since each spoke's noise e gives u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁). Sides and radius in one
-    unit, which cancels.
-    """
-    moves = radius * np.linalg.inv(np.stack((u, v)))
-    return np.asarray(noise**2 * moves @ np.array([[2.0, 1.0], [1.0, 2.0]]) @ moves.T)
 
 
 def _refusal(points: Array, noise: float, reason: str) -> CenterEstimate:

@@ -62,7 +62,14 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     z: Complex = (points[..., 0] + 1j * points[..., 1]).reshape(-1, n)
     theta = np.broadcast_to(angles, points.shape[:-1]).reshape(-1, n)
     circles = fit_circles(points.reshape(-1, n, 2))
-    start = _linear_start(z, theta)
+
+    # start: least squares of z = c + w exp(iθ) as (x, y, |w|, arg w), shape (runs, 4)
+    turn = np.exp(1j * theta)
+    away = turn - turn.mean(axis=-1, keepdims=True)
+    w = (z * away.conj()).sum(axis=-1) / (np.abs(away) ** 2).sum(axis=-1)
+    c = z.mean(axis=-1) - w * turn.mean(axis=-1)
+    start = np.stack((c.real, c.imag, np.abs(w), np.angle(w)), axis=-1)
+
     noise = np.where(
         circles.valid, circles.noise, np.abs(z - start[:, :1] - 1j * start[:, 1:2]).std(-1)
     )
@@ -75,15 +82,6 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
         found, H = _descend(_Runs(z, theta, noise, weights, weights.diagonal(), radius), found)
 
     return np.asarray(_guarded(found[:, :2], H, circles).reshape(*shape, 2))
-
-
-def _linear_start(z: Complex, theta: Array) -> Array:
-    """Return least squares of z = c + w exp(iθ) as (x, y, |w|, arg w), shape (runs, 4)."""
-    turn = np.exp(1j * theta)
-    away = turn - turn.mean(axis=-1, keepdims=True)
-    w = (z * away.conj()).sum(axis=-1) / (np.abs(away) ** 2).sum(axis=-1)
-    c = z.mean(axis=-1) - w * turn.mean(axis=-1)
-    return np.stack((c.real, c.imag, np.abs(w), np.angle(w)), axis=-1)
 
 
 @cache
